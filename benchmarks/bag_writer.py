@@ -55,15 +55,15 @@ def write_bag(path: str | Path, records: Iterable[Record], *, storage: str = "sq
             writer.write(connections[record.topic], record.stamp, store.serialize_cdr(record.message, kind))
 
 
-def cloud_message(points: Float[np.ndarray, "n 3"], frame: str, stamp: int) -> Any:
-    """A PointCloud2 of float32 points [m], not organised; NaN is kept."""
+def cloud_message(points: Float[np.ndarray, "*n 3"], frame: str, stamp: int) -> Any:
+    """A PointCloud2 of float32 points [m], organised if they are a grid of rows; NaN is kept."""
     types = jazzy_types().types
     fields = [types["sensor_msgs/msg/PointField"](name, 4 * axis, 7, 1) for axis, name in enumerate("xyz")]
     data = np.ascontiguousarray(points, dtype="<f4").view(np.uint8).reshape(-1)
-    width = len(points)
+    height, width = (1, *points.shape)[-3:-1]
     dense = bool(np.isfinite(points).all())
     return types["sensor_msgs/msg/PointCloud2"](
-        _header(frame, stamp), 1, width, fields, False, 12, 12 * width, data, dense
+        _header(frame, stamp), height, width, fields, False, 12, 12 * width, data, dense
     )
 
 

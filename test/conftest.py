@@ -34,6 +34,7 @@ hypothesis.settings.load_profile("ci" if os.environ.get("CI") else "dev")
 SHARED_NODE = {
     f"test/ros/{name}.py"
     for name in (
+        "inputs/test_situations",
         "outputs/test_messages",
         "test_action_server",
         "test_hostile",

@@ -187,7 +187,8 @@ def bag_views(path: Path, options: argparse.Namespace) -> Iterator[tuple[BagFram
 
     Raises BagError: nothing can be read, or the frame wanted is not in the bag.
     """
-    transforms, place = None, CameraPlace(options.view_point, options.sensor_frame)
+    said = options.view_point and tuple(options.view_point)
+    transforms, place = None, CameraPlace(said, options.sensor_frame)
     told = set[str]()
     frames = read_frames(
         path, topic=options.topic, info_topic=options.camera_info, every=options.every, limit=options.limit

@@ -110,7 +110,7 @@ def _single(points: Points) -> Points:
 
 def _doubts(seen: Segmentation, views: Sequence[PointCloud], farthest: float) -> tuple[str, ...]:
     """Why what is seen may not be what was there: nothing that is planned on it counts as verified."""
-    return (*_unit_doubts(seen, views, farthest), *_camera_doubts(seen, views))
+    return (*_unit_doubts(seen, views, farthest), *_camera_doubts(seen, views), *filter(None, (seen.beside,)))
 
 
 def _unit_doubts(seen: Segmentation, views: Sequence[PointCloud], farthest: float) -> tuple[str, ...]:

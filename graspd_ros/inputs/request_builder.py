@@ -185,7 +185,8 @@ def check_request(message: GraspRequest, hand: str) -> None:
     if message.use_target_point:
         near(message.target_point, "target_point")
         if message.source in (GraspRequest.MESH, GraspRequest.KNOWN):
-            told = f"with source {message.source}, one object; valid with CLOUD=0, LATEST_CLOUD=2 and VIEWS=3"
+            given = (message.mesh_uri or message.known_object)[:MOST_PATH]
+            told = f"given with {given}, a mesh; valid with CLOUD=0, LATEST_CLOUD=2 and VIEWS=3"
             raise bad_request(f"target_point: {told}")
     _check_camera_and_mask(message)
     if message.source not in (GraspRequest.MESH, GraspRequest.KNOWN) and any(message.surface.coef):

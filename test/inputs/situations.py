@@ -6,171 +6,49 @@ words. To add a situation, add a row.
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from dataclasses import dataclass, field
-from functools import cache
-from pathlib import Path
-from typing import Any
-
 import numpy as np
+from bag_writer import cloud_message
+from inputs_made import (
+    FRAME,
+    MATRIX,
+    POSE,
+    Situation,
+    all_round,
+    array_file,
+    bag,
+    bytes_file,
+    cloud,
+    depth_of,
+    grid_of,
+    in_camera,
+    in_world,
+    infinite,
+    mesh_file,
+    middle,
+    millimetres,
+    only_finite,
+    only_object,
+    padded,
+    padded_pcd,
+    pcd,
+    ply,
+    quads,
+    rows_of,
+    scaled,
+    sheared,
+    sheet,
+    sheet_in_world,
+    solid_stl,
+    stage,
+    text,
+    text_pcd,
+    text_ply,
+    volume,
+    zeroed,
+)
 
-from graspd_bench.rendering.depth_noise import DEFAULT
-from graspd_bench.rendering.tabletop import TabletopScene, depth_views, on_table, ring_poses, tabletop
-from graspd_core.mesh.mesh_files import mass_properties, save_mesh, surface_samples
 from graspd_core.mesh.shapes import make_shape
-from graspd_core.perception.cloud.camera import PinholeCamera, camera_rays
 from graspd_core.types import TriangleMesh
-
-CAMERA = PinholeCamera(320, 240, 308.0, 308.0, 159.5, 119.5)
-MATRIX = np.array([[CAMERA.fx, 0, CAMERA.cx], [0, CAMERA.fy, CAMERA.cy], [0, 0, 1]])
-POSE = ring_poses(1, elevation=0.6, azimuth=-1.2)[0]
-GITHUB = "https://github.com/"
-
-
-@dataclass(frozen=True)
-class Situation:
-    """An input and what a person would expect of it.
-
-    Attributes:
-        name: of the situation.
-        make: writes the input into a folder and returns its path.
-        expect: the object's volume [m³], or the words of a refusal as a regular expression.
-        thread: where somebody had it, below `GITHUB`; empty where it is of this project's own trials.
-        options: of the command line; the library's arguments follow from them.
-        warns: words of a warning.
-        near: share of the volume that the answer may be off, for one view guesses the back.
-    """
-
-    name: str
-    make: Callable[[Path], Path]
-    expect: float | str
-    thread: str = ""
-    options: dict[str, Any] = field(default_factory=dict)
-    warns: str = ""
-    near: float = 0.3
-
-
-def volume(shape: str) -> float:
-    return mass_properties(make_shape(shape))[0]
-
-
-@cache
-def stage(shape: str = "bottle", beside: str = "") -> TabletopScene:
-    if not shape:
-        return on_table(TriangleMesh(make_shape("box").vertices - np.array([0, 0, 0.3]), make_shape("box").faces))
-    return tabletop(shape, obstacles=[(beside, 0.064, 0.0)] if beside else [])
-
-
-@cache
-def depth_of(shape: str = "bottle", beside: str = "") -> tuple[np.ndarray, np.ndarray]:
-    """The depth image [m] and which mesh each pixel shows."""
-    return depth_views(stage(shape, beside), CAMERA, [POSE], DEFAULT)[0]
-
-
-def grid_of(shape: str = "bottle", beside: str = "") -> np.ndarray:
-    """An organised cloud in the camera's frame [m], NaN where nothing was seen."""
-    depth = depth_of(shape, beside)[0]
-    return camera_rays(CAMERA) * np.where(depth > 0, depth, np.nan)[..., None]
-
-
-def in_camera(point: np.ndarray) -> tuple[float, ...]:
-    return tuple(float(x) for x in (point - POSE[:3, 3]) @ POSE[:3, :3])
-
-
-def middle(mesh: TriangleMesh) -> tuple[float, ...]:
-    return in_camera(0.5 * (mesh.vertices.min(0) + mesh.vertices.max(0)))
-
-
-def sheet(gaps: bool = False) -> TriangleMesh:
-    """Faces between neighbouring pixels, as camera viewers write them; with `gaps`, to pixels without depth too."""
-    grid = np.nan_to_num(grid_of())
-    index = np.arange(grid.shape[0] * grid.shape[1]).reshape(grid.shape[:2])
-    a, b, c, d = index[:-1, :-1], index[:-1, 1:], index[1:, :-1], index[1:, 1:]
-    faces = np.concatenate([np.stack(corners, -1).reshape(-1, 3) for corners in ((a, c, b), (b, c, d))])
-    points = grid.reshape(-1, 3)
-    depth = points[faces][..., 2]
-    return TriangleMesh(points, faces[((np.ptp(depth, axis=1) < 0.02) & depth.all(1)) | (gaps & ~depth.all(1))])
-
-
-def sheet_in_world() -> TriangleMesh:
-    mesh, seen = sheet(), sheet().vertices.any(1)
-    return TriangleMesh(in_world(mesh.vertices[seen]), (np.cumsum(seen) - 1)[mesh.faces])
-
-
-def mesh_file(name: str, mesh: TriangleMesh) -> Callable[[Path], Path]:
-    def make(folder: Path) -> Path:
-        save_mesh(mesh, folder / name)
-        return folder / name
-
-    return make
-
-
-def array_file(name: str, make_arrays: Callable[[], Any]) -> Callable[[Path], Path]:
-    def make(folder: Path) -> Path:
-        arrays = make_arrays()
-        if name.endswith(".npz"):
-            np.savez(folder / name, **arrays)
-        else:
-            np.save(folder / name, arrays)
-        return folder / name
-
-    return make
-
-
-def bytes_file(name: str, make_bytes: Callable[[], bytes]) -> Callable[[Path], Path]:
-    def make(folder: Path) -> Path:
-        (folder / name).write_bytes(make_bytes())
-        return folder / name
-
-    return make
-
-
-def ply(points: np.ndarray, extra: str = "", promised: int | None = None) -> bytes:
-    """A binary cloud; `extra` names more properties, of floats."""
-    properties = "".join(f"property float {name}\n" for name in ("x", "y", "z", *extra.split()))
-    count = len(points) if promised is None else promised
-    head = f"ply\nformat binary_little_endian 1.0\nelement vertex {count}\n{properties}end_header\n"
-    return head.encode() + points.astype("<f4").tobytes()
-
-
-def pcd(points: np.ndarray, viewpoint: str = "0 0 0 1 0 0 0") -> bytes:
-    head = "VERSION .7\nFIELDS x y z\nSIZE 4 4 4\nTYPE F F F\nCOUNT 1 1 1\n"
-    head += f"WIDTH {len(points)}\nHEIGHT 1\nVIEWPOINT {viewpoint}\nPOINTS {len(points)}\nDATA binary\n"
-    return head.encode() + points.astype("<f4").tobytes()
-
-
-def rows_of(shape: str = "bottle") -> np.ndarray:
-    return grid_of(shape).reshape(-1, 3)
-
-
-def zeroed() -> np.ndarray:
-    return np.nan_to_num(rows_of())
-
-
-def infinite() -> np.ndarray:
-    return np.where(np.isfinite(rows_of()), rows_of(), -np.inf)
-
-
-def only_object() -> np.ndarray:
-    return grid_of()[depth_of()[1] == 0]
-
-
-def all_round(shape: str, noise: float = 0.0005) -> np.ndarray:
-    return surface_samples(make_shape(shape), 6000, 0)[0] + np.random.default_rng(0).normal(0, noise, (6000, 3))
-
-
-def in_world(points: np.ndarray) -> np.ndarray:
-    return points @ POSE[:3, :3].T + POSE[:3, 3]
-
-
-def scaled(shape: str, factor: float) -> TriangleMesh:
-    mesh = make_shape(shape)
-    return TriangleMesh(mesh.vertices * factor, mesh.faces)
-
-
-def millimetres() -> np.ndarray:
-    return (1000 * depth_of()[0]).astype(np.uint16)
-
 
 BOTTLE, BOX, CYLINDER = volume("bottle"), volume("box"), volume("cylinder")
 PAIR = ("box", "cylinder")
@@ -369,7 +247,7 @@ MESHES = (
     Situation(
         "a mesh with a target",
         mesh_file("a.stl", make_shape("box")),
-        "target: given with .*a.stl, a mesh",
+        "target(_point)?: given with .*a.stl, a mesh",
         "",
         {"target": (0.0, 0.0, 0.0)},
     ),
@@ -434,5 +312,115 @@ MESHES = (
         "isl-org/Open3D/issues/6623",
     ),
     Situation("a file that is not there", lambda folder: folder / "a.ply", "no such", "graspnet/graspnetAPI/issues/3"),
+    Situation("quadrilaterals, material lost", bytes_file("a.obj", quads), BOX, "graspnet/graspnetAPI/issues/34"),
+    Situation("a binary stl that begins with solid", solid_stl, BOX, "ros-industrial/abb/issues/104", near=0.01),
+    Situation(
+        "an stl with nothing in it",
+        bytes_file("a.stl", lambda: b"solid Empty\nendsolid Empty"),
+        "empty mesh",
+        "mikedh/trimesh/issues/95",
+    ),
 )
-SITUATIONS = CLOUDS + MESHES
+MESSAGES = (
+    Situation(
+        "a message without points",
+        bag(lambda stamp: cloud_message(np.zeros((0, 3)), FRAME, stamp)),
+        "empty",
+        "QingyongHu/RandLA-Net/issues/197",
+    ),
+    Situation(
+        "a message of 32 bytes a point",
+        cloud(grid_of(), **padded()),
+        BOTTLE,
+        "ros2/common_interfaces/issues/197",
+    ),
+    Situation(
+        "a message that says big endian and is not",
+        cloud(grid_of(), is_bigendian=True),
+        "is_bigendian=true, but",
+        "Field-Robotics-Japan/UnitySensors/pull/212",
+    ),
+    Situation(
+        "a message without a row's length",
+        cloud(rows_of(), row_step=0),
+        BOTTLE,
+        "ros-drivers/velodyne/issues/279",
+    ),
+    Situation(
+        "an organised message with the row's length of one row",
+        cloud(grid_of(), row_step=12 * 320 * 240),
+        BOTTLE,
+        "realsenseai/realsense-ros/pull/1668",
+    ),
+    Situation(
+        "a message cut short",
+        cloud(grid_of(), data=np.zeros(999, np.uint8)),
+        "999 bytes",
+        "ros2/common_interfaces/issues/106",
+    ),
+)
+DRIVERS = (
+    Situation(
+        "points with colours, n by 6",
+        array_file("a.npy", lambda: np.hstack([rows_of(), np.full((76800, 3), 128.0)])),
+        "colours or normals beside x, y, z",
+        "YanjieZe/Improved-3D-Diffusion-Policy/issues/24",
+    ),
+    Situation(
+        "text of points with colours",
+        bytes_file("a.xyz", lambda: text(only_finite(rows_of()), 128, 64, 0)),
+        BOTTLE,
+        "felja633/DARE/issues/3",
+    ),
+    Situation("a pcd with gaps in its fields", bytes_file("a.pcd", padded_pcd), BOTTLE, "PDAL/PDAL/issues/3254"),
+    Situation("a ply of text and doubles", bytes_file("a.ply", text_ply), BOTTLE, "keijiro/Pcx/issues/10"),
+    Situation(
+        "a ply that calls its types float64",
+        bytes_file("a.ply", lambda: text_ply("float64", colour=False)),
+        BOTTLE,
+        "keijiro/Pcx/issues/10",
+    ),
+    Situation(
+        "a cloud with y up and z back",
+        array_file("a.npy", lambda: rows_of() * [1, -1, -1]),
+        BOTTLE,
+        "realsenseai/librealsense/issues/5833",
+    ),
+    Situation(
+        "a ply of text with nan",
+        bytes_file("a.ply", lambda: text_ply("float", colour=False, gaps=True)),
+        BOTTLE,
+        "ddiakopoulos/tinyply/issues/46",
+    ),
+    Situation(
+        "a pcd of text with colours",
+        bytes_file("a.pcd", text_pcd),
+        BOTTLE,
+        "Hitachi-Automotive-And-Industry-Lab/semantic-segmentation-editor/issues/90",
+    ),
+    Situation(
+        "depth of 8 bits",
+        array_file("a.npz", lambda: {"depth": np.minimum(millimetres(), 255).astype(np.uint8), "K": MATRIX}),
+        "cut to 8 bits",
+        "realsenseai/librealsense/issues/3938",
+    ),
+    Situation(
+        "depth with 65535 where nothing was seen",
+        array_file("a.npz", lambda: {"depth": np.where(millimetres() > 0, millimetres(), 65535), "K": MATRIX}),
+        BOTTLE,
+        "isl-org/Open3D/issues/6962",
+    ),
+    Situation(
+        "a pose that is no rotation",
+        array_file("a.npz", lambda: {"depth": millimetres(), "K": MATRIX, "T_world_camera": sheared()}),
+        "rotation",
+        "NVlabs/6dof-graspnet/issues/10",
+    ),
+    Situation(
+        "the matrix of another resolution",
+        array_file("a.npz", lambda: {"depth": millimetres(), "K": MATRIX * [[2], [2], [1]]}),
+        "K is of another resolution",
+        "stepjam/RLBench/issues/208",
+    ),
+)
+SITUATIONS = CLOUDS + MESHES + DRIVERS + MESSAGES

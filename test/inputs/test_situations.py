@@ -8,16 +8,19 @@ from typing import Any
 
 import numpy as np
 import pytest
-from situations import SITUATIONS, Situation
+from inputs_made import Situation, camera_place, recorded
+from situations import MESSAGES, SITUATIONS
 
 from graspd_core.cli import main
-from graspd_core.cli.running import EXIT_BAD_INPUT, EXIT_OK
+from graspd_core.cli.running import EXIT_BAD_INPUT, EXIT_OK, EXIT_TOO_FEW
 from graspd_core.errors import GraspdError
 from graspd_core.perception.load_scene import load_scene
 from graspd_core.perception.segment.target_selection import Target
 
-REFUSED = [row for row in SITUATIONS if isinstance(row.expect, str)]
-ANSWERED = [row for row in SITUATIONS if not isinstance(row.expect, str)]
+FILES = [row for row in SITUATIONS if row not in MESSAGES]
+REFUSED = [row for row in FILES if isinstance(row.expect, str)]
+ANSWERED = [row for row in FILES if not isinstance(row.expect, str)]
+FEW = ["-n", "1", "--preset", "fast", "--verify", "none"]
 
 
 def name_of(row: Situation) -> str:
@@ -40,8 +43,8 @@ def words(row: Situation) -> list[str]:
 
 
 def test_the_table_names_each_situation_once_and_where_most_of_them_came_up():
-    assert len({row.name for row in SITUATIONS}) == len(SITUATIONS) >= 40
-    assert sum(bool(row.thread) for row in SITUATIONS) >= 30
+    assert len({row.name for row in SITUATIONS}) == len(SITUATIONS) >= 63
+    assert sum(bool(row.thread) for row in SITUATIONS) >= 50
     assert all(re.fullmatch(r"[\w.-]+/[\w.-]+/(issues|pull)/\d+", row.thread) for row in SITUATIONS if row.thread)
 
 
@@ -69,6 +72,24 @@ def test_the_library_makes_the_object_that_it_shows(row: Situation, tmp_path: Pa
 @pytest.mark.slow
 @pytest.mark.parametrize("row", ANSWERED, ids=name_of)
 def test_the_command_line_answers_it_and_says_the_same(row: Situation, tmp_path: Path, capsys):
-    asked = ["-n", "1", "--preset", "fast", "--verify", "none", *words(row)]
-    assert main(["synthesize", str(row.make(tmp_path)), *asked]) == EXIT_OK
+    assert main(["synthesize", str(row.make(tmp_path)), *FEW, *words(row)]) == EXIT_OK
     assert re.search(row.warns, capsys.readouterr().err)
+
+
+@pytest.mark.parametrize("row", SITUATIONS, ids=name_of)
+def test_replay_of_a_recording_answers_the_same(row: Situation, tmp_path: Path, capsys):
+    path = row.make(tmp_path)
+    recording, place = recorded(row, path), camera_place(path)
+    if recording is None:
+        pytest.skip("no message can be that")
+    at = ["--view-point", *map(str, place)] if any(place) else []
+    status = main(["replay", str(recording), *FEW, *words(row), *at])
+    told = capsys.readouterr()
+    if isinstance(row.expect, str):
+        assert status in (EXIT_BAD_INPUT, EXIT_TOO_FEW)
+        assert re.search(f"refused: .*(?:{row.expect})", told.out)
+        return
+    assert status == EXIT_OK
+    (volume,) = re.findall(r"its volume of (\d+) cm³", told.err)
+    assert 1e-6 * int(volume) == pytest.approx(row.expect, rel=row.near)
+    assert re.search(row.warns, told.err)

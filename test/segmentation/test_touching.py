@@ -12,6 +12,7 @@ from graspd_core.config import SegmentationConfig
 from graspd_core.mesh.shapes import SHAPES, make_shape
 from graspd_core.perception.cloud.camera import PinholeCamera
 from graspd_core.perception.cloud.point_cloud import PointCloud
+from graspd_core.perception.scene_from_views import scene_from_views
 from graspd_core.perception.segment.segment import find_things, segment
 from graspd_core.perception.segment.target_selection import Target
 
@@ -69,6 +70,31 @@ def side_by_side(one: str, other: str) -> TabletopScene:
     """Two shapes that touch where both are widest along x."""
     widths = [tabletop(name).truth.vertices[:, 0] for name in (one, other)]
     return tabletop(one, obstacles=[(other, float(widths[0].max() - widths[1].min()), 0.0)])
+
+
+def middle_of(stage: TabletopScene) -> Target:
+    return Target(point=0.5 * (stage.truth.vertices.min(0) + stage.truth.vertices.max(0)))
+
+
+@pytest.mark.parametrize("azimuth", [-2.2, -1.5, -0.8])
+def test_a_target_in_the_middle_of_one_of_two_that_stand_flush_is_doubted(azimuth):
+    stage = side_by_side("box", "box")
+    seen = segment([view_of(stage, azimuth)], target=middle_of(stage))
+    assert np.mean(seen.views[0].points[:, 0] > stage.truth.vertices[:, 0].max()) > 0.2
+    assert "off the middle of what was taken for it" in seen.beside
+    scene = scene_from_views([view_of(stage, azimuth)], target=middle_of(stage), resolution=16)
+    assert scene.evidence is not None
+    assert scene.evidence.doubts == (seen.beside,)
+    assert any("no grasp counts as verified" in warning for warning in scene.object.warnings)
+    # A point on the surface may be anywhere on a thing.
+    on_it = Target(point=seen.views[0].points[100])
+    assert not segment([view_of(stage, azimuth)], target=on_it).beside
+
+
+@pytest.mark.parametrize("shape", sorted(SHAPES))
+def test_a_target_in_the_middle_of_one_thing_is_not_doubted(shape):
+    stage = tabletop(shape, yaw=0.3)
+    assert not segment([view_of(stage, 1.2, 0.8)], target=middle_of(stage)).beside
 
 
 @pytest.mark.slow

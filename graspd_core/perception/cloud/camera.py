@@ -56,6 +56,11 @@ _REMEDIES = {
 _QUANTISED = struct.Struct("<iff")
 _PNG, _PNG_SIZES = b"\x89PNG\r\n\x1a\n", struct.Struct(">II")
 _MOST_PIXELS = 2**26
+# Depth in mm that was cut to 8 bits ends here [m], at this share of the pixels.
+_MOST_OF_8_BITS, _CUT_SHARE = 0.255, 0.2
+# A principal point so far from the middle, as a share of it, the same across and down to this share, is of an image of
+# another size. One that a crop moved is seldom off by the same share both ways.
+_OFF_MIDDLE, _SAME_MIDDLE, _MOST_SCALED = 0.3, 0.08, 4.5
 
 
 @dataclass(frozen=True)
@@ -317,7 +322,7 @@ def cloud_from_depth(
         T_frame_camera: pose of the camera (z forward, x right, y down).
 
     Raises:
-        CloudError: the image is not of the camera's size.
+        CloudError: the image is not of the camera's size, was cut to 8 bits, or the camera is of another resolution.
     """
     if depth.shape != (camera.height, camera.width):
         raise CloudError(
@@ -325,6 +330,7 @@ def cloud_from_depth(
             f"but its camera has {camera.width} x {camera.height}"
         )
     flat = depth.reshape(-1)
+    _check_image(flat, camera)
     seen = np.flatnonzero(np.isfinite(flat) & (flat > 0))
     points = camera_rays(camera).reshape(-1, 3).take(seen, axis=0)
     points *= flat[seen, None]
@@ -333,6 +339,25 @@ def cloud_from_depth(
         points = points[np.isfinite(points[:, 0])]
     cloud = PointCloud(points, np.zeros(3), np.array([0.0, 0.0, 1.0]), posed=True)
     return cloud if T_frame_camera is None else transform_cloud(cloud, T_frame_camera)
+
+
+def _check_image(depth: Float[np.ndarray, "pixels"], camera: PinholeCamera) -> None:
+    """Refuse depth of millimetres that ends at 255, and a camera's matrix that is of another resolution."""
+    known = depth[np.isfinite(depth) & (depth > 0)]
+    if known.size and abs(float(known.max()) - _MOST_OF_8_BITS) < 1e-6:
+        share = float((known > _MOST_OF_8_BITS - 1e-6).mean())
+        if share > _CUT_SHARE:
+            raise CloudError(
+                f"depth image: {100 * share:.0f} % of it is 255 mm: cut to 8 bits; valid: 16 bits (mm), floats (m)"
+            )
+    across, down = (2 * camera.cx + 1) / camera.width, (2 * camera.cy + 1) / camera.height
+    off = min(abs(across - 1), abs(down - 1))
+    scaled = off > _OFF_MIDDLE and max(across, down) < _MOST_SCALED
+    if scaled and abs(across - down) < _SAME_MIDDLE * max(across, down):
+        raise CloudError(
+            f"camera: its cx={camera.cx:g}, cy={camera.cy:g} are the middle of an image {across:.2g} times "
+            f"{camera.width} x {camera.height}: K is of another resolution; scale it as the image was"
+        )
 
 
 def _encoding(name: str) -> tuple[str, float]:

@@ -33,9 +33,6 @@ def view_in_mesh(mesh: TriangleMesh, source: str) -> PointCloud | None:
     """
     if len(mesh.vertices) < MIN_VERTICES or len(mesh.faces) < MIN_VERTICES or not np.isfinite(mesh.vertices).all():
         return None
-    borders = _borders(mesh)
-    if borders == 0:
-        return None
     some = mesh.faces[:: 1 + len(mesh.faces) // _MOST_FACES]
     # Pixels without depth are written as zeros, and some writers join them to their neighbours.
     some = some[np.asarray(mesh.vertices[some].any(2)).all(1)]
@@ -43,9 +40,9 @@ def view_in_mesh(mesh: TriangleMesh, source: str) -> PointCloud | None:
         return None
     corners, normals = mesh.vertices[some], scaled_normals(mesh.vertices, some)
     normals = normals / np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-300)
-    if _faces(corners, normals, np.zeros(3)) and _pixels(corners):
+    if _faces(corners, normals, np.zeros(3)) and _pixels(corners) and _is_open(mesh):
         return PointCloud(mesh.vertices, np.zeros(3), posed=True)
-    if borders >= MIN_BORDERS and _is_grid(mesh) and _camera_place(corners, normals) is not None:
+    if _borders(mesh) >= MIN_BORDERS and _is_grid(mesh) and _camera_place(corners, normals) is not None:
         raise MeshError(
             f"{source}: one side of a scene, an open sheet as camera viewers export it, not in the camera's frame; "
             "a mesh is a solid; give the points as a cloud with its camera's place (npz: points, viewpoint)"
@@ -99,6 +96,19 @@ def _edges(mesh: TriangleMesh) -> tuple[np.ndarray, np.ndarray]:
     edges = np.sort(mesh.faces[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2), axis=1)
     keys, count = np.unique(edges[:, 0] * len(mesh.vertices) + edges[:, 1], return_counts=True)
     return np.column_stack([keys // len(mesh.vertices), keys % len(mesh.vertices)]), count
+
+
+def _is_open(mesh: TriangleMesh) -> bool:
+    """Whether an edge is of one face only. The edges about a share of the vertices are looked at first."""
+    for share in (32, 1):
+        # All faces of an edge have both its ends: none is lost by taking the faces about a vertex.
+        wanted = np.arange(len(mesh.vertices)) % share == 0
+        faces = mesh.faces[wanted[mesh.faces].any(1)] if share > 1 else mesh.faces
+        edges = np.sort(faces[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2), axis=1)
+        edges = edges[wanted[edges].any(1)]
+        if (np.unique(edges[:, 0] * len(mesh.vertices) + edges[:, 1], return_counts=True)[1] == 1).any():
+            return True
+    return False
 
 
 def _borders(mesh: TriangleMesh) -> int:

@@ -22,6 +22,8 @@ MIN_POINTS = 50
 MAX_DISTANCE_IN_SIZES = 1e3
 # No camera measures what is this near to itself [m]. Drivers that have no depth send that.
 CAMERA_PLACE_TOLERANCE_M = 1e-5
+# So many numbers tell a byte order.
+_SOME_NUMBERS = 5000
 
 
 @dataclass(frozen=True)
@@ -212,6 +214,7 @@ def organised_points(layout: CloudLayout) -> Float[np.ndarray, "height width 3"]
     width, height = layout.width, layout.height
     if width == 0 or height == 0:
         raise CloudError(f"the cloud is empty: width={width}, height={height}")
+    layout = _with_rows(layout)
     _check_sizes(layout)
     # Before the array is made: a message's numbers can ask for any amount of memory, its bytes cannot.
     places = [_place_of(layout, name) for name in "xyz"]
@@ -221,7 +224,34 @@ def organised_points(layout: CloudLayout) -> Float[np.ndarray, "height width 3"]
         # A NaN of any kind stays one: numpy would warn of those that signal.
         with np.errstate(invalid="ignore"):
             points[..., axis] = np.ndarray((height, width), dtype, layout.data, offset, strides)
+    _check_order(layout, points)
     return points
+
+
+def _with_rows(layout: CloudLayout) -> CloudLayout:
+    """Set the length of a row where a driver left it 0 or that of all rows, and the data say how long rows are."""
+    row = layout.width * layout.point_step
+    unset = layout.row_step in (0, layout.data.nbytes) and layout.data.nbytes == layout.height * row
+    return replace(layout, row_step=row) if unset else layout
+
+
+def _check_order(layout: CloudLayout, points: Float[np.ndarray, "height width 3"]) -> None:
+    """Refuse a cloud whose numbers are lengths in the other byte order than the one that it says."""
+    some = points.reshape(-1)[:: 1 + points.size // _SOME_NUMBERS]
+    if _odd_share(some) < 0.5:
+        return
+    kind = np.dtype("f4" if layout.fields["x"][1] == 7 else "f8")
+    with np.errstate(over="ignore"):
+        swapped = some.astype(kind).byteswap().astype(float)
+    if _odd_share(swapped) < 0.01:
+        said, other = ("true", "false") if layout.is_bigendian else ("false", "true")
+        raise CloudError(f"is_bigendian={said}, but the cloud's numbers are lengths as is_bigendian={other} reads them")
+
+
+def _odd_share(numbers: Float[np.ndarray, "n"]) -> float:
+    """Share of the finite numbers other than 0 that are no lengths in any unit."""
+    size = np.abs(numbers[np.isfinite(numbers) & (numbers != 0)])
+    return float(((size < 1e-6) | (size > 1e9)).mean()) if len(size) else 0.0
 
 
 def _check_sizes(layout: CloudLayout) -> None:

@@ -167,7 +167,8 @@ def is_unposed(view: PointCloud, axis_known: bool = False) -> bool:
     near, far = np.full(line.max() + 1, np.inf), np.full(line.max() + 1, -np.inf)
     np.minimum.at(near, line, local[:, 2])
     np.maximum.at(far, line, local[:, 2])
-    most = LAYERED_SHARE_OF_CAMERA if axis_known else LAYERED_SHARE
+    # No camera sees what is behind it, whatever axis the name of its frame says.
+    most = LAYERED_SHARE_OF_CAMERA if axis_known and local[:, 2].min() > 0 else LAYERED_SHARE
     return bool((far - near > MAX_RISE_CELLS * cell).mean() > most)
 
 

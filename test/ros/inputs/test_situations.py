@@ -1,0 +1,81 @@
+"""The table of situations by way of the node, over DDS: the answer that the library gives, or a refusal by name."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+from geometry_msgs.msg import Point
+from graspd_msgs.msg import GraspArray, GraspRequest
+from inputs_made import Situation, camera_place, recorded
+from rclpy.serialization import deserialize_message
+from sensor_msgs.msg import CameraInfo, Image, PointCloud2
+from situations import MESHES, SITUATIONS
+
+from graspd_core.io.bags import read_raw
+
+pytestmark = pytest.mark.timeout(300)
+KINDS = {"points": PointCloud2, "image_rect": Image, "camera_info": CameraInfo}
+
+
+def messages(recording: Path) -> dict[str, Any]:
+    """Return the messages of a recording by the end of their topic's name."""
+    read = ((topic.name.rpartition("/")[2], data) for topic, _, data in read_raw(recording))
+    return {name: deserialize_message(data, KINDS[name]) for name, data in read}
+
+
+def point(values: tuple[float, ...]) -> Point:
+    x, y, z = map(float, values)
+    return Point(x=x, y=y, z=z)
+
+
+def source_of(row: Situation, path: Path, show: Callable[[dict[str, Any]], None]) -> dict[str, Any] | None:
+    """Return the request's fields that give a row's object; None where no message can."""
+    if row in MESHES:
+        return {"source": GraspRequest.MESH, "mesh_uri": str(path), "mesh_scale": row.options.get("scale", 1.0)}
+    recording = recorded(row, path)
+    if recording is None:
+        return None
+    found = messages(recording)
+    if "points" in found:
+        return {"source": GraspRequest.CLOUD, "cloud": found["points"]}
+    show(found)
+    return {"source": GraspRequest.LATEST_CLOUD}
+
+
+@pytest.mark.parametrize("row", SITUATIONS, ids=lambda row: row.name)
+def test_the_node_answers_the_same(row: Situation, client, node, tmp_path: Path):
+    def show(found: dict[str, Any]) -> None:
+        images = client.node.create_publisher(Image, "/depth/image_rect", 10)
+        infos = client.node.create_publisher(CameraInfo, "/depth/camera_info", 10)
+        client.spin_until(lambda: images.get_subscription_count() and infos.get_subscription_count(), "match")
+        send = lambda: (images.publish(found["image_rect"]), infos.publish(found["camera_info"]))  # noqa: E731
+        client.show(send, found["image_rect"].header)
+        client.node.destroy_publisher(images)
+        client.node.destroy_publisher(infos)
+
+    client.set_parameters(cloud_policy="off", cloud_max_age=0.0, verify="none", mesh_roots=[str(tmp_path)])
+    path = row.make(tmp_path)
+    asked = source_of(row, path, show)
+    if asked is None:
+        pytest.skip("no message can be that")
+    place, target = row.options.get("view_point") or camera_place(path), row.options.get("target")
+    if any(place):
+        asked |= {"use_view_point": True, "view_point": point(place)}
+    if target:
+        asked |= {"use_target_point": True, "target_point": point(target)}
+    client.send_request(id="row", num_grasps=1, preset="fast", alone="alone" in row.options, **asked)
+    answer = client.answer("row")
+    told = "\n".join(answer.warnings)
+    if isinstance(row.expect, str):
+        assert answer.status in (GraspArray.REFUSED, GraspArray.FAILED)
+        assert re.search(row.expect, answer.message)
+        assert "\n" not in answer.message
+        return
+    assert answer.status == GraspArray.SUCCEEDED, answer.message
+    (volume,) = re.findall(r"its volume of (\d+) cm³", told)
+    assert 1e-6 * int(volume) == pytest.approx(row.expect, rel=row.near)
+    assert re.search(row.warns, told), told
