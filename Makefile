@@ -51,12 +51,12 @@ cell: setup  ## a simulated arm, hand and camera empty a bin, in a browser; a li
 	$(RUN)/graspd cell --view --film results/cell.png
 
 BENCH := $(RUN)/graspd bench --processes 2
-PAGES := README.md $(addprefix docs/,bench.md hands.md stress.md metrics.md usage.md arms.md) $(wildcard docs/tables/*.md)
+PAGES := README.md $(addprefix docs/,bench.md hands.md stress.md metrics.md usage.md arms.md) docs/tables/clouds.md
 
 bench: setup  ## every study: the charts and tables of README and docs/ anew (under 90 minutes on two cores; resumable)
 	@mkdir -p results
 	$(RUN)/python benchmarks/mano_synthetic.py results/synthetic.pkl
-	$(BENCH) mano --hand results/synthetic.pkl --out results/mano --readme docs/tables/hands.md
+	$(BENCH) mano --hand results/synthetic.pkl --out results/mano --readme docs/reference/mano.md
 	$(BENCH) all --chart docs/figures/bench $(addprefix --readme ,$(PAGES))
 
 bench-quick: setup  ## a small part of it, in minutes, to results/bench-quick

@@ -89,17 +89,17 @@ MAY_IMPORT = {
 # The layout aims at 22,000 of graspd_core, 4,500 of graspd_ros and 26,000 of test. What inputs are checked for, which
 # came after it, took 1,700, 500 and 3,300.
 MAX_PACKAGE_LINES = {
-    "graspd_core": 26_730,
+    "graspd_core": 26_768,
     "graspd_ros": 5_200,
     "graspd_bench": 8_800,
     "graspd_dataset": 3_000,
     "graspd_viewer": 2_300,
     "graspd_cell": 3_800,
-    "test": 32_376,
+    "test": 32_389,
 }
 # Lines that a program reaches through its imports, those inside functions too.
 # The layout aims at 22,000 of the node.
-MAX_REACH = {"graspd_core.cli.synthesize_command": 21_630, "graspd_ros.node": 25_560}
+MAX_REACH = {"graspd_core.cli.synthesize_command": 21_656, "graspd_ros.node": 25_583}
 
 # The launch file imports this one where ROS runs it, perhaps without any library of graspd.
 SHORT = ("graspd_core/paths.py",)
