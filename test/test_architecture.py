@@ -95,7 +95,7 @@ MAX_PACKAGE_LINES = {
     "graspd_dataset": 3_000,
     "graspd_viewer": 2_300,
     "graspd_cell": 3_800,
-    "test": 32_389,
+    "test": 32_395,
 }
 # Lines that a program reaches through its imports, those inside functions too.
 # The layout aims at 22,000 of the node.
