@@ -51,19 +51,19 @@ cell: setup  ## a simulated arm, hand and camera empty a bin, in a browser; a li
 	$(RUN)/graspd cell --view --film results/cell.png
 
 BENCH := $(RUN)/graspd bench --processes 2
-PAGES := README.md $(addprefix docs/,bench.md hands.md clouds.md stress.md metrics.md usage.md arms.md tables/bench.md tables/stress.md)
+PAGES := README.md $(addprefix docs/,bench.md hands.md stress.md metrics.md usage.md arms.md tables/bench.md tables/clouds.md tables/stress.md)
 
 bench: setup  ## every study: the charts and tables of README and docs/ anew (under 90 minutes on two cores; resumable)
 	@mkdir -p results
 	$(RUN)/python benchmarks/mano_synthetic.py results/synthetic.pkl
-	$(BENCH) mano --hand results/synthetic.pkl --out results/mano --readme docs/hands.md
+	$(BENCH) mano --hand results/synthetic.pkl --out results/mano --readme docs/reference/mano.md
 	$(BENCH) all --chart docs/figures/bench $(addprefix --readme ,$(PAGES))
 
 bench-quick: setup  ## a small part of it, in minutes, to results/bench-quick
 	$(BENCH) --quick --out results/bench-quick --chart results/bench-quick/chart
 
-bench-rgbd: setup  ## the table of docs/clouds.md anew: shapes on a table, rendered with sensor noise; FRAMES=DIR: real ones
-	$(BENCH) $(if $(FRAMES),frames --objects $(FRAMES) --out results/frames,rgbd) --readme docs/clouds.md
+bench-rgbd: setup  ## the tables of docs/tables/clouds.md anew: shapes on a table, rendered with sensor noise; FRAMES=DIR: real ones
+	$(BENCH) $(if $(FRAMES),frames --objects $(FRAMES) --out results/frames,rgbd) --readme docs/tables/clouds.md
 
 bench-maps: setup  ## the failure maps of docs/stress.md anew: four pictures of where methods stop working
 	$(BENCH) maps --chart docs/figures/bench --readme docs/tables/stress.md

@@ -1,6 +1,6 @@
 """A node under mixed load for minutes: does its memory stay flat, does it answer in time, does each request end once?
 
-    python benchmarks/soak.py [--minutes 10] [--out results/soak] [--readme docs/ros.md]
+    python benchmarks/soak.py [--minutes 10] [--out results/soak] [--readme docs/reference/node_load.md]
 
 Three processes besides this one's client: the node (with a timer of its own to measure by), a camera of 640×480 at
 30 Hz, and a control that only ticks: how late that comes is the machine's doing. Nothing is mocked. The record, the

@@ -7,6 +7,7 @@ import sys
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from graspd_core.cli.options import add_plugin_option
 from graspd_core.cli.running import EXIT_INTERRUPTED, EXIT_OK, Interrupt
 from graspd_core.errors import ConfigError
 
@@ -24,6 +25,7 @@ def add_command(commands: Any) -> None:
     parser.add_argument("studies", nargs="*", metavar="STUDY", help="main (default), all, or others of docs/bench.md")
     parser.add_argument("--suite", action="append", default=[], metavar="STUDY", help="the same")
     parser.add_argument("--presets", nargs="+", default=(), metavar="PRESET", help="default: all built-in ones")
+    add_plugin_option(parser)
     parser.add_argument(
         "--objects",
         nargs="+",

@@ -39,10 +39,17 @@ if TYPE_CHECKING:
     from graspd_core.mesh.mesh_files import load_mesh as load_mesh
     from graspd_core.mesh.mesh_files import save_mesh as save_mesh
     from graspd_core.mesh.shapes import make_shape as make_shape
+    from graspd_core.optimize.candidates import PlannerInput as PlannerInput
+    from graspd_core.optimize.candidates import PlannerOutput as PlannerOutput
+    from graspd_core.optimize.initial_poses import draw_starts as draw_starts
+    from graspd_core.optimize.loop import Poses as Poses
+    from graspd_core.optimize.plan_config import METHODS as METHODS
+    from graspd_core.optimize.plan_config import Method as Method
     from graspd_core.optimize.plan_config import PlanConfig as PlanConfig
     from graspd_core.optimize.plan_config import load_preset as load_preset
     from graspd_core.optimize.plan_config import override as override
     from graspd_core.optimize.plan_config import preset_names as preset_names
+    from graspd_core.optimize.problem import Problem as Problem
     from graspd_core.optimize.problem import build_problem as build_problem
     from graspd_core.perception.cloud.camera import PinholeCamera as PinholeCamera
     from graspd_core.perception.cloud.camera import cloud_from_depth as cloud_from_depth
@@ -71,8 +78,11 @@ if TYPE_CHECKING:
     from graspd_core.types import Verdict as Verdict
     from graspd_core.verify.metrics import METRICS as METRICS
     from graspd_core.verify.metrics import Metric as Metric
+    from graspd_core.verify.prepared_grasp import MetricsContext as MetricsContext
+    from graspd_core.verify.prepared_grasp import PreparedGrasp as PreparedGrasp
     from graspd_core.verify.trial_registry import TRIALS as TRIALS
     from graspd_core.verify.trial_registry import Trial as Trial
+    from graspd_core.verify.trial_registry import TrialContext as TrialContext
     from graspd_core.verify.verification import verify_grasps as verify_grasps
 
 # The names of each module.
@@ -96,12 +106,16 @@ _MODULES = {
     "arms.reach": "Reach",
     "planning.steering": "Steering",
     "planning.regions": "Box NearPoints Sphere",
-    "optimize.plan_config": "PlanConfig load_preset override preset_names",
-    "optimize.problem": "build_problem",
+    "optimize.plan_config": "METHODS Method PlanConfig load_preset override preset_names",
+    "optimize.candidates": "PlannerInput PlannerOutput",
+    "optimize.loop": "Poses",
+    "optimize.initial_poses": "draw_starts",
+    "optimize.problem": "Problem build_problem",
     "verify.verification": "verify_grasps",
     "library.grasp_library": "GraspLibrary",
     "library.known_grasps": "known_grasps known_or_planned",
-    "verify.trial_registry": "TRIALS Trial",
+    "verify.trial_registry": "TRIALS Trial TrialContext",
+    "verify.prepared_grasp": "MetricsContext PreparedGrasp",
     "verify.metrics": "METRICS Metric",
     "types": "ArmPath Grasp GraspResult Outcome Posture Progress TrialResult TriangleMesh Verdict",
     "io.grasps_json": "load_grasps save_result",

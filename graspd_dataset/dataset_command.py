@@ -10,6 +10,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from graspd_core.cli.options import add_plugin_option
 from graspd_core.cli.running import EXIT_INTERRUPTED, EXIT_OK, Interrupt
 from graspd_core.errors import ConfigError
 
@@ -41,6 +42,7 @@ def add_command(commands: Any) -> None:
     make.add_argument("--hands", nargs="+", default=("allegro_right",), metavar="NAME|PATH")
     make.add_argument("--per-object", type=int, default=128, metavar="N", help="verified, by object, scale and hand")
     make.add_argument("--block", type=int, default=128, metavar="N", help="verified grasps of a file (default 128)")
+    add_plugin_option(make)
     make.add_argument("--preset", default="balanced")
     make.add_argument("--seed", type=int, default=0)
     make.add_argument("--scales", nargs="+", type=float, default=(1.0,), metavar="FACTOR", help="default 1")

@@ -146,6 +146,46 @@ def test_your_own_metric(run: Run, tmp_path: Path, monkeypatch: pytest.MonkeyPat
     assert 0 < best["metrics"]["contact_offset_mm"] < 100
 
 
+PLUGIN = ("--plugin", str(EXAMPLES / "your_own_method.py"))
+
+
+def graspd(folder: Path, *words: str) -> subprocess.CompletedProcess[str]:
+    command = [sys.executable, "-m", "graspd_core.cli", *words]
+    return subprocess.run(command, cwd=folder, capture_output=True, text=True)
+
+
+def test_your_own_method_plans(tmp_path: Path):
+    done = graspd(tmp_path, "synthesize", "shape:box", *PLUGIN, "--method", "draws", "-n", "1", "--out", "g.json")
+    assert done.returncode == 0, done.stderr
+    document = json.loads((tmp_path / "g.json").read_text())
+    assert (document["method"], document["grasps"][0]["verdict"]) == ("draws", "verified")
+
+
+def test_your_own_method_is_measured_in_the_processes_of_the_benchmark(tmp_path: Path):
+    (tmp_path / "mine.yaml").write_text("method: draws\ndraws: {per_grasp: 8}\n")
+    options = ["--objects", "shape:box", "--trials", "standard", "--count", "1", "--out", "results"]
+    done = graspd(tmp_path, "bench", *PLUGIN, "--presets", "mine.yaml", *options)
+    assert done.returncode == 0, done.stderr
+    assert "| `mine` | " in done.stdout
+
+
+@pytest.mark.parametrize(
+    ("name", "text", "told"),
+    [
+        ("nothing.py", None, "plugin: nothing.py is not a Python file; valid: the path of a .py file"),
+        ("broken_plugin.py", "1 / 0", "plugin broken_plugin.py: ZeroDivisionError: division by zero"),
+        ("json.py", "", "plugin json.py: a module called json exists; give the file another name"),
+    ],
+)
+def test_a_plugin_that_cannot_be_run_is_one_line(tmp_path: Path, name: str, text: str | None, told: str):
+    if text is not None:
+        (tmp_path / name).write_text(text)
+    # With -P Python does not look for its own modules in the folder.
+    command = [sys.executable, "-P", "-m", "graspd_core.cli", "synthesize", "shape:box", "--plugin", name]
+    done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True)
+    assert (done.returncode, done.stderr) == (2, f"graspd: {told}\n")
+
+
 def test_many_objects(run: Run, tmp_path: Path, capsys: pytest.CaptureFixture[str]):
     (tmp_path / "meshes").mkdir()
     graspd_core.save_mesh(graspd_core.make_shape("sphere"), tmp_path / "meshes" / "ball.stl")

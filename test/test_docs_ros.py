@@ -10,6 +10,7 @@ import subprocess
 import sys
 import threading
 from collections.abc import Callable, Iterator
+from dataclasses import fields
 from pathlib import Path
 from typing import Any
 
@@ -25,7 +26,7 @@ from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 from graspd_core.cli import build_parser
 from graspd_ros.grasp_node import GraspNode
 from graspd_ros.inputs.request_builder import check_request, source_of
-from graspd_ros.parameters import check_parameters
+from graspd_ros.parameters import Settings, check_parameters
 
 ROOT = Path(__file__).parents[1]
 PAGE = (ROOT / "docs" / "ros.md").read_text()
@@ -180,6 +181,11 @@ def test_documented_goals_fit_the_action():
         fill(goal, yaml.safe_load(text))
         check_request(goal.request, "allegro_right")
         source_of(goal.request)
+
+
+def test_the_table_of_parameters_has_those_of_the_node(node: GraspNode):
+    page = (ROOT / "docs" / "reference" / "parameters.md").read_text()
+    assert re.findall(r"^\| `(\w+)` \|", page, re.MULTILINE) == [field.name for field in fields(Settings)]
 
 
 def check_type(node: GraspNode, parameter: Parameter) -> None:

@@ -25,7 +25,7 @@ FOREIGN = re.compile(
     r"[RT](_[a-z]+)+|moveit_msgs/\w+|(object\.)?header\.frame_id|pre_grasp_approach\.direction|qos_overrides.*"
     r"|object\.(meshes|primitives|point_cluster|surface|name)|depth/(image_rect|camera_info)"
     r"|(DIR/)?\w+\.json|object_cloud\.xyz|my_hand\.yaml|cio\.py|setup\.bash|share/.*|results/.*|vX\.Y\.Z"
-    r"|copy_reg\._\w+|hand\.mimic|metric_\w+|squeeze_quaternion_wxyz|gripper_frame|PATH\W?.*|AWS_\w+"
+    r"|copy_reg\._\w+|hand\.mimic|metric_\w+|contact_\w+_(mm|cm2)|payload_kg|squeeze_quaternion_wxyz|gripper_frame|PATH\W?.*|AWS_\w+"
 )
 SPAN = re.compile(r"(?<!`)`([^`\n]+)`(?!`)")
 DOTTED = re.compile(r"[A-Za-z_]\w*(\.[A-Za-z_]\w*)+")

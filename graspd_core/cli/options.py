@@ -17,7 +17,7 @@ from graspd_core.config import VERIFICATIONS, SceneConfig, load_scene_config
 from graspd_core.errors import BagError, CloudError, ConfigError, TransformError
 from graspd_core.io.bags import BagFrame, is_bag, read_frames, read_transforms
 from graspd_core.io.messages import ORIGIN, CameraPlace, frame_doubt
-from graspd_core.optimize.plan_config import PlanConfig, load_preset, preset_names
+from graspd_core.optimize.plan_config import PlanConfig, load_plugin, load_preset, preset_names
 from graspd_core.perception.cloud.point_cloud import PointCloud
 from graspd_core.types import GraspResult, Outcome, Timing
 
@@ -34,11 +34,20 @@ _SHOWN = ("payload", "least_friction", "penetration", "contact_area", "epsilon",
 _FIRST = 3
 
 
+def add_plugin_option(parser: argparse._ActionsContainer) -> None:
+    """Add `--plugin`: the file is run while the options are read, so that they may name its methods."""
+    parser.add_argument(
+        "--plugin", type=load_plugin, action="append", metavar="FILE.py",
+        help="run a file that registers methods, metrics or trials (repeatable)",
+    )  # fmt: skip
+
+
 def add_planning_options(parser: argparse.ArgumentParser) -> None:
     """Add hand, number, method and trial of the grasps, and the object's mass and friction."""
     parser.add_argument("--hand", default="allegro_right", metavar="NAME|PATH", help="graspd hands lists the names")
     parser.add_argument("-n", "--count", type=int, default=16, help="verified grasps wanted (default 16)")
     parser.add_argument("--method", default=None, metavar="NAME", help="instead of the preset's, at its defaults")
+    add_plugin_option(parser)
     parser.add_argument("--preset", default="balanced", help=f"{', '.join(preset_names())}, or a .yaml file")
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument(

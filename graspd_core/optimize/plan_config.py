@@ -1,13 +1,16 @@
 """Hold the settings of a run of `plan_grasps`: the methods, their own settings, and the presets.
 
 A method of graspd_core is a row of `METHODS`. A method of another package registers itself: an entry point of the group
-`graspd.methods` names its row, which is loaded when the method is first asked for.
+`graspd.methods` names its row, which is loaded when the method is first asked for. A plugin is a Python file that adds
+rows to `METHODS`, `METRICS` or `TRIALS`. The environment names plugins, so that child processes run them too.
 """
 
 from __future__ import annotations
 
 import dataclasses
 import importlib
+import os
+import sys
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from functools import cache
@@ -74,7 +77,7 @@ METHODS: dict[str, Method] = {
     ),
 }
 
-_DEFAULT_METHOD, _GROUP = "closed_form", "graspd.methods"
+_DEFAULT_METHOD, _GROUP, _PLUGINS = "closed_form", "graspd.methods", "GRASPD_PLUGINS"
 
 
 @cache
@@ -82,13 +85,22 @@ def _registered() -> dict[str, EntryPoint]:
     return {point.name: point for point in entry_points(group=_GROUP)}
 
 
+@cache
+def _run_plugins() -> None:
+    """Run the plugins that a parent process was given. They import this module, so that it cannot run them itself."""
+    for path in filter(None, os.environ.get(_PLUGINS, "").split(os.pathsep)):
+        load_plugin(path)
+
+
 def method_names() -> tuple[str, ...]:
     """Return the names of all methods: those of graspd_core and those that other packages register."""
+    _run_plugins()
     return tuple(dict.fromkeys((*METHODS, *_registered())))
 
 
 def method_row(name: Any, where: str = "config") -> Method:
     """Return the row of a method. Raises ConfigError: there is no such method."""
+    _run_plugins()
     if not isinstance(name, str) or (name not in METHODS and name not in _registered()):
         raise ConfigError(f"{where}.method: {shown(name)} is not one of {', '.join(method_names())}")
     if name not in METHODS:
@@ -197,3 +209,25 @@ def load_preset(name: str) -> PlanConfig:
         told = f"preset {name}: no such file" if by_path else f"unknown preset {name!r}"
         raise ConfigError(f"{told}; valid presets: {', '.join(preset_names())}, or a .yaml file")
     return plan_config(read_yaml(path), where=path.name)
+
+
+def load_plugin(path: str) -> str:
+    """Run a Python file that registers methods, metrics or trials, here and in child processes. Returns its path.
+
+    Raises:
+        ConfigError: there is no such file, its module's name is taken, or it raises.
+    """
+    file = Path(path).resolve()
+    if file.suffix != ".py" or not file.is_file():
+        raise ConfigError(f"plugin: {path} is not a Python file; valid: the path of a .py file")
+    if str(file.parent) not in sys.path:
+        sys.path.append(str(file.parent))
+    try:
+        module = importlib.import_module(file.stem)
+    except Exception as error:
+        raise ConfigError(f"plugin {path}: {type(error).__name__}: {error}") from error
+    if module.__file__ is None or Path(module.__file__).resolve() != file:
+        raise ConfigError(f"plugin {path}: a module called {file.stem} exists; give the file another name")
+    named = os.environ.get(_PLUGINS, "").split(os.pathsep)
+    os.environ[_PLUGINS] = os.pathsep.join(filter(None, dict.fromkeys((*named, str(file)))))
+    return str(file)

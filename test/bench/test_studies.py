@@ -31,9 +31,9 @@ ROOT = Path(__file__).parents[2]
 # Of each the marker of a section that its report fills, and the page that has it; their smallest runs take seconds.
 PAGES = {
     "main": ("bench", "README.md"),
-    "rgbd": ("rgbd", "docs/clouds.md"),
-    "cameras": ("cameras", "docs/clouds.md"),
-    "piles": ("piles", "docs/clouds.md"),
+    "rgbd": ("rgbd", "docs/tables/clouds.md"),
+    "cameras": ("cameras", "docs/tables/clouds.md"),
+    "piles": ("piles", "docs/tables/clouds.md"),
     "robust": ("robust", "docs/tables/stress.md"),
     "steered": ("steered", "docs/usage.md"),
     "early": ("early-ends", "docs/tables/bench.md"),
