@@ -262,11 +262,13 @@ def known_or_planned(
     if outcome in (Outcome.SUCCEEDED, Outcome.NO_CANDIDATES) and found + len(new):
         outcome = Outcome.SUCCEEDED if found + len(new) >= count else Outcome.TOO_FEW
     told = f"{found} grasps of the library {library.path.name}, {len(new)} planned"
+    # A reason, not what the outcome of the plan alone says.
+    why = planned.message if planned.message != planned.outcome.value else ""
     return replace(
         planned,
         outcome=outcome,
         grasps=(*known.grasps, *new, *(grasp for grasp in planned.grasps if not grasp.usable)),
-        message="; ".join(filter(None, (told, planned.message))),
+        message="; ".join(filter(None, (told, why))),
         warnings=warnings,
         refused=Counter(known.refused) + Counter(planned.refused),
     )

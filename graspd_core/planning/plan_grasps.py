@@ -131,7 +131,8 @@ def plan_grasps(
     masses = {"mass": found.mass, "tried_mass": found.mass or scene.object.mass}
     result = replace(result, message=message or told, support=support, **masses)
     run.report(Stage.DONE, 1, 1, 0.0, found.good)
-    return result if found.good else _less_sure(scene, run.origin, result)
+    ended = result if found.good else _less_sure(scene, run.origin, result)
+    return replace(ended, message=ended.message or ended.outcome.value)
 
 
 def _prepared(

@@ -51,6 +51,7 @@ def arrays(grasp: Grasp) -> list[np.ndarray]:
 
 def test_grasps_called_verified_have_passed_and_come_first(result):
     assert result.outcome is Outcome.SUCCEEDED
+    assert result.message == Outcome.SUCCEEDED.value
     verdicts = [grasp.verdict for grasp in result.grasps]
     assert verdicts == sorted(verdicts, key=[Verdict.VERIFIED, Verdict.FAILED].index)
     assert verdicts.count(Verdict.VERIFIED) == 2

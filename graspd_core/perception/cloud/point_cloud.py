@@ -241,7 +241,7 @@ def _check_order(layout: CloudLayout, points: Float[np.ndarray, "height width 3"
     if _odd_share(some) < 0.5:
         return
     kind = np.dtype("f4" if layout.fields["x"][1] == 7 else "f8")
-    with np.errstate(over="ignore"):
+    with np.errstate(over="ignore", invalid="ignore"):
         swapped = some.astype(kind).byteswap().astype(float)
     if _odd_share(swapped) < 0.01:
         said, other = ("true", "false") if layout.is_bigendian else ("false", "true")
