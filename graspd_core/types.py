@@ -288,7 +288,7 @@ class AuditCount:
 
 @dataclass(frozen=True)
 class GraspResult:
-    """The result of a run: an outcome and its reason in `message`, always, and the grasps in rank order, verified first.
+    """The result of a run: always an outcome with its `message`, and the grasps in rank order, verified ones first.
 
     `support` is what the object stood on, None for a floating one. `audits` is always zero, and goes with 0.3.
     `next_view` is `T_object_camera` [m] of a further view of the hidden side. It is set if grasps hold on the likeliest

@@ -129,10 +129,9 @@ def plan_grasps(
     )
     told = "" if run.over() else _why_few(run, scene, bound, found, result)
     masses = {"mass": found.mass, "tried_mass": found.mass or scene.object.mass}
-    result = replace(result, message=message or told, support=support, **masses)
+    result = replace(result, message=message or told or result.outcome.value, support=support, **masses)
     run.report(Stage.DONE, 1, 1, 0.0, found.good)
-    ended = result if found.good else _less_sure(scene, run.origin, result)
-    return replace(ended, message=ended.message or ended.outcome.value)
+    return result if found.good else _less_sure(scene, run.origin, result)
 
 
 def _prepared(

@@ -290,7 +290,7 @@ def test_the_messages_alone_make_a_hand_hold_an_object():
     assert travel < PROTOCOLS["standard"].max_displacement
     # And the test can fail: a hand that closes half a metre above the object holds nothing.
     above = {
-        name: dataclasses.replace(posture, position=posture.position + [0.0, 0.0, 0.5])
+        name: dataclasses.replace(posture, position=posture.position + np.array([0.0, 0.0, 0.5]))
         for name, posture in vars(result.grasps[0]).items()
         if name in ("pregrasp", "grasp", "squeeze")
     }
