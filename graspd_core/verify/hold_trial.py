@@ -76,6 +76,7 @@ def _hold(world: World, grasp: Grasp, protocol: Protocol, worst: np.ndarray, sto
             reason = step_until_known(world, data, protocol, worst, steps, stop=stop)
             if reason:
                 return reason if reason == STOPPED else f"{reason} under a pull along {axis_name(direction)}"
+        world.closed.append((grasp.squeeze, protocol, held))
         return ""
 
 

@@ -36,8 +36,9 @@ def payload(
 ) -> float:
     """Return the greatest mass [kg] whose pulls the grasp holds, zero where it does not hold the `least`.
 
-    The hand closes once on the object's own mass. Each direction is then pulled as hard as the hold trial pulls the
-    mass that is asked about, from the same state. `held` says that a hold trial has shown that it holds the `least`.
+    The hand closes once on the object's own mass, unless a hold trial has just closed it. Each direction is then pulled
+    as hard as the trial pulls the mass that is asked about, from the same state. `held` says that a hold trial has shown
+    that the grasp holds the `least`.
     """
     import mujoco
 
@@ -46,10 +47,12 @@ def payload(
     most = math.inf
     try:
         with trial_data(world) as data:
-            if close_hand(world, data, grasp, protocol, np.zeros(2), stop=stop):
-                return 0.0
-            closed = np.empty(mujoco.mj_stateSize(world.model, kind))
-            mujoco.mj_getState(world.model, data, closed, kind)
+            closed = next((s for at, by, s in tuple(world.closed) if at is grasp.squeeze and by == protocol), None)
+            if closed is None:
+                if close_hand(world, data, grasp, protocol, np.zeros(2), stop=stop):
+                    return 0.0
+                closed = np.empty(mujoco.mj_stateSize(world.model, kind))
+                mujoco.mj_getState(world.model, data, closed, kind)
             # Hands are weakest against what pulls the object out of them, the way they came.
             way = grasp.grasp.position - grasp.pregrasp.position
             directions = DIRECTIONS[list(protocol.pulls)]

@@ -25,7 +25,7 @@ from graspd_core.mesh.mesh_files import surface_samples
 from graspd_core.mesh.sdf import sample_sdf
 from graspd_core.perception.scene import ObjectModel, Obstacle
 from graspd_core.se3 import quaternion_between, quaternion_from_rotation
-from graspd_core.types import Plane, TriangleMesh
+from graspd_core.types import Plane, Posture, TriangleMesh
 
 # mujoco is a compiled module without stubs.
 # pyright: reportAttributeAccessIssue=false
@@ -251,6 +251,11 @@ def at_friction(protocol: Protocol, friction: float) -> Protocol:
     return replace(protocol, friction=(sliding * share, torsional * share, rolling * share))
 
 
+# Squeeze and protocol of a grasp that held, and MuJoCo's state with the hand closed. So many are kept.
+ClosedState = tuple[Posture, Protocol, Float[np.ndarray, "state"]]
+_MOST_CLOSED = 32
+
+
 @dataclass(frozen=True)
 class World:
     """A compiled model and where things are in it. The model is never written to after compilation.
@@ -270,6 +275,7 @@ class World:
         fingers: number of the hand's fingertips.
         others: body ids of the free things about the object.
         spare: the `mujoco.MjData` of trials that ended, for `trial_data`.
+        closed: of the last grasps that held: squeeze, protocol and MuJoCo's state with the hand closed, for `payload`.
         watch: called with the `mujoco.MjData` after every step of a trial. None, as in planning, costs nothing.
     """
 
@@ -287,6 +293,7 @@ class World:
     fingers: int = 3
     others: tuple[int, ...] = ()
     spare: deque[Any] = field(default_factory=deque, repr=False, compare=False)
+    closed: deque[ClosedState] = field(default_factory=lambda: deque(maxlen=_MOST_CLOSED), repr=False, compare=False)
     watch: Callable[[Any], None] | None = field(default=None, repr=False, compare=False)
 
 
@@ -302,7 +309,7 @@ def altered(world: World, *, mass: float | None = None, friction: Friction | Non
         model.body_mass[body] = mass
         # What MuJoCo derives of the masses softens its contacts.
         mujoco.mj_setConst(model, mujoco.MjData(model))
-    return replace(world, model=model, spare=deque())
+    return replace(world, model=model, spare=deque(), closed=deque(maxlen=_MOST_CLOSED))
 
 
 @contextmanager

@@ -38,6 +38,18 @@ def test_the_payload_is_where_the_trial_s_verdict_changes(world, closing):
     assert payload(world, grasp, STANDARD, least=2 * found) == 0.0
 
 
+def test_a_hand_that_a_trial_closed_is_not_closed_again(world, closing):
+    grasp = pressed(closing, 4.0)
+    alone = altered(world)
+    found = payload(alone, grasp, STANDARD)
+    assert not alone.closed
+    assert hold_trial(alone, grasp, STANDARD).passed
+    assert len(alone.closed) == 1
+    assert payload(alone, grasp, STANDARD) == found
+    # Another mass presses otherwise.
+    assert not altered(alone, mass=0.5).closed
+
+
 def test_what_does_not_close_carries_nothing(world, closing):
     assert payload(world, closing(0.04, 0.04, (0.04, 0.04)), STANDARD) == 0.0
     assert payload(world, closing(0.015, 0.025, (0.04, 0.04), height=-0.145), STANDARD) == 0.0
