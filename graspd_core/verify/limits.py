@@ -37,8 +37,8 @@ def payload(
     """Return the greatest mass [kg] whose pulls the grasp holds, zero where it does not hold the `least`.
 
     The hand closes once on the object's own mass, unless a hold trial has just closed it. Each direction is then pulled
-    as hard as the trial pulls the mass that is asked about, from the same state. `held` says that a hold trial has shown
-    that the grasp holds the `least`.
+    as hard as the trial pulls the mass that is asked about, from the same state. `held` says that a hold trial has
+    shown that the grasp holds the `least`.
     """
     import mujoco
 
