@@ -6,16 +6,28 @@ import fcntl
 import os
 import sys
 import tempfile
+import threading
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import IO, Any
 
 import hypothesis
 import pytest
-from jaxtyping import install_import_hook
+from jaxtyping import _import_hook, install_import_hook
 
 # Before anything imports graspd_core, or its functions would stay unchecked.
 install_import_hook("graspd_core", "beartype.beartype")
+_to_code, _one_at_a_time = _import_hook._JaxtypingLoader.source_to_code, threading.RLock()
+
+
+def _locked_to_code(*arguments: Any, **named: Any) -> Any:
+    # Python 3.11 counts the depth of syntax trees for all threads together (python/cpython#106905): a module that the
+    # hook reads while another thread's is read would end in a SystemError.
+    with _one_at_a_time:
+        return _to_code(*arguments, **named)
+
+
+_import_hook._JaxtypingLoader.source_to_code = _locked_to_code
 
 import torch  # noqa: E402
 
