@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -19,6 +19,13 @@ from graspd_core.io.bags import read_raw
 
 pytestmark = pytest.mark.timeout(300)
 KINDS = {"points": PointCloud2, "image_rect": Image, "camera_info": CameraInfo}
+
+
+@pytest.fixture(scope="module", autouse=True)
+def _end_the_node(shared_node) -> Iterator[None]:
+    """End the node after these tests: the next test would get the refusal of an image that comes late."""
+    yield
+    shared_node.stop()
 
 
 def messages(recording: Path) -> dict[str, Any]:
