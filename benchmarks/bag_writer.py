@@ -56,7 +56,7 @@ def write_bag(path: str | Path, records: Iterable[Record], *, storage: str = "sq
 
 
 def cloud_message(points: Float[np.ndarray, "*n 3"], frame: str, stamp: int) -> Any:
-    """A PointCloud2 of float32 points [m], organised if they are a grid of rows; NaN is kept."""
+    """Return a PointCloud2 of float32 points [m], organised if they are a grid of rows. NaN is kept."""
     types = jazzy_types().types
     fields = [types["sensor_msgs/msg/PointField"](name, 4 * axis, 7, 1) for axis, name in enumerate("xyz")]
     data = np.ascontiguousarray(points, dtype="<f4").view(np.uint8).reshape(-1)

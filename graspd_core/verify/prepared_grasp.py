@@ -160,8 +160,6 @@ def touching(placed: PlacedHand, within: float = CONTACT_DISTANCE) -> Bool[np.nd
 
 # Cells are halved until they are 2 mm wide: 16 mm, 8, 4, 2. Lengths of cells are counted in the smallest.
 _CELL, _HALVINGS = 0.002, 3
-# A link shares nothing with the object where all its samples are farther off [m]: they lie some 3 mm apart.
-_NO_SAMPLE_NEARER = 0.01
 # Half the diagonal of a cube of side 1, with room for rounding.
 _HALF_DIAGONAL = 0.5 * np.sqrt(3.0) * 1.001
 
@@ -179,7 +177,7 @@ def penetration(context: MetricsContext, placed: PlacedHand) -> float:
 
 @lru_cache(maxsize=8)
 def _link_balls(hand: HandModel) -> tuple[Float[np.ndarray, "links 3"], Float[np.ndarray, "links"]]:
-    """Return centers, link frames, and radii of balls about the solids of each link [m]; zero for a bare link."""
+    """Return centers, in link frames, and radii of balls about the solids of each link [m]. A bare link's are zero."""
     centers, radii = np.zeros((hand.num_links, 3)), np.zeros(hand.num_links)
     for link, primitives in enumerate(hand.primitives_of):
         if primitives:
@@ -312,12 +310,7 @@ def _root_cells(
 ) -> tuple[Int[np.ndarray, "cells 3"], Int[np.ndarray, "cells"]]:
     """Return the coarsest cells over the boxes of all solids, base frame, and the solid of each, rising."""
     size, base, cells = 2**_HALVINGS, placed.rotations[0], [np.zeros((0, 3), dtype=np.int64)]
-    near = np.full(len(placed.translations), np.inf)
-    np.minimum.at(near, placed.links, placed.distance)
     for primitive in solids.primitives:
-        if near[primitive.link] > _NO_SAMPLE_NEARER:
-            cells.append(cells[0])
-            continue
         low, high = bounds(primitive)
         rotation = base.T @ placed.rotations[primitive.link]
         center = (placed.translations[primitive.link] - placed.translations[0]) @ base + rotation @ (low + high) / 2

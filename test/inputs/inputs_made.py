@@ -83,7 +83,7 @@ def middle(mesh: TriangleMesh) -> tuple[float, ...]:
 
 
 def sheet(gaps: bool = False) -> TriangleMesh:
-    """Faces between neighbouring pixels, as camera viewers write them; with `gaps`, to pixels without depth too."""
+    """Return faces between neighbouring pixels, as camera viewers write them. `gaps` adds pixels without depth."""
     grid = np.nan_to_num(grid_of())
     index = np.arange(grid.shape[0] * grid.shape[1]).reshape(grid.shape[:2])
     a, b, c, d = index[:-1, :-1], index[:-1, 1:], index[1:, :-1], index[1:, 1:]
@@ -127,7 +127,7 @@ def bytes_file(name: str, make_bytes: Callable[[], bytes]) -> Callable[[Path], P
 
 
 def ply(points: np.ndarray, extra: str = "", promised: int | None = None) -> bytes:
-    """A binary cloud; `extra` names more properties, of floats."""
+    """Write a binary cloud. `extra` names more properties, of floats."""
     properties = "".join(f"property float {name}\n" for name in ("x", "y", "z", *extra.split()))
     count = len(points) if promised is None else promised
     head = f"ply\nformat binary_little_endian 1.0\nelement vertex {count}\n{properties}end_header\n"
@@ -265,30 +265,22 @@ def bag(
     return make
 
 
-def recorded(row: Situation, path: Path) -> Path | None:
-    """Return the row's input as a recording of what a driver would publish; None where no message can be that."""
+def recorded(path: Path) -> Path:
+    """Return a row's input as a recording of what a driver would publish."""
     if path.is_dir():
         return path
-    if "scale" in row.options or not path.exists() or not is_cloud_file(path):
-        return None
     arrays = dict(np.load(path)) if path.suffix == ".npz" else {}
     if "depth" in arrays:
         whole = arrays["depth"].dtype.kind == "u"
         depth, encoding = (arrays["depth"] / 1000, "16UC1") if whole else (arrays["depth"], "32FC1")
         message = lambda stamp: depth_message(depth, FRAME, stamp, encoding=encoding)  # noqa: E731
-        told = "K" in arrays and "T_world_camera" not in arrays
-        return bag(message, "depth/image_rect", arrays["K"])(path.parent) if told else None
-    try:
-        points = np.load(path) if path.suffix == ".npy" else load_views(path)[0].points
-    except CloudError:
-        return None
-    if points.shape[-1] != 3:
-        return None
+        return bag(message, "depth/image_rect", arrays["K"])(path.parent)
+    points = np.load(path) if path.suffix == ".npy" else load_views(path)[0].points
     return bag(lambda stamp: cloud_message(points, FRAME, stamp))(path.parent)
 
 
 def camera_place(path: Path) -> tuple[float, ...]:
-    """Where a file says that its camera stood; empty where it does not say."""
+    """Return where a file says that its camera stood, or nothing."""
     if path.suffix.removeprefix(".") not in CLOUD_ENDINGS or not is_cloud_file(path):
         return ()
     try:

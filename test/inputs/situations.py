@@ -424,3 +424,14 @@ DRIVERS = (
     ),
 )
 SITUATIONS = CLOUDS + MESHES + DRIVERS + MESSAGES
+
+# Only a file can be these: a driver's message has a matrix, metres, a length and x, y, z.
+FILE_ONLY = {
+    "a cloud in mm, said",
+    "a cloud without points",
+    "a cloud cut short",
+    "a pose that is no rotation",
+    "another array",
+    "depth without a matrix",
+    "points with colours, n by 6",
+}

@@ -51,5 +51,10 @@ def test_other_structures_are_noticed(monkeypatch):
     assert builds.load("baseline").reason == "built from other sources: install graspd again"
 
 
+def test_a_build_that_lacks_a_function_is_noticed(monkeypatch):
+    monkeypatch.setitem(builds._ARGUMENTS, "graspd_of_tomorrow", [])
+    assert builds.load("baseline").reason == "built from other sources: install graspd again"
+
+
 def test_a_build_that_was_not_made_says_so():
     assert builds.load("none").reason.startswith("not built")

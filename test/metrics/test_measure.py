@@ -421,6 +421,18 @@ def hull(arms: np.ndarray, normals: np.ndarray, friction: float, length: float) 
     return found.epsilon, found.volume
 
 
+@pytest.mark.parametrize("joggle", [0.0, 1e-14])
+def test_a_hull_that_rounding_spoils_is_refused_or_right(joggle):
+    # Equal and coplanar points, which the caller joggles by far more.
+    rng = np.random.default_rng(3)
+    library = kernel().library
+    for _ in range(30 if library else 0):
+        points = np.round(rng.normal(size=(int(rng.integers(7, 150)), 6))) + joggle * rng.normal()
+        found = np.empty(9)
+        assert library.graspd_wrench_hull(len(points), points.ctypes.data, found.ctypes.data) == 0
+        assert found[8] > 1e-9 or found[7] == pytest.approx(ConvexHull(points).volume, rel=1e-6)
+
+
 @given(seed=st.integers(0, 2**31), contacts=st.integers(3, PROTOCOL_CONTACTS))
 @settings(max_examples=20)
 def test_the_compiled_hull_is_qhull_s(seed, contacts):

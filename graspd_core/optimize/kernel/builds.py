@@ -88,6 +88,8 @@ def _load(path: Path, name: str) -> Kernel:
     count = library.graspd_sizes(sizes)
     if list(sizes[:count]) != [ctypes.sizeof(structure) for structure in STRUCTURES]:
         return Kernel("", None, "built from other sources: install graspd again")
+    if not all(hasattr(library, function) for function in _ARGUMENTS):
+        return Kernel("", None, "built from other sources: install graspd again")
     for function, arguments in _ARGUMENTS.items():
         getattr(library, function).argtypes = arguments
     return Kernel(name, library)

@@ -15,7 +15,7 @@ class WrenchHull {
 
     WrenchHull(const double* points, int count) : points_(points), count_(count) {}
 
-    // Whether there is a hull with volume.
+    // Whether there is a hull with volume, and rounding has not spoilt it.
     bool build() {
         int simplex[D + 1];
         if (!first_simplex(simplex)) return false;
@@ -29,9 +29,9 @@ class WrenchHull {
                 if (j != i) facet.neighbor[k] = j, facet.vertex[k++] = uint8_t(simplex[j]);
             if (!set_first_plane(add(facet))) return false;
         }
-        for (int i = 0; i < count_; i++)
+        for (int i = 0; i < count_ && !broken_; i++)
             if (!used[i]) insert(i);
-        return true;
+        return !broken_;
     }
 
     // Of the facet nearest the origin: its outward unit normal, and its distance, negative where the origin is outside.
@@ -70,7 +70,7 @@ class WrenchHull {
         uint32_t key;
         int32_t facet, side;
     };
-    static constexpr int DEAD = -1;
+    static constexpr int DEAD = -1, CLOSED = -1;
 
     const double* at(int i) const { return points_ + D * i; }
     bool alive(int f) const { return facets_[f].neighbor[0] != DEAD; }
@@ -161,10 +161,7 @@ class WrenchHull {
         for (int f : seen_)
             for (int k = 0; k < D; k++)
                 if (const int beyond = facets_[f].neighbor[k]; height_[beyond] <= 0) add_cone(index, f, k, beyond);
-        for (int f : made_) {
-            int32_t* neighbor = facets_[facets_[f].neighbor[D - 1]].neighbor;
-            *std::find(neighbor, neighbor + D, -2 - f) = f;
-        }
+        for (int f : made_) exchange(facets_[f].neighbor[D - 1], -2 - f, f);
         for (int f : seen_) remove(f);
         connect();
     }
@@ -192,8 +189,16 @@ class WrenchHull {
         made_.push_back(made);
         height_.resize(facets_.size());
         // Marked, not set: the one beyond may meet two facets that see the point.
-        int32_t* neighbor = facets_[beyond].neighbor;
-        *std::find(neighbor, neighbor + D, f) = -2 - made;
+        exchange(beyond, f, -2 - made);
+    }
+
+    // Puts another neighbor in the place of one.
+    void exchange(int f, int32_t one, int32_t other) {
+        int32_t *neighbor = facets_[f].neighbor, *place = std::find(neighbor, neighbor + D, one);
+        if (place == neighbor + D)
+            broken_ = true;
+        else
+            *place = other;
     }
 
     // New facets are neighbors where they share a ridge: four old vertices and the new one.
@@ -202,6 +207,7 @@ class WrenchHull {
         while ((size_t(1) << bits) < 2 * (D - 1) * made_.size()) bits++;
         const uint32_t last = (uint32_t(1) << bits) - 1;
         ridges_.assign(size_t(last) + 1, Ridge{0, DEAD, 0});
+        size_t open = (D - 1) * made_.size();
         for (int f : made_)
             for (int k = 0; k < D - 1; k++) {
                 uint32_t key = 0;
@@ -212,11 +218,15 @@ class WrenchHull {
                 Ridge& ridge = ridges_[slot];
                 if (ridge.facet == DEAD) {
                     ridge = {key, f, k};
-                } else {
+                } else if (ridge.side != CLOSED) {
                     facets_[f].neighbor[k] = ridge.facet;
                     facets_[ridge.facet].neighbor[ridge.side] = f;
+                    ridge.side = CLOSED;
+                    open -= 2;
                 }
             }
+        // Rounding can leave a ridge to one facet, or to three.
+        broken_ |= open != 0;
     }
 
     static double determinant(double (&rows)[D][D]) {
@@ -244,6 +254,7 @@ class WrenchHull {
     std::vector<double> height_;        // of the point above each facet
     std::vector<int> free_, seen_, made_;
     std::vector<Ridge> ridges_;
+    bool broken_ = false;
 };
 
 }  // namespace graspd
