@@ -72,7 +72,7 @@ MAX_PACKAGE_LINES = {
     "graspd_dataset": 2_950,
     "graspd_viewer": 2_288,
     "graspd_cell": 3_800,
-    "test": 32_960,
+    "test": 32_962,
 }
 # Lines that a program reaches through its imports, those inside functions too.
 # The layout aims at 22,000 of the node.
