@@ -66,7 +66,7 @@ MAY_IMPORT = {
 # The layout aims at 22,000 of graspd_core, 4,500 of graspd_ros and 26,000 of test. What inputs are checked for, which
 # came after it, took 1,700, 500 and 3,300.
 MAX_PACKAGE_LINES = {
-    "graspd_core": 26_765,
+    "graspd_core": 26_789,
     "graspd_ros": 5_200,
     "graspd_bench": 8_800,
     "graspd_dataset": 2_950,
@@ -76,7 +76,7 @@ MAX_PACKAGE_LINES = {
 }
 # Lines that a program reaches through its imports, those inside functions too.
 # The layout aims at 22,000 of the node.
-MAX_REACH = {"graspd_core.cli.synthesize_command": 21_665, "graspd_ros.node": 25_614}
+MAX_REACH = {"graspd_core.cli.synthesize_command": 21_689, "graspd_ros.node": 25_638}
 
 # Docstrings with a semicolon, by path prefix, at most. The longest prefix of a path counts, all other files have none.
 MAX_SEMICOLONS = {
@@ -84,7 +84,6 @@ MAX_SEMICOLONS = {
     "graspd_cell/": 21,
     "graspd_core/perception/segment/": 19,
     "graspd_core/perception/scene": 5,
-    "graspd_core/perception/cloud/viewpoint_check.py": 3,
     "graspd_core/verify/metrics.py": 1,
     "graspd_core/verify/prepared_grasp.py": 7,
 }
