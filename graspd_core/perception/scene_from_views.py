@@ -14,7 +14,7 @@ from graspd_core.errors import CloudError
 from graspd_core.perception.cloud.point_cloud import PointCloud, Points
 from graspd_core.perception.cloud.viewpoint_check import check_scene, check_thing, fits_nowhere
 from graspd_core.perception.obstacles import make_obstacles
-from graspd_core.perception.reconstruct.merge_views import Evidence, is_unposed
+from graspd_core.perception.reconstruct.merge_views import Evidence, is_all_round, is_unposed
 from graspd_core.perception.reconstruct.reconstruct import Reconstruction, reconstruct
 from graspd_core.perception.scene import ObjectModel, Obstacle, Scene, build_scene, refuse_numbers
 from graspd_core.perception.segment.segment import Segmentation, segment
@@ -133,13 +133,18 @@ def _camera_doubts(seen: Segmentation, views: Sequence[PointCloud]) -> tuple[str
     try:
         told = [check_thing(thing, by_eye[tuple(thing.viewpoint.astype(float))], up) for thing in seen.views]
     except CloudError:
-        first = seen.views[0]
-        if len(seen.views) == 1 and fits_nowhere(first) and is_unposed(first, first.forward is not None):
-            # It shows an object from all round, so that no camera counts.
+        if _needs_no_camera(seen.views):
             return ()
         raise
     # Views of several sides explain each other.
-    return tuple(told) if len(told) == 1 and told[0] else ()
+    return tuple(told) if len(told) == 1 and told[0] and not _needs_no_camera(seen.views) else ()
+
+
+def _needs_no_camera(views: Sequence[PointCloud]) -> bool:
+    """Tell whether one cloud shows its object from all round."""
+    first = views[0]
+    all_round = len(views) == 1 and is_unposed(first, first.forward is not None)
+    return all_round and (fits_nowhere(first) or is_all_round(first))
 
 
 def _obstacles(seen: Segmentation, mesh: TriangleMesh, settings: SceneConfig) -> tuple[Obstacle, ...]:

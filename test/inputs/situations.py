@@ -167,6 +167,13 @@ CLOUDS = (
         near=0.6,
     ),
     Situation(
+        "one side of an object, about its own middle",
+        array_file("a.npy", lambda: only_object() - np.nanmean(only_object(), axis=0)),
+        "did not stand at the origin of its frame",
+        "NVlabs/6dof-graspnet/issues/7",
+        {"alone": True},
+    ),
+    Situation(
         "a target where nothing is",
         array_file("a.npy", grid_of),
         "target: nothing within 0.05 m",

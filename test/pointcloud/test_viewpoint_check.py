@@ -13,11 +13,12 @@ from graspd_bench.rendering.depth_noise import DEFAULT
 from graspd_bench.rendering.tabletop import depth_views, ring_poses, tabletop
 from graspd_core.config import SegmentationConfig
 from graspd_core.errors import CloudError
-from graspd_core.mesh.mesh_files import surface_samples
+from graspd_core.mesh.mesh_files import mass_properties, surface_samples
 from graspd_core.mesh.shapes import make_shape
 from graspd_core.perception.cloud.camera import PinholeCamera, camera_rays, cloud_from_depth, reaches_image_border
 from graspd_core.perception.cloud.point_cloud import PointCloud
 from graspd_core.perception.cloud.viewpoint_check import check_scene, check_thing, fits_nowhere, seen_from
+from graspd_core.perception.reconstruct.merge_views import is_all_round
 from graspd_core.perception.scene_from_views import scene_from_views
 from graspd_core.perception.segment.target_selection import Target
 
@@ -75,6 +76,28 @@ def test_an_object_alone_from_all_round_needs_no_camera():
     assert evidence.doubts == ()
     with pytest.raises(CloudError, match=r"did not stand at the origin of its frame: .*sensor_frame or view_point"):
         check_thing(cloud, cloud)
+
+
+@pytest.mark.parametrize("shape", ["box", "bowl", "mug", "bottle"])
+@pytest.mark.parametrize("place", [(0.0, 0.0, 0.0), (0.3, 0.2, 0.5)])
+def test_a_whole_object_is_taken_with_its_walls_and_without_a_doubt(shape: str, place: tuple[float, float, float]):
+    mesh = make_shape(shape)
+    points = surface_samples(mesh, 3000, seed=0)[0] + place
+    whole = scene_from_views([PointCloud(points, np.zeros(3))], alone=True)
+    assert whole.evidence is not None
+    assert whole.evidence.doubts == ()
+    # A wall of 4 mm may become 5.
+    assert mass_properties(whole.object.mesh)[0] == pytest.approx(mass_properties(mesh)[0], rel=0.25)
+
+
+def test_one_side_of_an_object_about_its_own_middle_is_refused_by_that_reason():
+    """As a view of which the mean was subtracted."""
+    _, points, place = seen("mug", 0.8)
+    thing = points[(np.abs(points[:, :2]) < 0.08).all(1) & (points[:, 2] > 0.008)]
+    assert is_all_round(PointCloud(surface_samples(make_shape("mug"), 3000, seed=0)[0], place))
+    assert not is_all_round(PointCloud(thing, place))
+    with pytest.raises(CloudError, match="did not stand at the origin of its frame: it lies within the object"):
+        scene_from_views([PointCloud(thing - thing.mean(0), np.zeros(3))], alone=True)
 
 
 @pytest.mark.parametrize(("factor", "doubt"), [(4.0, "are its numbers metres"), (0.1, "nearer than depth"), (10.0, "")])

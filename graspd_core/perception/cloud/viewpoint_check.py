@@ -122,6 +122,8 @@ def check_thing(thing: PointCloud, view: PointCloud, up: Vector | None = None) -
     own = _thinned(thing)
     if view.posed or len(own) < FEWEST_POINTS:
         return ""
+    if ((own.min(0) < view.viewpoint) & (view.viewpoint < own.max(0))).all():
+        raise _refusal(view.viewpoint, "it lies within the object")
     near = _some(view.points[_in_box(view.points, own)], view.viewpoint, MOST_POINTS)
     if len(near) < FEWEST_POINTS:
         return ""
@@ -156,8 +158,10 @@ def check_thing(thing: PointCloud, view: PointCloud, up: Vector | None = None) -
 def fits_nowhere(thing: PointCloud) -> bool:
     """Tell whether no camera on any side sees all points of a thing, as where it is shown from all round."""
     own = _thinned(thing)
+    if len(own) < FEWEST_POINTS:
+        return False
     surfaces, middle = _surfaces(own), own.mean(0)
-    far = float(np.linalg.norm(thing.viewpoint - middle))
+    far = max(float(np.linalg.norm(thing.viewpoint - middle)), 3 * longest_side(own))
     return all(_away_share(own, surfaces, middle + far * way) > MAX_AWAY_SHARE for way in _DIRECTIONS)
 
 
