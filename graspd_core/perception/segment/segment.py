@@ -46,12 +46,12 @@ class Segmentation:
     """An object and what is around it, in the frame of the clouds.
 
     Attributes:
-        views: the object's points as each camera saw them, at full density; views that do not show it are left out.
-        support: what it stands on; None where none was seen.
+        views: the object's points as each camera saw them, at full density. Views that do not show it are left out.
+        support: what it stands on, None where none was seen.
         obstacles: the points of each other thing near it, thinned [m].
         warnings: what the user should know.
         cut: whether the object reaches the border of the picture or of the workspace.
-        beside: why what was taken may be more than the target, or another thing; empty if nothing says so.
+        beside: why what was taken may be more than the target, or another thing. Empty if nothing says so.
     """
 
     views: tuple[PointCloud, ...]
@@ -68,9 +68,9 @@ def segment(
     """Find the object in one or several views of a scene, or take a cloud of an object alone as it is.
 
     Args:
-        views: what each camera saw, in one frame; points may be NaN.
-        target: what tells the object from other things; without it, the thing nearest the first view's axis is taken
-            (towards the middle of its points where the axis is not known).
+        views: what each camera saw, in one frame. Points may be NaN.
+        target: what tells the object from other things. Without it, the thing nearest the first view's axis is taken.
+            Where the axis is not known, it points to the middle of the points.
         settings: sizes and tolerances.
 
     Raises:
@@ -131,7 +131,7 @@ def find_things(
 class _Parted:
     """A scene, where its cameras stood [m], what things stand on, and the thing that each voxel is part of.
 
-    Things are numbered from the largest; -1 is background or noise.
+    Things are numbered from the largest. Background and noise are -1.
     """
 
     scene: VoxelScene
@@ -168,7 +168,7 @@ def _things(scene: VoxelScene, ground: Ground, eyes: Eyes, settings: Segmentatio
 
 
 def _candidates(parted: _Parted) -> list[int]:
-    """Things of a size to be grasped: those that stand on the support, else all."""
+    """Return the things of a size to be grasped: those that stand on the support, else all."""
     scene, label, settings, part = parted.scene, parted.label, parted.settings, parted.ground.support
     things = {k: label == k for k in range(int(label.max(initial=-1)) + 1)}
     fits = [k for k, mine in things.items() if extent(scene.mean[mine]) <= settings.largest_object]
@@ -180,7 +180,7 @@ def _candidates(parted: _Parted) -> list[int]:
 
 
 def _cut_out(views: Sequence[PointCloud], scene: VoxelScene, chosen: Mask, ground: Ground) -> tuple[PointCloud, ...]:
-    """The object's points of every view that shows it."""
+    """Return the object's points of every view that shows it."""
     wanted = chosen[scene.voxel]
     if ground.support is not None:
         rows = np.flatnonzero(wanted)
@@ -195,7 +195,7 @@ def _cut_out(views: Sequence[PointCloud], scene: VoxelScene, chosen: Mask, groun
 
 
 def _obstacles(parted: _Parted, chosen: Mask) -> tuple[Float[np.ndarray, "_ 3"], ...]:
-    """Other things and large flat parts, as far as they are within reach of the object's bounding box."""
+    """Return other things and large flat parts, as far as they are within reach of the object's bounding box."""
     mean, label, reach = parted.scene.mean, parted.label, parted.settings.obstacle_range
     mine = mean[chosen]
     low, high = mine.min(0) - reach, mine.max(0) + reach
@@ -206,7 +206,7 @@ def _obstacles(parted: _Parted, chosen: Mask) -> tuple[Float[np.ndarray, "_ 3"],
 
 
 def _doubts(parted: _Parted, chosen: Mask, crowded: bool) -> tuple[str, ...]:
-    """What the user should know of how the object was found."""
+    """Return what the user should know of how the object was found."""
     scene, ground, settings = parted.scene, parted.ground, parted.settings
     doubts = []
     if scene.size > 0.5 * settings.gap:
@@ -230,7 +230,7 @@ def _doubts(parted: _Parted, chosen: Mask, crowded: bool) -> tuple[str, ...]:
 
 
 def _parts(parted: _Parted, chosen: Mask) -> Labels:
-    """Which of several things that touch each voxel is of, if a seam parts what was taken for one on a support."""
+    """Return the thing that each voxel is of, where a seam parts what was taken for one on a support."""
     scene, support = parted.scene, parted.ground.support
     part = np.where(chosen, 0, -1)
     if support is not None:
@@ -241,7 +241,7 @@ def _parts(parted: _Parted, chosen: Mask) -> Labels:
 
 
 def _touching(scene: VoxelScene, chosen: Mask, part: Labels) -> tuple[str, ...]:
-    """That what was taken for one thing may be several, or what a seam set apart from the one that is meant."""
+    """Say that what was taken for one thing may be several, or what a seam set apart from the one that is meant."""
     parts = [part == k for k in range(int(part.max(initial=-1)) + 1)]
     apart = [mine for mine in parts if not (mine & chosen).any()]
     if len(parts) < 2:
@@ -290,7 +290,7 @@ def _cut_off(scene: VoxelScene, chosen: Mask, settings: SegmentationConfig) -> b
 
 
 def _nothing(parted: _Parted) -> str:
-    """What was seen instead of an object."""
+    """Say what was seen instead of an object."""
     scene, label, ground, settings = parted.scene, parted.label, parted.ground, parted.settings
     told = f"cloud: no object among {len(scene.points)} points:"
     if label.max(initial=-1) >= 0:
