@@ -86,8 +86,8 @@ def test_a_whole_object_is_taken_with_its_walls_and_without_a_doubt(shape: str, 
     whole = scene_from_views([PointCloud(points, np.zeros(3))], alone=True)
     assert whole.evidence is not None
     assert whole.evidence.doubts == ()
-    # A wall of 4 mm may become 5.
-    assert mass_properties(whole.object.mesh)[0] == pytest.approx(mass_properties(mesh)[0], rel=0.25)
+    # The mug's walls are 4 mm thick, as far as its points are apart.
+    assert mass_properties(whole.object.mesh)[0] == pytest.approx(mass_properties(mesh)[0], rel=0.1)
 
 
 def test_one_side_of_an_object_about_its_own_middle_is_refused_by_that_reason():
