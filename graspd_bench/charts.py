@@ -28,6 +28,7 @@ from graspd_bench.figures import (
 )
 from graspd_bench.study import Record
 from graspd_bench.suites import SWEEPS
+from graspd_core.errors import Extra
 from graspd_core.optimize.plan_config import method_row
 
 # Colours of Okabe and Ito (2008), which the colour-blind can tell apart. A marker's shape says the same.
@@ -54,7 +55,8 @@ _DISTANCES = (7.0, 13.0, 20.0, 28.0, 38.0, 50.0, 64.0)
 @contextmanager
 def figure(width: float, height: float, **grid: Any) -> Iterator[tuple[Any, Any]]:
     """Yield a figure and its axes in the common style [inches], and close it at the end."""
-    import matplotlib
+    with Extra("bench"):
+        import matplotlib
 
     matplotlib.use("Agg")
     from matplotlib import pyplot

@@ -24,7 +24,7 @@ from scipy.ndimage import distance_transform_edt
 from graspd_cell.layout import Box
 from graspd_cell.robot import JointMotion
 from graspd_core.arms.arm import Arm, tip_hand
-from graspd_core.errors import GraspdError
+from graspd_core.errors import Extra, GraspdError
 from graspd_core.hands.kinematics import link_poses
 from graspd_core.hands.model import HandModel
 from graspd_core.hands.surface_points import dense_samples
@@ -324,7 +324,8 @@ def find_path(mover: Mover, start: Joints, goal: Joints, seconds: float = 5.0) -
 
 
 def _planned(mover: Mover, start: Joints, goal: Joints, allowed: np.ndarray, seconds: float) -> Path | None:
-    from ompl import base, geometric, util
+    with Extra("cell"):
+        from ompl import base, geometric, util
 
     util.setLogLevel(util.LogLevel.LOG_ERROR)
     arm, count = mover.shape.arm, len(start)

@@ -7,6 +7,7 @@ The ROS probe keeps rclpy out of this process.
 from __future__ import annotations
 
 import ctypes
+import importlib.util
 import subprocess
 import sys
 import tempfile
@@ -17,18 +18,18 @@ from typing import Any
 
 PROBE_TIMEOUT = 60.0  # Seconds. A cold disk takes several for torch or Open3D.
 _SETUP = "run `make setup` in the checkout, or pip install graspd again"
+_CLOUDS = "only clouds need it: pip install 'graspd[clouds]'"
+# Open3D loads these.
 _SYSTEM_LIBRARIES = {"libusb-1.0.so.0": "libusb-1.0-0", "libGL.so.1": "libgl1", "libgomp.so.1": "libgomp1"}
 # distribution: module
 _LIBRARIES = {
     "numpy": "numpy",
     "scipy": "scipy",
     "trimesh": "trimesh",
-    "open3d": "open3d",
     "libigl": "igl",
     "fast-simplification": "fast_simplification",
     "pytorch-kinematics": "pytorch_kinematics",
     "pyyaml": "yaml",
-    "matplotlib": "matplotlib",
 }
 _LIBRARY = "import {module}; from importlib.metadata import version; print(version({name!r}))"
 _TORCH = """
@@ -98,6 +99,7 @@ def run_checks() -> list[Check]:
         ("mujoco", _MUJOCO, _SETUP, True),
         ("compiled kernel", _KERNEL, f"torch does its work, 30 times slower: {_SETUP}", False),
         *((name, _LIBRARY.format(module=module, name=name), _SETUP, True) for name, module in _LIBRARIES.items()),
+        ("open3d", _LIBRARY.format(module="open3d", name="open3d"), _CLOUDS, _has_open3d()),
         ("hands", _HANDS, "check the files under config/hands, or unset GRASPD_CONFIG", True),
         ("pybullet", _BULLET, "only benchmarks need it: make setup, on Python 3.11", False),
         ("ROS 2 (rclpy)", _ROS, "only the node needs it: make setup (docs/ros.md)", False),
@@ -143,12 +145,18 @@ def main() -> int:
 
 def _check_python() -> Check:
     version = ".".join(map(str, sys.version_info[:3]))
-    ok = (3, 11) <= sys.version_info[:2] <= (3, 12)
-    return Check("Python", ok, f"{version} at {sys.executable}", "use Python 3.11 or 3.12")
+    ok = (3, 11) <= sys.version_info[:2] <= (3, 13)
+    return Check("Python", ok, f"{version} at {sys.executable}", "use Python 3.11 to 3.13")
+
+
+def _has_open3d() -> bool:
+    return importlib.util.find_spec("open3d") is not None
 
 
 def _check_system_libraries() -> list[Check]:
-    checks = []
+    checks: list[Check] = []
+    if not _has_open3d():
+        return checks
     for library, package in _SYSTEM_LIBRARIES.items():
         try:
             ctypes.CDLL(library)

@@ -58,3 +58,20 @@ class ResourceError(GraspdError):
 
 class SimulatorError(GraspdError):
     """A trial needs a simulator that is not installed, or that cannot take the scene."""
+
+
+class Extra:
+    """Report a missing library of an extra in one line: `with Extra("clouds"): import open3d`.
+
+    Raises ConfigError: the library is not installed. The line names the command that installs the extra.
+    """
+
+    def __init__(self, name: str) -> None:
+        self.name = name
+
+    def __enter__(self) -> None:
+        """Begin."""
+
+    def __exit__(self, kind: object, error: object, trace: object) -> None:
+        if isinstance(error, ModuleNotFoundError):
+            raise ConfigError(f"{error.name} is not installed; run: pip install 'graspd[{self.name}]'") from None

@@ -14,7 +14,7 @@ from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
-from graspd_core.errors import ConfigError, GraspdError
+from graspd_core.errors import ConfigError, Extra, GraspdError
 from graspd_core.optimize.plan_config import PlanConfig
 from graspd_dataset.blocks import Block, DatasetObject
 from graspd_dataset.dataset_store import DatasetStore
@@ -95,10 +95,8 @@ def _remove_abandoned(folder: Path) -> None:
 
 
 def _ray() -> Any:
-    try:
+    with Extra("dataset"):
         import ray
-    except ImportError:
-        raise ConfigError("ray is not installed; pip install 'graspd[dataset]'") from None
     return ray
 
 

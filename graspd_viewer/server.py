@@ -16,7 +16,7 @@ from collections.abc import Callable
 from typing import Any
 from urllib.parse import urlsplit
 
-from graspd_core.errors import ConfigError
+from graspd_core.errors import ConfigError, Extra
 
 Work = Callable[[], object]
 
@@ -85,10 +85,8 @@ def start_server(host: str, port: int) -> Any:
     Raises:
         ConfigError: no viser, or no such address on this machine.
     """
-    try:
+    with Extra("view"):
         import viser
-    except ImportError:
-        raise ConfigError("viser is not installed, which the viewer needs: pip install 'graspd[view]'") from None
     if not 0 <= port < 65536:
         raise ConfigError(f"port: {port}; valid: 0 to 65535, 0 for any")
     try:

@@ -8,19 +8,19 @@ required=(libusb-1.0.so.0:libusb-1.0-0 libGL.so.1:libgl1 libgomp.so.1:libgomp1) 
 
 fail() { echo "setup: $*" >&2; exit 1; }
 
-suitable() { "$1" -c 'import sys; sys.exit(sys.version_info[:2] not in {(3, 11), (3, 12)})' 2>/dev/null; }
+suitable() { "$1" -c 'import sys; sys.exit(sys.version_info[:2] not in {(3, 11), (3, 12), (3, 13)})' 2>/dev/null; }
 
 choose_python() {
     if [ -n "$wanted" ]; then
-        command -v "$wanted" >/dev/null || fail "PYTHON=$wanted was not found; give a Python 3.11 or 3.12"
-        suitable "$wanted" || fail "PYTHON=$wanted is $("$wanted" --version 2>&1); graspd needs Python 3.11 or 3.12"
+        command -v "$wanted" >/dev/null || fail "PYTHON=$wanted was not found; give a Python 3.11 to 3.13"
+        suitable "$wanted" || fail "PYTHON=$wanted is $("$wanted" --version 2>&1); graspd needs Python 3.11 to 3.13"
         echo "$wanted"
         return
     fi
-    for python in python3.12 python3.11 python3; do
+    for python in python3.12 python3.11 python3.13 python3; do
         if suitable "$python"; then echo "$python"; return; fi
     done
-    fail "no Python 3.11 or 3.12 on the PATH; install one or name it: make setup PYTHON=/path/to/python3.11"
+    fail "no Python 3.11 to 3.13 on the PATH; install one or name it: make setup PYTHON=/path/to/python3.11"
 }
 
 # As root, or with a sudo that asks nothing.
@@ -82,7 +82,7 @@ fi
 echo "setup: installing packages into $venv (about 4 GB, a few minutes the first time)"
 unset _ROS_WHEELS_BOOTSTRAP_COMPLETE # another environment's ROS may have set it
 pip=("$venv/bin/python" -m pip install -qq --disable-pip-version-check)
-"${pip[@]}" -c constraints.txt -e ".[ros,view,bench,dataset,cell,fuzz,docs,dev]" "setuptools>=70.1"
+"${pip[@]}" -c constraints.txt -e ".[clouds,ros,view,bench,dataset,cell,fuzz,docs,dev]" "setuptools>=70.1"
 echo "setup: compiling the messages of graspd_msgs (20 seconds)"
 # Against the very libraries that it will be loaded with; what it needs is installed by now.
 "${pip[@]}" --no-build-isolation --no-deps ./msg_defs

@@ -11,6 +11,7 @@ import subprocess
 import sys
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 import graspd_core
@@ -95,6 +96,32 @@ def test_a_plan_on_a_mesh_imports_what_it_uses(program, tmp_path):
         run = subprocess.run([sys.executable, "-c", ask], env=environment, capture_output=True, text=True, check=False)
         assert run.returncode == 0, run.stderr
         assert run.stdout.splitlines()[-1] == "[]"
+
+
+NO_OPEN3D = "graspd: open3d is not installed; run: pip install 'graspd[clouds]'\n"
+WITHOUT_OPEN3D = """
+import sys
+sys.modules["open3d"] = None
+from graspd_core.cli import main
+sys.exit(main(["synthesize", sys.argv[1], "-n", "1", "--preset", "fast", "--out", "grasps.json"]))
+"""
+
+
+@pytest.mark.parametrize(
+    ("source", "status", "error"),
+    [("ball.stl", 0, ""), ("ball.npy", 2, NO_OPEN3D), ("ball.xyz", 2, NO_OPEN3D)],
+)
+def test_a_mesh_needs_no_open3d_and_a_cloud_names_its_extra(source: str, status: int, error: str, tmp_path: Path):
+    ball = graspd_core.make_shape("sphere")
+    graspd_core.save_mesh(ball, tmp_path / "ball.stl")
+    # What a camera at the origin sees.
+    seen = np.add(ball.vertices[ball.vertices[:, 2] < -0.01], (0, 0, 0.5))
+    np.save(tmp_path / "ball.npy", seen)
+    np.savetxt(tmp_path / "ball.xyz", seen)
+    command = [sys.executable, "-c", WITHOUT_OPEN3D, source]
+    done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, check=False)
+    assert (done.returncode, error in done.stderr) == (status, True), done.stderr
+    assert status == 0 or done.stderr == error
 
 
 ROOT = Path(__file__).parents[1]

@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Bool, Float, Integer
 
+from graspd_core.errors import Extra
 from graspd_core.mesh.topology import cut_long_faces, scaled_normals
 from graspd_core.types import TriangleMesh
 
@@ -197,7 +198,8 @@ def first_hits(
     mesh: TriangleMesh, directions: Float[np.ndarray, "*batch 3"]
 ) -> tuple[Float[np.ndarray, "*batch"], Integer[np.ndarray, "*batch"], Float[np.ndarray, "*batch 3"]]:
     """Cast rays from the origin. Return the lengths in `directions` (infinite: no hit), faces and unit normals."""
-    import open3d as o3d
+    with Extra("clouds"):
+        import open3d as o3d
 
     # Embree counts in float32: about the mesh's centre it need not be near the origin.
     centre = 0.5 * (mesh.vertices.min(0) + mesh.vertices.max(0))

@@ -15,7 +15,7 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float
 
-from graspd_core.errors import CloudError
+from graspd_core.errors import CloudError, Extra
 from graspd_core.perception.cloud.camera import camera_from_calibration, cloud_from_depth, depth_in_metres
 from graspd_core.perception.cloud.point_cloud import PointCloud, Points, Vector
 from graspd_core.perception.cloud.viewpoint_check import seen_from
@@ -387,7 +387,8 @@ def _has_commas(path: Path) -> bool:
 
 
 def _read_open3d(path: Path) -> Points:
-    import open3d as o3d
+    with Extra("clouds"):
+        import open3d as o3d
 
     # Open3D prints its complaints and returns nothing. The error below says it once.
     with o3d.utility.VerbosityContextManager(o3d.utility.VerbosityLevel.Error):

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Bool, Float
 
-from graspd_core.errors import CloudError
+from graspd_core.errors import CloudError, Extra
 from graspd_core.mesh.topology import voxel_keys
 
 # Positions or directions, one of them, and where the cameras of several views stood.
@@ -121,7 +121,8 @@ def clean_cloud(points: Points, viewpoint: Vector) -> PointCloud:
 
     Raises CloudError: empty, all NaN, or fewer than 50 points left.
     """
-    import open3d as o3d
+    with Extra("clouds"):
+        import open3d as o3d
 
     if len(points) == 0:
         raise CloudError("cloud: empty, no points at all")

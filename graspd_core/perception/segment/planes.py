@@ -12,6 +12,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from graspd_core.config import SegmentationConfig
+from graspd_core.errors import Extra
 from graspd_core.mesh.topology import packed_rows
 from graspd_core.perception.cloud.point_cloud import Eyes, Points, Vector, convex_hull, longest_side
 from graspd_core.types import Plane
@@ -86,7 +87,8 @@ def find_planes(
         viewpoints: where the cameras stood [m].
         settings: sizes and tolerances; parts smaller than a support are left alone.
     """
-    import open3d as o3d
+    with Extra("clouds"):
+        import open3d as o3d
 
     left, wide = np.arange(len(points)), settings.plane_search_width
     parts: list[FlatPart] = []
