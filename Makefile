@@ -11,7 +11,7 @@ RUN := $(VENV)/bin
 help:  ## list the targets
 	@grep -hE '^[a-z-]+: .*##' $(MAKEFILE_LIST) | sed -E 's/:[^#]*## /\t/' | expand -t 20
 
-setup: $(STAMP)  ## build .venv (Python 3.11 or 3.12; PYTHON=... names one)
+setup: $(STAMP)  ## build .venv (Python 3.11 to 3.13; PYTHON=... names one)
 
 # The directories too: adding or removing a message makes the environment stale.
 INTERFACES := $(wildcard $(addprefix msg_defs/,*.toml *.py *.xml msg msg/* srv srv/* action action/*) scripts/*_msgs/*/*)

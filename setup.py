@@ -43,7 +43,7 @@ def files_below(source: str, target: Path) -> list[tuple[str, list[str]]]:
 
 
 setup(
-    python_requires=">=3.11,<3.13",
+    python_requires=">=3.11,<3.14",
     ext_modules=[kernel_build(name, target) for name, target in TARGETS.items()],
     options={"bdist_wheel": {"py_limited_api": "cp311"}},
     data_files=[

@@ -219,7 +219,7 @@ setup(
     version=MANIFEST.findtext("version"),
     description=MANIFEST.findtext("description"),
     license=MANIFEST.findtext("license"),
-    python_requires=">=3.11,<3.13",
+    python_requires=">=3.11,<3.14",
     install_requires=["ros-rclpy[fastrtps]==7.1.6", "ros-common-interfaces==5.3.6"],
     packages=[NAME],
     package_dir={NAME: str(WORK / NAME)},
