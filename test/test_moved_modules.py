@@ -1,10 +1,11 @@
-"""Module paths of version 0.1: each is refused with the name that it has now."""
+"""Names of version 0.1: module paths are refused with the name that they have now, and the page lists every name."""
 
 from __future__ import annotations
 
 import importlib
 import importlib.util
 import json
+import re
 import sys
 from importlib.machinery import PathFinder
 from pathlib import Path
@@ -61,3 +62,10 @@ def test_what_never_was_is_told_by_python():
     # It is asked last but for finders that came later, so that it costs nothing where a module is there.
     names = [type(finder).__module__ for finder in sys.meta_path]
     assert names.index("graspd_core") > sys.meta_path.index(PathFinder)
+
+
+def test_the_page_has_the_tables_of_the_code():
+    page = (Path(__file__).parents[1] / "docs" / "reference" / "migration.md").read_text()
+    rows = re.findall(r"^\| (`.*`) \| `graspd_core\.([\w.]+)` \|$", page, re.MULTILINE)
+    assert {module: " ".join(re.findall(r"`(\w+)`", names)) for names, module in rows} == graspd_core._MOVED
+    assert '\n--8<-- "graspd_core/moved.json"\n' in page

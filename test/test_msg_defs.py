@@ -12,6 +12,7 @@ from pathlib import Path
 from xml.etree import ElementTree
 
 import pytest
+from packaging.utils import canonicalize_name
 
 ROOT = Path(__file__).parents[1]
 PACKAGE = ROOT / "msg_defs"
@@ -70,6 +71,31 @@ def test_colcon_and_pip_are_told_of_every_package_in_use():
 def test_one_version_everywhere():
     project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["version"]
     assert version(PACKAGE / "package.xml") == version(ROOT / "package.xml") == project
+    assert f"\nversion: {project}\n" in (ROOT / "CITATION.cff").read_text()
+    assert f"\n## [{project}] - 20" in (ROOT / "CHANGELOG.md").read_text()
+
+
+PINS = re.compile(r"^([\w.-]+)==([\w.]+)$", re.MULTILINE)
+
+
+def test_every_library_is_locked_listed_and_named_to_ros():
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
+    wanted = [*project["dependencies"], *project["optional-dependencies"]["clouds"]]
+    names = {re.split(r"[<>=\[]", requirement)[0] for requirement in wanted}
+    lock, pins = (
+        {canonicalize_name(name): pinned for name, pinned in PINS.findall((ROOT / file).read_text())}
+        for file in ("requirements.lock", "constraints.txt")
+    )
+    assert lock.keys() >= names
+    assert not {name for name in lock.keys() & pins.keys() if lock[name] != pins[name]}
+    page = (ROOT / "docs" / "reference" / "dependencies.md").read_text()
+    table = re.findall(r"^\| ([\w.-]+) \| [\d.]+ \|", page, re.MULTILINE)
+    # pip's list leaves setuptools out.
+    assert {*table} - {"graspd", "setuptools"} == lock.keys() - {"setuptools"}
+    keys = {"pyyaml": "python3-yaml", "pillow": "python3-pil", "tqdm": "python3-tqdm"}
+    by_pip = re.findall(r"[\w-]+", re.findall(r"<!-- From pip.*?-->", (ROOT / "package.xml").read_text(), re.DOTALL)[0])
+    assert {keys[name] for name in names & keys.keys()} <= dependencies(ROOT / "package.xml", "exec_depend")
+    assert names - keys.keys() <= {*by_pip}
 
 
 def test_the_interfaces_are_built_against_the_pinned_wheels():
