@@ -90,10 +90,10 @@ def reconstruct_object(
     """
     # The same cloud in numbers of 32 and of 64 bits is the same scene.
     views = [replace(view, points=_single(view.points)) for view in views]
+    alone = alone or _is_whole_object(views)
     if alone:
         seen = Segmentation(tuple(views), None, (), ())
     else:
-        check_scene(views)
         seen = segment(views, target=target, settings=settings.segmentation)
     doubts = _doubts(seen, views, settings.segmentation.max_range) if seen.views else ()
     whole = reconstruct(seen.views, seen.support, settings.reconstruction, () if alone else views)
@@ -138,6 +138,17 @@ def _camera_doubts(seen: Segmentation, views: Sequence[PointCloud]) -> tuple[str
         raise
     # Views of several sides explain each other.
     return tuple(told) if len(told) == 1 and told[0] and not _needs_no_camera(seen.views) else ()
+
+
+def _is_whole_object(views: Sequence[PointCloud]) -> bool:
+    """Check the cameras of a scene. Tell whether the one that fails shows an object from all round instead."""
+    try:
+        check_scene(views)
+    except CloudError:
+        if len(views) == 1 and is_all_round(views[0]):
+            return True
+        raise
+    return False
 
 
 def _needs_no_camera(views: Sequence[PointCloud]) -> bool:

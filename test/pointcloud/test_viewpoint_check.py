@@ -79,15 +79,25 @@ def test_an_object_alone_from_all_round_needs_no_camera():
 
 
 @pytest.mark.parametrize("shape", ["box", "bowl", "mug", "bottle"])
-@pytest.mark.parametrize("place", [(0.0, 0.0, 0.0), (0.3, 0.2, 0.5)])
-def test_a_whole_object_is_taken_with_its_walls_and_without_a_doubt(shape: str, place: tuple[float, float, float]):
+@pytest.mark.parametrize(
+    ("place", "alone"), [((0.0, 0.0, 0.0), True), ((0.0, 0.0, 0.0), False), ((0.3, 0.2, 0.5), True)]
+)
+def test_a_whole_object_is_taken_with_its_walls_and_without_a_doubt(shape: str, place, alone: bool):
     mesh = make_shape(shape)
     points = surface_samples(mesh, 3000, seed=0)[0] + place
-    whole = scene_from_views([PointCloud(points, np.zeros(3))], alone=True)
+    whole = scene_from_views([PointCloud(points, np.zeros(3))], alone=alone)
     assert whole.evidence is not None
     assert whole.evidence.doubts == ()
     # The mug's walls are 4 mm thick, as far as its points are apart.
     assert mass_properties(whole.object.mesh)[0] == pytest.approx(mass_properties(mesh)[0], rel=0.1)
+
+
+def test_a_ball_whose_camera_is_exactly_its_middle_is_taken():
+    half = np.random.default_rng(0).normal(size=(1500, 3))
+    half *= 0.04 / np.linalg.norm(half, axis=1, keepdims=True)
+    evidence = scene_from_views([PointCloud(np.concatenate([half, -half]), np.zeros(3))]).evidence
+    assert evidence is not None
+    assert evidence.doubts == ()
 
 
 def test_one_side_of_an_object_about_its_own_middle_is_refused_by_that_reason():

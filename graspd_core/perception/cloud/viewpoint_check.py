@@ -185,12 +185,14 @@ def hidden_share(points: Points, viewpoint: Vector, nearer: Float[np.ndarray, "p
 
     ray = points - viewpoint
     distance = np.linalg.norm(ray, axis=1)
-    axis = ray.mean(0) / max(float(np.linalg.norm(ray.mean(0))), 1e-12)
+    length = float(np.linalg.norm(ray.mean(0)))
+    # From the middle of the points one direction is as good as another.
+    axis = ray.mean(0) / length if length > 1e-12 else np.array([0.0, 0.0, 1.0])
     right = perpendicular(axis)
     across = np.column_stack([ray @ right, ray @ np.cross(axis, right)])
-    length = np.maximum(np.linalg.norm(across, axis=1), 1e-12)
+    aside = np.maximum(np.linalg.norm(across, axis=1), 1e-12)
     # Angles, not shares of depth: a wrong place may lie among the points.
-    image = across * (np.arctan2(length, ray @ axis) / length)[:, None]
+    image = across * (np.arctan2(aside, ray @ axis) / aside)[:, None]
     # A tree for few questions: balance would cost more than it saves.
     in_image = KDTree(image, balanced_tree=False, compact_nodes=False)
     spacing = float(np.median(in_image.query(image[::8], k=5)[0][:, -1]))
