@@ -12,10 +12,8 @@ import pytest
 from std_msgs.msg import Header
 
 from graspd_bench import tables
-from graspd_core.hands.library import load_hand
+from graspd_core import PlanConfig, load_hand, load_scene
 from graspd_core.io.grasps_json import grasps_of, result_document
-from graspd_core.optimize.plan_config import PlanConfig
-from graspd_core.perception.load_scene import load_scene
 from graspd_core.types import Contact, Grasp, GraspResult, Outcome, Posture, Timing, TrialResult, Verdict
 from graspd_core.verify.metrics import METRICS, Metric, measure
 from graspd_core.verify.prepared_grasp import make_metrics_context

@@ -23,14 +23,12 @@ from graspd_bench.studies.dexgraspbench import (
     write_grasps,
 )
 from graspd_bench.study import Request
-from graspd_core import Grasp, load_hand, load_mesh, load_scene
+from graspd_core import Grasp, Posture, load_hand, load_mesh, load_scene, make_shape
 from graspd_core.cli import main
 from graspd_core.errors import ConfigError
 from graspd_core.hands.kinematics import link_poses
 from graspd_core.io.grasps_json import load_document
-from graspd_core.mesh.shapes import make_shape
 from graspd_core.mesh.topology import moved_mesh
-from graspd_core.types import Posture
 from graspd_dataset.export_grasps import obj_text
 
 # A stand-in for its program: grasps whose number is even hold, and it ends as `{ending}` says.

@@ -37,11 +37,9 @@ from graspd_bench.figures import by_name, rows
 from graspd_bench.rendering.depth_noise import DEFAULT, NONE
 from graspd_bench.studies.robust_ranking import draw_robust
 from graspd_bench.study import Request
-from graspd_core.hands.library import load_hand
+from graspd_core import Method, load_hand, load_scene
 from graspd_core.optimize.closed_form.closed_form_config import ClosedFormConfig
 from graspd_core.optimize.plan_config import METHODS as ALL_METHODS
-from graspd_core.optimize.plan_config import Method
-from graspd_core.perception.load_scene import load_scene
 
 TINY = MapCase("size", "random_closure", "sphere", 0.2, ("sphere",), 1, 0)
 

@@ -17,11 +17,9 @@ from graspd_bench import result_store as store
 from graspd_bench.measurement import Cell, run_cell
 from graspd_bench.run_studies import ENVIRONMENT, Job, run_cases, run_job
 from graspd_bench.study import Case, find_objects
+from graspd_core import TriangleMesh, make_shape, save_mesh
 from graspd_core.errors import GraspdError, MeshError
-from graspd_core.mesh.mesh_files import save_mesh
-from graspd_core.mesh.shapes import make_shape
 from graspd_core.optimize.plan_config import METHODS, PlanConfig, load_preset, override, to_mapping
-from graspd_core.types import TriangleMesh
 from graspd_dataset import run_records
 
 CELL = Cell("raw", "balanced", PlanConfig(), "shape:box", "allegro_right", 0, 4, ("standard", "hard"))

@@ -12,16 +12,12 @@ import yaml
 
 from graspd_bench.rendering.depth_noise import NONE
 from graspd_bench.rendering.tabletop import ring_poses, tabletop, views_of
+from graspd_core import PinholeCamera, PlanConfig, PointCloud, Target, load_preset, preset_names, scene_from_views
 from graspd_core.config import SceneConfig, SegmentationConfig, from_mapping, load_scene_config
 from graspd_core.errors import ConfigError
-from graspd_core.optimize.plan_config import PlanConfig, load_preset, preset_names
-from graspd_core.perception.cloud.camera import PinholeCamera
-from graspd_core.perception.cloud.point_cloud import PointCloud
 from graspd_core.perception.obstacles import make_obstacles
 from graspd_core.perception.reconstruct.reconstruct import reconstruct
-from graspd_core.perception.scene_from_views import scene_from_views
 from graspd_core.perception.segment.segment import segment
-from graspd_core.perception.segment.target_selection import Target
 
 
 @pytest.mark.parametrize("name", preset_names())

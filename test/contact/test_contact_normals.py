@@ -7,9 +7,8 @@ import pytest
 import trimesh
 from scipy.optimize import nnls
 
-from graspd_core import load_hand, load_scene, make_shape, plan_grasps
+from graspd_core import TriangleMesh, load_hand, load_scene, make_shape, plan_grasps
 from graspd_core.mesh.surface_queries import Surface, make_surface, pressed_points
-from graspd_core.types import TriangleMesh
 
 
 def off_cone(surface: Surface, point: np.ndarray, normal: np.ndarray, about: float) -> float:

@@ -15,11 +15,10 @@ import pytest
 import yaml
 from scipy.spatial.transform import Rotation
 
-from graspd_core import load_grasps, load_hand, load_scene, plan_grasps
+from graspd_core import Posture, Verdict, load_grasps, load_hand, load_scene, plan_grasps
 from graspd_core.errors import FormatError
 from graspd_core.hands.kinematics import link_poses
 from graspd_core.hands.model import all_joint_names
-from graspd_core.types import Posture, Verdict
 from graspd_dataset.dataset_store import DatasetStore
 from graspd_dataset.export_grasps import qpos
 from graspd_dataset.foreign_grasps import STAGES, npy_dictionary, read_foreign

@@ -8,11 +8,10 @@ from pathlib import Path
 
 import pytest
 
-from graspd_core import load_hand, load_scene, plan_grasps
+from graspd_core import METRICS, load_hand, load_scene, plan_grasps
 from graspd_core.errors import ConfigError, FormatError, MeshError
 from graspd_core.hands.model import all_joint_names, all_joint_positions
 from graspd_core.runtime.worker_process import WorkerProcess
-from graspd_core.verify.metrics import METRICS
 from graspd_dataset import block_rows
 from graspd_dataset.blocks import Block, DatasetRequest, blocks_of, by_object
 from graspd_dataset.dataset_store import DatasetStore, key_of, parquet_bytes, read_parquet

@@ -17,13 +17,10 @@ import trimesh
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
+from graspd_core import METRICS, PlanConfig, load_hand, load_scene, make_shape
 from graspd_core.errors import ConfigError, FormatError
-from graspd_core.hands.library import load_hand
 from graspd_core.hands.model import Mount
 from graspd_core.io.grasps_json import check_writable, grasps_of, load_document, result_document, save_result
-from graspd_core.mesh.shapes import make_shape
-from graspd_core.optimize.plan_config import PlanConfig
-from graspd_core.perception.load_scene import load_scene
 from graspd_core.types import (
     ArmPath,
     Contact,
@@ -37,7 +34,6 @@ from graspd_core.types import (
     TrialResult,
     Verdict,
 )
-from graspd_core.verify.metrics import METRICS
 from graspd_viewer.grasp_page import placed_hand, save_view
 
 VERSION_1 = Path(__file__).parent / "data" / "grasps_v1.json"

@@ -11,15 +11,12 @@ import numpy as np
 import pytest
 import torch
 
+from graspd_core import Verdict, hand_names, load_hand, load_scene, plan_grasps
 from graspd_core.hands.kinematics import hand_mesh, link_poses, primitive_mesh
-from graspd_core.hands.library import hand_names, load_hand
 from graspd_core.hands.link_distance import primitive_sdf
 from graspd_core.hands.model import HandModel, all_joint_names, all_joint_positions
 from graspd_core.hands.self_collision import link_overlaps
 from graspd_core.hands.surface_points import dense_samples
-from graspd_core.perception.load_scene import load_scene
-from graspd_core.planning.plan_grasps import plan_grasps
-from graspd_core.types import Verdict
 
 
 @pytest.fixture(scope="module", params=hand_names())

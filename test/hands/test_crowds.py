@@ -15,6 +15,7 @@ import pytest
 import torch
 import trimesh
 
+from graspd_core import Outcome, load_scene, plan_grasps
 from graspd_core.hands.kinematics import link_poses
 from graspd_core.hands.library import load_hand, read_hand_file
 from graspd_core.hands.link_distance import bounds, make_collision_tensors, solid_distance
@@ -204,9 +205,6 @@ def test_distances_to_very_many_solids_are_those_to_each(tmp_path: Path) -> None
 @pytest.mark.timeout(900)
 @pytest.mark.parametrize("make", [lambda folder: fine_leap(folder, 4), lambda folder: cut_up(folder, (5, 5, 4))])
 def test_a_crowded_hand_holds_a_box(make: Callable[[Path], Path], tmp_path: Path) -> None:
-    from graspd_core.perception.load_scene import load_scene
-    from graspd_core.planning.plan_grasps import plan_grasps
-    from graspd_core.types import Outcome
 
     hand = load_hand(make(tmp_path))
     result = plan_grasps(load_scene("shape:box"), hand, count=1, seed=0, preset="fast")

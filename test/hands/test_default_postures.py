@@ -12,11 +12,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from graspd_core import HandModel, Outcome, Verdict, load_scene, plan_grasps
 from graspd_core.errors import HandError
 from graspd_core.hands.default_postures import default_palm, default_postures
 from graspd_core.hands.kinematics import link_poses
 from graspd_core.hands.library import hand_names, load_hand, read_hand_file
-from graspd_core.hands.model import HandModel
 from graspd_core.hands.self_collision import adjacent_links, link_overlaps
 from graspd_core.hands.surface_points import dense_samples
 from graspd_core.paths import config_dir
@@ -100,9 +100,6 @@ def test_a_description_overrides_what_it_names(tmp_path: Path) -> None:
 @pytest.mark.slow
 @pytest.mark.parametrize("name", HANDS)
 def test_a_guessed_hand_holds_a_box(name: str) -> None:
-    from graspd_core.perception.load_scene import load_scene
-    from graspd_core.planning.plan_grasps import plan_grasps
-    from graspd_core.types import Outcome
 
     hand = load_hand(config_dir() / "hands" / f"{name}.urdf")
     result = plan_grasps(load_scene("shape:box"), hand, count=1, seed=0, preset="fast", deadline=100.0)
@@ -354,9 +351,6 @@ def test_joints_that_carry_the_palm_leave_its_normal_alone(tmp_path: Path) -> No
 @pytest.mark.parametrize("shape", ["box", "sphere", "cylinder"])
 @pytest.mark.parametrize("name", GRIPPERS)
 def test_a_guessed_gripper_holds(name: str, shape: str, tmp_path: Path) -> None:
-    from graspd_core.perception.load_scene import load_scene
-    from graspd_core.planning.plan_grasps import plan_grasps
-    from graspd_core.types import Verdict
 
     hand = load_hand(write(GRIPPERS[name]().urdf, tmp_path))
     result = plan_grasps(load_scene(f"shape:{shape}"), hand, count=8, seed=0, preset="fast")

@@ -13,13 +13,12 @@ from bag_writer import Record, camera_info_message, cloud_message, depth_message
 
 from graspd_bench.rendering.depth_noise import DEFAULT
 from graspd_bench.rendering.tabletop import TabletopScene, depth_views, on_table, ring_poses, tabletop
+from graspd_core import TriangleMesh, make_shape
 from graspd_core.errors import CloudError
 from graspd_core.mesh.mesh_files import mass_properties, save_mesh, surface_samples
-from graspd_core.mesh.shapes import make_shape
 from graspd_core.perception.cloud.camera import PinholeCamera, camera_rays
 from graspd_core.perception.cloud.cloud_files import CLOUD_ENDINGS, is_cloud_file, load_views
 from graspd_core.transforms import SECOND
-from graspd_core.types import TriangleMesh
 
 CAMERA = PinholeCamera(320, 240, 308.0, 308.0, 159.5, 119.5)
 MATRIX = np.array([[CAMERA.fx, 0, CAMERA.cx], [0, CAMERA.fy, CAMERA.cy], [0, 0, 1]])

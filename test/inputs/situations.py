@@ -47,8 +47,7 @@ from inputs_made import (
     zeroed,
 )
 
-from graspd_core.mesh.shapes import make_shape
-from graspd_core.types import TriangleMesh
+from graspd_core import TriangleMesh, make_shape
 
 BOTTLE, BOX, CYLINDER = volume("bottle"), volume("box"), volume("cylinder")
 PAIR = ("box", "cylinder")

@@ -11,11 +11,9 @@ import pytest
 from inputs_made import Situation, camera_place, recorded
 from situations import FILE_ONLY, MESHES, MESSAGES, SITUATIONS
 
+from graspd_core import GraspdError, Target, load_scene
 from graspd_core.cli import main
 from graspd_core.cli.running import EXIT_BAD_INPUT, EXIT_OK, EXIT_TOO_FEW
-from graspd_core.errors import GraspdError
-from graspd_core.perception.load_scene import load_scene
-from graspd_core.perception.segment.target_selection import Target
 
 FILES = [row for row in SITUATIONS if row not in MESSAGES]
 RECORDED = [row for row in SITUATIONS if row not in MESHES and row.name not in FILE_ONLY]

@@ -9,16 +9,11 @@ import numpy as np
 import pytest
 import torch
 
+from graspd_core import HandModel, Problem, Scene, build_problem, draw_starts, load_hand, load_scene
 from graspd_core.config import ProblemConfig
-from graspd_core.hands.library import load_hand
-from graspd_core.hands.model import HandModel
-from graspd_core.optimize.initial_poses import draw_starts
 from graspd_core.optimize.kernel.builds import kernel
 from graspd_core.optimize.loop import moved_along, pack
-from graspd_core.optimize.problem import Problem, build_problem
-from graspd_core.perception.load_scene import load_scene
 from graspd_core.perception.obstacles import make_obstacles
-from graspd_core.perception.scene import Scene
 from graspd_core.types import Plane
 
 HANDS = ("allegro_left", "allegro_right", "barrett_like", "leap_right", "parallel_gripper")

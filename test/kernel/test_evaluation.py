@@ -7,14 +7,13 @@ from dataclasses import asdict, replace
 import pytest
 import torch
 
+from graspd_core import draw_starts, load_hand
 from graspd_core.config import ProblemConfig
-from graspd_core.hands.library import load_hand
 from graspd_core.optimize.closed_form.closed_form import (
     ClosedForm,
     weighted,
 )
 from graspd_core.optimize.closed_form.closed_form_config import ClosedFormConfig, LossWeights
-from graspd_core.optimize.initial_poses import draw_starts
 from graspd_core.optimize.kernel import builds
 from graspd_core.optimize.kernel_problem import KernelProblem
 from graspd_core.optimize.loop import moved_along, pack, unpack

@@ -13,6 +13,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from shape_volumes import shape_volume
 
+from graspd_core import TriangleMesh, load_scene
 from graspd_core.errors import MeshError
 from graspd_core.mesh.collada import read_dae
 from graspd_core.mesh.mesh_files import (
@@ -28,8 +29,6 @@ from graspd_core.mesh.mesh_files import (
 )
 from graspd_core.mesh.shapes import BOX_HALF, SHAPES, make_shape
 from graspd_core.mesh.topology import is_closed, is_oriented
-from graspd_core.perception.load_scene import load_scene
-from graspd_core.types import TriangleMesh
 
 
 def scaled(mesh, factor):

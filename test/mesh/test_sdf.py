@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 from graspd_bench.stress.broken_meshes import thin_cup
 from graspd_bench.stress.run_stress_case import GRASP, faults, run_case
 from graspd_bench.stress.stress_cases import CASES
-from graspd_core.hands.library import load_hand
+from graspd_core import TriangleMesh, load_hand, load_scene, plan_grasps
 from graspd_core.hands.link_distance import box_sdf, capsule_sdf, cylinder_sdf, sphere_sdf
 from graspd_core.mesh.mesh_files import check_mesh, save_mesh, surface_samples
 from graspd_core.mesh.sdf import BAND, PADDING, GridSDF, build_sdf, grid_layout, is_solid, sample_sdf
@@ -32,10 +32,7 @@ from graspd_core.mesh.shapes import (
 )
 from graspd_core.mesh.sharp_features import farthest_points, neighbours_together, sharp_points
 from graspd_core.mesh.surface_queries import closest_points, make_surface, winding_inside
-from graspd_core.perception.load_scene import load_scene
-from graspd_core.planning.plan_grasps import plan_grasps
 from graspd_core.se3 import random_rotations
-from graspd_core.types import TriangleMesh
 
 EXACT = {
     "sphere": lambda p: sphere_sdf(p, SPHERE_RADIUS),

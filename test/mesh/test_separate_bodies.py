@@ -10,14 +10,13 @@ from scipy.spatial import ConvexHull
 from shape_volumes import shape_volume
 
 from graspd_bench.stress.broken_meshes import thin_cup
+from graspd_core import load_scene, make_shape
 from graspd_core.mesh.components import bodies_apart, drop_small_components
 from graspd_core.mesh.convex_parts import convex_parts
 from graspd_core.mesh.mesh_files import mass_properties, surface_samples
 from graspd_core.mesh.sdf import build_sdf
-from graspd_core.mesh.shapes import make_shape
 from graspd_core.mesh.surface_queries import make_distance_query, signed_distance
 from graspd_core.mesh.topology import is_closed
-from graspd_core.perception.load_scene import load_scene
 from graspd_core.perception.scene import build_scene
 from graspd_core.types import TriangleMesh, joined
 

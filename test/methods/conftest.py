@@ -8,15 +8,10 @@ import pytest
 import torch
 from torch import Tensor
 
+from graspd_core import HandModel, Poses, Problem, Scene, build_problem, load_hand, load_scene
 from graspd_core.config import ProblemConfig
-from graspd_core.hands.library import load_hand
-from graspd_core.hands.model import HandModel
 from graspd_core.optimize.graspd2022.graspd2022 import Graspd2022, make_body, published_starts
 from graspd_core.optimize.graspd2022.graspd2022_config import Graspd2022Config
-from graspd_core.optimize.loop import Poses
-from graspd_core.optimize.problem import Problem, build_problem
-from graspd_core.perception.load_scene import load_scene
-from graspd_core.perception.scene import Scene
 
 
 @pytest.fixture(scope="session")

@@ -25,20 +25,15 @@ from graspd_bench.baselines.annealing import (
 )
 from graspd_bench.baselines.random_closure import RandomClosureConfig, advance, draw_approaches, touching_groups
 from graspd_bench.baselines.random_closure import plan as plan_closure
+from graspd_core import HandModel, PlanConfig, draw_starts, hand_names, load_hand, load_scene, make_shape
 from graspd_core.config import ProblemConfig
 from graspd_core.hands.kinematics import forward
-from graspd_core.hands.library import hand_names, load_hand
-from graspd_core.hands.model import HandModel
-from graspd_core.mesh.shapes import make_shape
 from graspd_core.optimize.candidates import PlannerInput, PlannerOutput, find_candidates
 from graspd_core.optimize.grasp_postures import ContactSet, hand_distance
-from graspd_core.optimize.initial_poses import draw_starts
 from graspd_core.optimize.loop import Hooks, Poses, minimise
 from graspd_core.optimize.losses import disturbance_directions
 from graspd_core.optimize.obstacle_distance import obstacle_gaps
-from graspd_core.optimize.plan_config import PlanConfig
 from graspd_core.optimize.problem import Problem, build_problem
-from graspd_core.perception.load_scene import load_scene
 from graspd_core.perception.scene import Scene, build_scene
 from graspd_core.se3 import rotation_from_quaternion
 from graspd_core.types import Plane, TriangleMesh

@@ -14,8 +14,8 @@ from hypothesis import strategies as st
 from torch import Tensor
 from torch.autograd import gradcheck
 
+from graspd_core import PlanConfig, PlannerInput, load_preset, override, preset_names
 from graspd_core.mesh.sdf import sample_sdf
-from graspd_core.optimize.candidates import PlannerInput
 from graspd_core.optimize.graspd2022.graspd2022 import (
     Adamax,
     actual,
@@ -32,7 +32,6 @@ from graspd_core.optimize.graspd2022.graspd2022 import (
 )
 from graspd_core.optimize.graspd2022.graspd2022_config import Graspd2022Config, LevelSetConfig
 from graspd_core.optimize.loop import Hooks, minimise, pack, unpack
-from graspd_core.optimize.plan_config import PlanConfig, load_preset, override, preset_names
 from graspd_core.optimize.problem import hand_forward
 from graspd_core.se3 import rotation_from_quaternion
 

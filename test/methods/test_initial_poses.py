@@ -9,14 +9,13 @@ from hypothesis import given
 from hypothesis import strategies as st
 from torch import Tensor
 
-from graspd_core import load_hand
+from graspd_core import TriangleMesh, load_hand
 from graspd_core.hands.fingers import find_fingers, placed_tips
 from graspd_core.mesh.mesh_files import surface_samples
 from graspd_core.mesh.sdf import sample_sdf
 from graspd_core.mesh.shapes import BOWL_RADIUS, make_shape
 from graspd_core.optimize.initial_poses import between_fingertips, closing_axis, convex_hull, draw_starts, half_widths
 from graspd_core.se3 import aligning_rotation, reflection_onto, rotation_from_quaternion
-from graspd_core.types import TriangleMesh
 
 EYE = torch.eye(3, dtype=torch.float64)
 COUNT = 24

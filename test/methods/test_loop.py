@@ -10,17 +10,15 @@ import numpy as np
 import pytest
 import torch
 
+from graspd_core import Scene, draw_starts, load_hand
 from graspd_core.config import GraspStagesConfig, ProblemConfig
-from graspd_core.hands.library import load_hand
 from graspd_core.hands.model import METRES_PER_RADIAN, HandModel
 from graspd_core.optimize import loop
 from graspd_core.optimize.closed_form.closed_form import ClosedForm, adam_step, weighted
 from graspd_core.optimize.closed_form.closed_form_config import ClosedFormConfig
 from graspd_core.optimize.grasp_postures import find_contacts, squeeze
-from graspd_core.optimize.initial_poses import draw_starts
 from graspd_core.optimize.loop import Hooks, Poses, minimise, pack, unpack
 from graspd_core.optimize.problem import Problem, build_problem, evaluate
-from graspd_core.perception.scene import Scene
 from graspd_core.se3 import rotation_from_quaternion
 
 CONFIG = ClosedFormConfig(explore_steps=4, refine_steps=2, polish_steps=4)

@@ -14,9 +14,9 @@ from hypothesis import strategies as st
 
 from graspd_bench.study import Request
 from graspd_bench.suites import main_suite
+from graspd_core import Grasp, Verdict, draw_starts, load_hand, load_scene, plan_grasps
 from graspd_core.cli import build_parser
 from graspd_core.errors import ConfigError
-from graspd_core.hands.library import load_hand
 from graspd_core.optimize.candidates import (
     PlannerInput,
     PlannerOutput,
@@ -25,13 +25,9 @@ from graspd_core.optimize.candidates import (
 )
 from graspd_core.optimize.closed_form.closed_form import ClosedForm
 from graspd_core.optimize.closed_form.closed_form_config import ClosedFormConfig, LossWeights
-from graspd_core.optimize.initial_poses import draw_starts
 from graspd_core.optimize.loop import Hooks, pack
 from graspd_core.optimize.losses import hard_contact, soft_contact
 from graspd_core.optimize.plan_config import METHODS, Method, PlanConfig, load_preset, override, plan_config, to_mapping
-from graspd_core.perception.load_scene import load_scene
-from graspd_core.planning.plan_grasps import plan_grasps
-from graspd_core.types import Grasp, Verdict
 
 
 @dataclass(frozen=True)

@@ -11,13 +11,12 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from graspd_core import PlanConfig, Scene, draw_starts, hand_names, load_hand
 from graspd_core.config import ProblemConfig
 from graspd_core.hands.kinematics import RETREAT, forward, hand_mesh, in_base, link_poses, place_points
-from graspd_core.hands.library import hand_names, load_hand
 from graspd_core.mesh.sdf import sample_sdf
 from graspd_core.optimize.candidates import PlannerInput, find_candidates
 from graspd_core.optimize.closed_form.closed_form_config import ClosedFormConfig
-from graspd_core.optimize.initial_poses import draw_starts
 from graspd_core.optimize.loop import Hooks, Poses, pack, unpack
 from graspd_core.optimize.obstacle_distance import (
     WIDE,
@@ -27,10 +26,8 @@ from graspd_core.optimize.obstacle_distance import (
     make_obstacle_tensors,
     obstacle_gaps,
 )
-from graspd_core.optimize.plan_config import PlanConfig
 from graspd_core.optimize.problem import Problem, build_problem, evaluate, make_hand_tensors, make_object_tensors
 from graspd_core.perception.obstacles import make_obstacles
-from graspd_core.perception.scene import Scene
 from graspd_core.se3 import SE3, rotation_from_quaternion
 from graspd_core.types import Plane, Posture
 

@@ -11,6 +11,7 @@ import ranking as benchmark
 import torch
 from scipy.optimize import nnls
 
+from graspd_core import Problem, draw_starts, load_preset
 from graspd_core.config import GraspStagesConfig
 from graspd_core.hands.kinematics import link_poses, point_jacobian
 from graspd_core.mesh.shapes import SPHERE_RADIUS
@@ -25,10 +26,7 @@ from graspd_core.optimize.grasp_postures import (
     self_overlap,
     squeeze,
 )
-from graspd_core.optimize.initial_poses import draw_starts
 from graspd_core.optimize.loop import Hooks, Poses
-from graspd_core.optimize.plan_config import load_preset
-from graspd_core.optimize.problem import Problem
 from graspd_core.optimize.ranking import Staged, log_odds, ranking_figures, score
 from graspd_core.se3 import rotation_from_quaternion
 

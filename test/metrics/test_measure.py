@@ -14,11 +14,9 @@ from hypothesis import strategies as st
 from scipy.spatial import ConvexHull
 
 from graspd_bench.studies.human_hand import CONTACT_DISTANCES, measure_skin
-from graspd_core.hands.library import load_hand
+from graspd_core import HandModel, load_hand, make_shape
 from graspd_core.hands.link_distance import depth_inside
-from graspd_core.hands.model import HandModel
 from graspd_core.mesh.mesh_files import content_hash, mass_properties
-from graspd_core.mesh.shapes import make_shape
 from graspd_core.mesh.surface_queries import make_distance_query
 from graspd_core.optimize.kernel.builds import kernel
 from graspd_core.perception.scene import ObjectModel

@@ -7,11 +7,9 @@ import pytest
 
 from graspd_bench.rendering.depth_noise import DEFAULT
 from graspd_bench.rendering.tabletop import CAMERA, ring_poses, tabletop, views_of
+from graspd_core import Grasp, PointCloud, Posture, Verdict, load_hand
 from graspd_core.errors import CloudError
-from graspd_core.hands.library import load_hand
-from graspd_core.perception.cloud.point_cloud import PointCloud
 from graspd_core.planning.any_thing import OUT_OF_TRIES, Failure, ThingPlan, plan_any_thing, unlike
-from graspd_core.types import Grasp, Posture, Verdict
 
 HAND = load_hand("parallel_gripper")
 ASKED = {"preset": "fast", "measure": False, "seed": 0}

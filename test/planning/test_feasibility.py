@@ -8,13 +8,9 @@ import numpy as np
 import pytest
 import trimesh
 
-from graspd_core.hands.library import hand_names, load_hand
-from graspd_core.hands.model import HandModel
+from graspd_core import HandModel, Scene, hand_names, load_hand, load_scene, plan_grasps
 from graspd_core.mesh.shapes import SHAPES, make_shape
-from graspd_core.perception.load_scene import load_scene
-from graspd_core.perception.scene import Scene
 from graspd_core.planning.feasibility import out_of_reach, reach_of, why_trials_failed
-from graspd_core.planning.plan_grasps import plan_grasps
 from graspd_core.types import Contact, Outcome, Plane, Stage, TrialResult, TriangleMesh, Verdict
 
 

@@ -15,19 +15,14 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from graspd_bench.rendering.tabletop import CAMERA, ring_poses, tabletop, views_of
+from graspd_core import PointCloud, load_hand, load_preset, load_scene, plan_grasps, scene_from_views
 from graspd_core.config import CertaintyConfig
 from graspd_core.config.planning_config import DOUBTED_SHARE, LIGHTER_SHARE, MASS_ASSUMED, MASS_KNOWN
 from graspd_core.errors import ConfigError
-from graspd_core.hands.library import load_hand
 from graspd_core.mesh.convex_parts import convex_parts
-from graspd_core.optimize.plan_config import load_preset
 from graspd_core.perception import scene as scene_module
-from graspd_core.perception.cloud.point_cloud import PointCloud
-from graspd_core.perception.load_scene import load_scene
 from graspd_core.perception.reconstruct.merge_views import Evidence
 from graspd_core.perception.scene import COARSE_CUTS, ObjectModel, Scene, object_parts
-from graspd_core.perception.scene_from_views import scene_from_views
-from graspd_core.planning.plan_grasps import plan_grasps
 from graspd_core.types import HYPOTHESES, Grasp, GraspResult, Posture, StopHook, TrialResult, Verdict
 from graspd_core.verify import robustness as hypotheses
 from graspd_core.verify import verification

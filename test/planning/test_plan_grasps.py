@@ -9,15 +9,11 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from graspd_core import TRIALS, load_hand, load_preset, load_scene, override, plan_grasps
 from graspd_core.errors import ConfigError
-from graspd_core.hands.library import load_hand
-from graspd_core.optimize.plan_config import load_preset, override
-from graspd_core.perception.load_scene import load_scene
-from graspd_core.planning.plan_grasps import plan_grasps
 from graspd_core.runtime import disk_cache as cache
 from graspd_core.types import Grasp, GraspResult, Outcome, Plane, Progress, Stage, TrialResult, Verdict
 from graspd_core.verify import verification
-from graspd_core.verify.trial_registry import TRIALS
 
 # A search that nobody waits for.
 ENDLESS = replace(load_preset("fast"), settings=replace(load_preset("fast").settings, refine_steps=10**7))

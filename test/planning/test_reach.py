@@ -10,10 +10,9 @@ import numpy as np
 import pytest
 import torch
 
-from graspd_core import Reach, Scene, load_arm, load_grasps, load_hand, load_preset, plan_grasps, save_result
+from graspd_core import HandModel, Reach, Scene, load_arm, load_grasps, load_hand, load_preset, plan_grasps, save_result
 from graspd_core.arms.arm import arm_links, tip_hand
 from graspd_core.errors import ConfigError
-from graspd_core.hands.model import HandModel
 from graspd_core.mesh.shapes import make_shape
 from graspd_core.optimize.initial_poses import draw_starts
 from graspd_core.optimize.restrictions import BoundRestrictions

@@ -9,10 +9,8 @@ import numpy as np
 import pytest
 import torch
 
-from graspd_core import load_hand, load_scene, plan_grasps
+from graspd_core import HandModel, Scene, draw_starts, load_hand, load_scene, plan_grasps
 from graspd_core.errors import ConfigError
-from graspd_core.hands.model import HandModel
-from graspd_core.optimize.initial_poses import draw_starts
 from graspd_core.optimize.restrictions import (
     UNRESTRICTED,
     BoundRestriction,
@@ -20,7 +18,6 @@ from graspd_core.optimize.restrictions import (
     Refusal,
     restrictions_in_words,
 )
-from graspd_core.perception.scene import Scene
 from graspd_core.types import Grasp, Outcome, Plane
 
 

@@ -10,18 +10,14 @@ import pytest
 import torch
 
 from graspd_bench.studies.robust_ranking import correlation, orders
-from graspd_core import verify_grasps
+from graspd_core import TriangleMesh, load_hand, load_scene, make_shape, plan_grasps, verify_grasps
 from graspd_core.config import RobustConfig
 from graspd_core.errors import ConfigError
-from graspd_core.hands.library import load_hand
 from graspd_core.io.grasps_json import result_document
-from graspd_core.mesh.shapes import make_shape
 from graspd_core.optimize.candidates import Candidates
 from graspd_core.optimize.plan_config import PlanConfig, load_preset
-from graspd_core.perception.load_scene import load_scene
 from graspd_core.perception.scene import Obstacle, Scene, object_parts
 from graspd_core.planning import rounds as planning_rounds
-from graspd_core.planning.plan_grasps import plan_grasps
 from graspd_core.planning.rounds import rounds_of
 from graspd_core.types import Grasp, GraspMetrics, Outcome, Plane, Posture, Progress, Snapshot, Stage, Verdict
 from graspd_core.verify.hold_trial import noisy_share, pose_errors
@@ -151,8 +147,6 @@ def test_a_watched_run_ends_as_one_that_nobody_watches(preset: str):
 
 
 def test_hands_are_seen_where_the_object_is_though_it_is_planned_on_about_its_own_centre():
-    from graspd_core.mesh.shapes import make_shape
-    from graspd_core.types import TriangleMesh
 
     shape, far = make_shape("box"), np.array([40.0, 0.0, 0.0])
     scene, seen = load_scene(TriangleMesh(shape.vertices + far, shape.faces)), list[Snapshot]()

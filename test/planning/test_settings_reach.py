@@ -12,16 +12,12 @@ import pytest
 from graspd_bench.baselines.annealing import AnnealingConfig
 from graspd_bench.baselines.random_closure import RandomClosureConfig
 from graspd_bench.rendering.tabletop import CAMERA, ring_poses, tabletop, views_of
+from graspd_core import GraspdError, HandModel, load_hand, make_shape, scene_from_views
 from graspd_core.config import GraspStagesConfig, ProblemConfig, RoundsConfig
-from graspd_core.errors import GraspdError
-from graspd_core.hands.library import load_hand
-from graspd_core.hands.model import HandModel
-from graspd_core.mesh.shapes import make_shape
 from graspd_core.optimize.closed_form.closed_form_config import ClosedFormConfig
 from graspd_core.optimize.graspd2022.graspd2022_config import Graspd2022Config, InitialPosesConfig, LevelSetConfig
 from graspd_core.optimize.plan_config import PlanConfig, method_names, method_row
 from graspd_core.perception.scene import Scene, build_scene
-from graspd_core.perception.scene_from_views import scene_from_views
 from graspd_core.planning.plan_grasps import plan_grasps, planning_scene
 from graspd_core.types import Grasp, Plane, Posture, Progress, Stage
 

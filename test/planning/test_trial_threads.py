@@ -10,12 +10,10 @@ from contextlib import closing
 import pytest
 import torch
 
+from graspd_core import load_hand, load_preset, load_scene
 from graspd_core.config import RobustConfig
-from graspd_core.hands.library import load_hand
 from graspd_core.optimize.candidates import PlannerInput, find_candidates
 from graspd_core.optimize.loop import Hooks
-from graspd_core.optimize.plan_config import load_preset
-from graspd_core.perception.load_scene import load_scene
 from graspd_core.perception.scene import object_parts
 from graspd_core.types import Grasp, GraspMetrics, Progress, StopHook, TrialResult, Verdict
 from graspd_core.verify import verification

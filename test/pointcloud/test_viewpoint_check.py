@@ -11,16 +11,13 @@ import pytest
 
 from graspd_bench.rendering.depth_noise import DEFAULT
 from graspd_bench.rendering.tabletop import depth_views, ring_poses, tabletop
+from graspd_core import PointCloud, Target, make_shape, scene_from_views
 from graspd_core.config import SegmentationConfig
 from graspd_core.errors import CloudError
 from graspd_core.mesh.mesh_files import mass_properties, surface_samples
-from graspd_core.mesh.shapes import make_shape
 from graspd_core.perception.cloud.camera import PinholeCamera, camera_rays, cloud_from_depth, reaches_image_border
-from graspd_core.perception.cloud.point_cloud import PointCloud
 from graspd_core.perception.cloud.viewpoint_check import check_scene, check_thing, fits_nowhere, seen_from
 from graspd_core.perception.reconstruct.merge_views import is_all_round
-from graspd_core.perception.scene_from_views import scene_from_views
-from graspd_core.perception.segment.target_selection import Target
 
 CAMERA = PinholeCamera(320, 240, 308.0, 308.0, 159.5, 119.5)
 

@@ -8,9 +8,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from graspd_bench.rendering.tabletop import depth_views, ring_poses, tabletop
+from graspd_core import PinholeCamera, PointCloud, cloud_from_depth, make_shape
 from graspd_core.errors import CloudError
 from graspd_core.mesh.mesh_files import surface_samples
-from graspd_core.mesh.shapes import make_shape
 from graspd_core.mesh.surface_queries import (
     make_distance_query,
     make_surface,
@@ -18,8 +18,6 @@ from graspd_core.mesh.surface_queries import (
     unsigned_distance,
     winding_inside,
 )
-from graspd_core.perception.cloud.camera import PinholeCamera, cloud_from_depth
-from graspd_core.perception.cloud.point_cloud import PointCloud
 from graspd_core.perception.reconstruct.merge_views import Surfels, merge_views, point_step, thin
 from graspd_core.perception.reconstruct.poisson import BAND_CELLS, grid_poisson_field, march
 

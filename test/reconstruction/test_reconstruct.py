@@ -11,15 +11,14 @@ from shape_volumes import shape_volume
 from graspd_bench.rendering.depth_noise import DEFAULT, NONE, DepthNoise
 from graspd_bench.rendering.tabletop import CAMERA as D415
 from graspd_bench.rendering.tabletop import TabletopScene, depth_views, ring_poses, tabletop
+from graspd_core import PinholeCamera, PointCloud, cloud_from_depth
 from graspd_core.config import ReconstructionConfig
 from graspd_core.errors import CloudError
 from graspd_core.mesh.mesh_files import mass_properties, surface_samples
 from graspd_core.mesh.shapes import BOX_HALF, SHAPES, make_shape
 from graspd_core.mesh.surface_queries import inside, make_distance_query, unsigned_distance
 from graspd_core.mesh.topology import is_closed
-from graspd_core.perception.cloud.camera import PinholeCamera, cloud_from_depth
 from graspd_core.perception.cloud.free_space import FreeSpace, empty_depth, make_view_depths
-from graspd_core.perception.cloud.point_cloud import PointCloud
 from graspd_core.perception.reconstruct.reconstruct import Reconstruction, reconstruct
 from graspd_core.types import Plane, TriangleMesh
 

@@ -32,8 +32,7 @@ from sensor_msgs.msg import JointState, PointCloud2, PointField
 from std_msgs.msg import Header, String
 from std_srvs.srv import Trigger
 
-from graspd_core.mesh.mesh_files import save_mesh
-from graspd_core.mesh.shapes import make_shape
+from graspd_core import make_shape, save_mesh
 from graspd_core.paths import config_dir
 from graspd_ros.parameters import Settings
 

@@ -18,12 +18,7 @@ from shape_msgs.msg import Mesh, MeshTriangle, Plane, SolidPrimitive
 from trajectory_msgs.msg import JointTrajectory, JointTrajectoryPoint
 
 from graspd_bench.rendering.tabletop import CAMERA, depth_views, ring_poses, tabletop
-from graspd_core import HandModel, load_scene
-from graspd_core.errors import GraspdError
-from graspd_core.hands.library import load_hand
-from graspd_core.mesh.shapes import make_shape
-from graspd_core.perception.cloud.camera import cloud_from_depth
-from graspd_core.types import Posture
+from graspd_core import GraspdError, HandModel, Posture, cloud_from_depth, load_hand, load_scene, make_shape
 from graspd_core.verify.prepared_grasp import make_metrics_context, penetration, placed_hand
 from graspd_ros.convert import array_of, matrix_of, matrix_of_pose, wxyz_of_matrix
 from graspd_ros.error_codes import code_of

@@ -9,10 +9,8 @@ import numpy as np
 import pytest
 from builtin_interfaces.msg import Time
 
-from graspd_core import Steering
+from graspd_core import Steering, load_hand, load_scene
 from graspd_core.errors import MeshError, TransformError
-from graspd_core.hands.library import load_hand
-from graspd_core.perception.load_scene import load_scene
 from graspd_core.types import GraspResult, Outcome, Progress, Stage, Verdict
 from graspd_ros.convert import matrix_of_posture
 from graspd_ros.error_codes import RequestError

@@ -10,25 +10,19 @@ import torch
 from shape_volumes import shape_volume
 
 from graspd_bench.rendering.tabletop import CAMERA, ring_poses, tabletop, views_of
+from graspd_core import PointCloud, Target, load_hand, load_preset, load_scene, make_shape, verify_grasps
 from graspd_core.errors import CloudError, MeshError
-from graspd_core.hands.library import load_hand
 from graspd_core.io.grasps_json import grasps_of, load_document, save_result
 from graspd_core.mesh.mesh_files import save_mesh, surface_samples
 from graspd_core.mesh.sdf import sample_sdf
-from graspd_core.mesh.shapes import make_shape
 from graspd_core.mesh.topology import far_centre
-from graspd_core.optimize.plan_config import load_preset
 from graspd_core.perception.cloud.free_space import FreeSpace, empty_depth, make_view_depths
-from graspd_core.perception.cloud.point_cloud import PointCloud
-from graspd_core.perception.load_scene import load_scene
 from graspd_core.perception.reconstruct.reconstruct import reconstruct
 from graspd_core.perception.scene import build_scene, moved_object, object_parts
 from graspd_core.perception.scene_from_views import scene_from_views
 from graspd_core.perception.segment.segment import segment
-from graspd_core.perception.segment.target_selection import Target
 from graspd_core.planning.plan_grasps import plan_grasps, planning_scene
 from graspd_core.types import Outcome, Plane, TriangleMesh, Verdict
-from graspd_core.verify.verification import verify_grasps
 
 
 def test_file_scale_and_value_agree(tmp_path):

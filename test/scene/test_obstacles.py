@@ -8,12 +8,11 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from graspd_core import Scene, TriangleMesh, load_scene, with_neighbours
+from graspd_core import Scene, TriangleMesh, load_scene, make_shape, with_neighbours
 from graspd_core.config import ObstacleConfig
 from graspd_core.errors import MeshError
 from graspd_core.mesh.mesh_files import mass_properties
 from graspd_core.mesh.sdf import sample_sdf
-from graspd_core.mesh.shapes import make_shape
 from graspd_core.perception.obstacles import make_obstacles, padded_hull
 from graspd_core.perception.scene import build_scene, sample_confidence
 from graspd_core.types import Plane

@@ -8,13 +8,12 @@ import pytest
 import torch
 from shape_volumes import shape_volume
 
+from graspd_core import TriangleMesh, load_scene
 from graspd_core.errors import MeshError
 from graspd_core.mesh.sdf import sample_sdf
 from graspd_core.mesh.shapes import SPHERE_RADIUS
-from graspd_core.perception.load_scene import load_scene
 from graspd_core.perception.scene import build_scene, heavy_mass, object_parts
 from graspd_core.runtime import disk_cache as cache
-from graspd_core.types import TriangleMesh
 
 
 @pytest.fixture(autouse=True)

@@ -9,16 +9,13 @@ from scipy.spatial.transform import Rotation
 from graspd_bench.rendering.depth_noise import LEVELS, NONE, DepthNoise, add_noise
 from graspd_bench.rendering.render import look_at, render_scene
 from graspd_bench.rendering.tabletop import ring_poses, tabletop, views_of
+from graspd_core import PinholeCamera, PointCloud, Target, TriangleMesh, cloud_from_depth
 from graspd_core.config import SegmentationConfig
 from graspd_core.errors import CloudError, NoObjectError
 from graspd_core.mesh.mesh_files import surface_samples
 from graspd_core.mesh.shapes import SHAPES, make_shape
 from graspd_core.mesh.surface_queries import make_surface, surface_distance
-from graspd_core.perception.cloud.camera import PinholeCamera, cloud_from_depth
-from graspd_core.perception.cloud.point_cloud import PointCloud
 from graspd_core.perception.segment.segment import Segmentation, find_things, segment
-from graspd_core.perception.segment.target_selection import Target
-from graspd_core.types import TriangleMesh
 
 # As a D415 with half its pixels each way.
 CAMERA = PinholeCamera(320, 240, 308.0, 308.0, 159.5, 119.5)

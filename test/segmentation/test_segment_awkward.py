@@ -9,17 +9,14 @@ from graspd_bench.rendering.depth_noise import LEVELS, NONE, DepthNoise
 from graspd_bench.rendering.tabletop import CAMERA as D415
 from graspd_bench.rendering.tabletop import TabletopScene, ring_poses, tabletop, views_of
 from graspd_bench.stress.broken_clouds import beside_a_step, half_out_of_view, zero_filled
+from graspd_core import PinholeCamera, Target, TriangleMesh, make_shape
 from graspd_core.config import SegmentationConfig
 from graspd_core.errors import CloudError, NoObjectError
-from graspd_core.mesh.shapes import make_shape
 from graspd_core.mesh.surface_queries import make_surface, surface_distance
-from graspd_core.perception.cloud.camera import PinholeCamera
 from graspd_core.perception.cloud.point_cloud import PointCloud, measured
 from graspd_core.perception.reconstruct.reconstruct import reconstruct
 from graspd_core.perception.segment.clusters import merge_occluded
 from graspd_core.perception.segment.segment import Segmentation, segment
-from graspd_core.perception.segment.target_selection import Target
-from graspd_core.types import TriangleMesh
 
 CAMERA = PinholeCamera(320, 240, 308.0, 308.0, 159.5, 119.5)
 STAGE = tabletop("box", yaw=0.3)

@@ -8,13 +8,10 @@ import pytest
 
 from graspd_bench.rendering.depth_noise import DEFAULT
 from graspd_bench.rendering.tabletop import TabletopScene, moved, on_table, ring_poses, tabletop, views_of
+from graspd_core import PinholeCamera, PointCloud, Target, scene_from_views
 from graspd_core.config import SegmentationConfig
 from graspd_core.mesh.shapes import SHAPES, make_shape
-from graspd_core.perception.cloud.camera import PinholeCamera
-from graspd_core.perception.cloud.point_cloud import PointCloud
-from graspd_core.perception.scene_from_views import scene_from_views
 from graspd_core.perception.segment.segment import find_things, segment
-from graspd_core.perception.segment.target_selection import Target
 
 # As a D415 with half its pixels each way.
 CAMERA = PinholeCamera(320, 240, 308.0, 308.0, 159.5, 119.5)

@@ -10,15 +10,11 @@ import pytest
 from graspd_bench.rendering.depth_noise import DEFAULT, HIGH
 from graspd_bench.rendering.tabletop import CAMERA, TabletopScene, depth_views, ring_poses, tabletop, views_of
 from graspd_bench.stress.broken_clouds import bled
+from graspd_core import Outcome, PointCloud, Verdict, load_hand, plan_grasps, scene_from_views
 from graspd_core.errors import NoObjectError
-from graspd_core.hands.library import load_hand
 from graspd_core.mesh.surface_queries import make_surface, surface_distance
 from graspd_core.mesh.topology import is_closed
-from graspd_core.perception.cloud.point_cloud import PointCloud
-from graspd_core.perception.scene_from_views import scene_from_views
 from graspd_core.perception.segment.segment import Target
-from graspd_core.planning.plan_grasps import plan_grasps
-from graspd_core.types import Outcome, Verdict
 
 PAGE = Path(__file__).parents[2] / "docs" / "clouds.md"
 POSES = ring_poses(3, elevation=0.7, azimuth=0.5)

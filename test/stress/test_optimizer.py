@@ -10,17 +10,12 @@ import pytest
 import torch
 from torch import Tensor
 
-from graspd_core.hands.library import load_hand
-from graspd_core.hands.model import HandModel
+from graspd_core import HandModel, PlanConfig, Scene, draw_starts, load_hand, load_scene
 from graspd_core.mesh.sdf import sample_sdf
 from graspd_core.optimize.candidates import PlannerInput, assemble
 from graspd_core.optimize.closed_form.closed_form import ClosedForm
-from graspd_core.optimize.initial_poses import draw_starts
 from graspd_core.optimize.loop import Hooks, Poses, minimise, pack, unpack
-from graspd_core.optimize.plan_config import PlanConfig
 from graspd_core.optimize.problem import Problem, hand_forward
-from graspd_core.perception.load_scene import load_scene
-from graspd_core.perception.scene import Scene
 from graspd_core.se3 import rotation_from_quaternion
 
 PLAN = PlanConfig()

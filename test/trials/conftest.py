@@ -8,12 +8,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from graspd_core.hands.library import load_hand
-from graspd_core.hands.model import HandModel
+from graspd_core import Grasp, HandModel, Posture, TriangleMesh, load_hand, make_shape
 from graspd_core.mesh.mesh_files import content_hash, mass_properties
-from graspd_core.mesh.shapes import make_shape
 from graspd_core.perception.scene import ObjectModel
-from graspd_core.types import Grasp, Posture, TriangleMesh
 from graspd_core.verify.world import World, build_world
 
 FINGER = """

@@ -16,11 +16,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from graspd_bench.trials import TOLERANCE, gravity_trial
-from graspd_core.hands.library import load_hand
+from graspd_core import load_hand, load_preset, load_scene
 from graspd_core.optimize.candidates import PlannerInput, find_candidates
 from graspd_core.optimize.loop import Hooks
-from graspd_core.optimize.plan_config import load_preset
-from graspd_core.perception.load_scene import load_scene
 from graspd_core.perception.scene import Scene, object_parts
 from graspd_core.types import Grasp, Plane
 from graspd_core.verify.early_stop import (

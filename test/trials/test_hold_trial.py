@@ -8,8 +8,7 @@ import numpy as np
 import pytest
 
 from graspd_bench.trials import LOST, gravity_trial
-from graspd_core.hands.model import HandModel
-from graspd_core.types import Posture, Verdict
+from graspd_core import HandModel, Posture, Verdict
 from graspd_core.verify import world as trial_world
 from graspd_core.verify.hold_trial import displaced, hold_trial, noisy_share, pose_error, pose_errors
 from graspd_core.verify.world import PROTOCOLS, Protocol, World, build_world

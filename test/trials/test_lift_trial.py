@@ -13,11 +13,10 @@ import numpy as np
 import pytest
 
 from graspd_bench.trials import Lifted, lift_out, placed, settle
+from graspd_core import HandModel, make_shape
 from graspd_core.errors import ConfigError
 from graspd_core.hands.kinematics import retreat_posture
-from graspd_core.hands.model import HandModel
 from graspd_core.mesh.sdf import build_sdf
-from graspd_core.mesh.shapes import make_shape
 from graspd_core.perception.scene import Obstacle
 from graspd_core.types import Grasp, Plane, Posture, TrialResult, TriangleMesh, Verdict
 from graspd_core.verify.lift_trial import LiftSettings, lift_trial

@@ -6,8 +6,7 @@ from dataclasses import replace
 
 import pytest
 
-from graspd_core import load_hand, load_preset, load_scene, plan_grasps, verify_grasps
-from graspd_core.types import Outcome, Verdict
+from graspd_core import Outcome, Verdict, load_hand, load_preset, load_scene, plan_grasps, verify_grasps
 from graspd_core.verify.hold_trial import hold_trial
 from graspd_core.verify.limits import FINENESS, MOST_PAYLOAD, least_friction, payload
 from graspd_core.verify.world import PROTOCOLS, altered, build_world

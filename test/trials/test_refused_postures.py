@@ -8,15 +8,12 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from graspd_core.hands.library import load_hand
+from graspd_core import load_hand, load_scene, plan_grasps, verify_grasps
 from graspd_core.hands.self_collision import deepest_overlap
-from graspd_core.perception.load_scene import load_scene
 from graspd_core.perception.scene import object_parts
-from graspd_core.planning.plan_grasps import plan_grasps
 from graspd_core.types import Grasp, Plane, Posture, Verdict
 from graspd_core.verify.hold_trial import hold_trial, out_of_place, self_fault, set_hand_pose
 from graspd_core.verify.lift_trial import lift_trial
-from graspd_core.verify.verification import verify_grasps
 from graspd_core.verify.world import PROTOCOLS, build_world, trial_data
 
 STANDARD = PROTOCOLS["standard"]

@@ -11,13 +11,12 @@ import mujoco
 import numpy as np
 import pytest
 
+from graspd_core import Grasp, Posture, load_hand
 from graspd_core.hands.kinematics import link_poses
-from graspd_core.hands.library import load_hand
 from graspd_core.hands.model import HandModel, all_joint_positions
 from graspd_core.mesh.convex_parts import convex_parts
 from graspd_core.mesh.sdf import build_sdf
 from graspd_core.mesh.shapes import MUG_HALF, MUG_WALL, make_shape
-from graspd_core.types import Grasp, Posture
 from graspd_core.verify.hold_trial import DIRECTIONS, hold_trial, set_hand_pose, set_joints, start_penetration
 from graspd_core.verify.world import PROTOCOLS, World, at_friction, build_world
 

@@ -17,9 +17,9 @@ from hypothesis import given
 from scipy.sparse import csr_matrix
 
 from graspd_bench.studies.human_hand import measure_skin
+from graspd_core import Posture, Verdict, load_hand, load_scene, plan_grasps
 from graspd_core.errors import HandError
 from graspd_core.hands.kinematics import in_base, link_poses
-from graspd_core.hands.library import load_hand
 from graspd_core.hands.mano import mano_hand as mano_joints
 from graspd_core.hands.mano.mano_file import ADMITTED, BODIES, PARENTS, ManoData, numbers, read_mano, read_pickle
 from graspd_core.hands.mano.mano_hand import ManoHand, load_mano
@@ -36,10 +36,7 @@ from graspd_core.hands.mano.mano_skin import (
 from graspd_core.hands.self_collision import deepest_overlap
 from graspd_core.hands.surface_points import with_candidates
 from graspd_core.mesh.surface_queries import make_distance_query, signed_distance
-from graspd_core.perception.load_scene import load_scene
-from graspd_core.planning.plan_grasps import plan_grasps
 from graspd_core.runtime.inert_pickle import Maker
-from graspd_core.types import Posture, Verdict
 
 SYNTHETIC = runpy.run_path(str(Path(__file__).parents[3] / "benchmarks" / "mano_synthetic.py"))
 

@@ -7,13 +7,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from graspd_core import HandModel, TriangleMesh, make_shape, save_mesh
 from graspd_core.errors import HandError
 from graspd_core.hands.library import hand_names, load_hand, read_hand_file
-from graspd_core.hands.model import HandModel
 from graspd_core.hands.readers.urdf import visual_solids
-from graspd_core.mesh.mesh_files import save_mesh
-from graspd_core.mesh.shapes import make_shape
-from graspd_core.types import TriangleMesh
 
 WEDGE = "v 0 0 0\nv 0.02 0 0\nv 0 0.02 0\nv 0 0 0.03\nf 1 3 2\nf 1 2 4\nf 1 4 3\nf 2 3 4\n"
 URDF = (

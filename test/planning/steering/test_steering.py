@@ -10,13 +10,11 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
-from graspd_core import Verdict, load_hand, load_scene, plan_grasps
+from graspd_core import Verdict, draw_starts, load_hand, load_scene, make_shape, plan_grasps
 from graspd_core.errors import ConfigError
 from graspd_core.hands.kinematics import link_poses
 from graspd_core.mesh.sdf import sample_sdf
-from graspd_core.mesh.shapes import make_shape
 from graspd_core.mesh.topology import moved_mesh
-from graspd_core.optimize.initial_poses import draw_starts
 from graspd_core.optimize.restrictions import BoundRestrictions, Refusal, Roll
 from graspd_core.planning.regions import Box, NearPoints, Sphere, boxes_in_reach, entered
 from graspd_core.planning.steering import (

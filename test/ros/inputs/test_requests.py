@@ -18,10 +18,8 @@ from sensor_msgs.msg import Image, PointCloud2
 from shape_msgs.msg import SolidPrimitive
 from std_msgs.msg import Header
 
-from graspd_core import Box, Sphere, load_scene
+from graspd_core import Box, PointCloud, Sphere, load_scene, preset_names
 from graspd_core.errors import CloudError, GraspdError, MeshError, NoObjectError, ResourceError, TransformError
-from graspd_core.optimize.plan_config import preset_names
-from graspd_core.perception.cloud.point_cloud import PointCloud
 from graspd_ros.convert import pose_matrix
 from graspd_ros.error_codes import ErrorCode, RequestError, code_of, sentence_of
 from graspd_ros.inputs.request_builder import (

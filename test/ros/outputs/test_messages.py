@@ -23,8 +23,7 @@ from std_msgs.msg import Header
 from std_srvs.srv import Trigger
 from visualization_msgs.msg import Marker, MarkerArray
 
-from graspd_core.hands.kinematics import hand_mesh
-from graspd_core.hands.library import load_hand
+from graspd_core import hand_mesh, load_hand
 from graspd_core.hands.model import Primitive
 from graspd_core.paths import config_dir
 from graspd_core.types import (

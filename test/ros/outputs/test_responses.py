@@ -24,9 +24,8 @@ from rclpy.context import Context
 from rclpy.serialization import deserialize_message, serialize_message
 from visualization_msgs.msg import MarkerArray
 
+from graspd_core import Scene, load_hand
 from graspd_core.errors import MeshError
-from graspd_core.hands.library import load_hand
-from graspd_core.perception.scene import Scene
 from graspd_core.types import (
     Contact,
     Grasp,

@@ -19,14 +19,11 @@ from scipy.spatial.transform import Rotation, Slerp
 from std_msgs.msg import Header
 from trajectory_msgs.msg import JointTrajectory
 
+from graspd_core import ArmPath, Grasp, Posture, load_hand, load_scene, plan_grasps
 from graspd_core.arms.arm_paths import STAGE_ROWS
 from graspd_core.errors import ConfigError
-from graspd_core.hands.library import load_hand
 from graspd_core.hands.model import HandModel, Mount
-from graspd_core.perception.load_scene import load_scene
 from graspd_core.perception.scene import object_parts
-from graspd_core.planning.plan_grasps import plan_grasps
-from graspd_core.types import ArmPath, Grasp, Posture
 from graspd_core.verify.world import PROTOCOLS, build_world
 from graspd_ros.convert import matrix_of, matrix_of_pose
 from graspd_ros.outputs.messages import (

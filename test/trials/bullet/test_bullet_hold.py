@@ -24,15 +24,14 @@ from graspd_bench.bullet.bullet_world import (
     simulation,
 )
 from graspd_bench.trials import FrozenWorld, build_frozen_world, displacement_trial
+from graspd_core import Posture, TriangleMesh, load_hand
 from graspd_core.errors import SimulatorError
 from graspd_core.hands.kinematics import forward, make_kinematics
-from graspd_core.hands.library import load_hand
 from graspd_core.hands.model import Mimic
 from graspd_core.hands.readers.xml_io import rotation_from_rpy
 from graspd_core.mesh.mesh_files import content_hash, mass_properties
 from graspd_core.perception.scene import ObjectModel
 from graspd_core.se3 import quaternion_from_rotation, random_rotations, rotation_from_quaternion
-from graspd_core.types import Posture, TriangleMesh
 from graspd_core.verify.hold_trial import DIRECTIONS, hold_trial
 from graspd_core.verify.world import PROTOCOLS, build_world
 
