@@ -1,7 +1,5 @@
 """Switched on for every test: array shapes checked at run time, one torch thread, reproducible Hypothesis draws."""
 
-from __future__ import annotations
-
 import fcntl
 import os
 import sys

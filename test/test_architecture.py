@@ -1,7 +1,5 @@
 """The rules of docs/architecture.md, read off the sources: imports, sizes, names."""
 
-from __future__ import annotations
-
 import ast
 import io
 import re

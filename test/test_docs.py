@@ -3,8 +3,6 @@
 Pages build, their Python runs, their commands parse, their links lead somewhere, and the examples do what they say.
 """
 
-from __future__ import annotations
-
 import importlib
 import json
 import math

@@ -1,7 +1,5 @@
 """docs/ros.md against a live node: names, types and QoS, the command lines, and the client as the page shows it."""
 
-from __future__ import annotations
-
 import importlib
 import importlib.util
 import re

@@ -1,7 +1,5 @@
 """Names of version 0.1: module paths are refused with the name that they have now, and the page lists every name."""
 
-from __future__ import annotations
-
 import importlib
 import importlib.util
 import json

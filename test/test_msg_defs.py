@@ -1,7 +1,5 @@
 """The sources of graspd_msgs: documented, told alike to colcon and pip, built when stale."""
 
-from __future__ import annotations
-
 import ast
 import os
 import re

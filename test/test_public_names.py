@@ -1,7 +1,5 @@
 """The package: what it offers, what a fresh interpreter imports of it, where its configuration lies, and its doctor."""
 
-from __future__ import annotations
-
 import ast
 import compileall
 import inspect

@@ -1,7 +1,5 @@
 """What pages, docstrings and comments name in backticks exists: files, modules, functions, fields, settings."""
 
-from __future__ import annotations
-
 import ast
 import io
 import re

@@ -1,7 +1,5 @@
 """One place to add a metric or a trial: a row that is added here shows everywhere, with nothing else edited."""
 
-from __future__ import annotations
-
 import json
 from dataclasses import replace
 from pathlib import Path

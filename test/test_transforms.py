@@ -1,7 +1,5 @@
 """Rigid transforms: round trips, gradients where norms vanish; the buffer of transforms against matrices."""
 
-from __future__ import annotations
-
 import math
 import threading
 

@@ -1,7 +1,5 @@
 """The shipped arms, loaded once."""
 
-from __future__ import annotations
-
 import pytest
 
 from graspd_core.arms.arm import Arm, arm_names, load_arm

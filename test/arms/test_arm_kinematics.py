@@ -1,7 +1,5 @@
 """Arm descriptions, one error for each mistake; an arm's tip and Jacobian against tables, differences and itself."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

@@ -3,8 +3,6 @@
 The capsules that its links are: their distances against MuJoCo's, and that they hold what they stand for.
 """
 
-from __future__ import annotations
-
 from dataclasses import replace
 from pathlib import Path
 from typing import Any, get_args

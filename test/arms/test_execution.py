@@ -1,7 +1,5 @@
 """A grasp as a timed trajectory of arm and hand: gates at rest, speeds within limits, efforts of a closed hand."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

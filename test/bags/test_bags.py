@@ -1,7 +1,5 @@
 """Recordings written and read back, both storages; and one line for whatever is wrong with one."""
 
-from __future__ import annotations
-
 import argparse
 import contextlib
 import sqlite3

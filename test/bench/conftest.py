@@ -1,7 +1,5 @@
 """Records as cells leave them, with figures that can be worked out by hand."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from typing import Any
 

@@ -1,7 +1,5 @@
 """Study `dexgraspbench`, without a checkout: what is written for it, how it is run, what is told of its results."""
 
-from __future__ import annotations
-
 import json
 import re
 import sys

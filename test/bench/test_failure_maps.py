@@ -1,7 +1,5 @@
 """Failure maps and charts: cells, records, what is counted from them, and pictures that are the same every time."""
 
-from __future__ import annotations
-
 from collections import Counter
 from dataclasses import asdict, replace
 from itertools import combinations, product

@@ -1,7 +1,5 @@
 """From records to figures, tables, comparisons and the front."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

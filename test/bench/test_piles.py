@@ -1,7 +1,5 @@
 """Study `piles`: what is drawn and dropped, a thing that gets cleared, and the report of made records."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any

@@ -1,7 +1,5 @@
 """What a record is kept under, that it appears whole or not at all, and how a failure is written down."""
 
-from __future__ import annotations
-
 import importlib
 import json
 import sys

@@ -1,7 +1,5 @@
 """Stress cases: named once, refused inputs refused in one line, endings weighed, and a table that hides no fault."""
 
-from __future__ import annotations
-
 from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any

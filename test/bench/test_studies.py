@@ -1,7 +1,5 @@
 """Every study ends in records and sections; `graspd bench` resumes after a kill and names what is wrong in one line."""
 
-from __future__ import annotations
-
 import os
 import re
 import runpy

@@ -1,7 +1,5 @@
 """Settings of plans and of scenes: presets load, one file reaches every field, and what is wrong in one is named."""
 
-from __future__ import annotations
-
 import dataclasses
 from pathlib import Path
 from typing import Any

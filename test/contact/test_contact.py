@@ -3,8 +3,6 @@
 Each is worked by hand and against finite differences; the support also against brute force over sampled cone forces.
 """
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 import torch

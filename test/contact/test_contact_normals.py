@@ -1,7 +1,5 @@
 """Contacts of results lie on the mesh, and their normals are the surface's: of a face, or between those of an edge."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 import trimesh

@@ -3,8 +3,6 @@
 cluster_run.py OUT
 """
 
-from __future__ import annotations
-
 import json
 import os
 import secrets

@@ -1,7 +1,5 @@
 """A small data set, made once without Ray: two blocks of a sphere; and what the tests of a folder of files share."""
 
-from __future__ import annotations
-
 import shutil
 import sys
 from collections.abc import Callable

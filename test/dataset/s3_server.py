@@ -1,7 +1,5 @@
 """An S3 server on this machine (moto), which answers every n-th request with 503 where that is asked for."""
 
-from __future__ import annotations
-
 import threading
 from collections.abc import Iterator
 from contextlib import contextmanager

@@ -1,7 +1,5 @@
 """Blocks made in this process, without Ray: what whole runs are compared with."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 
 from graspd_dataset import block_rows

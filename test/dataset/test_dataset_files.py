@@ -1,7 +1,5 @@
 """A data set that is there: resumed by listing, looked through, merged, sampled, read by others."""
 
-from __future__ import annotations
-
 import importlib
 import shutil
 import subprocess

@@ -1,7 +1,5 @@
 """Files whole or not at all, on a disk and on a real S3 protocol server; a full disk; a server that is busy."""
 
-from __future__ import annotations
-
 import pickle
 import resource
 from collections.abc import Iterator

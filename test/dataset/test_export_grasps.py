@@ -1,7 +1,5 @@
 """What others read: the same fingertips by MuJoCo's kinematics of the URDF, the same poses, the same object."""
 
-from __future__ import annotations
-
 import json
 from pathlib import Path
 

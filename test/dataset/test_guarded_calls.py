@@ -1,7 +1,5 @@
 """What a block does to its process is written down, and the next one has a process that works."""
 
-from __future__ import annotations
-
 import json
 import os
 import subprocess

@@ -1,7 +1,5 @@
 """Grasps of others: what was exported comes back to the digit, and a file that is wrong is named in one line."""
 
-from __future__ import annotations
-
 import json
 import os
 import pickle

@@ -3,8 +3,6 @@
 What comes out is compared to the byte with blocks that were made without Ray.
 """
 
-from __future__ import annotations
-
 import json
 import os
 import secrets

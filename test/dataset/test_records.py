@@ -1,7 +1,5 @@
 """What rows hold, that they come back as they were, and that a block made twice is the same to the byte."""
 
-from __future__ import annotations
-
 import re
 from dataclasses import replace
 from pathlib import Path

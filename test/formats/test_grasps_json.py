@@ -1,7 +1,5 @@
 """The file format: what is written comes back, other files are refused by name; and the page of a grasp."""
 
-from __future__ import annotations
-
 import base64
 import io
 import json

@@ -1,7 +1,5 @@
 """The parsers of benchmarks/fuzz_targets.py, and ways to spoil their inputs."""
 
-from __future__ import annotations
-
 import copy
 import importlib
 import re

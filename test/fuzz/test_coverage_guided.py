@@ -1,7 +1,5 @@
 """The coverage-guided fuzzer itself: it runs, learns, and finds what is planted; not where atheris is missing."""
 
-from __future__ import annotations
-
 import subprocess
 import sys
 from pathlib import Path

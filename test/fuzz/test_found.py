@@ -1,7 +1,5 @@
 """What fuzzing found once, as small as it gets: each is refused in one line now, or read as it should be."""
 
-from __future__ import annotations
-
 import io
 import json
 import pickle

@@ -3,8 +3,6 @@
 Each ends in a value of finite numbers or in one clear error.
 """
 
-from __future__ import annotations
-
 import copy
 import dataclasses
 import json

@@ -1,7 +1,5 @@
 """What every built-in hand must show, a new one too; the makers' figures of the Allegro and the LEAP hand."""
 
-from __future__ import annotations
-
 import importlib
 import re
 from pathlib import Path

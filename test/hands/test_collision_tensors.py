@@ -1,7 +1,5 @@
 """Distances to primitives and of all solids at once; forward kinematics against finite differences."""
 
-from __future__ import annotations
-
 import gc
 import weakref
 from dataclasses import replace

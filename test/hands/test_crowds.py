@@ -4,8 +4,6 @@ The LEAP hand that its makers publish has fine meshes for collision shapes. A st
 the shipped hand here: every link is a shell of thin plates, each a fine mesh file.
 """
 
-from __future__ import annotations
-
 import re
 from collections.abc import Callable, Sequence
 from pathlib import Path

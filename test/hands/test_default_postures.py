@@ -3,8 +3,6 @@
 Dimensions of the grippers are public figures of the makers, rounded; widths and masses are estimates, solids are bars.
 """
 
-from __future__ import annotations
-
 import xml.etree.ElementTree as ET
 from dataclasses import dataclass, replace
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Loading hands: names, descriptions, bare URDFs, errors that name the culprit; and the report on a hand."""
 
-from __future__ import annotations
-
 import dataclasses
 import re
 import shutil

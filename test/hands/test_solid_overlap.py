@@ -1,8 +1,6 @@
 """How deep solids are in each other, against MuJoCo, and its gradients against finite differences."""
 # pyright: reportAttributeAccessIssue=false
 
-from __future__ import annotations
-
 import mujoco
 import numpy as np
 import pytest

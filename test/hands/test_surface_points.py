@@ -1,7 +1,5 @@
 """Candidates and dense samples lie on the hand's outer surface and cover it; on disk they are that hand's alone."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

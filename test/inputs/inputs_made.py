@@ -1,7 +1,5 @@
 """Inputs as people send them, made in a folder: clouds, depth images, meshes, recordings of messages."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from functools import cache

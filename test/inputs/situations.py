@@ -4,8 +4,6 @@ A row makes its input in a folder and says what a person would expect: the objec
 words. To add a situation, add a row.
 """
 
-from __future__ import annotations
-
 import numpy as np
 from bag_writer import cloud_message
 from inputs_made import (

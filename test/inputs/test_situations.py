@@ -1,7 +1,5 @@
 """Every situation of the table, by every way in that takes it: the scene that it shows, or a refusal by name."""
 
-from __future__ import annotations
-
 import re
 from pathlib import Path
 from typing import Any

@@ -1,7 +1,5 @@
 """Problems that use every part of the kernel."""
 
-from __future__ import annotations
-
 import os
 from dataclasses import replace
 

@@ -1,7 +1,5 @@
 """Which build is loaded, and what is said where none is."""
 
-from __future__ import annotations
-
 import ctypes
 
 import pytest

@@ -1,7 +1,5 @@
 """Pregrasps and self-overlap by the kernel, against torch."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import pytest

@@ -1,7 +1,5 @@
 """The compiled step against torch: values and gradients on every hand, and what must not matter."""
 
-from __future__ import annotations
-
 from dataclasses import asdict, replace
 
 import pytest

@@ -1,7 +1,5 @@
 """The compiled search: as good as torch's, alike on all threads, ended by its hooks."""
 
-from __future__ import annotations
-
 import time
 from dataclasses import replace
 

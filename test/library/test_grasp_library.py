@@ -1,7 +1,5 @@
 """A library of grasps: what goes in comes out, after a kill or a write; what it has of an object in its scene."""
 
-from __future__ import annotations
-
 import os
 import re
 import signal

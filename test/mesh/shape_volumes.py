@@ -1,7 +1,5 @@
 """Closed-form volumes of the authored shapes [m³]. Overlaps count once."""
 
-from __future__ import annotations
-
 from itertools import pairwise
 from math import asin, pi, prod, sqrt
 

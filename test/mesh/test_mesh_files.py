@@ -1,7 +1,5 @@
 """Meshes: authored, read, refused, cut off, cleaned and measured."""
 
-from __future__ import annotations
-
 import dataclasses
 import re
 import zlib

@@ -1,7 +1,5 @@
 """The grid against exact distances and differences; sharp points, and walls thinner than a cell."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

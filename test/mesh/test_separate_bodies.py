@@ -1,7 +1,5 @@
 """Bodies apart, small components, and convex parts that fill the object, stay near it and leave hollows open."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from hypothesis import given, settings

@@ -1,7 +1,5 @@
 """The winding number's inside, closest points and exact distances, for surfaces of every kind; rows as numbers."""
 
-from __future__ import annotations
-
 import dataclasses
 from typing import Any
 

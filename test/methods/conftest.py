@@ -1,7 +1,5 @@
 """One small hand and small problems for the whole folder, and the one finite-difference checker."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 
 import pytest

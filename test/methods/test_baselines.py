@@ -1,7 +1,5 @@
 """The baselines, GraspIt!'s annealing and random closure, and the closing of fingers until contact that both use."""
 
-from __future__ import annotations
-
 import math
 import time
 from dataclasses import replace

@@ -1,7 +1,5 @@
 """Every differentiable term against central differences in float64, and the terms in single precision."""
 
-from __future__ import annotations
-
 import subprocess
 import sys
 from collections.abc import Callable

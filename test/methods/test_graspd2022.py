@@ -1,7 +1,5 @@
 """Grasp'D as published and as released: multipliers, desired forces, starts, short runs, what its code does besides."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import replace
 from typing import Any

@@ -1,7 +1,5 @@
 """Starts are seeded, outside the object, within limits, and face what the hand can span."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 import torch

@@ -1,7 +1,5 @@
 """The loop and the closed-form solver: stops, best iterates, broken starts; grippers that slide."""
 
-from __future__ import annotations
-
 import time
 from dataclasses import replace
 from types import SimpleNamespace

@@ -1,7 +1,5 @@
 """A method is added by one row; presets, ablations and budgets change what they name; searches go on where few hold."""
 
-from __future__ import annotations
-
 import sys
 from dataclasses import dataclass, replace
 from pathlib import Path

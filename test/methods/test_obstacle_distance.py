@@ -1,7 +1,5 @@
 """Support and neighbours in the optimiser, patches of the hand that are drawn to the surface, a hand that gives."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from functools import partial
 

@@ -1,7 +1,5 @@
 """Contacts, balanced forces and the open posture on cases worked out by hand; the score that ranks candidates."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from pathlib import Path
 

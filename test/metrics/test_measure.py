@@ -1,7 +1,5 @@
 """Metrics of boxes and hands that can be worked out on paper: contact, penetration, overlap, wrench hull, copies."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from pathlib import Path
 

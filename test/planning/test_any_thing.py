@@ -1,7 +1,5 @@
 """Of all things seen, one with a grasp that is sure enough; what failed is not asked again in the same way."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

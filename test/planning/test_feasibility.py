@@ -1,7 +1,5 @@
 """What a hand cannot hold anywhere is told at once; what it might hold is never refused."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

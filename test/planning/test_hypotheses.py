@@ -1,7 +1,5 @@
 """Grasps of an object that cameras saw: what else may be true, how many survive it, what is said of it."""
 
-from __future__ import annotations
-
 import threading
 import time
 from collections.abc import Sequence

@@ -1,7 +1,5 @@
 """`plan_grasps`, end to end on a cylinder: verdicts, limits, reproducibility, and every way for a run to end early."""
 
-from __future__ import annotations
-
 import threading
 import time
 from dataclasses import replace

@@ -1,7 +1,5 @@
 """Grasps that an arm reaches: what it refuses, what its grasps carry, and that who asks for none loads none of it."""
 
-from __future__ import annotations
-
 import re
 from dataclasses import replace
 from pathlib import Path

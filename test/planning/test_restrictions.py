@@ -1,7 +1,5 @@
 """Restrictions: starts that they forbid are drawn anew, candidates that they refuse are not tried, reasons counted."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
@@ -28,7 +26,7 @@ class Side(BoundRestriction):
     at: float = 0.0
     told: str = ""
 
-    def bind(self, scene: Scene, hand: HandModel) -> Side:
+    def bind(self, scene: Scene, hand: HandModel) -> "Side":
         if not np.isfinite(self.at):
             raise ConfigError(f"side: {self.at} m; valid: a finite number")
         return self
@@ -51,7 +49,7 @@ class Every(BoundRestriction):
 
     n: int
 
-    def bind(self, scene: Scene, hand: HandModel) -> Every:
+    def bind(self, scene: Scene, hand: HandModel) -> "Every":
         return self
 
     def admit(self, grasps: Sequence[Grasp]) -> Sequence[Grasp | Refusal]:

@@ -1,7 +1,5 @@
 """Rounds of growing effort, ranking by robustness, runs that are watched, and grasps from elsewhere that are tried."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from itertools import pairwise
 

@@ -1,7 +1,5 @@
 """Every setting of a preset reaches `plan_grasps`: changed alone, it changes a very short run."""
 
-from __future__ import annotations
-
 import dataclasses
 from functools import cache, partial
 from typing import Any, Literal, get_args, get_origin, get_type_hints

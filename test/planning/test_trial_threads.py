@@ -1,7 +1,5 @@
 """Trials on several threads: the same results in the same order as on one."""
 
-from __future__ import annotations
-
 import threading
 import time
 from collections.abc import Iterator

@@ -1,7 +1,5 @@
 """Cameras and their images: the lens can be undone, every encoding comes back as metres, clouds lie on the thing."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from hypothesis import given

@@ -1,7 +1,5 @@
 """Clouds from files: every kind and every header comes back, and what is no cloud is named."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Depth images of every kind of file become the same points, or are refused by one line that names the file."""
 
-from __future__ import annotations
-
 import json
 from pathlib import Path
 from typing import Any

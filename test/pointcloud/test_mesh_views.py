@@ -1,7 +1,5 @@
 """A camera viewer's mesh is a view; open, thin and cut meshes of objects are not."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from situations import sheet, sheet_in_world

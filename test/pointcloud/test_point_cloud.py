@@ -1,7 +1,5 @@
 """Clouds: refused, cleaned and moved; their layouts as bytes. Messages: test/ros/inputs/test_sensor_frames.py."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Whether clouds tell that their camera stood elsewhere, and whether an object reaches the border of a picture."""
 
-from __future__ import annotations
-
 import re
 from contextlib import nullcontext
 from dataclasses import replace

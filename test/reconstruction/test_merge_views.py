@@ -1,7 +1,5 @@
 """Several views to oriented points, and the field on a grid whose zero is the surface through them."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from hypothesis import given, settings

@@ -1,7 +1,5 @@
 """Guesses about unseen sides: symmetries, axes, what cameras say of guessed points; other shapes, and the next view."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from hypothesis import given

@@ -1,7 +1,5 @@
 """Irregular things are closed, of a hand's size and heavy as such things are. Cameras err as their makers say."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

@@ -1,7 +1,5 @@
 """Depth images and pictures, the sensor's faults one by one, and authored scenes on a table."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

@@ -1,7 +1,5 @@
 """A node in a process of its own and a client that talks to it over DDS, both in a domain that nobody else uses."""
 
-from __future__ import annotations
-
 import array
 import dataclasses
 import json

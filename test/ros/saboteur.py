@@ -3,8 +3,6 @@
 Started by test_node_process.py.
 """
 
-from __future__ import annotations
-
 import sys
 from dataclasses import replace
 from typing import Any

@@ -1,7 +1,5 @@
 """A node like any other, but it warms up again and again until it stops. Started by test_node_process.py."""
 
-from __future__ import annotations
-
 import sys
 
 from graspd_core import HandModel

@@ -1,7 +1,5 @@
 """The action server on the worker's queue: feedback, results, cancelling, and what becomes of those in the way."""
 
-from __future__ import annotations
-
 from types import SimpleNamespace
 from typing import Any
 

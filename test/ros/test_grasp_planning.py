@@ -1,7 +1,5 @@
 """The action GraspPlanning end to end: a mesh, a primitive and a cluster in, MoveIt's grasps out, feedback before."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Any
 

@@ -1,7 +1,5 @@
 """Messages that nobody means well: any numbers, texts and bytes end in a request or a refusal; the node lives on."""
 
-from __future__ import annotations
-
 import array
 import json
 from typing import Any

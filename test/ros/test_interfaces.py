@@ -3,8 +3,6 @@
 The oracle for bytes and type hashes is rosbags, which shares no code with rosidl.
 """
 
-from __future__ import annotations
-
 import itertools
 import os
 import sys

@@ -1,7 +1,5 @@
 """Requests for objects that a library knows: what answers them, what is planned for them, and what is refused."""
 
-from __future__ import annotations
-
 import shutil
 import subprocess
 import sys

@@ -1,7 +1,5 @@
 """The node in its own process, over DDS: objects in, grasps and events out; floods, bursts and cancels."""
 
-from __future__ import annotations
-
 import json
 import os
 from collections import Counter

@@ -1,7 +1,5 @@
 """How the node starts and ends: signals, bad parameters, crashes of its work, kills."""
 
-from __future__ import annotations
-
 import json
 import os
 import signal

@@ -3,8 +3,6 @@
 Started as a program, this file is that node.
 """
 
-from __future__ import annotations
-
 import sys
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """What parameters may be set to while the node runs."""
 
-from __future__ import annotations
-
 import dataclasses
 import math
 from collections.abc import Callable, Iterator

@@ -1,7 +1,5 @@
 """Things of a planning scene: what messages make of them, and that grasps keep clear of them."""
 
-from __future__ import annotations
-
 import subprocess
 import sys
 from collections.abc import Mapping

@@ -1,7 +1,5 @@
 """A recording goes out over DDS as it was recorded, and comes in by a subscription."""
 
-from __future__ import annotations
-
 import os
 import signal
 import subprocess

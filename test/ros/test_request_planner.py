@@ -1,7 +1,5 @@
 """Work on one request: what it gives, and that nobody waits for it once the request is over."""
 
-from __future__ import annotations
-
 import threading
 from dataclasses import replace
 

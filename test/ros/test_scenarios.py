@@ -1,7 +1,5 @@
 """Whole stories between processes: a recording played in, its answer recorded, simulated time, a client that dies."""
 
-from __future__ import annotations
-
 import os
 import signal
 import subprocess

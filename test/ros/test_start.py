@@ -1,7 +1,5 @@
 """What a start finds: another ROS, no place for logs, arguments, a robot's arm, two hands on one robot."""
 
-from __future__ import annotations
-
 import ast
 import json
 import os

@@ -1,7 +1,5 @@
 """`graspd_view` follows a node: what the topics say is on the page."""
 
-from __future__ import annotations
-
 import math
 import time
 from typing import Any

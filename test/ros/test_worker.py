@@ -1,7 +1,5 @@
 """Every accepted request ends in exactly one report, whatever happens to it."""
 
-from __future__ import annotations
-
 import threading
 import time
 from collections import Counter

@@ -1,7 +1,5 @@
 """A function in a process of its own; and freed memory, where the C library has no call to give it back."""
 
-from __future__ import annotations
-
 import ctypes
 import math
 import os

@@ -1,7 +1,5 @@
 """Scenes from every kind of source, from what a camera saw of a crowded table, and of an object far from the origin."""
 
-from __future__ import annotations
-
 import dataclasses
 
 import numpy as np

@@ -1,7 +1,5 @@
 """What stands about the object, seen or known: hulls that hold it and leave the object room; and the grid of trust."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 import torch

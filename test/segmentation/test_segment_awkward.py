@@ -1,7 +1,5 @@
 """Scenes that are awkward: units, cameras far apart, gaps filled with zeros, steps, pictures that end too soon."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

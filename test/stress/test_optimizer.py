@@ -1,7 +1,5 @@
 """The optimiser where numbers go wrong: poisoned fields, precisions, batches, threads, starts inside things."""
 
-from __future__ import annotations
-
 import subprocess
 import sys
 from dataclasses import replace

@@ -1,7 +1,5 @@
 """A two-finger gripper about boxes: grasps whose fate can be told beforehand."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from pathlib import Path
 

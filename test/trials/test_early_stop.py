@@ -3,8 +3,6 @@
 # mujoco is a compiled module without stubs.
 # pyright: reportAttributeAccessIssue=false
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable
 from dataclasses import replace

@@ -1,7 +1,5 @@
 """The hold trial and the drop trial on grasps made by hand: good ones pass, bad ones fail for the right reason."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

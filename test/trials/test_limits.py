@@ -1,7 +1,5 @@
 """How much a grasp holds: payload and least friction against Coulomb's law, and runs whose object is too heavy."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import pytest

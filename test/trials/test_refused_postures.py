@@ -1,8 +1,6 @@
 """What a trial refuses before the hand moves: links in each other, and a grasp deep in the object, by name."""
 # pyright: reportAttributeAccessIssue=false
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

@@ -3,8 +3,6 @@
 # mujoco is a compiled module without stubs.
 # pyright: reportAttributeAccessIssue=false
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import mujoco

@@ -1,7 +1,5 @@
 """MANO: what is read of a file, what a file can not make this program do, and the hand made of it."""
 
-from __future__ import annotations
-
 import os
 import pickle
 import runpy

@@ -1,7 +1,5 @@
 """Meshes that hands name: found where ROS keeps them, read as hulls, refused by name, and drawn whole but bounded."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

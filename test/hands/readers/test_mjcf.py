@@ -1,7 +1,5 @@
 """MJCF and trees at random move as in MuJoCo and are given a palm and postures; what is not read is refused by name."""
 
-from __future__ import annotations
-
 import importlib
 import re
 from pathlib import Path

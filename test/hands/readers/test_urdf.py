@@ -1,7 +1,5 @@
 """Each URDF loads as its author meant it, coupled joints included, or is refused by one line that names the element."""
 
-from __future__ import annotations
-
 import json
 from pathlib import Path
 

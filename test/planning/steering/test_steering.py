@@ -1,7 +1,5 @@
 """Grasps come from where they are asked to, touch regions that they are asked to, and enter no avoided box."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Matrices of messages, results in another frame, /tf over DDS, and where the arm stands that carries the hand."""
 
-from __future__ import annotations
-
 import math
 import os
 import subprocess

@@ -1,7 +1,5 @@
 """From messages to requests: what is checked, where meshes may lie, the sources, and wishes for place and direction."""
 
-from __future__ import annotations
-
 import array
 import math
 from dataclasses import replace

@@ -1,7 +1,5 @@
 """Layouts of clouds and depth images, their cameras, and where a cloud's camera stood."""
 
-from __future__ import annotations
-
 import array
 from typing import Any
 

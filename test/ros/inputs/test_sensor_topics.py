@@ -1,7 +1,5 @@
 """Topics of sensors over DDS, from processes of their own: large clouds, what is offered, what is lost or missing."""
 
-from __future__ import annotations
-
 import os
 import subprocess
 import sys

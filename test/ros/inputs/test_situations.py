@@ -1,7 +1,5 @@
 """The table of situations by way of the node, over DDS: the answer that the library gives, or a refusal by name."""
 
-from __future__ import annotations
-
 import re
 from collections.abc import Callable, Iterator
 from pathlib import Path

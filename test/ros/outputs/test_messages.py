@@ -1,7 +1,5 @@
 """What the node publishes on a grasp, over DDS; and its markers."""
 
-from __future__ import annotations
-
 import array
 import dataclasses
 

@@ -1,7 +1,5 @@
 """A grasp as MoveIt's message: every field as MoveIt reads it, and what is refused."""
 
-from __future__ import annotations
-
 import math
 import sys
 from copy import deepcopy

@@ -1,7 +1,5 @@
 """Answers, events, poses, joint values and health."""
 
-from __future__ import annotations
-
 import dataclasses
 import json
 import subprocess

@@ -1,7 +1,5 @@
 """The second simulator: the model's hand, the hold trial's verdicts, displacements against falls on paper."""
 
-from __future__ import annotations
-
 import pickle
 from dataclasses import replace
 
