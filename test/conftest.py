@@ -130,3 +130,11 @@ def bytecodes() -> Callable[[Callable[[], Any]], int]:
         return ran
 
     return bytecodes
+
+
+@pytest.fixture(scope="session")
+def hand() -> Any:
+    """The hand of the tests that name none."""
+    from graspd_core import load_hand
+
+    return load_hand("allegro_right")

@@ -38,11 +38,6 @@ VERSION_1 = Path(__file__).parent / "data" / "grasps_v1.json"
 
 
 @pytest.fixture(scope="module")
-def hand():
-    return load_hand("allegro_right")
-
-
-@pytest.fixture(scope="module")
 def target():
     return load_scene("shape:box", mass=0.25, friction=0.8, resolution=16).object
 

@@ -6,15 +6,13 @@ import numpy as np
 import pytest
 import torch
 
-from graspd_core import Posture, load_hand, load_scene
+from graspd_core import Posture, hand_names, load_hand, load_scene
 from graspd_core.hands.kinematics import forward, make_kinematics
 from graspd_core.hands.link_distance import CollisionTensors, make_collision_tensors
 from graspd_core.hands.solid_overlap import solid_overlaps, solid_pairs
 from graspd_core.se3 import SE3
 from graspd_core.verify.hold_trial import set_hand_pose
 from graspd_core.verify.world import PROTOCOLS, build_world, trial_data
-
-HANDS = ("allegro_left", "allegro_right", "barrett_like", "leap_right", "parallel_gripper")
 
 
 def postures_of(hand, count: int) -> np.ndarray:
@@ -40,7 +38,7 @@ def test_known_depths():
     assert two(cylinders, [0, 0], [1, 1], [[0, 0, 0], [0.0, 0.024, 0.0]]).tolist() == pytest.approx([0.006])
 
 
-@pytest.mark.parametrize("name", HANDS)
+@pytest.mark.parametrize("name", hand_names())
 def test_it_is_what_mujoco_finds(name):
     hand, scene = load_hand(name, candidates=8), load_scene("shape:box", resolution=16)
     world = build_world(hand, scene.object, (scene.object.mesh,), PROTOCOLS["standard"])
@@ -62,7 +60,7 @@ def test_it_is_what_mujoco_finds(name):
     assert ((mine > 0.002) == (np.array(found) > 0.002)).mean() > 0.9
 
 
-@pytest.mark.parametrize("name", HANDS[:4])
+@pytest.mark.parametrize("name", hand_names()[:4])
 def test_gradients_are_finite_differences(name):
     hand = load_hand(name, candidates=8)
     kinematics = make_kinematics(hand, "cpu", torch.float64)

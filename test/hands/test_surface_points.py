@@ -42,11 +42,6 @@ AREAS = {
 }
 
 
-@pytest.fixture(scope="module")
-def hand() -> HandModel:
-    return load_hand("allegro_right")
-
-
 def _group_distance(hand: HandModel, points: np.ndarray, links: np.ndarray) -> np.ndarray:
     """Signed distance to the union of each point's rigid group [m]."""
     rotations, translations = link_poses(hand, hand.open_posture)

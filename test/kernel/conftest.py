@@ -7,14 +7,12 @@ import numpy as np
 import pytest
 import torch
 
-from graspd_core import HandModel, Problem, Scene, build_problem, draw_starts, load_hand, load_scene
+from graspd_core import HandModel, Problem, Scene, build_problem, draw_starts, hand_names, load_hand, load_scene
 from graspd_core.config import ProblemConfig
 from graspd_core.optimize.kernel.builds import kernel
 from graspd_core.optimize.loop import moved_along, pack
 from graspd_core.perception.obstacles import make_obstacles
 from graspd_core.types import Plane
-
-HANDS = ("allegro_left", "allegro_right", "barrett_like", "leap_right", "parallel_gripper")
 
 
 @pytest.fixture(scope="session", autouse=True)
@@ -42,7 +40,7 @@ def scenes() -> dict[str, Scene]:
 
 @pytest.fixture(scope="session")
 def hands() -> dict[str, HandModel]:
-    return {name: load_hand(name, candidates=240) for name in HANDS}
+    return {name: load_hand(name, candidates=240) for name in hand_names()}
 
 
 @pytest.fixture(scope="session")

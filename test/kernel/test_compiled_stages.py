@@ -5,11 +5,10 @@ from dataclasses import replace
 import pytest
 import torch
 
+from graspd_core import hand_names
 from graspd_core.config import GraspStagesConfig
 from graspd_core.optimize.grasp_postures import find_pregrasp, nearest_features, self_overlap, settle
 from graspd_core.optimize.loop import Poses, moved_along, unpack
-
-HANDS = ("allegro_left", "allegro_right", "barrett_like", "leap_right", "parallel_gripper")
 
 
 @pytest.fixture
@@ -22,7 +21,7 @@ def grasps_of(problem, rows) -> Poses:
 
 
 @pytest.mark.parametrize("scene", ["mug", "crowded"])
-@pytest.mark.parametrize("hand", HANDS)
+@pytest.mark.parametrize("hand", hand_names())
 def test_a_few_steps_are_torchs_and_all_come_as_far(problem_of, rows_of, torch_alone, hand, scene):
     problem = problem_of(hand, scene)
     poses = grasps_of(problem, rows_of(hand, scene, problem))
@@ -41,7 +40,7 @@ def test_a_few_steps_are_torchs_and_all_come_as_far(problem_of, rows_of, torch_a
 
 
 @pytest.mark.parametrize("scene", ["mug", "crowded"])
-@pytest.mark.parametrize("hand", HANDS)
+@pytest.mark.parametrize("hand", hand_names())
 def test_settling_is_torchs(problem_of, rows_of, torch_alone, hand, scene):
     problem = problem_of(hand, scene)
     poses = grasps_of(problem, rows_of(hand, scene, problem))
@@ -89,7 +88,7 @@ def test_a_pose_that_is_not_a_number_stays_alone(problem_of, rows_of):
     assert share.isfinite().tolist() == others.tolist()
 
 
-@pytest.mark.parametrize("hand", HANDS)
+@pytest.mark.parametrize("hand", hand_names())
 def test_overlap_is_torchs(problem_of, torch_alone, hand):
     problem = problem_of(hand, "box")
     share = torch.rand(24, len(problem.hand.lower), generator=torch.Generator().manual_seed(0))
@@ -102,7 +101,7 @@ def test_overlap_is_torchs(problem_of, torch_alone, hand):
 
 
 @pytest.mark.parametrize("scene", ["mug", "box"])
-@pytest.mark.parametrize("hand", HANDS)
+@pytest.mark.parametrize("hand", hand_names())
 def test_the_sharp_points_nearest_to_solids_are_torchs(problem_of, rows_of, torch_alone, hand, scene):
     problem = problem_of(hand, scene)
     poses = grasps_of(problem, rows_of(hand, scene, problem))

@@ -5,12 +5,9 @@ from dataclasses import asdict, replace
 import pytest
 import torch
 
-from graspd_core import draw_starts, load_hand
+from graspd_core import draw_starts, hand_names, load_hand
 from graspd_core.config import ProblemConfig
-from graspd_core.optimize.closed_form.closed_form import (
-    ClosedForm,
-    weighted,
-)
+from graspd_core.optimize.closed_form.closed_form import ClosedForm, weighted
 from graspd_core.optimize.closed_form.closed_form_config import ClosedFormConfig, LossWeights
 from graspd_core.optimize.kernel import builds
 from graspd_core.optimize.kernel_problem import KernelProblem
@@ -18,7 +15,6 @@ from graspd_core.optimize.loop import moved_along, pack, unpack
 from graspd_core.optimize.losses import hard_contact
 from graspd_core.optimize.problem import Problem, Terms, build_problem, evaluate, least_distance
 
-HANDS = ("allegro_left", "allegro_right", "barrett_like", "leap_right", "parallel_gripper")
 DELTA = 0.006
 # Exploring, refining among sharp points, polishing.
 LOOKS = ({}, {"sharp": True}, {"sharp": True, "fine": True})
@@ -55,7 +51,7 @@ def gradient_of(problem, x, radius, weights: LossWeights, **look) -> torch.Tenso
 
 @pytest.mark.parametrize("look", LOOKS, ids=["coarse", "sharp", "fine"])
 @pytest.mark.parametrize("scene", ["box", "mug", "guessed", "crowded"])
-@pytest.mark.parametrize("hand", HANDS)
+@pytest.mark.parametrize("hand", hand_names())
 def test_it_agrees_with_torch(problem_of, rows_of, hand, scene, look):
     problem = problem_of(hand, scene)
     x = rows_of(hand, scene, problem)

@@ -46,11 +46,6 @@ from graspd_core.verify.trial_registry import grasp_trials
 
 
 @pytest.fixture(scope="session")
-def hand() -> HandModel:
-    return load_hand("allegro_right")
-
-
-@pytest.fixture(scope="session")
 def scene() -> Scene:
     return load_scene("shape:sphere", mass=0.1)
 

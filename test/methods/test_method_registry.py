@@ -15,12 +15,7 @@ from graspd_bench.suites import main_suite
 from graspd_core import Grasp, Verdict, draw_starts, load_hand, load_scene, plan_grasps
 from graspd_core.cli import build_parser
 from graspd_core.errors import ConfigError
-from graspd_core.optimize.candidates import (
-    PlannerInput,
-    PlannerOutput,
-    expected_to_hold,
-    find_candidates,
-)
+from graspd_core.optimize.candidates import PlannerInput, PlannerOutput, expected_to_hold, find_candidates
 from graspd_core.optimize.closed_form.closed_form import ClosedForm
 from graspd_core.optimize.closed_form.closed_form_config import ClosedFormConfig, LossWeights
 from graspd_core.optimize.loop import Hooks, pack

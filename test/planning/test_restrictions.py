@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 import torch
 
-from graspd_core import HandModel, Scene, draw_starts, load_hand, load_scene, plan_grasps
+from graspd_core import HandModel, Scene, draw_starts, load_scene, plan_grasps
 from graspd_core.errors import ConfigError
 from graspd_core.optimize.restrictions import (
     UNRESTRICTED,
@@ -54,11 +54,6 @@ class Every(BoundRestriction):
 
     def admit(self, grasps: Sequence[Grasp]) -> Sequence[Grasp | Refusal]:
         return [Refusal("by number") if i % self.n == 0 else replace(g, score=7.0) for i, g in enumerate(grasps)]
-
-
-@pytest.fixture(scope="module")
-def hand():
-    return load_hand("allegro_right")
 
 
 @pytest.fixture(scope="module")

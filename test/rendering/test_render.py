@@ -10,15 +10,7 @@ from hypothesis import strategies as st
 from graspd_bench.rendering.depth_noise import DEFAULT, HIGH, LEVELS, LOW, NONE, DepthNoise, add_noise
 from graspd_bench.rendering.render import BACKGROUND, look_at, render_depth, render_scene, render_shaded, save_png
 from graspd_bench.rendering.tabletop import CAMERA as D415
-from graspd_bench.rendering.tabletop import (
-    TABLE_HALF,
-    depth_views,
-    lowest_pose,
-    moved,
-    ring_poses,
-    tabletop,
-    views_of,
-)
+from graspd_bench.rendering.tabletop import TABLE_HALF, depth_views, lowest_pose, moved, ring_poses, tabletop, views_of
 from graspd_core.errors import CloudError
 from graspd_core.mesh.shapes import CAPSULE_RADIUS, HEAD_HALF, PLATE_HALF, SHAPES, SPHERE_RADIUS, make_shape
 from graspd_core.perception.cloud.camera import PinholeCamera, camera_rays, cloud_from_depth, project

@@ -16,7 +16,7 @@ from scipy.spatial.transform import Rotation
 from shape_msgs.msg import Plane
 from std_msgs.msg import Header
 
-from graspd_core import GraspResult, HandModel, Outcome, TriangleMesh, hand_mesh, load_hand, load_scene, make_shape
+from graspd_core import GraspResult, HandModel, Outcome, TriangleMesh, hand_mesh, load_scene, make_shape
 from graspd_core.errors import ConfigError, GraspdError, MeshError
 from graspd_core.library.grasp_library import GraspLibrary
 from graspd_core.library.known_grasps import known_or_planned
@@ -29,11 +29,6 @@ from graspd_ros.inputs.solids import Thing
 from graspd_ros.parameters import Settings
 from graspd_ros.request_planner import Planned, Planner
 from graspd_ros.worker import StopHook
-
-
-@pytest.fixture(scope="module")
-def hand() -> HandModel:
-    return load_hand("allegro_right")
 
 
 @pytest.fixture(scope="module")

@@ -10,14 +10,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from bag_writer import (
-    Record,
-    camera_info_message,
-    cloud_message,
-    depth_message,
-    transforms_message,
-    write_bag,
-)
+from bag_writer import Record, camera_info_message, cloud_message, depth_message, transforms_message, write_bag
 from rclpy.qos import DurabilityPolicy, QoSProfile
 from sensor_msgs.msg import CameraInfo, Image, PointCloud2
 

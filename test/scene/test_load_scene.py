@@ -8,7 +8,7 @@ import torch
 from shape_volumes import shape_volume
 
 from graspd_bench.rendering.tabletop import CAMERA, ring_poses, tabletop, views_of
-from graspd_core import PointCloud, Target, load_hand, load_preset, load_scene, make_shape, verify_grasps
+from graspd_core import PointCloud, Target, load_preset, load_scene, make_shape, verify_grasps
 from graspd_core.errors import CloudError, MeshError
 from graspd_core.io.grasps_json import grasps_of, load_document, save_result
 from graspd_core.mesh.mesh_files import save_mesh, surface_samples
@@ -127,11 +127,6 @@ def test_a_far_scene_is_planned_about_its_object():
     assert np.abs(planned.object.mesh.vertices).max() < 0.1
     corner = planned.sdf.origin.new_tensor(planned.object.mesh.vertices)
     assert sample_sdf(planned.sdf, corner)[0].abs().max() < 0.005
-
-
-@pytest.fixture(scope="module")
-def hand():
-    return load_hand("allegro_right")
 
 
 def test_grasps_of_a_far_object_hold_there(hand, tmp_path):

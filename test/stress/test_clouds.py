@@ -10,7 +10,7 @@ import pytest
 from graspd_bench.rendering.depth_noise import DEFAULT, HIGH
 from graspd_bench.rendering.tabletop import CAMERA, TabletopScene, depth_views, ring_poses, tabletop, views_of
 from graspd_bench.stress.broken_clouds import bled
-from graspd_core import Outcome, PointCloud, Verdict, load_hand, plan_grasps, scene_from_views
+from graspd_core import Outcome, PointCloud, Verdict, plan_grasps, scene_from_views
 from graspd_core.errors import NoObjectError
 from graspd_core.mesh.surface_queries import make_surface, surface_distance
 from graspd_core.mesh.topology import is_closed
@@ -21,11 +21,6 @@ POSES = ring_poses(3, elevation=0.7, azimuth=0.5)
 
 # From pixels to a trial, in ten CPU seconds each.
 pytestmark = pytest.mark.timeout(300)
-
-
-@pytest.fixture(scope="module")
-def hand():
-    return load_hand("allegro_right")
 
 
 @pytest.fixture(scope="module")

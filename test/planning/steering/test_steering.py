@@ -35,11 +35,6 @@ def bottle():
     return load_scene("shape:bottle")
 
 
-@pytest.fixture(scope="module")
-def hand():
-    return load_hand("allegro_right")
-
-
 def plan(scene, hand, steering, **settings):
     options = {"count": 3, "preset": "fast", "measure": False, **settings}
     return plan_grasps(scene, hand, restrictions=[steering], **options)
