@@ -193,15 +193,6 @@ def test_momentum_grows_by_the_impulse(seed):
     assert (turning @ body.inertia).numpy() == pytest.approx((STEP * by_hand).numpy(), abs=1e-12)
 
 
-@given(seed=st.integers(0, 2**31))
-def test_opposite_forces_on_one_line_move_nothing(seed):
-    arm, force = RADIUS * drawn(seed, 1, 1, 3), drawn(seed + 1, 1, 1, 1, 3)
-    along = arm + 0.5 * RADIUS * force[:, :, 0]
-    net, torque = net_wrench(torch.cat([force, -force], 1), torch.cat([arm, along], 1))
-    assert net.abs().max() == 0.0
-    assert torque.abs().max() < 1e-12
-
-
 def test_a_turning_body_keeps_its_angular_momentum_to_first_order():
     body = make_body(MASS, INERTIA * np.diag([1.0, 2.0, 3.0]), np.zeros(3), RADIUS, "cpu", torch.float64)
     still, turning = torch.zeros(1, 3, dtype=torch.float64), torch.tensor([[3.0, -2.0, 1.0]], dtype=torch.float64)
@@ -268,16 +259,6 @@ def test_the_support_is_the_best_that_sampled_cone_forces_do(seed):
     # 1e-3 · μ at a contact that hardly moves.
     assert closed == pytest.approx(best, abs=5 * (FRICTION * 1e-3 + 2e-5))
     assert (closed >= best - 1e-9).all()
-
-
-def test_one_push_on_a_plane():
-    up = torch.tensor([[[0.0, 0.0, 1.0]]], dtype=torch.float64)
-    arms, activation = torch.zeros(1, 1, 3, dtype=torch.float64), torch.ones(1, 1, dtype=torch.float64)
-    directions = torch.eye(6, dtype=torch.float64)[[0, 2]]
-    down = -torch.eye(6, dtype=torch.float64)[[2]]
-    support = wrench_support(arms, up, activation, torch.cat([directions, down]), FRICTION)[0]
-    # Sideways friction only, no pull upwards, the whole push downwards; the floor adds 1e-3 · μ where nothing slides.
-    assert support.tolist() == pytest.approx([FRICTION, 0.0, 1.0], abs=1e-3 * FRICTION + 1e-12)
 
 
 @given(seed=st.integers(0, 2**31))

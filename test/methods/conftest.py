@@ -4,10 +4,10 @@ from collections.abc import Callable
 
 import pytest
 import torch
+from small_problem import small_problem
 from torch import Tensor
 
-from graspd_core import HandModel, Poses, Problem, Scene, build_problem, load_hand, load_scene
-from graspd_core.config import ProblemConfig
+from graspd_core import HandModel, Poses, Problem, Scene, load_hand, load_scene
 from graspd_core.optimize.graspd2022.graspd2022 import Graspd2022, make_body, published_starts
 from graspd_core.optimize.graspd2022.graspd2022_config import Graspd2022Config
 
@@ -29,13 +29,7 @@ def problem_of(hand: HandModel, scenes: dict[str, Scene]) -> Callable[[str, torc
 
     def problem_of(name: str, dtype: torch.dtype = torch.float64) -> Problem:
         if (name, dtype) not in built:
-            built[name, dtype] = build_problem(
-                scenes[name],
-                hand,
-                ProblemConfig(candidates=60, features=24, directions=12, friction=0.5),
-                seed=0,
-                dtype=dtype,
-            )
+            built[name, dtype] = small_problem(scenes[name], hand, dtype)
         return built[name, dtype]
 
     return problem_of

@@ -9,6 +9,7 @@ import pytest
 import torch
 from hypothesis import given
 from hypothesis import strategies as st
+from small_problem import small_problem
 
 from graspd_bench.baselines.annealing import (
     AnnealingConfig,
@@ -31,7 +32,7 @@ from graspd_core.optimize.grasp_postures import ContactSet, hand_distance
 from graspd_core.optimize.loop import Hooks, Poses, minimise
 from graspd_core.optimize.losses import disturbance_directions
 from graspd_core.optimize.obstacle_distance import obstacle_gaps
-from graspd_core.optimize.problem import Problem, build_problem
+from graspd_core.optimize.problem import Problem
 from graspd_core.perception.scene import Scene, build_scene
 from graspd_core.se3 import rotation_from_quaternion
 from graspd_core.types import Plane, TriangleMesh
@@ -316,12 +317,6 @@ def cube_scene(half: float, shift: float = 0.0) -> Scene:
     box = make_shape("box")
     unit = 2 * (box.vertices - box.vertices.min(0)) / np.ptp(box.vertices, axis=0) - 1
     return build_scene(TriangleMesh(unit * half + np.array([shift, 0.0, 0.02]), box.faces), resolution=48)
-
-
-def small_problem(scene: Scene, hand: HandModel) -> Problem:
-    return build_problem(
-        scene, hand, ProblemConfig(candidates=60, features=24, directions=12, friction=0.5), seed=0, dtype=DOUBLE
-    )
 
 
 def closed(scene: Scene, hand: HandModel, starts: Poses) -> tuple[Problem, Closing, Poses]:

@@ -28,36 +28,33 @@ from graspd_core.optimize.graspd2022.graspd2022 import (
     plan,
     published_starts,
 )
-from graspd_core.optimize.graspd2022.graspd2022_config import Graspd2022Config, LevelSetConfig
+from graspd_core.optimize.graspd2022.graspd2022_config import Graspd2022Config
 from graspd_core.optimize.loop import Hooks, minimise, pack, unpack
 from graspd_core.optimize.problem import hand_forward
 from graspd_core.se3 import rotation_from_quaternion
 
-SHORT = Graspd2022Config(steps=12, level_set=LevelSetConfig(coarse_steps=6))
 
-
-def changed(config: Graspd2022Config, **changes: Any) -> Graspd2022Config:
-    """The settings with some changed, each by its dotted name with two underscores for a dot."""
-    for name, value in changes.items():
-        group, _, rest = name.partition("__")
-        config = replace(config, **{group: replace(getattr(config, group), **{rest: value}) if rest else value})
-    return config
+def short(changes: Mapping[str, Any]) -> Graspd2022Config:
+    """The paper's settings in twelve steps, with some changed, each by its dotted name."""
+    changes = {"steps": 12, "level_set.coarse_steps": 6, **changes}
+    paper = PlanConfig(method="graspd2022")
+    return override(paper, {f"graspd2022.{name}": value for name, value in changes.items()}).settings
 
 
 VARIANTS = {
-    "force": SHORT,
-    "wrench": changed(SHORT, relaxation__desired="wrench"),
-    "cone": changed(SHORT, relaxation__desired="cone", simulation__scaling="object", contact__stiffness=1e3),
-    "direct": changed(SHORT, relaxation__enabled=False),
-    "code": changed(
-        SHORT,
-        relaxation__desired="wrench",
-        pose_steps__optimiser="adam",
-        pose_steps__in_turns=True,
-        pose_steps__within_limits=True,
-        warm_up=3,
-    ),
+    "force": {},
+    "wrench": {"relaxation.desired": "wrench"},
+    "cone": {"relaxation.desired": "cone", "simulation.scaling": "object", "contact.stiffness": 1e3},
+    "direct": {"relaxation.enabled": False},
+    "code": {
+        "relaxation.desired": "wrench",
+        "pose_steps.optimiser": "adam",
+        "pose_steps.in_turns": True,
+        "pose_steps.within_limits": True,
+        "warm_up": 3,
+    },
 }
+SHORT = short({})
 
 
 def draw(seed: int, *shape: int) -> Tensor:
@@ -127,7 +124,7 @@ def test_desired_forces_that_balance_the_momentum_leave_no_motion(solver_of):
 
 
 def test_gradients_of_motion_and_physics(solver_of):
-    solver = solver_of(changed(SHORT, simulation__scaling="object"))
+    solver = solver_of(short({"simulation.scaling": "object"}))
 
     def cost(forces: Tensor, arms: Tensor) -> Tensor:
         left = motion_left(solver.body, forces, arms, solver.velocities, solver.time_step)
@@ -139,7 +136,9 @@ def test_gradients_of_motion_and_physics(solver_of):
 @pytest.mark.parametrize("name", VARIANTS)
 def test_gradients_of_the_whole_evaluation(name, problem, starts, solver_of, slope_errors):
     # Without a leak, and with the hand partly below the level set; the leak's own gradient is tested in test_forces.py.
-    solver = solver_of(changed(VARIANTS[name], contact__leak=0.0, simulation__scaling="object", contact__stiffness=1e3))
+    solver = solver_of(
+        short({**VARIANTS[name], "contact.leak": 0.0, "simulation.scaling": "object", "contact.stiffness": 1e3})
+    )
     x = pack(starts)
     components = 6 if solver.config.relaxation.desired == "wrench" else 3
     desired = 0.1 * draw(0, len(x), len(problem.hand.coarse.links), 3, components)
@@ -155,7 +154,7 @@ def test_gradients_of_the_whole_evaluation(name, problem, starts, solver_of, slo
 
 
 def test_the_task_is_a_matter_of_the_forces_not_of_the_pose(problem, starts, solver_of):
-    solver = solver_of(VARIANTS["cone"])
+    solver = solver_of(short(VARIANTS["cone"]))
     x = pack(starts).requires_grad_(True)
     desired = (0.1 * draw(0, len(x), len(problem.hand.coarse.links), 3, 3)).requires_grad_(True)
     task = solver.evaluate(problem, x, desired, x.detach().new_zeros(len(x))).task
@@ -192,8 +191,8 @@ def run(config, problem, starts, solver_of, **hooks) -> tuple[Tensor, Tensor]:
 
 @pytest.mark.parametrize("name", VARIANTS)
 def test_the_same_seed_gives_the_same_bits_and_nothing_is_not_a_number(name, problem, starts, solver_of):
-    once, loss = run(VARIANTS[name], problem, starts, solver_of)
-    again, _ = run(VARIANTS[name], problem, starts, solver_of)
+    once, loss = run(short(VARIANTS[name]), problem, starts, solver_of)
+    again, _ = run(short(VARIANTS[name]), problem, starts, solver_of)
     assert torch.equal(once, again)
     assert torch.isfinite(once).all()
     assert torch.isfinite(loss).all()
@@ -204,14 +203,16 @@ def test_the_same_seed_gives_the_same_bits_and_nothing_is_not_a_number(name, pro
 @pytest.mark.parametrize("name", VARIANTS)
 def test_it_brings_its_own_cost_down(name, problem, starts, solver_of):
     # On a fixed level set that the hands already touch.
-    config = changed(
-        VARIANTS[name],
-        steps=60,
-        level_set__coarse_steps=0,
-        simulation__scaling="object",
-        contact__stiffness=1e3,
-        relaxation__force_rate=0.05,
-        initial__kind="hull",
+    config = short(
+        {
+            **VARIANTS[name],
+            "steps": 60,
+            "level_set.coarse_steps": 0,
+            "simulation.scaling": "object",
+            "contact.stiffness": 1e3,
+            "relaxation.force_rate": 0.05,
+            "initial.kind": "hull",
+        }
     )
     near = replace(starts, translation=0.6 * starts.translation)
     first = run(replace(config, steps=1), problem, near, solver_of)[1]
@@ -220,7 +221,7 @@ def test_it_brings_its_own_cost_down(name, problem, starts, solver_of):
 
 
 def test_desired_forces_of_the_cone_stay_in_it(problem, starts, solver_of):
-    solver = solver_of(changed(VARIANTS["cone"], relaxation__force_rate=0.05))
+    solver = solver_of(short({**VARIANTS["cone"], "relaxation.force_rate": 0.05}))
     state = solver.init(problem, starts)
     for index in range(5):
         before = state
@@ -241,7 +242,7 @@ def test_the_level_set_falls_to_the_surface_and_only_then_is_judged(problem, sta
         assert not torch.isfinite(state.best_loss).any()
     state = solver.step(problem, state, SHORT.level_set.coarse_steps)
     assert torch.isfinite(state.best_loss).all()
-    by_code = solver_of(changed(SHORT, level_set__schedule="code")).init(problem, starts).radius
+    by_code = solver_of(short({"level_set.schedule": "code"})).init(problem, starts).radius
     placed = hand_forward(problem, problem.hand.coarse, starts)
     nearest = sample_sdf(problem.object.sdf, placed.points)[0].amin(-1)
     assert by_code.numpy() == pytest.approx((nearest - 0.01).clamp_min(0.0).numpy())
@@ -252,7 +253,7 @@ def test_the_level_set_falls_to_the_surface_and_only_then_is_judged(problem, sta
 
 
 def test_the_best_iterate_is_kept_or_the_last(problem, starts, solver_of):
-    wild = changed(VARIANTS["cone"], steps=20, level_set__coarse_steps=0, pose_rate=0.2)
+    wild = short({**VARIANTS["cone"], "steps": 20, "level_set.coarse_steps": 0, "pose_rate": 0.2})
     _, best = run(wild, problem, starts, solver_of)
     _, last = run(replace(wild, keep="last"), problem, starts, solver_of)
     assert (best <= last).all()
@@ -287,15 +288,6 @@ def test_presets_name_this_method_and_change_what_they_say():
     assert mine["graspd2022_no_coarse_to_fine"].settings.level_set.coarse_steps == 0
     assert not mine["graspd2022_no_relaxation"].settings.relaxation.enabled
     assert mine["graspd2022_no_leak"].settings.contact.leak == 0.0
-
-
-PAPER = PlanConfig(method="graspd2022")
-
-
-def short(changes: Mapping[str, Any]) -> Graspd2022Config:
-    """The paper's settings in twelve steps, with some changed, each by its dotted name."""
-    changes = {"steps": 12, "level_set.coarse_steps": 6, **changes}
-    return override(PAPER, {f"graspd2022.{name}": value for name, value in changes.items()}).settings
 
 
 def test_adam_is_that_of_torch():

@@ -7,16 +7,17 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 import torch
+from small_problem import small_problem
 
 from graspd_core import Scene, draw_starts, load_hand
-from graspd_core.config import GraspStagesConfig, ProblemConfig
+from graspd_core.config import GraspStagesConfig
 from graspd_core.hands.model import METRES_PER_RADIAN, HandModel
 from graspd_core.optimize import loop
 from graspd_core.optimize.closed_form.closed_form import ClosedForm, adam_step, weighted
 from graspd_core.optimize.closed_form.closed_form_config import ClosedFormConfig
 from graspd_core.optimize.grasp_postures import find_contacts, squeeze
 from graspd_core.optimize.loop import Hooks, Poses, minimise, pack, unpack
-from graspd_core.optimize.problem import Problem, build_problem, evaluate
+from graspd_core.optimize.problem import evaluate
 from graspd_core.se3 import rotation_from_quaternion
 
 CONFIG = ClosedFormConfig(explore_steps=4, refine_steps=2, polish_steps=4)
@@ -137,12 +138,6 @@ def gripper() -> HandModel:
     return load_hand("parallel_gripper", candidates=150)
 
 
-def problem_with(hand: HandModel, scene: Scene) -> Problem:
-    return build_problem(
-        scene, hand, ProblemConfig(candidates=80, features=24, directions=12, friction=0.5), seed=0, dtype=DOUBLE
-    )
-
-
 def rebased(hand: HandModel, shift: np.ndarray) -> HandModel:
     """The same hand with its base frame's origin moved by −shift [m]."""
     roots = hand.link_parent == 0
@@ -167,8 +162,8 @@ def test_the_solver_does_not_see_where_a_far_base_frame_is(gripper: HandModel, s
         return poses.translation + sign * rotation_from_quaternion(poses.quaternion) @ offset
 
     begun = Poses(base_of(starts, -1.0), starts.quaternion, starts.joints)
-    here = minimise(ClosedForm(FEW_STEPS, 4), problem_with(gripper, scenes["box"]), starts, Hooks()).poses
-    there = minimise(ClosedForm(FEW_STEPS, 4), problem_with(moved, scenes["box"]), begun, Hooks()).poses
+    here = minimise(ClosedForm(FEW_STEPS, 4), small_problem(scenes["box"], gripper), starts, Hooks()).poses
+    there = minimise(ClosedForm(FEW_STEPS, 4), small_problem(scenes["box"], moved), begun, Hooks()).poses
     assert not torch.allclose(here.translation, starts.translation, atol=1e-3)
     # 1e-6: Adam divides by gradients that may be as small as rounding.
     torch.testing.assert_close(base_of(there, 1.0), here.translation, atol=1e-6, rtol=0)
@@ -181,7 +176,7 @@ def test_a_hand_whose_base_lies_in_its_palm_turns_about_that(problem_of) -> None
 
 
 def test_a_first_step_of_a_sliding_joint_is_its_share_of_a_radian(gripper: HandModel, scenes: dict[str, Scene]) -> None:
-    problem = problem_with(gripper, scenes["box"])
+    problem = small_problem(scenes["box"], gripper)
     solver = ClosedForm(FEW_STEPS, 2)
     middle = Poses(
         torch.zeros(2, 3, dtype=DOUBLE),
@@ -195,7 +190,7 @@ def test_a_first_step_of_a_sliding_joint_is_its_share_of_a_radian(gripper: HandM
 
 
 def test_a_sliding_joint_is_told_to_go_on_by_force_over_stiffness(gripper: HandModel, scenes: dict[str, Scene]) -> None:
-    problem = problem_with(gripper, scenes["sphere"])
+    problem = small_problem(scenes["sphere"], gripper)
     # Jaws on either side of the ball of 35 mm, the palm 7 mm off.
     poses = Poses(
         torch.tensor([[0.0, 0.0, -0.132]], dtype=DOUBLE),

@@ -8,6 +8,7 @@ import pytest
 import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from small_problem import small_problem
 
 from graspd_core import PlanConfig, Scene, draw_starts, hand_names, load_hand
 from graspd_core.config import ProblemConfig
@@ -24,7 +25,7 @@ from graspd_core.optimize.obstacle_distance import (
     make_obstacle_tensors,
     obstacle_gaps,
 )
-from graspd_core.optimize.problem import Problem, build_problem, evaluate, make_hand_tensors, make_object_tensors
+from graspd_core.optimize.problem import evaluate, make_hand_tensors, make_object_tensors
 from graspd_core.perception.obstacles import make_obstacles
 from graspd_core.se3 import SE3, rotation_from_quaternion
 from graspd_core.types import Plane, Posture
@@ -43,16 +44,6 @@ def beside(scene: Scene, x: float) -> Scene:
     y, z = np.meshgrid(np.linspace(-0.05, 0.05, 15), np.linspace(-0.045, 0.055, 15))
     wall = np.column_stack([np.full(y.size, x), y.ravel(), z.ravel()])
     return replace(scene, obstacles=make_obstacles([wall], scene.support, scene.object.mesh, 10.0))
-
-
-def problem(scene: Scene, hand, **more) -> Problem:
-    return build_problem(
-        scene,
-        hand,
-        ProblemConfig(candidates=60, features=24, directions=12, friction=0.5, **more),
-        seed=0,
-        dtype=DOUBLE,
-    )
 
 
 def lowest(hand, posture: Posture, plane: Plane) -> float:
@@ -74,7 +65,7 @@ def test_depth_in_a_half_space_is_that_of_the_hands_meshes(hand, scenes, seed: i
     obstacles = make_obstacle_tensors(replace(scenes["box"], support=plane), hand, "cpu", DOUBLE)
     assert obstacles is not None
     base = SE3(rotation_from_quaternion(torch.as_tensor(quaternion)), torch.as_tensor(posture.position))[None]
-    links = forward(problem(scenes["box"], hand).hand.kinematics, torch.as_tensor(joints)[None])
+    links = forward(small_problem(scenes["box"], hand).hand.kinematics, torch.as_tensor(joints)[None])
     gaps = obstacle_gaps(obstacles, base, links)
     # Meshes of round solids are inscribed: facets cut off up to half a millimetre of a fingertip.
     assert float(gaps.min()) == pytest.approx(lowest(hand, posture, plane), abs=5e-4)
@@ -85,7 +76,7 @@ def test_gaps_up_to_the_widest_are_exact_and_wider_ones_are_known_to_be(hand, sc
     obstacles = make_obstacle_tensors(scene, hand, "cpu", DOUBLE)
     assert obstacles is not None
     starts = draw_starts(scenes["box"], hand, 6, 0, "cpu", DOUBLE)
-    links = forward(problem(scene, hand).hand.kinematics, starts.joints)
+    links = forward(small_problem(scene, hand).hand.kinematics, starts.joints)
     base = starts.base
     balls = [(obstacles.corner_matrix, obstacles.corner_radii), (obstacles.sphere_matrix, obstacles.sphere_radii)]
     whole = [sample_sdf(obstacles.sdfs[0], base.apply(place_points(at, links)))[0] - radii for at, radii in balls]
@@ -108,7 +99,7 @@ def test_the_least_gap_is_the_least_of_all_gaps(hand, scenes):
     turns = rng.normal(size=(300, 4))
     rotation = rotation_from_quaternion(torch.as_tensor(turns / np.linalg.norm(turns, axis=1, keepdims=True)))
     base = SE3(rotation, torch.as_tensor(rng.normal(size=(300, 3)) * 0.1))
-    links = forward(problem(scene, hand).hand.kinematics, torch.as_tensor(joints))
+    links = forward(small_problem(scene, hand).hand.kinematics, torch.as_tensor(joints))
     every = obstacle_gaps(obstacles, base, links).amin(-1)
     assert bool((every < 0).any())
     assert bool((every > WIDE).any() or (every == WIDE).any())
@@ -116,22 +107,22 @@ def test_the_least_gap_is_the_least_of_all_gaps(hand, scenes):
 
 
 def test_a_free_object_pays_nothing(hand, scenes):
-    free = problem(scenes["box"], hand)
+    free = small_problem(scenes["box"], hand)
     assert (free.obstacles, free.object.confidence) == (None, None)
     starts = draw_starts(scenes["box"], hand, 3, 0, "cpu", DOUBLE)
     terms = evaluate(free, starts, torch.zeros(3, dtype=DOUBLE), 0.004)
     assert terms.obstacle is None
     # A wall that no hand on the object could touch is no obstacle either.
     far = hand_reach(hand) + RETREAT + 0.05
-    assert problem(beside(scenes["box"], far + 0.03), hand).obstacles is None
-    assert problem(beside(scenes["box"], far - 0.1), hand).obstacles is not None
+    assert small_problem(beside(scenes["box"], far + 0.03), hand).obstacles is None
+    assert small_problem(beside(scenes["box"], far - 0.1), hand).obstacles is not None
 
 
 def test_obstacles_leave_the_other_terms_alone(hand, scenes):
     starts = draw_starts(scenes["box"], hand, 4, 0, "cpu", DOUBLE)
     arguments = (starts, torch.zeros(4, dtype=DOUBLE), 0.004)
-    free = evaluate(problem(scenes["box"], hand), *arguments)
-    among = evaluate(problem(beside(on_table(scenes["box"]), 0.1), hand), *arguments)
+    free = evaluate(small_problem(scenes["box"], hand), *arguments)
+    among = evaluate(small_problem(beside(on_table(scenes["box"]), 0.1), hand), *arguments)
     for name in free._fields[:-1]:
         assert torch.equal(getattr(free, name), getattr(among, name))
 
@@ -140,7 +131,7 @@ def test_obstacles_leave_the_other_terms_alone(hand, scenes):
 @pytest.mark.parametrize("kind", ["table", "wall"])
 def test_gradients_of_the_obstacle_term(hand, scenes, slope_errors, kind: str, fine: bool):
     scene = on_table(scenes["box"]) if kind == "table" else beside(scenes["box"], 0.06)
-    built = problem(scene, hand)
+    built = small_problem(scene, hand)
     x = pack(draw_starts(scenes["box"], hand, 6, 3, "cpu", DOUBLE))
 
     def term(y: torch.Tensor) -> torch.Tensor:
@@ -160,9 +151,11 @@ def test_trust_scales_what_a_contact_counts(hand, scenes):
     x = draw_starts(scenes["box"], hand, 4, 0, "cpu", DOUBLE)
     arguments = (x, torch.zeros(4, dtype=DOUBLE), 0.02)
     ones = torch.ones_like(scenes["box"].sdf.field[0])
-    known = evaluate(problem(scenes["box"], hand), *arguments)
-    seen = evaluate(problem(replace(scenes["box"], confidence=ones), hand, confidence_floor=0.4), *arguments)
-    guessed = evaluate(problem(replace(scenes["box"], confidence=0 * ones), hand, confidence_floor=0.4), *arguments)
+    known = evaluate(small_problem(scenes["box"], hand), *arguments)
+    seen, guessed = (
+        evaluate(small_problem(replace(scenes["box"], confidence=values), hand, confidence_floor=0.4), *arguments)
+        for values in (ones, 0 * ones)
+    )
     # Interpolating ones leaves rounding.
     assert seen.wrench_resistance.tolist() == pytest.approx(known.wrench_resistance.tolist(), rel=1e-12)
     # The support falls to 0.4 of itself, and its logarithm by −log 0.4, but for the floor that keeps it finite.
@@ -203,7 +196,7 @@ def test_no_candidate_reaches_through_the_table_or_a_wall(hand, scenes):
     assert found.grasps
     obstacles = make_obstacle_tensors(scene, hand, "cpu", DOUBLE)
     assert obstacles is not None
-    kinematics = problem(scene, hand).hand.kinematics
+    kinematics = small_problem(scene, hand).hand.kinematics
     for grasp in found.grasps:
         for posture in (grasp.pregrasp, grasp.grasp):
             assert lowest(hand, posture, scene.support) > -0.0016

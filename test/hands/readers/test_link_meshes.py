@@ -4,6 +4,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import trimesh
 
 from graspd_core import HandModel, TriangleMesh, make_shape, save_mesh
 from graspd_core.errors import HandError
@@ -126,16 +127,10 @@ def hand_of(folder: Path, mesh: TriangleMesh, scale: str, prefix: str = ""):
     return load_hand(folder / "hand.urdf", candidates=50, prefix=prefix)
 
 
-def fine_ring() -> TriangleMesh:
-    import trimesh
-
-    ring = trimesh.creation.torus(0.04, 0.01, major_sections=100, minor_sections=60)
-    return TriangleMesh(np.array(ring.vertices), np.array(ring.faces, dtype=np.int64))
-
-
 @pytest.mark.parametrize("prefix", ["", "left_"])
 def test_a_mesh_is_drawn_whole_and_bounded_and_other_links_as_they_collide(tmp_path: Path, prefix: str):
-    ring = fine_ring()
+    torus = trimesh.creation.torus(0.04, 0.01, major_sections=100, minor_sections=60)
+    ring = TriangleMesh(np.array(torus.vertices), np.array(torus.faces, dtype=np.int64))
     assert len(ring.faces) > 8000
     hand = hand_of(tmp_path, ring, "0.5 0.5 -0.5", prefix)
     drawn = visual_solids(hand, prefix)
