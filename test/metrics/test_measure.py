@@ -14,10 +14,9 @@ from scipy.spatial import ConvexHull
 from graspd_bench.studies.human_hand import CONTACT_DISTANCES, measure_skin
 from graspd_core import HandModel, load_hand, make_shape
 from graspd_core.hands.link_distance import depth_inside
-from graspd_core.mesh.mesh_files import content_hash, mass_properties
 from graspd_core.mesh.surface_queries import make_distance_query
 from graspd_core.optimize.kernel.builds import kernel
-from graspd_core.perception.scene import ObjectModel
+from graspd_core.perception.scene import ObjectModel, build_scene
 from graspd_core.se3 import quaternion_from_rotation, random_rotations
 from graspd_core.types import Grasp, GraspMetrics, Posture, TriangleMesh
 from graspd_core.verify.metrics import distinct, measure
@@ -80,17 +79,9 @@ def box() -> TriangleMesh:
     return make_shape("box")
 
 
-@pytest.fixture(scope="session")
-def as_object() -> Callable[[TriangleMesh], ObjectModel]:
+def as_object(mesh: TriangleMesh) -> ObjectModel:
     """A mesh as an object of 100 g and friction 0.6."""
-
-    def build(mesh: TriangleMesh) -> ObjectModel:
-        volume, center, inertia = mass_properties(mesh)
-        radius = float(np.linalg.norm(mesh.vertices - center, axis=1).max())
-        sha256 = content_hash(mesh)
-        return ObjectModel("mesh", sha256, mesh, volume, 0.1, center, inertia * (0.1 / volume), 0.6, 1.0, radius, ())
-
-    return build
+    return build_scene(mesh, mass=0.1, resolution=8).object
 
 
 @pytest.fixture(scope="session")
@@ -113,7 +104,7 @@ def area_noise(area: float) -> float:
 
 
 @pytest.mark.parametrize("depth", [0.005, 0.012])
-def test_a_block_sunk_into_a_flat_face(depth, block, box, as_object, at):
+def test_a_block_sunk_into_a_flat_face(depth, block, box, at):
     context = make_metrics_context(as_object(box), block)
     placed = placed_hand(context, at((0.05 - depth, 0, 0), (0.0,)))
     # The whole end of 30 x 20 mm lies `depth` below the face; Embree counts in float32.
@@ -130,7 +121,7 @@ def test_a_block_sunk_into_a_flat_face(depth, block, box, as_object, at):
 
 
 @pytest.mark.parametrize("gap", [0.001, 0.003])
-def test_a_block_before_a_face_touches_only_within_two_millimetres(gap, block, box, as_object, at):
+def test_a_block_before_a_face_touches_only_within_two_millimetres(gap, block, box, at):
     context = make_metrics_context(as_object(box), block)
     placed = placed_hand(context, at((0.05 + gap, 0, 0), (0.0,)))
     assert penetration(context, placed) == 0.0
@@ -143,14 +134,14 @@ def test_a_block_before_a_face_touches_only_within_two_millimetres(gap, block, b
 
 @settings(max_examples=10)
 @given(depth=st.floats(1e-5, 0.002), across=st.floats(-0.001, 0.001))
-def test_a_flat_overlap_counts_however_thin_it_is(depth, across, block, box, as_object, at):
+def test_a_flat_overlap_counts_however_thin_it_is(depth, across, block, box, at):
     context = make_metrics_context(as_object(box), block)
     placed = placed_hand(context, at((0.05 - depth, across, across), (0.0,)))
     # But for a rim of cells that the sides cut.
     assert intersection_volume(context, placed) == pytest.approx(depth * 0.03 * 0.02, rel=0.1)
 
 
-def test_the_overlap_with_a_thin_rod_is_counted_deep_inside_the_hand(block, box, as_object, at):
+def test_the_overlap_with_a_thin_rod_is_counted_deep_inside_the_hand(block, box, at):
     # Three millimetres square, right through the block's 20 mm: most of it is far from the hand's surface.
     rod = TriangleMesh(box.vertices * np.array([0.0015, 0.0015, 0.045]) / np.array([0.03, 0.03, 0.045]), box.faces)
     context = make_metrics_context(as_object(rod), block)
@@ -159,7 +150,7 @@ def test_the_overlap_with_a_thin_rod_is_counted_deep_inside_the_hand(block, box,
     assert intersection_volume(context, placed) == pytest.approx(3 * 3 * 20 * MM3, rel=0.15)
 
 
-def test_a_slanted_overlap_is_within_the_cells_error(block, box, as_object, at):
+def test_a_slanted_overlap_is_within_the_cells_error(block, box, at):
     context = make_metrics_context(as_object(box), block)
     # About z by 45°: a corner of the block goes in. Depth t of a right-angled edge over 20 mm: t² · 20 mm.
     turn = np.deg2rad(45.0)
@@ -173,7 +164,7 @@ def test_a_slanted_overlap_is_within_the_cells_error(block, box, as_object, at):
     assert penetration(context, placed) == pytest.approx(depth, abs=0.0005)
 
 
-def test_fingers_that_pass_through_each_other(gripper, box, as_object, at):
+def test_fingers_that_pass_through_each_other(gripper, box, at):
     context = make_metrics_context(as_object(box), gripper)
     far = (0.0, 0.0, 1.0)
     # Inner faces are 45 mm − q from the middle: at 46 mm each is 2 mm inside the other finger.
@@ -195,7 +186,7 @@ SOLIDS = """<robot name="solids"><link name="base">
 
 
 @pytest.mark.parametrize("where", [(0.0, 0.0, 0.0), (0.02, 0.01, -0.05), (0.025, 0.025, 0.0)])
-def test_what_solids_of_every_kind_share_with_an_object_is_that_of_small_voxels(where, box, as_object, at, tmp_path):
+def test_what_solids_of_every_kind_share_with_an_object_is_that_of_small_voxels(where, box, at, tmp_path):
     trimesh.creation.icosphere(subdivisions=1, radius=0.015).export(tmp_path / "lump.stl")
     (tmp_path / "hand.urdf").write_text(SOLIDS)
     hand = load_hand(tmp_path / "hand.urdf", candidates=8)
@@ -271,7 +262,7 @@ def some(value: float | None) -> float:
     return value
 
 
-def test_a_gripper_about_a_box_closes_and_one_finger_does_not(gripper, box, as_object, at):
+def test_a_gripper_about_a_box_closes_and_one_finger_does_not(gripper, box, at):
     context = make_metrics_context(as_object(box), gripper)
     # Inner faces 45 mm − q from the middle: at 14.5 mm half a millimetre from the box's 30 mm.
     both = measure(context, at((0, 0, -0.05), (0.0145, 0.0145)))
@@ -286,12 +277,12 @@ def test_a_gripper_about_a_box_closes_and_one_finger_does_not(gripper, box, as_o
     assert one["epsilon"] == 0.0
 
 
-def test_nothing_touched_is_all_zero(gripper, box, as_object, at):
+def test_nothing_touched_is_all_zero(gripper, box, at):
     metrics = measure(make_metrics_context(as_object(box), gripper), at((0, 0, 1.0), (0.0, 0.0)))
     assert all(value in (0.0, None) for value in metrics.values())
 
 
-def test_the_same_posture_measures_the_same_by_any_judge(gripper, box, as_object, at):
+def test_the_same_posture_measures_the_same_by_any_judge(gripper, box, at):
     posture = at((0.003, 0.001, -0.05), (0.016, 0.015))
     contexts = [make_metrics_context(as_object(box), gripper) for _ in range(2)]
     assert measure(contexts[0], posture) == measure(contexts[0], posture) == measure(contexts[1], posture)
@@ -299,7 +290,7 @@ def test_the_same_posture_measures_the_same_by_any_judge(gripper, box, as_object
 
 @settings(max_examples=8)
 @given(seed=st.integers(0, 2**31))
-def test_moving_object_and_hand_together_changes_nothing(seed, gripper, box, as_object, at):
+def test_moving_object_and_hand_together_changes_nothing(seed, gripper, box, at):
     rotation = random_rotations(1, torch.Generator().manual_seed(seed), torch.float64)[0].numpy()
     shift = np.random.default_rng(seed).uniform(-0.5, 0.5, 3)
     # Not flush with anything, so that no sample or voxel sits on a border.
@@ -322,7 +313,7 @@ def test_moving_object_and_hand_together_changes_nothing(seed, gripper, box, as_
     assert there["epsilon"] == pytest.approx(here["epsilon"], rel=0.09)
 
 
-def test_normals_point_out_on_either_side_of_the_surface(gripper, box, as_object):
+def test_normals_point_out_on_either_side_of_the_surface(gripper, box):
     context = make_metrics_context(as_object(box), gripper)
     points = np.array([[0.031, 0, 0], [0.029, 0, 0], [0, -0.031, 0.01], [0, 0, 0.046], [0.03, 0.01, 0.01]])
     expected = np.array([[1, 0, 0], [1, 0, 0], [0, -1, 0], [0, 0, 1], [1, 0, 0]])
@@ -330,7 +321,7 @@ def test_normals_point_out_on_either_side_of_the_surface(gripper, box, as_object
     assert surface_normals(context.query, points) == pytest.approx(expected, abs=1e-4)
 
 
-def test_wider_contacts_about_a_box(gripper, box, as_object, at):
+def test_wider_contacts_about_a_box(gripper, box, at):
     context = make_metrics_context(as_object(box), gripper)
     assert len(context.surface.points) >= 2000
     # Inner faces half a millimetre off. Within 5 mm of the box's planes: the inner faces, 4.5 mm of the sides about
@@ -342,13 +333,13 @@ def test_wider_contacts_about_a_box(gripper, box, as_object, at):
     assert metrics["contact_area_10mm"] == pytest.approx(2 * (0.03 * 0.06 + 0.18 * 0.0095) + strip, rel=0.08)
 
 
-def test_area_over_volume_of_a_block_sunk_into_a_face(block, box, as_object, at):
+def test_area_over_volume_of_a_block_sunk_into_a_face(block, box, at):
     metrics = measure(make_metrics_context(as_object(box), block), at((0.045, 0, 0), (0.0,)))
     # 5 mm deep over 30 x 20 mm; a band of 4 mm about a perimeter of 100 mm is within 2 mm of the face.
     assert metrics["contact_per_volume"] == pytest.approx(0.1 * 0.004 / (0.005 * 0.03 * 0.02), rel=0.2)
 
 
-def test_more_contacts_only_widen_the_wrench_hull(gripper, box, as_object, at):
+def test_more_contacts_only_widen_the_wrench_hull(gripper, box, at):
     context, posture = make_metrics_context(as_object(box), gripper), at((0, 0, -0.05), (0.0145, 0.0145))
     few, many = (measure(context, posture, max_contacts=count) for count in (8, PROTOCOL_CONTACTS))
     # Farthest points are nested: the first eight are among the first 32. Joggled by 1e-10.

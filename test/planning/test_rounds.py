@@ -120,15 +120,6 @@ def test_figures_of_the_benchmark():
     assert correlation(rows, "ranked_by") == pytest.approx((1.0 - 1.0) / 2)
 
 
-@pytest.fixture
-def _one_thread():
-    before = torch.get_num_threads()
-    torch.set_num_threads(1)
-    yield
-    torch.set_num_threads(before)
-
-
-@pytest.mark.usefixtures("_one_thread")
 @pytest.mark.parametrize("preset", ["fast", "random_closure"])
 def test_a_watched_run_ends_as_one_that_nobody_watches(preset: str):
     scene, hand, seen = load_scene("shape:box"), load_hand("parallel_gripper"), list[Snapshot]()
@@ -145,7 +136,6 @@ def test_a_watched_run_ends_as_one_that_nobody_watches(preset: str):
 
 
 def test_hands_are_seen_where_the_object_is_though_it_is_planned_on_about_its_own_centre():
-
     shape, far = make_shape("box"), np.array([40.0, 0.0, 0.0])
     scene, seen = load_scene(TriangleMesh(shape.vertices + far, shape.faces)), list[Snapshot]()
     plan_grasps(scene, load_hand("parallel_gripper"), count=1, preset="fast", measure=False, watch=seen.append)

@@ -7,8 +7,7 @@ import numpy as np
 import pytest
 
 from graspd_core import Grasp, HandModel, Posture, TriangleMesh, load_hand, make_shape
-from graspd_core.mesh.mesh_files import content_hash, mass_properties
-from graspd_core.perception.scene import ObjectModel
+from graspd_core.perception.scene import ObjectModel, build_scene
 from graspd_core.verify.world import World, build_world
 
 FINGER = """
@@ -39,10 +38,7 @@ def cube() -> ObjectModel:
     """A cube of 40 mm and 100 g."""
     box = make_shape("box")
     mesh = TriangleMesh(box.vertices / np.array([0.03, 0.03, 0.045]) * 0.02, box.faces)
-    volume, center, inertia = mass_properties(mesh)
-    radius = float(np.linalg.norm(mesh.vertices, axis=1).max())
-    inertia = inertia * (0.1 / volume)
-    return ObjectModel("cube", content_hash(mesh), mesh, volume, 0.1, center, inertia, 0.6, 1.0, radius, ())
+    return build_scene(mesh, source="cube", mass=0.1, resolution=8).object
 
 
 @pytest.fixture(scope="module")

@@ -27,8 +27,7 @@ from graspd_core.errors import SimulatorError
 from graspd_core.hands.kinematics import forward, make_kinematics
 from graspd_core.hands.model import Mimic
 from graspd_core.hands.readers.xml_io import rotation_from_rpy
-from graspd_core.mesh.mesh_files import content_hash, mass_properties
-from graspd_core.perception.scene import ObjectModel
+from graspd_core.perception.scene import build_scene
 from graspd_core.se3 import quaternion_from_rotation, random_rotations, rotation_from_quaternion
 from graspd_core.verify.hold_trial import DIRECTIONS, hold_trial
 from graspd_core.verify.world import PROTOCOLS, build_world
@@ -112,7 +111,6 @@ def test_both_simulators_keep_coulombs_limit(friction, share, held, world, gripp
     assert first.passed == second.passed == held, (first, second)
 
 
-pytest.importorskip("pybullet")
 STEP, STEPS, GRAVITY = 1 / 240, 35, 9.8
 UP = np.array([1.0, 0.0, 0.0, 0.0])
 
@@ -179,9 +177,7 @@ def test_turning_and_moving_everything_changes_nothing(seed, world, gripper, cub
     rotation = random_rotations(1, torch.Generator().manual_seed(seed), torch.float64)[0].numpy()
     shift = np.random.default_rng(seed).uniform(-0.5, 0.5, 3)
     mesh = TriangleMesh(cube.mesh.vertices @ rotation.T + shift, cube.mesh.faces)
-    volume, center, inertia = mass_properties(mesh)
-    sha256 = content_hash(mesh)
-    turned = ObjectModel("cube", sha256, mesh, volume, 0.1, center, inertia * 0.1 / volume, 0.6, 1.0, cube.radius, ())
+    turned = build_scene(mesh, mass=0.1, resolution=8).object
     here = hand_at(-0.03, 0.0)
     there = Posture(
         rotation @ here.position + shift, quaternion_from_rotation(torch.as_tensor(rotation)).numpy(), np.zeros(2)
