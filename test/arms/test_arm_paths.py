@@ -70,9 +70,7 @@ def test_the_way_of_a_hand_is_that_of_the_trial(hand: HandModel):
 
 
 @pytest.mark.parametrize("away", [0.45, 0.6])
-def test_a_way_goes_where_the_hand_goes_within_limits_without_jump_or_hit(
-    arm: Arm, hand: HandModel, table: Scene, away: float
-):
+def test_a_way_goes_where_the_hand_goes_within_limits_without_jump_or_hit(arm, hand, table, away):
     grasps = [from_above(hand, 0.2, turn) for turn in np.linspace(-3, 3, 7)]
     task = task_of(arm, hand, table, away)
     found = arm_paths(task, grasps)

@@ -64,9 +64,7 @@ def test_faults_are_named():
 
 
 @pytest.mark.timeout(120)
-def test_a_case_ends_in_a_process_of_its_own_and_leaves_nothing_on_disk(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-):
+def test_a_case_ends_in_a_process_of_its_own_and_leaves_nothing_on_disk(tmp_path, monkeypatch):
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
     job = Job("stress", StressRun("too-wide", "fast"), run_stress, "here", alone=True)
     ((_, record),) = run_cases([job], tmp_path / "out", 1)

@@ -137,9 +137,7 @@ BAD: list[tuple[list[str], str]] = [
 
 
 @pytest.mark.parametrize(("options", "culprit"), BAD, ids=lambda value: str(value)[:40])
-def test_a_bad_option_is_named_in_one_line(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str], options: list[str], culprit: str
-):
+def test_a_bad_option_is_named_in_one_line(tmp_path, capsys, options, culprit):
     assert main(["bench", "--out", str(tmp_path / "out"), *options]) == EXIT_BAD_INPUT
     out, err = capsys.readouterr()
     assert (out, err.count("\n")) == ("", 1)
@@ -147,9 +145,7 @@ def test_a_bad_option_is_named_in_one_line(
     assert not (tmp_path / "out").exists()
 
 
-def test_an_empty_folder_of_objects_and_a_file_for_a_folder_are_named(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-):
+def test_an_empty_folder_of_objects_and_a_file_for_a_folder_are_named(tmp_path, capsys):
     (tmp_path / "none").mkdir()
     assert main(["bench", "--objects", str(tmp_path / "none")]) == EXIT_BAD_INPUT
     assert "none: no mesh in this folder; valid endings: dae" in capsys.readouterr().err
@@ -158,9 +154,7 @@ def test_an_empty_folder_of_objects_and_a_file_for_a_folder_are_named(
     assert "cannot be written" in capsys.readouterr().err
 
 
-def test_cells_that_raise_are_named_at_the_end_and_the_others_kept(
-    tmp_path: Path, record, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-):
+def test_cells_that_raise_are_named_at_the_end_and_the_others_kept(tmp_path, record, monkeypatch, capsys):
     def run(jobs: Sequence[Job], folder: Path, processes: int, stop: Any):
         for job in jobs:
             case: Any = job.case

@@ -53,9 +53,7 @@ def test_a_server_that_refuses_one_request_in_ten_loses_and_doubles_nothing(serv
         server.fail_each = 0
 
 
-def test_a_server_that_is_gone_or_a_bucket_that_is_not_there_is_one_line_and_tells_no_secret(
-    monkeypatch: pytest.MonkeyPatch,
-):
+def test_a_server_that_is_gone_or_a_bucket_that_is_not_there_is_one_line_and_tells_no_secret(monkeypatch):
     monkeypatch.setattr(dataset_store, "_TRIES", 1)
     gone = DatasetStore("s3://a:b@bucket/x?region=us-east-1&scheme=http&endpoint_override=127.0.0.1:9")
     with pytest.raises(StorageError, match="bucket") as caught:

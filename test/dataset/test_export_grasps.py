@@ -83,9 +83,7 @@ def rows_of_objects(store: DatasetStore) -> list[dict]:
     return pd.read_parquet(f"{store.where}/objects").to_dict("records")
 
 
-def test_an_unknown_format_and_a_hand_that_a_format_does_not_know_are_refused(
-    allegro: DatasetStore, tmp_path: Path, graspd, capsys, made: DatasetStore
-):
+def test_an_unknown_format_and_a_hand_that_a_format_does_not_know_are_refused(allegro, tmp_path, graspd, capsys, made):
     assert graspd("dataset", "export", allegro.where, "--to", "usd", "--out", tmp_path) == 2
     assert "to: 'usd'; valid: isaac, graspgen, dexgraspbench" in capsys.readouterr().err
     assert graspd("dataset", "export", made.where, "--to", "dexgraspbench", "--out", tmp_path / "x") == 2

@@ -165,9 +165,7 @@ def test_an_s3_server_that_refuses_one_request_in_ten(start: Start, many: dict[s
         assert [r for r in server.requests if "PUT" in r and "grasps" in r and "partNumber" in r] == []
 
 
-def test_a_cluster_that_is_there_is_used_through_rays_client(
-    start: Start, made: DatasetStore, tmp_path: Path, monkeypatch
-):
+def test_a_cluster_that_is_there_is_used_through_rays_client(start, made, tmp_path, monkeypatch):
     with socket.create_server(("127.0.0.1", 0)) as first, socket.create_server(("127.0.0.1", 0)) as second:
         ports = [server.getsockname()[1] for server in (first, second)]
     for name, value in {
@@ -215,9 +213,7 @@ def small_disk(tmp_path: Path) -> Iterator[Path]:
     subprocess.run(["umount", "-l", where], check=True)
 
 
-def test_a_full_disk_ends_the_run_in_one_line_and_what_is_there_stays(
-    start: Start, many: dict[str, bytes], small_disk: Path
-):
+def test_a_full_disk_ends_the_run_in_one_line_and_what_is_there_stays(start, many, small_disk):
     store = DatasetStore(str(small_disk / "out"))
     process = dataset(start, store.where, "--per-object", "40")
     _, errors = process.communicate()

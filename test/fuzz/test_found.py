@@ -216,9 +216,7 @@ def test_a_chain_of_couplings_beyond_all_numbers(fuzz: ModuleType, folder: Path)
     ],
     ids=["elements", "attributes", "classes"],
 )
-def test_hand_files_that_would_take_gigabytes(
-    fuzz: ModuleType, folder: Path, name: str, text: str, message: str
-) -> None:
+def test_hand_files_that_would_take_gigabytes(fuzz, folder, name, text, message):
     assert message in refusal(fuzz, name, text.encode(), folder)
 
 

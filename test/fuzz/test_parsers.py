@@ -44,9 +44,7 @@ def test_the_first_seed_is_read(fuzz: ModuleType, folder: Path, name: str) -> No
 @pytest.mark.parametrize("name", NAMES)
 @settings(max_examples=8 * LONGER, derandomize=LONGER == 1)
 @given(data=st.data())
-def test_a_spoilt_file_is_read_or_refused(
-    fuzz: ModuleType, folder: Path, spoilt, name: str, data: st.DataObject
-) -> None:
+def test_a_spoilt_file_is_read_or_refused(fuzz, folder, spoilt, name, data):
     target = fuzz.TARGETS[name]
     seed = data.draw(st.sampled_from(target.seeds()), label="seed")
     fuzz.try_input(target, data.draw(spoilt(seed), label="input"), folder)
@@ -129,9 +127,7 @@ CHANGES: dict[str, st.SearchStrategy[Any]] = {
 
 @settings(max_examples=60 * LONGER, derandomize=LONGER == 1)
 @given(data=st.binary(min_size=96, max_size=96), change=st.fixed_dictionaries({}, optional=CHANGES))
-def test_a_cloud_of_any_layout_gives_finite_points_or_an_error(
-    fuzz: ModuleType, data: bytes, change: dict[str, Any]
-) -> None:
+def test_a_cloud_of_any_layout_gives_finite_points_or_an_error(fuzz, data, change):
     layout = dataclasses.replace(GOOD_LAYOUT, **{"data": memoryview(data), **change})
     points, refusal = fuzz.outcome(lambda: points_from_layout(layout), CloudError)
     if refusal is None:
@@ -149,9 +145,7 @@ GOOD_ARCHIVES: list[dict[str, np.ndarray]] = [
 @pytest.mark.parametrize("good", GOOD_ARCHIVES, ids=lambda good: next(iter(good)))
 @settings(max_examples=15 * LONGER, derandomize=LONGER == 1)
 @given(data=st.data())
-def test_an_archive_of_any_arrays_gives_points_or_an_error(
-    fuzz: ModuleType, folder: Path, good: dict[str, np.ndarray], data: st.DataObject
-) -> None:
+def test_an_archive_of_any_arrays_gives_points_or_an_error(fuzz, folder, good, data):
     np.savez(folder / "any.npz", allow_pickle=False, **good)
     first = load_views(folder / "any.npz")
     kinds = st.sampled_from(["f4", "f8", "u2", "u8", "i1", "i8", "?", "c8", "S3", "U2", "M8[s]"])
@@ -275,9 +269,7 @@ def clouds(draw: st.DrawFn) -> PointCloud:
 
 @settings(max_examples=8 * LONGER, derandomize=LONGER == 1)
 @given(views=st.lists(clouds(), min_size=0, max_size=2), alone=st.booleans())
-def test_views_make_a_scene_of_finite_numbers_or_are_refused(
-    fuzz: ModuleType, views: list[PointCloud], alone: bool
-) -> None:
+def test_views_make_a_scene_of_finite_numbers_or_are_refused(fuzz, views, alone):
     scene, refusal = fuzz.outcome(
         lambda: scene_from_views(views, alone=alone, source="views", resolution=12), CloudError, MeshError
     )

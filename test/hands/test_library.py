@@ -237,13 +237,7 @@ def test_the_command_inspects_a_file(tmp_path: Path, capsys: pytest.CaptureFixtu
         (["MANO_RIGHT.pkl", "--yaml", "hand.yaml"], "hand.yaml: a description names a URDF or MJCF file, not a MANO"),
     ],
 )
-def test_the_command_refuses_in_one_line(
-    arguments: list[str],
-    message: str,
-    capsys: pytest.CaptureFixture[str],
-    tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
+def test_the_command_refuses_in_one_line(arguments, message, capsys, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     assert main(["hands", "inspect", *arguments]) == 2
     printed = capsys.readouterr().err

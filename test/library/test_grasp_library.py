@@ -305,9 +305,7 @@ def at_height(scene: Scene, hand: HandModel, grasps: GraspResult, gap: float) ->
     return replace(scene, support=Plane(np.array([0.0, 0.0, 1.0]), low + lift))
 
 
-def test_only_what_comes_near_something_is_tried_again(
-    library: GraspLibrary, scene: Scene, hand: HandModel, planned: GraspResult, monkeypatch: pytest.MonkeyPatch
-):
+def test_only_what_comes_near_something_is_tried_again(library, scene, hand, planned, monkeypatch):
     tried = []
     real = grasp_trials
     monkeypatch.setattr(module, "grasp_trials", lambda *given: tried.append(1) or real(*given))

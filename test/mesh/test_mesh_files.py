@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from made_meshes import box_of
 from shape_volumes import shape_volume
 
 from graspd_core import TriangleMesh, load_scene
@@ -241,10 +242,9 @@ def test_samples_lie_on_the_surface_and_are_spread_by_area(seed):
 
 def test_a_tear_made_by_simplifying_is_not_blamed_on_the_mesh():
     # Boxes that touch along whole sides share edges of four faces: closed, and torn by the simplifier.
-    box = make_shape("box")
-    halves = box.vertices / np.abs(box.vertices).max(0) * 0.02
-    row = np.concatenate([halves + np.array([0.04 * i, 0.0, 0.0]) for i in range(4)])
-    joined = TriangleMesh(row, np.concatenate([box.faces + i * len(halves) for i in range(4)]))
+    row = [box_of(0.02, (0.04 * i, 0.0, 0.0)) for i in range(4)]
+    faces = [box.faces + i * len(box.vertices) for i, box in enumerate(row)]
+    joined = TriangleMesh(np.concatenate([box.vertices for box in row]), np.concatenate(faces))
     mesh, warnings = check_mesh(joined, "row", 600)
     assert not is_closed(mesh)
     assert warnings == ("row: simplified from 4096 to 600 faces",)

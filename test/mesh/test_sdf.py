@@ -7,6 +7,7 @@ import pytest
 import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from made_meshes import box_of
 
 from graspd_bench.stress.broken_meshes import thin_cup
 from graspd_bench.stress.run_stress_case import GRASP, faults, run_case
@@ -225,9 +226,7 @@ def test_cells_are_the_finest_that_cover_any_box(sides, resolution):
 
 
 def test_a_rod_is_seen_by_a_grid_of_as_many_nodes():
-    box = make_shape("box")
-    rod = TriangleMesh(box.vertices / np.abs(box.vertices).max(0) * (0.012, 0.012, 0.6), box.faces)
-    sdf = build_sdf(rod)
+    sdf = build_sdf(box_of((0.012, 0.012, 0.6)))
     # Cells of a cube about it would be 26 mm wide.
     assert float(sdf.spacing) < 0.005
     assert is_solid(sdf)

@@ -9,6 +9,7 @@ import pytest
 import torch
 from hypothesis import given
 from hypothesis import strategies as st
+from made_meshes import box_of
 from small_problem import small_problem
 
 from graspd_bench.baselines.annealing import (
@@ -24,7 +25,7 @@ from graspd_bench.baselines.annealing import (
 )
 from graspd_bench.baselines.random_closure import RandomClosureConfig, advance, draw_approaches, touching_groups
 from graspd_bench.baselines.random_closure import plan as plan_closure
-from graspd_core import HandModel, PlanConfig, draw_starts, hand_names, load_hand, load_scene, make_shape
+from graspd_core import HandModel, PlanConfig, draw_starts, hand_names, load_hand, load_scene
 from graspd_core.config import ProblemConfig
 from graspd_core.hands.kinematics import forward
 from graspd_core.optimize.candidates import PlannerInput, PlannerOutput, find_candidates
@@ -35,7 +36,7 @@ from graspd_core.optimize.obstacle_distance import obstacle_gaps
 from graspd_core.optimize.problem import Problem
 from graspd_core.perception.scene import Scene, build_scene
 from graspd_core.se3 import rotation_from_quaternion
-from graspd_core.types import Plane, TriangleMesh
+from graspd_core.types import Plane
 from graspd_dataset.finger_closing import Closing, finger_of, link_gaps, make_closing, moved_links
 
 DOUBLE = torch.float64
@@ -314,9 +315,7 @@ def pincher(tmp_path_factory: pytest.TempPathFactory) -> HandModel:
 
 
 def cube_scene(half: float, shift: float = 0.0) -> Scene:
-    box = make_shape("box")
-    unit = 2 * (box.vertices - box.vertices.min(0)) / np.ptp(box.vertices, axis=0) - 1
-    return build_scene(TriangleMesh(unit * half + np.array([shift, 0.0, 0.02]), box.faces), resolution=48)
+    return build_scene(box_of(half, (shift, 0.0, 0.02)), resolution=48)
 
 
 def closed(scene: Scene, hand: HandModel, starts: Poses) -> tuple[Problem, Closing, Poses]:

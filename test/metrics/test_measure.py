@@ -9,6 +9,7 @@ import torch
 import trimesh
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from made_meshes import box_of, taken
 from scipy.spatial import ConvexHull
 
 from graspd_bench.studies.human_hand import CONTACT_DISTANCES, measure_skin
@@ -141,10 +142,9 @@ def test_a_flat_overlap_counts_however_thin_it_is(depth, across, block, box, at)
     assert intersection_volume(context, placed) == pytest.approx(depth * 0.03 * 0.02, rel=0.1)
 
 
-def test_the_overlap_with_a_thin_rod_is_counted_deep_inside_the_hand(block, box, at):
+def test_the_overlap_with_a_thin_rod_is_counted_deep_inside_the_hand(block, at):
     # Three millimetres square, right through the block's 20 mm: most of it is far from the hand's surface.
-    rod = TriangleMesh(box.vertices * np.array([0.0015, 0.0015, 0.045]) / np.array([0.03, 0.03, 0.045]), box.faces)
-    context = make_metrics_context(as_object(rod), block)
+    context = make_metrics_context(as_object(box_of((0.0015, 0.0015, 0.045))), block)
     placed = placed_hand(context, at((0.0005, 0.0005, 0), (0.0,)))
     # All its cells are cut by its sides.
     assert intersection_volume(context, placed) == pytest.approx(3 * 3 * 20 * MM3, rel=0.15)
@@ -206,19 +206,10 @@ def test_what_solids_of_every_kind_share_with_an_object_is_that_of_small_voxels(
     assert intersection_volume(context, placed) == pytest.approx(shared.sum() * MM3 / 8, rel=0.02)
 
 
-def mesh_of(made: trimesh.Trimesh, shift: np.ndarray) -> TriangleMesh:
-    return TriangleMesh(np.asarray(made.vertices) + shift, np.asarray(made.faces, dtype=np.int64))
-
-
-def cube_of(size: float, shift: np.ndarray) -> TriangleMesh:
-    return mesh_of(trimesh.creation.box(extents=np.full(3, size)), shift)
-
-
 @pytest.mark.parametrize("depth", [0.0, 0.001, 0.006])
 def test_a_box_that_sinks_into_a_box(depth: float) -> None:
     """A cube of 40 mm whose face lies `depth` below that of one of 60 mm."""
-    shift = np.array([0.0, 0.0, 0.05 - depth])
-    found = measure_skin(make_distance_query(cube_of(0.06, np.zeros(3))), cube_of(0.04, shift))
+    found = measure_skin(make_distance_query(box_of(0.03)), box_of(0.02, (0.0, 0.0, 0.05 - depth)))
     assert found.intersection_volume == pytest.approx(0.04**2 * depth, abs=1e-9)
     assert found.penetration == pytest.approx(depth, abs=1e-6)
     # Near the object's face: the skin's own face, and of its sides the strips within reach on either side of it.
@@ -231,13 +222,13 @@ def test_a_box_that_sinks_into_a_box(depth: float) -> None:
 def test_spheres_share_a_lens_and_bodies_far_apart_nothing() -> None:
     """Two balls of 30 mm whose centres are 50 mm apart share π (4r + d)(2r − d)² / 12 (MathWorld)."""
     ball = trimesh.creation.icosphere(subdivisions=4, radius=0.03)
-    query = make_distance_query(mesh_of(ball, np.zeros(3)))
-    found = measure_skin(query, mesh_of(ball, np.array([0.05, 0.0, 0.0])))
+    query = make_distance_query(taken(ball))
+    found = measure_skin(query, taken(ball.apply_translation([0.05, 0.0, 0.0])))
     expected = np.pi * (4 * 0.03 + 0.05) * (2 * 0.03 - 0.05) ** 2 / 12
     # Facets lie up to 0.04 mm inside the ball, of a lens 10 mm deep; the rest is the voxels' edge.
     assert found.intersection_volume == pytest.approx(expected, rel=0.03)
     assert found.penetration == pytest.approx(0.01, abs=1e-4)
-    found = measure_skin(make_distance_query(cube_of(0.06, np.zeros(3))), cube_of(0.04, np.full(3, 0.5)))
+    found = measure_skin(make_distance_query(box_of(0.03)), box_of(0.02, (0.5, 0.5, 0.5)))
     assert found.contact_area == (0.0, 0.0, 0.0)
     assert (found.intersection_volume, found.penetration) == (0.0, 0.0)
 
@@ -250,8 +241,7 @@ def test_figures_do_not_depend_on_the_frame() -> None:
         target = trimesh.creation.box(extents=[0.05, 0.06, 0.07]).apply_transform(transform)
         skin = trimesh.creation.icosphere(subdivisions=3, radius=0.02)
         skin.apply_translation([0.035, 0.0, 0.0]).apply_transform(transform)
-        query = make_distance_query(mesh_of(target, np.zeros(3)))
-        figures.append(measure_skin(query, mesh_of(skin, np.zeros(3))))
+        figures.append(measure_skin(make_distance_query(taken(target)), taken(skin)))
     assert figures[0].contact_area == pytest.approx(figures[1].contact_area, rel=0.06)
     assert figures[0].intersection_volume == pytest.approx(figures[1].intersection_volume, rel=0.02)
 

@@ -37,9 +37,7 @@ def test_the_first_verified_grasp_ends_the_search_and_all_things_are_told(first:
     assert first[1].reason == "not looked at"
 
 
-def test_what_failed_comes_last_and_is_given_up_after_some_tries(
-    views: tuple[PointCloud, ...], first: tuple[ThingPlan, ...]
-):
+def test_what_failed_comes_last_and_is_given_up_after_some_tries(views, first):
     place = first[0].place
     other = plan_any_thing(views, HAND, failures=[Failure(place)], **ASKED)
     assert np.linalg.norm(other[0].place - place) > 0.05

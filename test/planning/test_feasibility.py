@@ -5,6 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import trimesh
+from made_meshes import box_of
 
 from graspd_core import HandModel, Scene, hand_names, load_hand, load_scene, plan_grasps
 from graspd_core.mesh.shapes import SHAPES, make_shape
@@ -19,24 +20,19 @@ def scene_of(*meshes: TriangleMesh, friction: float = 0.6) -> Scene:
     return load_scene(whole, resolution=8, friction=friction)
 
 
-def box(half: tuple[float, float, float], at: tuple[float, float, float] = (0.0, 0.0, 0.0)) -> TriangleMesh:
-    unit = make_shape("box")
-    return TriangleMesh(unit.vertices / np.abs(unit.vertices).max(0) * half + np.array(at), unit.faces)
-
-
 def crate(wall: float) -> tuple[TriangleMesh, ...]:
     """A cube of 1.2 m, open above."""
     half = 0.6
     sides = [((wall, half, half), (x, 0.0, 0.0)) for x in (-half, half)]
     sides += [((half, wall, half), (0.0, y, 0.0)) for y in (-half, half)]
-    return tuple(box(*side) for side in (*sides, ((half, half, wall), (0.0, 0.0, -half))))
+    return tuple(box_of(*side) for side in (*sides, ((half, half, wall), (0.0, 0.0, -half))))
 
 
 HOLDABLE = {
-    "rod": (box((0.6, 0.012, 0.012)),),
-    "board": (box((0.6, 0.6, 0.008)),),
+    "rod": (box_of((0.6, 0.012, 0.012)),),
+    "board": (box_of((0.6, 0.6, 0.008)),),
     "open crate": crate(0.005),
-    "cube with a handle": (box((0.5, 0.5, 0.5)), box((0.01, 0.06, 0.03), (0.53, 0.0, 0.0))),
+    "cube with a handle": (box_of((0.5, 0.5, 0.5)), box_of((0.01, 0.06, 0.03), (0.53, 0.0, 0.0))),
 }
 
 
@@ -62,7 +58,7 @@ def test_no_hand_refuses_what_it_might_hold(name: str, holdable):
 
 def test_a_small_knob_on_a_cabinet_of_many_faces_is_found(holdable):
     """Ten of 16394 faces, and a four thousandth of the surface; the knob is open where it sits."""
-    whole, knob = box((0.99, 0.99, 0.99)), trimesh.creation.box((0.02, 0.02, 0.02))
+    whole, knob = box_of((0.99, 0.99, 0.99)), trimesh.creation.box((0.02, 0.02, 0.02))
     fine = trimesh.Trimesh(whole.vertices, whole.faces, process=False).subdivide().subdivide()
     outer = knob.faces[(knob.vertices[knob.faces, 0] > -0.009).any(1)] + len(fine.vertices)
     corners = np.add(knob.vertices, (1.0, 0.3, 0.2))
@@ -74,7 +70,7 @@ def test_a_small_knob_on_a_cabinet_of_many_faces_is_found(holdable):
 
 @pytest.mark.parametrize("friction", [0.1, 0.6, 1.5])
 def test_a_crate_beyond_the_hand_is_refused_with_both_sizes(hand, friction: float):
-    said = out_of_reach(scene_of(box((0.6, 0.6, 0.6)), friction=friction), hand)
+    said = out_of_reach(scene_of(box_of((0.6, 0.6, 0.6)), friction=friction), hand)
     assert "120 cm across" in said
     assert "fingertips of allegro_right open to" in said
 
@@ -82,8 +78,8 @@ def test_a_crate_beyond_the_hand_is_refused_with_both_sizes(hand, friction: floa
 def test_the_corner_of_a_crate_is_refused_up_to_the_friction_that_would_hold_it(hand, monkeypatch: pytest.MonkeyPatch):
     """The normals of a corner lie arccos(1/√3) = 54.7° about its diagonal: friction of tan(35.3°) = 0.707 closes it."""
     monkeypatch.setattr("graspd_core.planning.feasibility._MOST_FRICTION", 10.0)
-    assert out_of_reach(scene_of(box((0.6, 0.6, 0.6)), friction=0.65), hand)
-    assert not out_of_reach(scene_of(box((0.6, 0.6, 0.6)), friction=0.75), hand)
+    assert out_of_reach(scene_of(box_of((0.6, 0.6, 0.6)), friction=0.65), hand)
+    assert not out_of_reach(scene_of(box_of((0.6, 0.6, 0.6)), friction=0.75), hand)
 
 
 def test_a_jaw_opens_as_wide_as_its_description_says():
@@ -104,7 +100,7 @@ def test_a_ball_of_70_cm_ends_the_run_before_its_first_step(hand):
 
 @pytest.fixture(scope="module")
 def card_on_table() -> Scene:
-    return replace(scene_of(box((0.043, 0.027, 0.001))), support=Plane(np.array([0.0, 0.0, 1.0]), -0.001))
+    return replace(scene_of(box_of((0.043, 0.027, 0.001))), support=Plane(np.array([0.0, 0.0, 1.0]), -0.001))
 
 
 def test_what_is_too_low_for_the_fingers_is_told_with_what_became_of_the_trials(hand, card_on_table):

@@ -154,12 +154,6 @@ def test_the_arm_is_written_and_read(hand: HandModel, table: Scene, reached: Gra
         ((0.0, 0.0, 0.0), (1.0, 1.0, 0.0, 0.0), "arm base: quaternion .*; valid: w x y z of length 1"),
     ],
 )
-def test_a_base_that_is_nowhere_is_refused(
-    hand: HandModel,
-    table: Scene,
-    position: tuple[float, float, float],
-    quaternion: tuple[float, float, float, float],
-    told: str,
-):
+def test_a_base_that_is_nowhere_is_refused(hand, table, position, quaternion, told):
     with pytest.raises(ConfigError, match=told):
         planned(table, hand, Reach(load_arm("panda_like"), position, quaternion))

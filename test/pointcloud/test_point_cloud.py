@@ -20,23 +20,26 @@ from graspd_core.perception.cloud.point_cloud import (
     points_from_layout,
     transform_cloud,
 )
+from graspd_core.perception.reconstruct.reconstruct import reconstruct
+from graspd_core.perception.segment.segment import segment
 
 ORIGIN = np.zeros(3)
 
 
+@pytest.mark.parametrize("entry", [segment, reconstruct])
 @pytest.mark.parametrize(
-    ("points", "complaint"),
+    ("views", "complaint"),
     [
-        (np.zeros((0, 3)), "empty"),
-        (np.full((100, 3), np.nan), "all 100 points are NaN"),
-        (np.full((100, 3), np.inf), "all 100 points are NaN"),
-        (np.eye(3)[[0, 1, 2] * 3], "only 9 finite points of 9; at least 50"),
-        (np.zeros((100, 3)), "in one place"),
+        ([], "no view at all"),
+        ([np.zeros((0, 3))], "empty"),
+        ([np.full((100, 3), np.nan), np.full((20, 3), np.inf)], "all 120 points are NaN"),
+        ([np.eye(3)[[0, 1, 2] * 3]], "only 9 finite points of 9; at least 50"),
+        ([np.ones((500, 3))], "in one place"),
     ],
 )
-def test_hopeless_clouds_are_named(points, complaint):
+def test_hopeless_clouds_are_named(entry, views, complaint):
     with pytest.raises(CloudError, match=complaint):
-        clean_cloud(points, ORIGIN)
+        entry([PointCloud(points, np.zeros(3)) for points in views])
 
 
 def test_cleaning_drops_nan_and_strays_and_thins():

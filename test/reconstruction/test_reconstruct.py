@@ -4,6 +4,7 @@ import functools
 
 import numpy as np
 import pytest
+from made_meshes import box_of
 from scipy.spatial import KDTree
 from scipy.spatial.transform import Rotation
 from shape_volumes import shape_volume
@@ -15,7 +16,7 @@ from graspd_core import PinholeCamera, PointCloud, cloud_from_depth
 from graspd_core.config import ReconstructionConfig
 from graspd_core.errors import CloudError
 from graspd_core.mesh.mesh_files import mass_properties, surface_samples
-from graspd_core.mesh.shapes import BOX_HALF, SHAPES, make_shape
+from graspd_core.mesh.shapes import SHAPES, make_shape
 from graspd_core.mesh.surface_queries import inside, make_distance_query, unsigned_distance
 from graspd_core.mesh.topology import is_closed
 from graspd_core.perception.cloud.free_space import FreeSpace, empty_depth, make_view_depths
@@ -182,9 +183,7 @@ def test_a_bottle_seen_from_straight_above_has_a_neck(elevation, noise):
 
 def test_a_bar_of_which_no_camera_sees_top_and_bottom_is_doubted():
     # Normals of the four sides cancel, and no point of it is far from them.
-    half = np.array([0.045, 0.01, 0.01])
-    bar = TriangleMesh(make_shape("box").vertices / BOX_HALF * half, make_shape("box").faces)
-    points, normals = surface_samples(bar, 24_000, 0)
+    points, normals = surface_samples(box_of((0.045, 0.01, 0.01)), 24_000, 0)
     eyes = np.array([[0.4, 0.3, 0.0], [-0.4, -0.3, 0.0]])
     found = reconstruct([PointCloud(points[((eye - points) * normals).sum(1) > 0], eye) for eye in eyes])
     assert found.method == "poisson"
@@ -243,11 +242,6 @@ def test_an_all_round_cloud_needs_no_camera(name):
 @pytest.mark.parametrize(
     ("views", "complaint"),
     [
-        ([], "no view at all"),
-        ([PointCloud(np.zeros((0, 3)), np.zeros(3))], "empty"),
-        ([PointCloud(np.full((90, 3), np.nan), np.zeros(3))], "all 90 points are NaN"),
-        ([PointCloud(np.eye(3)[[0, 1, 2] * 3], np.zeros(3))], "only 9 finite points of 9; at least 50"),
-        ([PointCloud(np.ones((500, 3)), np.zeros(3))], "in one place"),
         ([PointCloud(np.eye(3)[[0, 1, 2] * 30], np.array([0, 0, np.nan]))], "viewpoint"),
         ([PointCloud(part, np.array([0, 0, 1.0])) for part in np.split(BALL[:280], 14)], "none of its 14 views"),
     ],

@@ -34,6 +34,7 @@ from graspd_core import make_shape, save_mesh
 from graspd_core.paths import config_dir
 from graspd_ros.parameters import Settings
 
+LATCHED = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
 PATIENCE = 200.0  # seconds until what is waited for is held to never come; a test's own limit is 300
 
 READ_ONLY = {"hand", "hand_prefix", "device", "torch_threads", "queue_size", "collision_objects"}
@@ -55,14 +56,13 @@ class Client:
         self.node = rclpy.create_node("graspd_test_client", context=self.context)
         self._executor = SingleThreadedExecutor(context=self.context)
         self._executor.add_node(self.node)
-        latched = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
         self.events: list[Event] = []
         self.joints: list[JointState] = []
         self.poses: list[PoseStamped] = []
         told = QoSProfile(depth=100, durability=DurabilityPolicy.TRANSIENT_LOCAL)
         self.node.create_subscription(String, "/graspd/status", self._on_status, told)
-        self.node.create_subscription(JointState, "/graspd/joint_states", self.joints.append, latched)
-        self.node.create_subscription(PoseStamped, "/graspd/grasp_pose", self.poses.append, latched)
+        self.node.create_subscription(JointState, "/graspd/joint_states", self.joints.append, LATCHED)
+        self.node.create_subscription(PoseStamped, "/graspd/grasp_pose", self.poses.append, LATCHED)
         self.progress: list[GraspProgress] = []
         self.answers: list[GraspArray] = []
         self.node.create_subscription(GraspProgress, "/graspd/progress", self.progress.append, 500)
@@ -117,6 +117,16 @@ class Client:
             return next(filter(condition, told), None)
 
         return self.spin_until(find, "health")
+
+    def late(self, kind: type, topic: str) -> list[Any]:
+        """What somebody hears who comes late to a topic whose last message is kept."""
+        heard: list[Any] = []
+        self.node.create_subscription(kind, topic, heard.append, LATCHED)
+        return heard
+
+    def kept(self, kind: type, topic: str) -> Any:
+        """A publisher whose last message is kept for whoever comes late."""
+        return self.node.create_publisher(kind, topic, LATCHED)
 
     def now(self) -> Time:
         return self.node.get_clock().now().to_msg()

@@ -102,16 +102,6 @@ def test_bad_input_is_named_and_the_node_lives_on(client, node, make_cloud):
     assert "mesh-99" not in log, "a late cancel is no error"
 
 
-@pytest.mark.parametrize(("policy", "ends_as"), [("reject", "refused"), ("replace", "superseded")])
-def test_a_busy_node_obeys_its_policy(client, node, policy, ends_as):
-    client.set_parameters(**LONG | {"busy_policy": policy})
-    client.send_mesh("sphere.obj")
-    first = client.event(event="progress")["request"]
-    client.send_mesh("sphere.obj")
-    ended = client.event(event=ends_as)
-    assert (ended["request"] == first) is (policy == "replace")
-
-
 def test_only_the_newest_cloud_waits_and_the_others_are_counted(client, node, make_cloud, seen_ball):
     client.set_parameters(**LONG)
     cloud = make_cloud(seen_ball)

@@ -149,13 +149,8 @@ def test_the_shipped_parameter_file_holds_every_parameter_at_its_default():
     assert shipped == dataclasses.asdict(Settings())
 
 
-def test_settings_follow_the_parameters():
-    context = Context()
-    rclpy.init(context=context)
-    node = rclpy.create_node("parameters", context=context)
-    settings = LiveSettings(node)
+def test_settings_follow_the_parameters(started):
+    node, settings = started()
     before = settings.now
     node.set_parameters([Parameter("seed", value=7), Parameter("deadline", value=-1.0)])
     assert (settings.now.seed, settings.now.deadline, before.seed) == (7, 60.0, 0)
-    node.destroy_node()
-    rclpy.shutdown(context=context)

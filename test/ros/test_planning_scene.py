@@ -12,7 +12,6 @@ from builtin_interfaces.msg import Time
 from geometry_msgs.msg import Point, Pose, Quaternion, TransformStamped, Vector3
 from graspd_msgs.msg import GraspArray, GraspRequest
 from moveit_msgs.msg import CollisionObject
-from rclpy.qos import DurabilityPolicy, QoSProfile
 from scipy.spatial.transform import Rotation
 from shape_msgs.msg import Mesh, Plane, SolidPrimitive
 from std_msgs.msg import Header
@@ -52,9 +51,7 @@ def farthest(answer: GraspArray) -> float:
 def test_later_requests_keep_clear_of_the_scene_and_bad_messages_do_no_harm(client, start_node):
     start_node(collision_objects="/collision_object", num_grasps=4, preset="fast", deadline=100.0)
     things = client.node.create_publisher(CollisionObject, "/collision_object", 50)
-    frames = client.node.create_publisher(
-        TFMessage, "/tf_static", QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
-    )
+    frames = client.kept(TFMessage, "/tf_static")
     client.spin_until(things.get_subscription_count, "node that hears the scene")
     shelf = TransformStamped(header=Header(frame_id="object"), child_frame_id="shelf")
     shelf.transform.translation, shelf.transform.rotation = Vector3(x=WALL + 0.25), Quaternion(w=1.0)

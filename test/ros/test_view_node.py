@@ -8,7 +8,6 @@ import numpy as np
 import pytest
 from builtin_interfaces.msg import Time
 from graspd_msgs.msg import GraspArray, GraspProgress
-from rclpy.qos import DurabilityPolicy, QoSProfile
 from std_msgs.msg import Header
 
 from graspd_core import load_hand
@@ -67,8 +66,7 @@ def test_a_grasp_comes_back_from_its_message():
 def test_what_a_node_publishes_is_shown(client):
     viewer = Watched()
     Follower(client.node, viewer, "/followed")
-    latched = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
-    answers = client.node.create_publisher(GraspArray, "/followed/grasps", latched)
+    answers = client.kept(GraspArray, "/followed/grasps")
     progress = client.node.create_publisher(GraspProgress, "/followed/progress", 50)
     answers.publish(an_answer(a_grasp()))
     (session,) = client.spin_until(lambda: viewer.sessions, "session")
@@ -89,8 +87,7 @@ def test_what_a_node_publishes_is_shown(client):
 def test_answers_that_cannot_be_shown_are_left_out(client):
     viewer = Watched()
     Follower(client.node, viewer, "/followed_too")
-    latched = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
-    answers = client.node.create_publisher(GraspArray, "/followed_too/grasps", latched)
+    answers = client.kept(GraspArray, "/followed_too/grasps")
     path, joints, nan = an_answer(a_grasp()), an_answer(a_grasp()), an_answer(a_grasp())
     path.grasps[0].hand = "/etc/hand.urdf"
     joints.grasps[0].grasp_joints.name[0] = "another"

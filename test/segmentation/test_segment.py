@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from made_meshes import box_between
 from scipy.spatial.transform import Rotation
 
 from graspd_bench.rendering.depth_noise import LEVELS, NONE, DepthNoise, add_noise
@@ -21,13 +22,6 @@ from graspd_core.perception.segment.segment import Segmentation, find_things, se
 CAMERA = PinholeCamera(320, 240, 308.0, 308.0, 159.5, 119.5)
 POSE = ring_poses(1, elevation=0.7, azimuth=0.4)[0]
 THREE = tabletop("box", obstacles=[("cylinder", 0.02, 0.14), ("mug", -0.02, -0.15)])
-
-
-def block(low: tuple[float, float, float], high: tuple[float, float, float]) -> TriangleMesh:
-    import trimesh
-
-    box = trimesh.creation.box(bounds=[low, high])
-    return TriangleMesh(np.array(box.vertices), np.array(box.faces))
 
 
 def seen(meshes, pose=POSE, noise: DepthNoise = NONE) -> tuple[PointCloud, np.ndarray]:
@@ -142,8 +136,8 @@ def test_an_object_sampled_all_round_passes_unharmed(shape, viewpoint):
 
 def test_walls_and_floors_are_not_what_it_stands_on():
     scene = tabletop("mug")
-    walls = [block((-0.35, -0.6, -0.02), (-0.33, 0.6, 0.6)), block((-0.4, -0.35, -0.02), (0.4, -0.33, 0.6))]
-    floor = block((-2, -2, -0.75), (2, 2, -0.72))
+    walls = [box_between((-0.35, -0.6, -0.02), (-0.33, 0.6, 0.6)), box_between((-0.4, -0.35, -0.02), (0.4, -0.33, 0.6))]
+    floor = box_between((-2, -2, -0.75), (2, 2, -0.72))
     for meshes in ([*scene.meshes, walls[0]], [*scene.meshes, *walls], [*scene.meshes, floor]):
         view, _ = seen(meshes, noise=LEVELS["default"])
         found = segment([view])
@@ -165,7 +159,7 @@ def test_what_is_seen_from_straight_above_stands_on_the_table(shape, noise):
 
 def test_before_a_wall_without_a_table_nothing_supports_it():
     mug = tabletop("mug").truth
-    view, label = seen([mug, block((-0.35, -0.6, -0.2), (-0.33, 0.6, 0.6))])
+    view, label = seen([mug, box_between((-0.35, -0.6, -0.2), (-0.33, 0.6, 0.6))])
     found = segment([view])
     assert found.support is None
     assert share_found(found, view.points[label == 0]) > 0.98
@@ -245,10 +239,7 @@ def test_an_empty_table_says_what_was_seen():
     ("target", "complaint"),
     [
         (Target(point=np.array([0.0, 0.0, 0.5])), r"nothing within 0.05 m of the point .* 3 things are seen, the l"),
-        (
-            Target(box=(np.array([0.2, 0.2, 0.2]), np.array([0.3, 0.3, 0.3]))),
-            r"nothing in the box .* 3 things",
-        ),
+        (Target(box=(np.array([0.2, 0.2, 0.2]), np.array([0.3, 0.3, 0.3]))), r"nothing in the box .* 3 things"),
     ],
 )
 def test_nothing_at_the_target_lists_what_there_is(target, complaint):
@@ -292,21 +283,6 @@ def test_a_mask_of_background_finds_nothing():
 def test_targets_that_cannot_be_meant_are_refused(target, complaint):
     with pytest.raises(CloudError, match=complaint):
         segment([seen(THREE.meshes)[0]], target=target)
-
-
-@pytest.mark.parametrize(
-    ("views", "complaint"),
-    [
-        ([], "no view at all"),
-        ([np.zeros((0, 3))], "empty"),
-        ([np.full((100, 3), np.nan), np.full((20, 3), np.inf)], "all 120 points are NaN"),
-        ([np.eye(3)[[0, 1, 2] * 3]], "only 9 finite points of 9; at least 50"),
-        ([np.ones((100, 3))], "in one place"),
-    ],
-)
-def test_hopeless_clouds_are_named(views, complaint):
-    with pytest.raises(CloudError, match=complaint):
-        segment([PointCloud(points, np.zeros(3)) for points in views])
 
 
 def test_points_without_any_surface_are_no_object():

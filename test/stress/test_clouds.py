@@ -10,8 +10,7 @@ import pytest
 from graspd_bench.rendering.depth_noise import DEFAULT, HIGH
 from graspd_bench.rendering.tabletop import CAMERA, TabletopScene, depth_views, ring_poses, tabletop, views_of
 from graspd_bench.stress.broken_clouds import bled
-from graspd_core import Outcome, PointCloud, Verdict, plan_grasps, scene_from_views
-from graspd_core.errors import NoObjectError
+from graspd_core import Outcome, Verdict, plan_grasps, scene_from_views
 from graspd_core.mesh.surface_queries import make_surface, surface_distance
 from graspd_core.mesh.topology import is_closed
 from graspd_core.perception.segment.segment import Target
@@ -21,11 +20,6 @@ POSES = ring_poses(3, elevation=0.7, azimuth=0.5)
 
 # From pixels to a trial, in ten CPU seconds each.
 pytestmark = pytest.mark.timeout(300)
-
-
-@pytest.fixture(scope="module")
-def box_view() -> PointCloud:
-    return views_of(tabletop("box", yaw=0.3), CAMERA, POSES[:1], DEFAULT)[0]
 
 
 def grasp_of(views, hand, **options):
@@ -82,8 +76,3 @@ def test_of_two_touching_objects_the_masked_one_is_taken(hand):
     other = view.points[label[depth > 0] == 1]
     covered = [surface_distance(make_surface(near.mesh), other) < 0.01 for near in scene.obstacles]
     assert np.any(covered, axis=0).mean() > 0.95
-
-
-def test_a_target_where_nothing_is_names_what_there_is(box_view):
-    with pytest.raises(NoObjectError, match=r"target: .*\(0\."):
-        scene_from_views([box_view], target=Target(point=np.array([0.25, 0.25, 0.05])))

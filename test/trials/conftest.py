@@ -5,8 +5,9 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from made_meshes import box_of
 
-from graspd_core import Grasp, HandModel, Posture, TriangleMesh, load_hand, make_shape
+from graspd_core import Grasp, HandModel, Posture, load_hand
 from graspd_core.perception.scene import ObjectModel, build_scene
 from graspd_core.verify.world import World, build_world
 
@@ -36,9 +37,7 @@ def gripper(tmp_path_factory: pytest.TempPathFactory) -> HandModel:
 @pytest.fixture(scope="session")
 def cube() -> ObjectModel:
     """A cube of 40 mm and 100 g."""
-    box = make_shape("box")
-    mesh = TriangleMesh(box.vertices / np.array([0.03, 0.03, 0.045]) * 0.02, box.faces)
-    return build_scene(mesh, source="cube", mass=0.1, resolution=8).object
+    return build_scene(box_of(0.02), source="cube", mass=0.1, resolution=8).object
 
 
 @pytest.fixture(scope="module")

@@ -9,14 +9,15 @@ from dataclasses import replace
 import mujoco
 import numpy as np
 import pytest
+from made_meshes import box_of
 
 from graspd_bench.trials import Lifted, lift_out, placed, settle
-from graspd_core import HandModel, make_shape
+from graspd_core import HandModel
 from graspd_core.errors import ConfigError
 from graspd_core.hands.kinematics import retreat_posture
 from graspd_core.mesh.sdf import build_sdf
 from graspd_core.perception.scene import Obstacle
-from graspd_core.types import Grasp, Plane, Posture, TrialResult, TriangleMesh, Verdict
+from graspd_core.types import Grasp, Plane, Posture, TrialResult, Verdict
 from graspd_core.verify.lift_trial import LiftSettings, lift_trial
 from graspd_core.verify.trial_registry import TrialContext, grasp_trials
 from graspd_core.verify.world import PROTOCOLS, FreeBody, World, build_world
@@ -35,8 +36,7 @@ CLEAR = -0.052
 
 def box(centre: tuple[float, float, float], half: float) -> Obstacle:
     """A fixed cube [m]."""
-    unit = make_shape("box")
-    mesh = TriangleMesh(unit.vertices / np.array([0.03, 0.03, 0.045]) * half + np.array(centre), unit.faces)
+    mesh = box_of(half, centre)
     return Obstacle(mesh, build_sdf(mesh, resolution=16))
 
 

@@ -5,6 +5,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import trimesh
+from made_meshes import taken
 
 from graspd_core import HandModel, TriangleMesh, make_shape, save_mesh
 from graspd_core.errors import HandError
@@ -57,9 +58,7 @@ def test_a_mesh_is_found(workspace: Path, name: str) -> None:
 
 
 @pytest.mark.parametrize(("variable", "folder"), [("AMENT_PREFIX_PATH", "opt"), ("ROS_PACKAGE_PATH", "opt/share/far")])
-def test_a_package_is_found_where_ros_says(
-    workspace: Path, variable: str, folder: str, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_package_is_found_where_ros_says(workspace, variable, folder, monkeypatch):
     name = "package://far/m/wedge.obj"
     with pytest.raises(
         HandError, match=r"link 'a': mesh 'package://far/m/wedge.obj' was not found in any package path"
@@ -129,8 +128,7 @@ def hand_of(folder: Path, mesh: TriangleMesh, scale: str, prefix: str = ""):
 
 @pytest.mark.parametrize("prefix", ["", "left_"])
 def test_a_mesh_is_drawn_whole_and_bounded_and_other_links_as_they_collide(tmp_path: Path, prefix: str):
-    torus = trimesh.creation.torus(0.04, 0.01, major_sections=100, minor_sections=60)
-    ring = TriangleMesh(np.array(torus.vertices), np.array(torus.faces, dtype=np.int64))
+    ring = taken(trimesh.creation.torus(0.04, 0.01, major_sections=100, minor_sections=60))
     assert len(ring.faces) > 8000
     hand = hand_of(tmp_path, ring, "0.5 0.5 -0.5", prefix)
     drawn = visual_solids(hand, prefix)

@@ -7,7 +7,6 @@ import sys
 import time
 from collections.abc import Callable, Iterator
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -36,7 +35,6 @@ from graspd_ros.parameters import Settings
 from graspd_ros.request import Request
 from graspd_ros.request_planner import Planner
 
-ROOT = Path(__file__).parents[3]
 SECOND = 1_000_000_000
 
 # A robot: base_link under world, static; the camera turns about z and rises by 1 m/s.
@@ -152,9 +150,7 @@ def node(monkeypatch: pytest.MonkeyPatch, domain: int) -> Iterator[Node]:
     rclpy.shutdown(context=context)
 
 
-def test_without_tf2_msgs_the_node_says_so_once_and_goes_on(
-    node: Node, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
-):
+def test_without_tf2_msgs_the_node_says_so_once_and_goes_on(node, monkeypatch, capfd):
     monkeypatch.setitem(sys.modules, "tf2_msgs.msg", None)
     before = len(list(node.subscriptions))
     listener = tf_listener.TransformListener(node, TransformBuffer())

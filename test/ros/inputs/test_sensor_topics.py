@@ -142,9 +142,7 @@ def test_what_comes_once_while_the_choice_is_made_is_heard(node: Node):
     assert len([info for info in heard if info.width == 3]) == 1
 
 
-def test_a_camera_that_offers_less_is_heard_too_and_its_losses_are_told(
-    node: Node, publish: Start, capfd: pytest.CaptureFixture[str]
-):
+def test_a_camera_that_offers_less_is_heard_too_and_its_losses_are_told(node, publish, capfd):
     heard: list[PointCloud2] = []
     topic = SensorTopic(node, PointCloud2, "points", heard.append)
     publish("PointCloud2", "/points", "BEST_EFFORT", count=3)
@@ -204,9 +202,7 @@ def test_packed_images_are_heard_where_nobody_sends_plain_ones(node: Node, publi
     assert packed._subscription is None
 
 
-def test_a_publisher_that_sends_nothing_or_another_type_is_told(
-    node: Node, publish: Start, monkeypatch: pytest.MonkeyPatch
-):
+def test_a_publisher_that_sends_nothing_or_another_type_is_told(node, publish, monkeypatch):
     monkeypatch.setattr(sensor_topics, "SILENCE", 0.3)
     clouds, images = (
         SensorTopic(node, kind, name, lambda message: None)

@@ -13,7 +13,7 @@ from graspd_msgs.msg import GraspArray, GraspRequest
 from graspd_msgs.srv import ListHands
 from hypothesis import given
 from hypothesis import strategies as st
-from rclpy.qos import DurabilityPolicy, QoSProfile, qos_profile_sensor_data
+from rclpy.qos import qos_profile_sensor_data
 from rclpy.serialization import serialize_message
 from scipy.spatial.transform import Rotation
 from sensor_msgs.msg import CameraInfo, Image
@@ -55,9 +55,7 @@ def place(pose: Pose) -> np.ndarray:
 
 
 def test_a_request_keeps_its_id_tells_progress_and_gets_one_full_answer(client, node):
-    markers: list[MarkerArray] = []
-    latched = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
-    client.node.create_subscription(MarkerArray, "/graspd/markers", markers.append, latched)
+    markers = client.late(MarkerArray, "/graspd/markers")
     turned = Quaternion(z=np.sqrt(0.5), w=np.sqrt(0.5))
     header = Header(frame_id="table", stamp=client.now())
     client.send_request(
@@ -231,15 +229,9 @@ def test_hands_are_listed_and_a_reset_leaves_late_joiners_nothing_but_the_last_a
     assert hands.current in hands.names
     assert (hands.current, len(hands.joint_names), hands.base_link) == ("allegro_right", 16, "base_link")
 
-    def joiner(kind: type, topic: str) -> list:
-        got: list = []
-        latched = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
-        client.node.create_subscription(kind, topic, got.append, latched)
-        return got
-
     client.send_request(id="refused", source=9)
     client.answer("refused")
-    late = joiner(GraspArray, "/graspd/grasps")
+    late = client.late(GraspArray, "/graspd/grasps")
     client.spin_until(lambda: late, "the last answer for a late joiner")
     assert late[0].request_id == "refused"
     client.forget()
@@ -247,7 +239,7 @@ def test_hands_are_listed_and_a_reset_leaves_late_joiners_nothing_but_the_last_a
     client.event(event="progress", request="running")
     assert client.call(Trigger, "reset").message == "cancelled 1 requests, dropped 0 views"
     assert client.answer("running").status == GraspArray.CANCELLED
-    answers, markers = joiner(GraspArray, "/graspd/grasps"), joiner(MarkerArray, "/graspd/markers")
+    answers, markers = client.late(GraspArray, "/graspd/grasps"), client.late(MarkerArray, "/graspd/markers")
     client.spin_until(lambda: answers, "the last answer for a late joiner")
     client.spin_for(1.0)
     assert [answer.request_id for answer in answers] == ["running"]
