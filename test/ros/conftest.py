@@ -23,6 +23,7 @@ from rcl_interfaces.srv import SetParameters
 from rclpy.action.client import ActionClient
 from rclpy.context import Context
 from rclpy.executors import SingleThreadedExecutor
+from rclpy.node import Node
 from rclpy.parameter import Parameter
 from rclpy.qos import DurabilityPolicy, QoSProfile
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
@@ -305,6 +306,23 @@ def agree() -> Callable[[Any, Any], bool]:
 @pytest.fixture(scope="session")
 def make_cloud() -> Callable[..., PointCloud2]:
     return cloud_message
+
+
+@pytest.fixture
+def make_node() -> Iterator[Callable[..., Node]]:
+    """Makes nodes in this process, each with ROS arguments of its own."""
+    made: list[Node] = []
+
+    def make_node(*arguments: str, domain: int | None = None) -> Node:
+        context = Context()
+        rclpy.init(args=["--ros-args", *arguments], context=context, domain_id=domain)
+        made.append(rclpy.create_node("made_by_a_test", context=context))
+        return made[-1]
+
+    yield make_node
+    for node in made:
+        node.destroy_node()
+        rclpy.shutdown(context=node.context)
 
 
 @pytest.fixture(scope="session")

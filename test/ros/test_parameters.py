@@ -2,14 +2,12 @@
 
 import dataclasses
 import math
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
 import pytest
-import rclpy
 import yaml
-from rclpy.context import Context
 from rclpy.node import Node
 from rclpy.parameter import Parameter
 
@@ -76,21 +74,14 @@ def test_a_scene_file_sets_the_reconstruction_and_is_refused_by_its_key(tmp_path
 
 
 @pytest.fixture
-def started() -> Iterator[Callable[..., tuple[Node, LiveSettings]]]:
+def started(make_node) -> Callable[..., tuple[Node, LiveSettings]]:
     """Makes what a node makes of its arguments."""
-    made: list[Node] = []
 
     def started(*arguments: str, frames: tuple[str, ...] = ()) -> tuple[Node, LiveSettings]:
-        context = Context()
-        rclpy.init(args=["--ros-args", *(part for given in arguments for part in ("-p", given))], context=context)
-        made.append(rclpy.create_node("parameters", context=context))
-        return made[-1], LiveSettings(made[-1], lambda: frames)
+        node = make_node(*(part for given in arguments for part in ("-p", given)))
+        return node, LiveSettings(node, lambda: frames)
 
-    yield started
-    for node in made:
-        context = node.context
-        node.destroy_node()
-        rclpy.shutdown(context=context)
+    return started
 
 
 def test_an_integer_is_taken_where_a_number_is_meant_and_doubts_are_told(started, tmp_path: Path, capfd):

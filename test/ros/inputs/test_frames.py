@@ -10,13 +10,11 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-import rclpy
 import torch
 from builtin_interfaces.msg import Time
 from geometry_msgs.msg import Point, Pose, Quaternion, Transform, Vector3
 from hypothesis import given
 from hypothesis import strategies as st
-from rclpy.context import Context
 from rclpy.executors import SingleThreadedExecutor
 from rclpy.node import Node
 from rclpy.parameter import Parameter
@@ -140,14 +138,9 @@ def test_a_moved_result_is_the_same_grasp_seen_from_elsewhere(where, how, base, 
 
 
 @pytest.fixture
-def node(monkeypatch: pytest.MonkeyPatch, domain: int) -> Iterator[Node]:
+def node(monkeypatch: pytest.MonkeyPatch, domain: int, make_node) -> Node:
     monkeypatch.setenv("ROS_AUTOMATIC_DISCOVERY_RANGE", "LOCALHOST")
-    context = Context()
-    rclpy.init(context=context, domain_id=domain)
-    node = rclpy.create_node("listener", context=context)
-    yield node
-    node.destroy_node()
-    rclpy.shutdown(context=context)
+    return make_node(domain=domain)
 
 
 def test_without_tf2_msgs_the_node_says_so_once_and_goes_on(node, monkeypatch, capfd):

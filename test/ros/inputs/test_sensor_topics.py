@@ -7,8 +7,6 @@ from collections.abc import Callable, Iterator
 from typing import Any
 
 import pytest
-import rclpy
-from rclpy.context import Context
 from rclpy.executors import Executor, SingleThreadedExecutor
 from rclpy.node import Node
 from rclpy.qos import DurabilityPolicy, ReliabilityPolicy
@@ -61,20 +59,11 @@ def domain(claim_domain: Callable[[], int]) -> int:
 
 
 @pytest.fixture
-def node(monkeypatch: pytest.MonkeyPatch, domain: int) -> Iterator[Node]:
+def node(monkeypatch: pytest.MonkeyPatch, domain: int, make_node) -> Iterator[Node]:
     """A node with the shared memory that Fast DDS has by itself."""
     monkeypatch.setenv("ROS_AUTOMATIC_DISCOVERY_RANGE", "LOCALHOST")
     monkeypatch.delenv("FASTRTPS_DEFAULT_PROFILES_FILE", raising=False)
-    context = Context()
-    rclpy.init(context=context, domain_id=domain)
-    node = rclpy.create_node("topics", context=context, use_global_arguments=False)
-    yield node
-    end_executors()
-    node.destroy_node()
-    rclpy.shutdown(context=context)
-
-
-def end_executors() -> None:
+    yield make_node(domain=domain)
     for executor in set(EXECUTORS):
         executor.shutdown()
     EXECUTORS.clear()
@@ -165,19 +154,13 @@ def test_what_was_published_before_is_heard_where_it_is_kept(node: Node, publish
     assert topic._qos.durability is DurabilityPolicy.TRANSIENT_LOCAL
 
 
-def test_what_somebody_asks_for_by_a_parameter_stays(monkeypatch, domain: int, publish: Start):
-    context = Context()
-    key = "qos_overrides./points.subscription.reliability:=best_effort"
-    rclpy.init(args=["--ros-args", "-p", key], context=context, domain_id=domain)
-    node = rclpy.create_node("topics", context=context)
+def test_what_somebody_asks_for_by_a_parameter_stays(make_node, domain: int, publish: Start):
+    node = make_node("-p", "qos_overrides./points.subscription.reliability:=best_effort", domain=domain)
     heard: list[PointCloud2] = []
     topic = SensorTopic(node, PointCloud2, "points", heard.append)
     publish("PointCloud2", "/points", "RELIABLE", asked="BEST_EFFORT", count=5)
     watch(node, [topic], lambda told: heard)
     assert topic._qos.reliability is ReliabilityPolicy.BEST_EFFORT
-    end_executors()
-    node.destroy_node()
-    rclpy.shutdown(context=context)
 
 
 def test_packed_images_are_heard_where_nobody_sends_plain_ones(node: Node, publish: Start):

@@ -4,7 +4,6 @@ import dataclasses
 import json
 import subprocess
 import sys
-from collections.abc import Iterator
 from dataclasses import replace
 from typing import Any
 
@@ -18,7 +17,6 @@ from geometry_msgs.msg import PoseStamped
 from graspd_msgs.msg import GraspArray
 from hypothesis import given
 from hypothesis import strategies as st
-from rclpy.context import Context
 from rclpy.serialization import deserialize_message, serialize_message
 from visualization_msgs.msg import MarkerArray
 
@@ -83,14 +81,9 @@ class Broken:
     ended = progressed
 
 
-@pytest.fixture(scope="module")
-def node() -> Iterator[rclpy.node.Node]:
-    context = Context()
-    rclpy.init(context=context)
-    node = rclpy.create_node("graspd_answers", context=context)
-    yield node
-    node.destroy_node()
-    rclpy.shutdown(context=context)
+@pytest.fixture
+def node(make_node) -> rclpy.node.Node:
+    return make_node()
 
 
 def published(node, report: Report[Planned], listener=None) -> tuple[list, list[str]]:
