@@ -69,7 +69,7 @@ _NEAR_SURFACE_CELLS = 2.0
 def confidence_grid(
     vertices: Float[np.ndarray, "vertices 3"], confidence: Float[np.ndarray, "vertices"], sdf: GridSDF
 ) -> Float[Tensor, "x y z"]:
-    """The confidence in the vertex nearest to each node by the surface; elsewhere, that of the nearest such node."""
+    """Return the confidence in the vertex nearest to each node by the surface, elsewhere of the nearest such node."""
     spacing = float(sdf.spacing)
     near = sdf.field[0].abs().cpu().numpy() < _NEAR_SURFACE_CELLS * spacing
     nodes = sdf.origin.cpu().numpy() + spacing * np.argwhere(near)
@@ -83,7 +83,7 @@ def confidence_grid(
 def sample_confidence(
     grid: Float[Tensor, "x y z"], sdf: GridSDF, points: Float[Tensor, "batch points 3"]
 ) -> Float[Tensor, "batch points"]:
-    """Trilinear; beyond the grid that of its border. Differentiable in the points."""
+    """Interpolate linearly, beyond the grid from its border. Differentiable in the points."""
     unit = points / sdf.half - (sdf.origin / sdf.half + 1)
     # grid_sample takes x for the last axis of its input.
     field = grid.permute(2, 1, 0)[None, None]
@@ -159,16 +159,16 @@ class Obstacle:
 
 @dataclass(frozen=True, eq=False)
 class Scene:
-    """What a grasp is planned against; all in the object's frame.
+    """What a grasp is planned against, all in the object's frame.
 
     Attributes:
         object: the thing to grasp.
         sdf: its signed distance.
         timing: seconds taken by loading and by the distance field.
-        support: what the object stands on, if anything; gravity points against its normal.
+        support: what the object stands on, if anything. Gravity points against its normal.
         obstacles: other things, only those that the hand could reach.
-        confidence: how far the surface nearest to each node of `sdf` was seen, 1, or guessed, 0; None: all of it known.
-        evidence: of what else may be true of an object that cameras saw; None: of a mesh.
+        confidence: how far the surface nearest to each node of `sdf` was seen, 1, or guessed, 0. None: all of it known.
+        evidence: of what else may be true of an object that cameras saw. None for a mesh.
     """
 
     object: ObjectModel
@@ -196,19 +196,19 @@ def build_scene(
     confidence: Float[np.ndarray, "vertices"] | None = None,
     ahead: Callable[[ObjectModel], None] | None = None,
 ) -> Scene:
-    """The scene of a mesh already in metres; `scale` is what its file was multiplied by, for the record and for advice.
+    """Build the scene of a mesh already in metres.
 
-    Its callers check the numbers (`refuse_numbers`).
+    Its callers check the numbers (`refuse_numbers`). `scale` is what its file was multiplied by, for record and advice.
 
     Args:
-        mass: [kg]; None assumes the most that a thing of its volume may weigh (`heavy_mass`), and warns of it.
+        mass: [kg]. None assumes the most that a thing of its volume may weigh (`heavy_mass`), and warns of it.
         support: what the object stands on.
         obstacles: other things near it.
-        confidence: how far each of the mesh's vertices was seen, 1, or guessed, 0; None: all of it is known.
+        confidence: how far each of the mesh's vertices was seen, 1, or guessed, 0. None where all of it is known.
         ahead: called with the object before its distance grid is built, to begin what does without.
 
     Raises:
-        MeshError: see `load_scene`; or there is not one confidence for every vertex.
+        MeshError: see `load_scene`, or there is not one confidence for every vertex.
     """
     if confidence is not None and len(confidence) != len(mesh.vertices):
         raise MeshError(
@@ -237,7 +237,7 @@ def build_scene(
 
 
 def object_sdf(model: ObjectModel, resolution: int = 48) -> GridSDF:
-    """The signed distance of an object near the origin (float32, CPU) on at most `resolution`³ nodes.
+    """Return the signed distance of an object near the origin (float32, CPU) on at most `resolution`³ nodes.
 
     Remembered by content.
     """
@@ -260,7 +260,7 @@ def object_sdf(model: ObjectModel, resolution: int = 48) -> GridSDF:
 
 
 def object_sharp_points(model: ObjectModel, count: int) -> tuple[Float[np.ndarray, "points 3"], float]:
-    """The object's sharp points [m] and its share of thin surface (`sharp_points`), remembered by content."""
+    """Return the object's sharp points [m] and its share of thin surface (`sharp_points`), remembered by content."""
     coarse = {"pool": _COARSE_POOL} if model.reconstructed else {}
 
     def build() -> cache.Arrays:

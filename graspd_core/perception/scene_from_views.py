@@ -41,21 +41,21 @@ def scene_from_views(
     device: torch.device | str = "cpu",
     ahead: Callable[[ObjectModel, Evidence], None] | None = None,
 ) -> Scene:
-    """The scene that one or several views show, in their common frame; what was guessed is in the object's warnings.
+    """Build the scene that one or several views show, in their common frame. Its warnings tell what was guessed.
 
     Args:
-        views: what each camera saw [m]; points may be NaN.
-        target: which of the things seen is meant; without it, the one nearest the first view's axis.
+        views: what each camera saw [m]. Points may be NaN.
+        target: which of the things seen is meant. Without it, the one nearest the first view's axis.
         alone: the views show the object and nothing else, so that all they show is taken.
         settings: of segmentation, reconstruction and obstacles.
-        mass: [kg]; None assumes the heavy end of what the volume allows, and warns of it.
+        mass: [kg]. None assumes the heavy end of what the volume allows, and warns of it.
         friction: Coulomb coefficient between hand and object.
         source: name of the views, for messages.
         resolution: the distance grid has at most the cube of it in nodes.
         ahead: called as soon as the object is known, before its distance grid is built, to begin what does without.
 
     Raises:
-        CloudError: the views show no usable object; NoObjectError where what was asked for is not in them.
+        CloudError: the views show no usable object. It is a NoObjectError where what was asked for is not in them.
         MeshError: the object they show is too small or too large, or a number is out of range.
     """
     started = time.perf_counter()

@@ -34,9 +34,9 @@ class Metric:
 
     Attributes:
         name: key of `GraspMetrics`.
-        unit: that files and tables show; empty without one.
+        unit: that files and tables show, empty without one.
         scale: value in that unit over value in SI units.
-        measure: gives the value in SI units; None where another step of planning fills it in.
+        measure: gives the value in SI units. None where another step of planning fills it in.
         description: definition, for docs/metrics.md.
         digits: decimals in tables.
     """
@@ -60,7 +60,7 @@ class Metric:
         return f"{self.name.replace('_', ' ')} {self.unit}".rstrip()
 
     def text(self, value: float) -> str:
-        """A value in SI units for people."""
+        """Write a value in SI units for people."""
         return f"{self.name.replace('_', ' ')} {value * self.scale:.{self.digits}f} {self.unit}".rstrip()
 
 
@@ -148,7 +148,7 @@ APART, TURNED = 0.02, float(np.deg2rad(20.0))
 
 
 def distinct(grasps: Sequence[Grasp], hand: HandModel) -> tuple[Grasp, ...]:
-    """The grasps, in their order, without those that are copies of one kept before.
+    """Return the grasps, in their order, without those that are copies of one kept before.
 
     A copy has the middle of its palm within 20 mm and its base turned by less than 20° of the other's, in the object's
     frame. What the object looks like plays no part: to grasp a ball from the left and from the right is two grasps,

@@ -74,7 +74,7 @@ class MetricsContext:
     Attributes:
         points: of the object's surface and edges [m].
         tree: of these points, a `scipy.spatial.KDTree`.
-        world: of the hold trial; None where there is none, and then no contact depth is measured.
+        world: of the hold trial. None where there is none, and then no contact depth is measured.
     """
 
     target: ObjectModel
@@ -117,7 +117,7 @@ class PlacedHand:
         points: [m].
         links: link of each sample.
         areas: surface that each sample stands for [m²].
-        distance: signed distance of each sample to the object [m]; a lower bound beyond 15 mm.
+        distance: signed distance of each sample to the object [m], a lower bound beyond 15 mm.
         rotations: `R_object_link`.
         translations: link origins in the object frame [m].
     """
@@ -144,17 +144,17 @@ def placed_hand(context: MetricsContext, posture: Posture) -> PlacedHand:
 
 
 def contact_area(placed: PlacedHand, within: float = CONTACT_DISTANCE) -> float:
-    """Hand surface within a distance of the object's surface, on either side of it [m²]; at most 15 mm."""
+    """Measure the hand's surface within a distance of the object's, of at most 15 mm, on either side of it [m²]."""
     return float(placed.areas[np.abs(placed.distance) <= within].sum())
 
 
 def contact_links(placed: PlacedHand, within: float = CONTACT_DISTANCE) -> int:
-    """Number of links that come within a distance of the object, penetrating ones included."""
+    """Count the links that come within a distance of the object, penetrating ones included."""
     return len(np.unique(placed.links[touching(placed, within)]))
 
 
 def touching(placed: PlacedHand, within: float = CONTACT_DISTANCE) -> Bool[np.ndarray, "samples"]:
-    """Samples that count as contacts."""
+    """Tell which samples count as contacts."""
     return placed.distance <= within
 
 
@@ -323,7 +323,7 @@ def _root_cells(
 def _solid_distance(
     solids: _PlacedSolids, which: Int[np.ndarray, "n"], points: Float[np.ndarray, "n 3"]
 ) -> Float[np.ndarray, "n"]:
-    """Signed distance [m] of points of the object frame each to one solid, `which` rising; of hulls a lower bound."""
+    """Measure how far each point of the object frame is from one solid [m], `which` rising. At least that of hulls."""
     local = np.einsum("nji,nj->ni", solids.rotations[which], points - solids.translations[which])
     hulls = int(np.searchsorted(which, len(solids.smooth.link)))
     smooth = local_distance(solids.smooth, torch.as_tensor(local[:hulls]), torch.as_tensor(which[:hulls])).numpy()
@@ -359,10 +359,10 @@ class WrenchHull:
     """The convex hull of unit-force friction-cone wrenches, quality figures of Ferrari and Canny.
 
     Attributes:
-        epsilon: radius of the largest ball about the origin in the hull; 0 where the origin is outside.
+        epsilon: radius of the largest ball about the origin in the hull, 0 where the origin is outside.
         volume: of the hull.
         weakest_push: the unit disturbance (force, torque over length) that is resisted least, against the nearest
-            facet; None where the origin is outside.
+            facet. None where the origin is outside.
     """
 
     epsilon: float = 0.0

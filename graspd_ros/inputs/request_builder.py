@@ -1,7 +1,7 @@
 """Messages to requests: from a mesh path, from what a camera showed, and from a GraspRequest, which is checked here.
 
 The sources of a GraspRequest's object are rows of `SOURCES`. To add one, write its function and its row here, and its
-constant in `GraspRequest.msg`; nothing else is edited.
+constant in `GraspRequest.msg`. Nothing else is edited.
 """
 
 from __future__ import annotations
@@ -57,8 +57,8 @@ class RequestBuilder:
     Used by the executor's thread only. Frames and views are immutable, so that requests may hold on to them.
 
     Args:
-        lookup: `T_target_source` of two frames at a time, without waiting; may raise a TransformError.
-        lookup_in_time: the same for the worker's thread; waits for what comes late. None: as `lookup`.
+        lookup: `T_target_source` of two frames at a time, without waiting. May raise a TransformError.
+        lookup_in_time: the same for the worker's thread. Waits for what comes late. None: as `lookup`.
     """
 
     def __init__(
@@ -128,7 +128,7 @@ class RequestBuilder:
         return replace(request, closes_late=message.closes_late, **asked)
 
     def _steering(self, message: GraspRequest, request: Request) -> Callable[[], Steering] | None:
-        """What the request asks of a grasp's place and direction, checked but for its mask. Raises GraspdError."""
+        """Read what the request asks of a grasp's place and direction, checked but for its mask. Raises GraspdError."""
         if not _asks_for_any(message):
             return None
         stamp, shown = message.header.stamp, request.shown
@@ -141,7 +141,7 @@ class RequestBuilder:
     def from_loader(
         self, request_id: str, header: Header, settings: Settings, load: Callable[[], Scene], listener: Listener | None
     ) -> Request:
-        """Return the request for the object of a GraspPlanning in the frame of a header; empty: `mesh_frame`."""
+        """Return the request for the object of a GraspPlanning in a header's frame, `mesh_frame` if that is empty."""
         timeless = nanoseconds(header.stamp) == 0
         stamp = self._now() if timeless else header.stamp
         frame = header.frame_id or settings.mesh_frame
@@ -162,7 +162,7 @@ class RequestBuilder:
 
 
 def check_request(message: GraspRequest, hand: str) -> None:
-    """Raise RequestError where no settings can make good what a field holds; `source_of` checks the source."""
+    """Raise RequestError where no settings can make good what a field holds. `source_of` checks the source."""
     if message.id and not _ID.fullmatch(message.id):
         shown = message.id[:MOST_ID]
         raise bad_request(f"id: {shown!r} may hold letters, digits and _.:@+- only, at most {MOST_ID} of them")
@@ -215,7 +215,7 @@ def _check_mask_source(message: GraspRequest, name: str, height: int) -> None:
 
 
 def settings_of(message: GraspRequest, settings: Settings) -> Settings:
-    """The settings with what a checked request asks for itself."""
+    """Return the settings with what a checked request asks for itself."""
     return replace(
         settings,
         num_grasps=message.num_grasps or settings.num_grasps,
@@ -279,7 +279,7 @@ def _check(message: GraspRequest) -> None:
 
 
 def _direction(message: GraspRequest) -> tuple[float, ...]:
-    """The approach asked for; empty where it is all 0."""
+    """Return the approach asked for, empty where it is all 0."""
     given = message.approach_direction.x, message.approach_direction.y, message.approach_direction.z
     return given if any(given) else ()
 
@@ -321,7 +321,7 @@ class SourceInput:
     builder: RequestBuilder
 
     def request(self, frame: str, stamp: Time, load: Callable[[], Scene], **fields: Any) -> Request:
-        """Return the request for an object in a frame; a stamp of zero is that of now. `fields` are more of Request."""
+        """Return the request for an object in a frame. A stamp of zero is that of now. `fields` are more of Request."""
         timeless = nanoseconds(stamp) == 0
         fields |= {"listener": self.listener, "timeless": timeless}
         stamp = self.now if timeless else stamp
@@ -330,7 +330,7 @@ class SourceInput:
 
 @dataclass(frozen=True)
 class Source:
-    """One place that objects come from; its name in capitals is that of its constant in the message.
+    """One place that objects come from. Its name in capitals is that of its constant in the message.
 
     `find` gives the object without reading it. Raises GraspdError: it is missing, old or out of reach.
     """
@@ -346,7 +346,7 @@ def mesh_loader(path: Path, settings: Settings) -> Callable[[], Scene]:
 
 
 def known_mesh(path: Path, settings: Settings) -> KnownObject | None:
-    """Return what a library may know a mesh by; None if the node has no library."""
+    """Return what a library may know a mesh by, None if the node has no library."""
     return KnownObject("", str(path), False) if settings.grasp_library else None
 
 
@@ -358,7 +358,7 @@ def frame_loader(
     point: Float[np.ndarray, "3"] | None = None,
     mask: Image | None = None,
 ) -> Callable[[], Scene]:
-    """Return a function that makes a scene of what one camera showed; `lookup` is for the worker's thread.
+    """Return a function that makes a scene of what one camera showed. `lookup` is for the worker's thread.
 
     A `point` on or near the object, in the frame's own frame [m], or a `mask` of its pixels says which one is meant.
     """
@@ -444,7 +444,7 @@ SOURCES: dict[int, Source] = {
 
 
 def source_of(message: GraspRequest) -> Source:
-    """The row of the source that a request names. Raises RequestError: there is none."""
+    """Return the row of the source that a request names. Raises RequestError: there is none."""
     if message.source not in SOURCES:
         valid = ", ".join(f"{source.name.upper()}={number}" for number, source in SOURCES.items())
         raise bad_request(f"source: {message.source}; valid: {valid}")
@@ -478,10 +478,10 @@ def _target(given: SourceInput, frame: str) -> Float[np.ndarray, "3"] | None:
 
 
 def resolve_mesh(uri: str, roots: Sequence[str]) -> Path:
-    """Return the file that `uri` names: a path, `file://` or `package://`; relative paths start at the first root.
+    """Return the file that `uri` names: a path, `file://` or `package://`. Relative paths start at the first root.
 
     Links are followed before the file is compared with the roots, so a link inside a root does not lead out of it.
-    A root may itself be a `package://` name; one whose package is not installed is left out.
+    A root may itself be a `package://` name. One whose package is not installed is left out.
     Raises MeshError: an unknown form or package, a path outside every root, no such file, a file too large.
     """
     uri = uri.strip()
@@ -507,7 +507,7 @@ def resolve_mesh(uri: str, roots: Sequence[str]) -> Path:
 
 
 def _allowed_roots(roots: Sequence[str]) -> list[Path]:
-    """The directories behind `mesh_roots`, links followed; those that do not exist are left out."""
+    """Return the directories behind `mesh_roots`, links followed, without those that do not exist."""
     found = []
     for root in roots:
         try:

@@ -79,9 +79,9 @@ def link_length(points: Points, settings: SegmentationConfig) -> float:
 def link_points(
     points: Points, weight: Float[np.ndarray, "n"], link: float, neighbour_share: float
 ) -> Int[np.ndarray, "n"]:
-    """Clusters of evenly dense points, numbered from the largest; -1: a stray.
+    """Link evenly dense points to clusters, numbered from the largest. A stray is -1.
 
-    As in DBSCAN, only points with enough neighbours carry a cluster on; the others join the nearest that does.
+    As in DBSCAN, only points with enough neighbours carry a cluster on. The others join the nearest that does.
 
     Args:
         points: one a voxel [m].
@@ -120,7 +120,7 @@ def extent(points: Points) -> float:
 
 
 def renumber(label: Int[np.ndarray, "n"]) -> Int[np.ndarray, "n"]:
-    """Number clusters from the largest, without gaps; strays (-1) stay."""
+    """Give clusters their numbers from the largest, without gaps. Strays (-1) stay."""
     answer = np.full(len(label), -1)
     known = label >= 0
     count = np.bincount(label[known])
@@ -131,8 +131,7 @@ def renumber(label: Int[np.ndarray, "n"]) -> Int[np.ndarray, "n"]:
 
 
 def touching_things(points: Points, eyes: Eyes, height: Float[np.ndarray, "n"], spacing: float) -> Int[np.ndarray, "n"]:
-    """Number the parts of a cluster that seams and waists set apart and that stand on their own; all 0 where there
-    is one.
+    """Tell apart the parts of a cluster that seams and waists bound and that stand on their own, all 0 where one is.
 
     Args:
         points: thinned evenly [m].
@@ -168,7 +167,7 @@ def touching_things(points: Points, eyes: Eyes, height: Float[np.ndarray, "n"], 
 
 
 def _normals(points: Points, near: Int[np.ndarray, "n near"], eyes: Eyes) -> Points:
-    """Unit normals of planes through neighbours, towards the camera that sees each the least from the side."""
+    """Return unit normals of planes through neighbours, towards the camera that sees each the least from the side."""
     spread = points[near] - points[near].mean(1, keepdims=True)
     normals = least_axes(spread.transpose(0, 2, 1) @ spread)
     way = eyes[:, None] - points
@@ -178,7 +177,7 @@ def _normals(points: Points, near: Int[np.ndarray, "n near"], eyes: Eyes) -> Poi
 
 
 def _outline(points: Points, normals: Points, near: Int[np.ndarray, "n near"]) -> Bool[np.ndarray, "n"]:
-    """Which points have a wide sector about them, in the surface, without any of their neighbours; -1 is none."""
+    """Tell which points have a wide sector about them, in the surface, without any of their neighbours. -1 is none."""
     near = near[:, 1 : 1 + _OUTLINE_NEIGHBOURS]
     way = points[near] - points[:, None]
     right = np.cross(normals, np.eye(3)[np.abs(normals).argmin(1)])
@@ -194,7 +193,7 @@ def _outline(points: Points, normals: Points, near: Int[np.ndarray, "n near"]) -
 def _bend(
     points: Points, normals: Points, one: Int[np.ndarray, "pairs"], other: Int[np.ndarray, "pairs"]
 ) -> Float[np.ndarray, "n"]:
-    """Mean curvature about each point [1/m], of pairs `_REACH_M` apart at most; negative where it is hollow."""
+    """Measure the mean curvature about each point [1/m], of pairs `_REACH_M` apart at most, negative in hollows."""
     way = points[other] - points[one]
     squared = np.einsum("pd,pd->p", way, way)
     # Near ones say more of noise than of the surface.
@@ -207,7 +206,7 @@ def _bend(
 
 
 def _linked(kept: Bool[np.ndarray, "n"], links: Int[np.ndarray, "links 2"]) -> Int[np.ndarray, "n"]:
-    """The connected part that each of the kept points is of; -1 of the others."""
+    """Return the connected part that each of the kept points is of, -1 for the others."""
     one, other = links[kept[links].all(1)].T
     graph = coo_matrix((np.ones(len(one), dtype=bool), (one, other)), shape=(len(kept), len(kept)))
     return np.where(kept, connected_components(graph, directed=False)[1], -1)
@@ -223,16 +222,16 @@ def merge_occluded(
     settings: SegmentationConfig,
     support: FlatPart | None,
 ) -> Int[np.ndarray, "n"]:
-    """The clusters with such pieces joined, numbered from the largest; -1: a stray.
+    """Return the clusters with such pieces joined, numbered from the largest. A stray is -1.
 
     Args:
         points: evenly dense [m].
         distance: of each from its camera [m].
-        label: their clusters, numbered from the largest; -1: a stray.
+        label: their clusters, numbered from the largest, -1 for a stray.
         viewpoints: where the cameras stood [m].
         link: distance at which points were linked [m].
         settings: pieces that are longer than its largest object together are not one thing.
-        support: what the things stand on; pieces that end well above it hang on others.
+        support: what the things stand on. Pieces that end well above it hang on others.
     """
     many = min(int(label.max(initial=-1)) + 1, MAX_PIECES)
     pieces = [points[label == k] for k in range(many)]

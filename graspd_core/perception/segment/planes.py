@@ -46,7 +46,7 @@ class FlatPart:
         most: tolerance where it is large [m].
         inliers: which of the scene's points lie on it.
         sides: length and width of the seen part [m].
-        hull: half-planes n·x + c <= 0 around the seen part, in the coordinates of `axes`; rows n, c.
+        hull: half-planes n·x + c <= 0 around the seen part, in the coordinates of `axes`, as rows n, c.
         area: inside the hull [m²].
         filled: share of that area where it was seen.
     """
@@ -79,13 +79,13 @@ class FlatPart:
 def find_planes(
     points: Points, distance: Float[np.ndarray, "n"], viewpoints: Eyes, settings: SegmentationConfig
 ) -> list[FlatPart]:
-    """Flat parts in order of their number of points, each point in at most one.
+    """Find flat parts in order of their number of points, each point in at most one.
 
     Args:
         points: evenly dense [m].
         distance: of each from its camera [m].
         viewpoints: where the cameras stood [m].
-        settings: sizes and tolerances; parts smaller than a support are left alone.
+        settings: sizes and tolerances. Parts smaller than a support are left alone.
     """
     with Extra("clouds"):
         import open3d as o3d
@@ -123,7 +123,7 @@ def _refine(
     gate: float,
     settings: SegmentationConfig,
 ) -> FlatPart | None:
-    """Weighted least squares over points that the last fit calls near; None where too few are."""
+    """Fit by weighted least squares to the points that the last fit calls near. None where too few are."""
     least, most = settings.plane_tolerance, settings.max_plane_tolerance
     size = float(np.linalg.norm(guess[:3]))
     if not size > 0:
@@ -160,7 +160,7 @@ def _refine(
 def _measure(
     points: Points, inliers: Bool[np.ndarray, "n"], plane: Plane, noise: float, settings: SegmentationConfig
 ) -> FlatPart | None:
-    """The largest connected part of the inliers, by a raster in the plane; the others are no inliers."""
+    """Keep the largest connected part of the inliers, by a raster in the plane. The others are no inliers."""
     from scipy.ndimage import binary_dilation, label
 
     axes = np.linalg.svd(plane.normal[None])[2][1:].T

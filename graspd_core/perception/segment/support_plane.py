@@ -1,8 +1,8 @@
 """Which flat part of a scene is what things stand on, which are background, and which a face of a thing.
 
 A support has the cameras on its free side, is larger than what stands on it, and something stands on it: comes down to
-it, lies over its seen part, and is of a size to be grasped. A face of a convex body has nothing on its free side; the
-floor of a tray has only a rim that is as wide as itself; a wall has things before it that do not come down to it.
+it, lies over its seen part, and is of a size to be grasped. A face of a convex body has nothing on its free side. The
+floor of a tray has only a rim that is as wide as itself. A wall has things before it that do not come down to it.
 """
 
 from __future__ import annotations
@@ -77,7 +77,7 @@ def find_ground(scene: VoxelScene, parts: list[FlatPart], viewpoints: Eyes, sett
 
 
 def _left(scene: VoxelScene, support: FlatPart | None, background: Sequence[Mask]) -> Mask:
-    """What is above the support and not part of the background."""
+    """Tell what is above the support and not part of the background."""
     left = np.ones(len(scene.mean), dtype=bool)
     if support is not None:
         left = support.height(scene.mean) > support.tolerance(scene.mean_distance)

@@ -23,7 +23,7 @@ MIDDLE_SHARE = 0.4
 
 @dataclass(frozen=True)
 class Target:
-    """What tells the object from other things; at most one of these is given.
+    """What tells the object from other things. At most one of these is given.
 
     Attributes:
         point: on or near the object, in the clouds' frame [m].
@@ -70,7 +70,7 @@ def select_target(
     views: Sequence[PointCloud],
     settings: SegmentationConfig,
 ) -> Mask:
-    """The voxels of the object.
+    """Return the voxels of the object.
 
     Args:
         label: the thing each voxel is part of, -1 for none.
@@ -80,7 +80,7 @@ def select_target(
         settings: how near a point, and how much of a thing a box or mask, must be.
 
     Raises:
-        NoObjectError: nothing where the target says; it lists the things there are.
+        NoObjectError: nothing where the target says. It lists the things there are.
     """
     many = int(label.max(initial=-1)) + 1
     if target.point is not None:
@@ -101,7 +101,7 @@ def select_target(
 def select_part(
     scene: VoxelScene, part: Labels, target: Target, views: Sequence[PointCloud], settings: SegmentationConfig
 ) -> Mask:
-    """The voxels of the parts that the target means, of a thing that it chose.
+    """Return the voxels of the parts that the target means, of a thing that it chose.
 
     Args:
         part: of things that touch, the one that each voxel is of, -1 for none.
@@ -121,7 +121,7 @@ def select_part(
 
 
 def _meant(scene: VoxelScene, target: Target) -> Mask:
-    """The voxels in the box or under the mask."""
+    """Return the voxels in the box or under the mask."""
     if target.box is not None:
         low, high = np.minimum(*target.box) - scene.size, np.maximum(*target.box) + scene.size
         return np.asarray(((scene.mean >= low) & (scene.mean <= high)).all(1))
@@ -143,7 +143,7 @@ def seen(scene: VoxelScene, label: Labels) -> str:
 def _thing_of(
     point: Vector, scene: VoxelScene, label: Labels, views: Sequence[PointCloud], settings: SegmentationConfig
 ) -> int:
-    """The thing that a point means: one it lies on or in, else the nearest within reach.
+    """Return the thing that a point means: one it lies on or in, else the nearest within reach.
 
     A point is in a thing if the thing's hull holds it, or if the thing hides it from a camera, not deeper than half the
     thing's length. Deeper than `MIDDLE_SHARE` of the length, it may as well mean a nearer thing.
@@ -170,7 +170,7 @@ def _thing_of(
 
 
 def _hiding(point: Vector, scene: VoxelScene, views: Sequence[PointCloud]) -> Mask:
-    """The voxels that hide a point from a camera; none if a camera sees through the point to what is behind it."""
+    """Return the voxels that hide a point from a camera, none if a camera sees through it to what is behind."""
     hiding = np.zeros(len(scene.mean), dtype=bool)
     for view in views:
         ray = point - view.viewpoint
@@ -191,7 +191,7 @@ def _holds(points: Points, point: Vector) -> bool:
 
 
 def _masked(scene: VoxelScene, label: Labels, many: int, meant: Mask, least: float) -> Mask:
-    """A mask may cover several things, pieces of one that others hide in part; a few points of it may miss."""
+    """Return what a mask covers: several things, pieces of one that others hide in part. A few points may miss."""
     of_first = scene.voxel[scene.of_view(0)]
     shown, covered = (
         np.bincount(label[rows][label[rows] >= 0], minlength=many) for rows in (of_first, of_first[meant[of_first]])
