@@ -70,7 +70,7 @@ MAX_PACKAGE_LINES = {
     "graspd_dataset": 2_950,
     "graspd_viewer": 2_286,
     "graspd_cell": 3_800,
-    "test": 33_062,
+    "test": 0,
 }
 # Lines that a program reaches through its imports, those inside functions too.
 # The layout aims at 22,000 of the node.
