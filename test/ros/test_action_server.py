@@ -102,10 +102,12 @@ def test_a_goal_that_is_refused_or_superseded_is_aborted_and_told_why(client, no
     client.set_parameters(busy_policy="reject")
     status, result = Goal(client, actions, **LONG).end()
     assert (status, result.error_code) == (GoalStatus.STATUS_ABORTED, "BUSY")
+    client.event(event="refused", code="BUSY")
     client.set_parameters(busy_policy="replace")
     second = Goal(client, actions, **LONG)
     status, result = first.end()
     assert (status, result.status) == (GoalStatus.STATUS_ABORTED, GraspArray.SUPERSEDED)
+    client.event(event="superseded", request="first")
     second.reaches("load")
     client.send_cancel("")  # not by its own client: rcl knows no cancelled state for that
     status, result = second.end()
