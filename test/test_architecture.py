@@ -70,7 +70,7 @@ MAX_PACKAGE_LINES = {
     "graspd_dataset": 2_950,
     "graspd_viewer": 2_286,
     "graspd_cell": 3_800,
-    "test": 0,
+    "test": 32_247,
 }
 # Lines that a program reaches through its imports, those inside functions too.
 # The layout aims at 22,000 of the node.
@@ -79,7 +79,6 @@ MAX_REACH = {"graspd_core.cli.synthesize_command": 21_780, "graspd_ros.node": 25
 # Docstrings with a semicolon, by path prefix, at most. The longest prefix of a path counts, all other files have none.
 MAX_SEMICOLONS = {
     "graspd_cell/": 21,
-    "graspd_core/perception/segment/segment.py": 3,
 }
 
 # The launch file imports this one where ROS runs it, perhaps without any library of graspd.
