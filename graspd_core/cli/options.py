@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import argparse
 import dataclasses
-import sys
 import time
 from collections.abc import Iterator
 from pathlib import Path
@@ -12,6 +11,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from graspd_core.cli.output import print_note
 from graspd_core.cli.running import EXIT_INTERRUPTED, EXIT_OK, EXIT_TOO_FEW
 from graspd_core.config import VERIFICATIONS, SceneConfig, load_scene_config
 from graspd_core.errors import BagError, CloudError, ConfigError, TransformError
@@ -92,6 +92,11 @@ def not_loaded(options: argparse.Namespace, config: PlanConfig, began: float) ->
     """Return the result of a run whose deadline passed while its object was loaded, from `began` on."""
     taken = time.perf_counter() - began
     return GraspResult(Outcome.DEADLINE, (), Timing(load=taken, total=taken), options.seed, config.method)
+
+
+def not_loaded_document(result: GraspResult) -> dict[str, Any]:
+    """Return what there is of a grasps.json without an object."""
+    return {"outcome": {"name": result.outcome.name, "message": result.outcome.value}, "grasps": []}
 
 
 def summary(result: GraspResult, wanted: int, different: int) -> str:
@@ -213,7 +218,7 @@ def bag_views(path: Path, options: argparse.Namespace) -> Iterator[tuple[BagFram
         try:
             seen = frame.view(transforms, options.frame, place)
             if place == ORIGIN and frame.frame not in told and (doubt := frame_doubt(frame.frame, frame.view().points)):
-                print(f"graspd: {doubt}", file=sys.stderr)
+                print_note(doubt)
             told.add(frame.frame)
             yield frame, seen
         except (CloudError, TransformError) as error:
@@ -239,7 +244,7 @@ def merged_views(path: Path, options: argparse.Namespace) -> tuple[PointCloud, .
         raise BagError(f"{path}: {refusals[0]}")
     if refusals:
         count = len(views) + len(refusals)
-        print(f"graspd: {len(refusals)} of {count} clouds left out, the first {refusals[0]}", file=sys.stderr)
+        print_note(f"{len(refusals)} of {count} clouds left out, the first {refusals[0]}")
     if len(names) > 1:
         raise BagError(f"{path}: clouds in several frames ({', '.join(sorted(names))}); name one with --frame")
     return tuple(views)

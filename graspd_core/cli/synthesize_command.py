@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import argparse
 import shlex
-import sys
 from contextlib import nullcontext
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -18,13 +17,15 @@ from graspd_core.cli.options import (
     exit_status,
     good_grasps,
     not_loaded,
+    not_loaded_document,
     planning_options,
     restrictions_of,
     scene_config_of,
     summary,
     target_of,
 )
-from graspd_core.cli.running import Deadline, DeadlinePassed, Interrupt, Reporter, Watched, sibling
+from graspd_core.cli.output import Reporter, answer, busy, print_note
+from graspd_core.cli.running import Deadline, DeadlinePassed, Interrupt, Watched, sibling
 from graspd_core.types import GraspResult
 
 if TYPE_CHECKING:
@@ -68,7 +69,7 @@ def run(options: argparse.Namespace) -> int:
         if path:
             check_writable(path)
     try:
-        with deadline.cuts_short():
+        with deadline.cuts_short(), busy("load"):
             scene = load_scene(
                 options.object,
                 mass=options.mass,
@@ -85,9 +86,10 @@ def run(options: argparse.Namespace) -> int:
         # Nothing is written: results are of an object.
         result = not_loaded(options, config, options.began)
         print(summary(result, options.count, 0))
+        answer(not_loaded_document(result))
         return exit_status(result)
     for warning in (*scene.object.warnings, *hand.named_warnings):
-        print(f"graspd: {warning}", file=sys.stderr)
+        print_note(warning)
     page_of_run = nullcontext(Watched())
     if options.view:
         page_of_run = sibling("graspd_viewer.view_command").watched(options, scene, hand, config)
@@ -104,9 +106,10 @@ def _report(
     options: argparse.Namespace, result: GraspResult, scene: Scene, hand: HandModel, config: PlanConfig
 ) -> None:
     """Write the result to the files asked for, and print a summary."""
-    from graspd_core.io.grasps_json import save_result
+    from graspd_core.io.grasps_json import result_document, save_result
     from graspd_core.verify.metrics import distinct
 
+    answer(result_document(result, scene.object, hand, config))
     if options.out:
         save_result(options.out, result, scene.object, hand, config)
     if options.html:

@@ -41,9 +41,9 @@ BAD_OBJECTS: dict[str, tuple[Callable[[Path], object], str]] = {
     "nan.npy": (lambda path: np.save(path, np.full((100, 3), np.nan)), "NaN"),
 }
 BAD_OPTIONS: list[tuple[list[str], str]] = [
-    (["--hand", "claw"], "unknown hand 'claw'; known: allegro_left, allegro_right"),
-    (["--preset", "best"], f"unknown preset 'best'; valid presets: {', '.join(preset_names())}"),
-    (["--preset", "mine/best.yaml"], "preset mine/best.yaml: no such file; valid presets: accurate"),
+    (["--hand", "claw"], "unknown hand 'claw'; valid: allegro_left, allegro_right"),
+    (["--preset", "best"], f"unknown preset 'best'; valid: {', '.join(preset_names())}"),
+    (["--preset", "mine/best.yaml"], "preset mine/best.yaml: no such file; valid: accurate"),
     (["-n", "many"], "invalid int value: 'many'"),
     (["--mass", "-0.1"], "mass -0.1 kg must be a positive number"),
     (["--units", "furlong"], "invalid choice: 'furlong' (choose from"),
@@ -59,6 +59,10 @@ BAD_OPTIONS: list[tuple[list[str], str]] = [
     (["--arm", "ur5e_like", "--arm-base", "1", "0", "0", "1"], "--arm-base: 4 numbers; valid"),
     (["--arm-base", "1", "0", "0"], "--arm-base: there is no arm"),
     (["--frobnicate"], "unrecognized arguments: --frobnicate"),
+    (["--preste", "fast"], "unrecognized arguments: --preste fast; did you mean --preset?"),
+    (["--hand", "alegro_right"], "unknown hand 'alegro_right'; did you mean 'allegro_right'?"),
+    (["--preset", "balnced"], "unknown preset 'balnced'; did you mean 'balanced'?"),
+    (["--method", "closedform"], "unknown method 'closedform'; did you mean 'closed_form'?"),
 ]
 
 
@@ -154,7 +158,7 @@ def test_a_scene_file_sets_the_reconstruction(tmp_path: Path, capsys: pytest.Cap
     scene.write_text("reconstruction: {most_faces: 300}")
     for bad in (command, ["synthesize", str(tmp_path / "ball.npy"), "--scene", str(scene)]):
         assert main(bad) == EXIT_BAD_INPUT
-        assert "scene.yaml.reconstruction: unknown key 'most_faces'; valid keys: fit_distance" in the_line(capsys)
+        assert "scene.yaml:1: reconstruction: unknown key 'most_faces'; did you mean 'max_faces'?" in the_line(capsys)
 
 
 def test_an_arm_that_reaches_is_written_and_one_that_does_not_is_told(
