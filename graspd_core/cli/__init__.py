@@ -1,7 +1,7 @@
 """The command line, one file a command. Each command imports heavy libraries when it runs.
 
-graspd synthesize | replay | reconstruct | library | hands | doctor are graspd_core's own. Other packages add commands
-by entry points of the group `graspd.commands`: view, bench, dataset, import and cell.
+graspd synthesize | replay | reconstruct | library | hands | doctor | completion are graspd_core's own. Other packages
+add commands by entry points of the group `graspd.commands`: view, bench, dataset, import and cell.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ import sys
 import time
 from collections.abc import Iterator, Sequence
 from importlib.metadata import entry_points, version
-from typing import NoReturn
+from typing import Any, NoReturn
 
 from graspd_core.cli.output import add_output_options, output_of, print_error
 from graspd_core.cli.running import EXIT_BAD_INPUT, EXIT_INTERRUPTED, SIBLINGS, process_began
@@ -56,10 +56,17 @@ class _Parser(argparse.ArgumentParser):
     def error(self, message: str) -> NoReturn:
         # The parser that meets words which none of its commands took knows those commands.
         if (words := message.removeprefix("unrecognized arguments: ")) != message and words.startswith("--"):
-            known = [option for below in _runnable(self) for option in below._option_string_actions]
+            known = [option for below in runnable(self) for option in below._option_string_actions]
             if near := difflib.get_close_matches(words.split()[0].split("=")[0], known, 1):
                 message = f"{message}; did you mean {near[0]}?"
         raise ConfigError(f"{message} (see {self.prog} --help)")
+
+
+class _Commands(argparse._SubParsersAction):
+    """Commands with their summaries, without which they are hidden from completion."""
+
+    def add_parser(self, name: str, **settings: Any) -> argparse.ArgumentParser:
+        return super().add_parser(name, help=_SUMMARIES.get(name, ""), **settings)
 
 
 # The commands of graspd_core, in the order of `graspd --help`.
@@ -70,6 +77,7 @@ _COMMANDS = {
     "library": "graspd_core.cli.library_command",
     "hands": "graspd_core.cli.hands_command",
     "doctor": "graspd_core.doctor",
+    "completion": "graspd_core.cli.completion_command",
 }
 # What `graspd --help` says, which imports no command. Commands of other packages are listed by name.
 _SUMMARIES = {
@@ -79,6 +87,7 @@ _SUMMARIES = {
     "library": "keep verified grasps of known objects in a file",
     "hands": "list the built-in hands, or inspect one",
     "doctor": "check the installation",
+    "completion": "print a script that lets bash, zsh or tcsh complete commands and options",
     "view": "show hands, grasps and results in a browser",
     "bench": "measure presets and methods on objects, with tables and charts",
     "dataset": "make a data set of grasps, or look at one",
@@ -107,19 +116,19 @@ def build_parser(command: str = "") -> argparse.ArgumentParser:
         if command in SIBLINGS:
             raise ConfigError(f"{command}: {SIBLINGS[command]} is not installed; run: pip install graspd")
         raise ConfigError(f"unknown command {command!r}; {choices(command, modules)}")
-    commands = parser.add_subparsers(required=True, metavar="COMMAND", dest="command")
+    commands = parser.add_subparsers(required=True, metavar="COMMAND", dest="command", action=_Commands)
     for name in [command] if command else modules:
         importlib.import_module(modules[name]).add_command(commands)
-    for runs in _runnable(parser):
+    for runs in runnable(parser):
         add_output_options(runs)
     return parser
 
 
-def _runnable(parser: argparse.ArgumentParser) -> Iterator[argparse.ArgumentParser]:
+def runnable(parser: argparse.ArgumentParser) -> Iterator[argparse.ArgumentParser]:
     """Yield the parsers below one, and that itself, that something is run by."""
     for action in parser._actions:
         for below in action.choices.values() if isinstance(action, argparse._SubParsersAction) else ():
-            yield from _runnable(below)
+            yield from runnable(below)
     if parser.get_default("run"):
         yield parser
 

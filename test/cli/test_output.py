@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from graspd_core.cli import _runnable, build_parser, main, output
+from graspd_core.cli import build_parser, main, output, runnable
 from graspd_core.cli.output import answer, busy, print_note, waiting
 from graspd_core.cli.running import EXIT_BAD_INPUT, EXIT_OK
 from graspd_core.io.grasps_json import load_document
@@ -26,7 +26,7 @@ from graspd_core.mesh.shapes import make_shape
 
 QUICK = ["shape:box", "-n", "1", "--preset", "fast"]
 # Commands that serve a page or write a script have no result to give as JSON.
-NO_JSON = {"view"}
+NO_JSON = {"view", "completion"}
 ESCAPE = "\x1b"
 
 
@@ -51,7 +51,7 @@ def on_a_terminal(code: str, **environment: str) -> str:
 
 
 def test_every_command_has_the_options():
-    for parser in _runnable(build_parser()):
+    for parser in runnable(build_parser()):
         known, name = parser._option_string_actions, parser.prog.split()[1]
         assert "--quiet" in known, parser.prog
         assert ("--json" in known) == (name not in NO_JSON), parser.prog
@@ -147,3 +147,35 @@ def test_a_wait_is_shown_on_a_terminal_only(capsys: pytest.CaptureFixture[str]):
     assert list(waiting(range(3), "thing", 3)) == [0, 1, 2]
     assert capsys.readouterr().err == "graspd: seen\n"
     assert time.perf_counter() - began < 1.0
+
+
+@pytest.mark.parametrize(
+    ("words", "offered"),
+    [
+        (["sy"], ["synthesize"]),
+        (["synthesize", "--hand", "al"], ["allegro_left", "allegro_right"]),
+        (["synthesize", "--qu"], ["--quiet"]),
+        (["hands", "in"], ["inspect"]),
+        (["reconstruct", "--out", "clo"], ["cloud.npy"]),
+    ],
+)
+def test_bash_completes_what_was_begun(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], words: list[str], offered: list[str]
+):
+    pytest.importorskip("shtab")
+    assert main(["completion", "bash"]) == EXIT_OK
+    (tmp_path / "cloud.npy").touch()
+    last = f"'{words[-1]}' '{['graspd', *words][-2]}'"
+    words_of_shell = " ".join(f"'{word}'" for word in ["graspd", *words])
+    asked = f"COMP_WORDS=({words_of_shell}); COMP_CWORD={len(words)}; _shtab_graspd graspd {last}"
+    script = f"{capsys.readouterr().out}\n{asked}; printf '%s\\n' \"${{COMPREPLY[@]}}\""
+    done = subprocess.run(["bash", "-c", script], cwd=tmp_path, capture_output=True, text=True)
+    assert done.stdout.split() == offered, done.stderr
+
+
+def test_completion_says_what_it_lacks(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setitem(sys.modules, "shtab", None)
+    assert main(["completion", "bash"]) == EXIT_BAD_INPUT
+    assert capsys.readouterr().err == "graspd: completion: shtab is not installed; run: pip install shtab\n"
+    assert main(["completion", "fish"]) == EXIT_BAD_INPUT
+    assert "choose from" in capsys.readouterr().err
