@@ -21,10 +21,10 @@ def shown(value: object) -> str:
 
 
 def choices(name: object, valid: Iterable[str], more: str = "") -> str:
-    """Return the end of a message about an unknown name: valid ones that are near, else all, and what `more` is."""
+    """Return the end of a message about an unknown name: the valid one that is near, else all, and what `more` is."""
     names = [*valid]
-    near = " or ".join(map(repr, difflib.get_close_matches(str(name), names, cutoff=_NEAR)))
-    return f"did you mean {near}?" if near else f"valid: {', '.join(names)}{more}"
+    near = difflib.get_close_matches(str(name), names, 1, _NEAR)
+    return f"did you mean {near[0]!r}?" if near else f"valid: {', '.join(names)}{more}"
 
 
 class GraspdError(Exception):

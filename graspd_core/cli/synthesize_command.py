@@ -26,6 +26,7 @@ from graspd_core.cli.options import (
 )
 from graspd_core.cli.output import Reporter, answer, busy, print_note
 from graspd_core.cli.running import Deadline, DeadlinePassed, Interrupt, Watched, sibling
+from graspd_core.errors import ConfigError
 from graspd_core.types import GraspResult
 
 if TYPE_CHECKING:
@@ -50,6 +51,7 @@ def add_command(commands: Any) -> None:
     sizes.add_argument("--units", choices=tuple(_UNITS), default=None, help="unit of the file's coordinates")
     parser.add_argument("--out", type=Path, default=None, metavar="grasps.json", help="the grasps (docs/format.md)")
     parser.add_argument("--html", type=Path, default=None, metavar="view.html", help="a page that shows them")
+    parser.add_argument("--picture", type=Path, default=None, metavar="grasp.png", help="the best grasp, drawn")
     parser.add_argument("--view", action="store_true", help="watch it in a browser (docs/viewer.md)")
     add_address(parser)
 
@@ -65,7 +67,9 @@ def run(options: argparse.Namespace) -> int:
     request["restrictions"] = restrictions_of(options)
     deadline = Deadline(options.deadline, options.began)
     # A run whose result could not be written would be lost.
-    for path in (options.out, options.html):
+    if options.picture and options.picture.suffix.lower() != ".png":
+        raise ConfigError(f"--picture {options.picture}: a .png file is written")
+    for path in (options.out, options.html, options.picture):
         if path:
             check_writable(path)
     try:
@@ -112,12 +116,19 @@ def _report(
     answer(result_document(result, scene.object, hand, config))
     if options.out:
         save_result(options.out, result, scene.object, hand, config)
-    if options.html:
+    if options.html or options.picture:
         page = sibling("graspd_viewer.grasp_page")
-        page.save_view(options.html, scene.object.mesh, hand, result.grasps, name=Path(options.object).name)
+        shown = (scene.object.mesh, hand, result.grasps)
+        up = result.support and result.support.normal
+        if options.html:
+            page.save_view(options.html, *shown, name=Path(options.object).name, up=up)
+        if options.picture:
+            page.save_picture(options.picture, *shown, up=up)
     different = len(distinct(result.grasps[: good_grasps(result)], hand))
     print(summary(result, options.count, different))
     if options.out:
         print(f"written: {options.out}; to look at it: graspd view {shlex.quote(str(options.out))}")
     if options.html:
-        print(f"written: {options.html}: the best grasp, for any browser")
+        print(f"written: {options.html}: the grasps, for any browser")
+    if options.picture:
+        print(f"written: {options.picture}: the best grasp")

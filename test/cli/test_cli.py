@@ -49,6 +49,7 @@ BAD_OPTIONS: list[tuple[list[str], str]] = [
     (["--units", "furlong"], "invalid choice: 'furlong' (choose from"),
     (["--scale", "2", "--units", "mm"], "not allowed with argument"),
     (["--verify", "gently"], "invalid choice: 'gently' (choose from"),
+    (["--picture", "grasp.jpg"], "--picture grasp.jpg: a .png file is written"),
     (["--threads", "0"], "threads: 0; at least 1"),
     (["--approach-angle", "20"], "--approach-angle: it needs --approach"),
     (["--roll-tolerance", "20"], "--roll-tolerance: it needs --roll"),
@@ -91,13 +92,17 @@ def test_a_bad_option_is_named_in_one_line(capsys: pytest.CaptureFixture[str], o
     assert culprit in the_line(capsys)
 
 
-@pytest.mark.parametrize("option", ["--out", "--html"])
+@pytest.mark.parametrize("option", ["--out", "--html", "--picture"])
 def test_an_unwritable_result_is_refused_before_the_run(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], option: str, monkeypatch: pytest.MonkeyPatch
 ):
     monkeypatch.setattr(pipeline, "plan_grasps", lambda *_, **__: pytest.fail("the run was started"))
     (tmp_path / "file").write_text("here")
-    for path, culprit in ((tmp_path, "is a directory"), (tmp_path / "file" / "out", "cannot be written")):
+    (tmp_path / "folder.png").mkdir()
+    for path, culprit in (
+        (tmp_path / "folder.png", "is a directory"),
+        (tmp_path / "file" / "a.png", "cannot be written"),
+    ):
         assert main(["synthesize", "shape:box", option, str(path)]) == EXIT_BAD_INPUT
         line = the_line(capsys)
         assert str(path) in line
@@ -238,7 +243,7 @@ def test_the_main_job_in_a_process_of_its_own(tmp_path: Path):
     """A mesh in millimetres on disk in; grasps.json and a page out."""
     box = make_shape("box")
     save_mesh(TriangleMesh(box.vertices * 1000, box.faces), tmp_path / "box.stl")
-    out = ["--out", "grasps.json", "--html", "view.html"]
+    out = ["--out", "grasps.json", "--html", "view.html", "--picture", "grasp.png"]
     options = ["-n", "1", "--units", "mm", "--preset", "fast", "--seed", "1", *out]
     done = subprocess.run([*GRASPD, "synthesize", "box.stl", *options], cwd=tmp_path, capture_output=True, text=True)
     assert done.returncode == EXIT_OK, done.stderr
@@ -249,6 +254,7 @@ def test_the_main_job_in_a_process_of_its_own(tmp_path: Path):
     assert document["seed"] == 1
     assert len(document["grasps"][0]["joint_positions"]) == len(document["hand"]["joint_names"]) == 16
     assert (tmp_path / "view.html").stat().st_size > 100_000
+    assert (tmp_path / "grasp.png").read_bytes().startswith(b"\x89PNG")
     assert "graspd: optimise" in done.stderr
     assert "total" in done.stdout
 
