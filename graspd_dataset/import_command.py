@@ -65,11 +65,11 @@ def run(options: argparse.Namespace) -> int:
             result = _result(scene, hand, imported, config, options.verify)
         path = options.out if single else options.out / f"{scene.object.sha256[:16]}.json"
         save_result(path, result, scene.object, hand, config)
-        status = status if result.grasps else EXIT_TOO_FEW
-        held = sum(grasp.verdict is Verdict.VERIFIED for grasp in result.grasps)
+        status = status if result.tried else EXIT_TOO_FEW
+        held = sum(grasp.verdict is Verdict.VERIFIED for grasp in result.tried)
         tried = f", {held} verified" if options.verify != "none" else ""
-        print(f"{path}: {len(result.grasps)} of {len(imported)} grasps of {mesh}{tried}")
-        counts = {"given": len(imported), "grasps": len(result.grasps), "verified": held}
+        print(f"{path}: {len(result.tried)} of {len(imported)} grasps of {mesh}{tried}")
+        counts = {"given": len(imported), "grasps": len(result.tried), "verified": held}
         files.append({"file": path, "object": mesh, **counts, "refused": result.refused, "warnings": result.warnings})
         for line in (*(f"{count} refused: {why}" for why, count in result.refused.items()), *result.warnings):
             print_note(line)

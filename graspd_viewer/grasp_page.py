@@ -98,7 +98,7 @@ def save_picture(
     for part in contact_parts(grasp.contacts) if grasp else ():
         arrows = render_shaded([(part.mesh, part.colour)], **look)
         image = np.where((arrows == BACKGROUND).all(-1, keepdims=True), image, arrows)
-    save_png(image, path)
+    save_png(path, image)
 
 
 def best_view(
@@ -140,7 +140,7 @@ def view_scene(object_mesh: TriangleMesh, hand: HandModel, grasps: Sequence[Gras
                 pose = np.eye(4)
                 pose[:3, :3] = rotation_from_quaternion(torch.as_tensor(quaternions[link])).numpy()
                 pose[:3, 3] = positions[link]
-                named = {"node_name": f"{kind}{rank}_{link}", "geom_name": f"{kind}_{link}"}
+                named: dict[str, Any] = {"node_name": f"{kind}{rank}_{link}", "geom_name": f"{kind}_{link}"}
                 if rank == 0:
                     scene.add_geometry(body, **named, transform=pose)
                 else:

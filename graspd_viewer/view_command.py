@@ -75,7 +75,7 @@ def watched(options: argparse.Namespace, scene: Scene, hand: HandModel, config: 
 
     def show(result: GraspResult) -> None:
         viewer.live.end()
-        viewer.show(make_session(name, hand, result.grasps, scene, config, seen, notes))
+        viewer.show(make_session(name, hand, result.tried, scene, config, seen, notes))
         wait_for_end(viewer.url)
 
     viewer = Viewer(host=options.host, port=options.port, plan=False)

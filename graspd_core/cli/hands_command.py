@@ -72,7 +72,7 @@ def run_inspect(options: argparse.Namespace) -> int:
     answer(_document(hand))
     if options.picture is not None:
         render = sibling("graspd_bench.rendering.render")
-        render.save_png(render.hand_picture(hand), options.picture)
+        render.save_png(options.picture, render.hand_picture(hand))
         print(f"{options.picture}: open (left) and closed (right), from the side and onto the palm")
     if options.yaml is not None:
         urdf = os.path.relpath(hand.urdf, options.yaml.parent)

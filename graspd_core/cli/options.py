@@ -104,10 +104,10 @@ def summary(result: GraspResult, wanted: int, different: int) -> str:
     from graspd_core.verify.metrics import METRICS
 
     good = good_grasps(result)
-    kind = "unverified" if any(not grasp.trials for grasp in result.grasps) else "verified"
+    kind = "unverified" if any(not grasp.trials for grasp in result.tried) else "verified"
     ending = result.message or result.outcome.value
     copies = f", {different} of them different" if different < good else ""
-    lines = [f"{good} of {wanted} grasps ({kind}{copies}, {len(result.grasps)} tried): {ending}"]
+    lines = [f"{good} of {wanted} grasps ({kind}{copies}, {len(result.tried)} tried): {ending}"]
     timing = result.timing
     lines.append(
         f"load {timing.load:.2f} s, sdf {timing.sdf:.2f} s, optimise {timing.optimise:.2f} s, "

@@ -46,7 +46,7 @@ def run(options: argparse.Namespace) -> int:
     with busy("reconstruct"):
         whole, _, _, warnings = reconstruct_object(views, target_of(options), options.alone, settings)
     mesh = whole.mesh
-    save_mesh(mesh, options.out)
+    save_mesh(options.out, mesh)
     for warning in (*warnings, *whole.warnings):
         print_note(warning)
     extent = mesh.vertices.max(0) - mesh.vertices.min(0)

@@ -115,7 +115,7 @@ def _outcome_line(job: _Job, result: GraspResult, count: int) -> str:
     first = result.timing.first_verified
     return (
         f"{job.label}: {sum(len(v.points) for v in job.views)} points, {good_grasps(result)} of {count} grasps "
-        f"({len(result.grasps)} tried): {result.message or result.outcome.value}; "
+        f"({len(result.tried)} tried): {result.message or result.outcome.value}; "
         + (f"first verified after {first:.2f} s, " if first else "")
         + f"total {result.timing.total:.2f} s"
     )

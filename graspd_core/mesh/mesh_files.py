@@ -8,8 +8,10 @@ from __future__ import annotations
 
 import hashlib
 import os
+import warnings
 from math import ceil, log, log10
 from pathlib import Path
+from typing import cast
 
 import numpy as np
 import torch
@@ -166,10 +168,14 @@ def read_mesh(path: str | Path, *, scale: float = 1.0) -> tuple[TriangleMesh, tu
     return TriangleMesh(mesh.vertices * scale, mesh.faces), warnings
 
 
-def save_mesh(mesh: TriangleMesh, path: str | Path) -> None:
+def save_mesh(path: str | Path, mesh: TriangleMesh) -> None:
     """Write a mesh in the format of the path's ending. Raises MeshError for an ending that cannot be written."""
     import trimesh
 
+    # The order of version 0.1.
+    if isinstance(path, TriangleMesh):
+        warnings.warn("save_mesh(mesh, path) goes with version 0.3; the path comes first", DeprecationWarning, 2)
+        path, mesh = cast("tuple[Path, TriangleMesh]", (mesh, path))
     path = Path(path)
     ending = path.suffix.lower().lstrip(".")
     writable = [e for e in MESH_ENDINGS if e != "dae"]

@@ -242,7 +242,7 @@ def test_the_first_interrupt_ends_the_run_and_the_second_the_process(number: sig
 def test_the_main_job_in_a_process_of_its_own(tmp_path: Path):
     """A mesh in millimetres on disk in; grasps.json and a page out."""
     box = make_shape("box")
-    save_mesh(TriangleMesh(box.vertices * 1000, box.faces), tmp_path / "box.stl")
+    save_mesh(tmp_path / "box.stl", TriangleMesh(box.vertices * 1000, box.faces))
     out = ["--out", "grasps.json", "--html", "view.html", "--picture", "grasp.png"]
     options = ["-n", "1", "--units", "mm", "--preset", "fast", "--seed", "1", *out]
     done = subprocess.run([*GRASPD, "synthesize", "box.stl", *options], cwd=tmp_path, capture_output=True, text=True)
@@ -487,7 +487,7 @@ def test_a_library_is_built_gone_on_with_and_listed(tmp_path: Path, capsys: pyte
     # A mesh that cannot be used keeps no other from being added.
     (tmp_path / "meshes").mkdir()
     (tmp_path / "meshes" / "bad.obj").write_text("v 0 0 0\n")
-    save_mesh(make_shape("capsule"), tmp_path / "meshes" / "capsule.obj")
+    save_mesh(tmp_path / "meshes" / "capsule.obj", make_shape("capsule"))
     assert build(out, str(tmp_path / "meshes")) == 3
     told = capsys.readouterr()
     assert "capsule: 2 of 2 grasps" in told.out
@@ -498,7 +498,7 @@ def test_an_object_that_would_go_by_the_name_of_another_is_refused(tmp_path: Pat
     out, mesh = tmp_path / "known.grasps", make_shape("sphere")
     for folder, size in (("a", 1.0), ("b", 0.9)):
         (tmp_path / folder).mkdir()
-        save_mesh(TriangleMesh(mesh.vertices * size, mesh.faces), tmp_path / folder / "ball.obj")
+        save_mesh(tmp_path / folder / "ball.obj", TriangleMesh(mesh.vertices * size, mesh.faces))
     assert build(out, str(tmp_path / "a" / "ball.obj")) == 0
     assert build(out, str(tmp_path / "b" / "ball.obj")) == 2
     told = capsys.readouterr().err
