@@ -168,15 +168,17 @@ def read_mesh(path: str | Path, *, scale: float = 1.0) -> tuple[TriangleMesh, tu
     return TriangleMesh(mesh.vertices * scale, mesh.faces), warnings
 
 
-def save_mesh(path: str | Path, mesh: TriangleMesh) -> None:
-    """Write a mesh in the format of the path's ending. Raises MeshError for an ending that cannot be written."""
+def save_mesh(path: str | Path | TriangleMesh, mesh: TriangleMesh | str | Path) -> None:
+    """Write a mesh in the format of the path's ending. Raises MeshError for an ending that cannot be written.
+
+    The order of version 0.1, with the mesh first, is taken with a warning until 0.3.
+    """
     import trimesh
 
-    # The order of version 0.1.
     if isinstance(path, TriangleMesh):
         warnings.warn("save_mesh(mesh, path) goes with version 0.3; the path comes first", DeprecationWarning, 2)
-        path, mesh = cast("tuple[Path, TriangleMesh]", (mesh, path))
-    path = Path(path)
+        path, mesh = mesh, path
+    path, mesh = Path(cast(str, path)), cast(TriangleMesh, mesh)
     ending = path.suffix.lower().lstrip(".")
     writable = [e for e in MESH_ENDINGS if e != "dae"]
     if ending not in writable:
