@@ -108,8 +108,7 @@ def run(options: argparse.Namespace) -> int:
     every = [record for own in records_of(plan).values() for record in own]
     write_results(options.out / "results.json", every)
     answer(results_document(every))
-    with busy("report"):
-        _report(options, plan)
+    _report(options, plan)
     if old is not None:
         from graspd_bench.figures import comparison
 
@@ -124,7 +123,8 @@ def _report(options: argparse.Namespace, plan: Plan) -> None:
     from graspd_bench.run_studies import report_of
     from graspd_bench.tables import fill, written
 
-    sections = report_of(plan, options.chart)
+    with busy("report"):
+        sections = report_of(plan, options.chart)
     # Every object's table is long, and what a first page shows is part of the whole.
     shown = [written(parts) for name, parts in sections.items() if name not in ("bench-objects", "bench")]
     print("\n\n".join(filter(None, shown)))

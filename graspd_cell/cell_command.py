@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import argparse
 import atexit
-import dataclasses
 import gc
 from collections.abc import Callable
 from pathlib import Path
@@ -99,7 +98,7 @@ def run(options: argparse.Namespace) -> int:
     places = robot.referee().places
     left = [name for name, place in places.items() if place != world.layout.place.name]
     print(f"{summary(attempts)}; left: {', '.join(left) or 'nothing'}; {picker.why_ended or 'interrupted'}", flush=True)
-    answer({"attempts": [dataclasses.asdict(attempt) for attempt in attempts], "left": left})
+    answer({"attempts": attempts, "left": left})
     if interrupt.came():
         return EXIT_INTERRUPTED
     return EXIT_LEFT if left else EXIT_OK

@@ -143,7 +143,7 @@ def main() -> int:
     """Print the report. Returns 0 when all that is needed works, else 1."""
     checks = run_checks()
     print(format_checks(checks))
-    answer([dataclasses.asdict(check) for check in checks])
+    answer(checks)
     return 0 if all(check.ok for check in checks if check.needed) else 1
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 import time
 from collections import Counter
-from dataclasses import asdict, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -74,8 +74,7 @@ def run(options: argparse.Namespace) -> int:
         return _make(options)
     if not places or (action not in ("merge",) and len(places) > 1):
         raise ConfigError(f"dataset {action}: {len(places)} data sets; valid: {'some' if action == 'merge' else 'one'}")
-    with busy(action):
-        return _ACTIONS[action](options, [DatasetStore(place) for place in places])
+    return _ACTIONS[action](options, [DatasetStore(place) for place in places])
 
 
 def _make(options: argparse.Namespace) -> int:
@@ -144,10 +143,11 @@ def _finish(store: DatasetStore) -> None:
 
     if not store.list("grasps"):
         return
-    stats = stats_of(store)
+    with busy("count"):
+        stats = stats_of(store)
     store.write("README.md", data_card(store, stats).encode())
     print(stats_table(stats))
-    answer({"dataset": store.shown, **asdict(stats)})
+    answer({"dataset": store.shown, **vars(stats)})
 
 
 def _request(options: argparse.Namespace) -> DatasetRequest:
@@ -221,16 +221,18 @@ class Lines:
 def _stats(options: argparse.Namespace, stores: list[DatasetStore]) -> int:
     from graspd_dataset.inspect_dataset import reason_lines, stats_of, stats_table
 
-    stats = stats_of(stores[0])
+    with busy("count"):
+        stats = stats_of(stores[0])
     print("\n".join([stats_table(stats), "", *reason_lines(stats)]))
-    answer({"dataset": stores[0].shown, **asdict(stats)})
+    answer({"dataset": stores[0].shown, **vars(stats)})
     return EXIT_OK
 
 
 def _validate(options: argparse.Namespace, stores: list[DatasetStore]) -> int:
     from graspd_dataset.inspect_dataset import faults_of_dataset, recorded_hashes
 
-    faults = list(faults_of_dataset(stores[0]))
+    with busy("validate"):
+        faults = list(faults_of_dataset(stores[0]))
     if not faults:
         paths, known = stores[0].list("grasps"), recorded_hashes(stores[0])
         without = sum(path not in known for path in paths)
@@ -248,7 +250,8 @@ def _merge(options: argparse.Namespace, stores: list[DatasetStore]) -> int:
     if not options.out:
         raise ConfigError("--out is missing: where the merged data set goes")
     out = DatasetStore(options.out)
-    copied, common = merge(stores, out)
+    with busy("merge"):
+        copied, common = merge(stores, out)
     print(f"{out.shown}: {copied} blocks copied, {common} were there or in several")
     _finish(out)
     return EXIT_OK
@@ -262,7 +265,8 @@ def _sample(options: argparse.Namespace, stores: list[DatasetStore]) -> int:
     if not options.out.endswith(".parquet"):
         raise ConfigError(f"--out {options.out}: a .parquet file is written")
     check_writable(Path(options.out))
-    content, rows = sample(stores[0], options.count, options.seed, options.verdict)
+    with busy("sample"):
+        content, rows = sample(stores[0], options.count, options.seed, options.verdict)
     save_bytes(Path(options.out), content)
     print(f"{options.out}: {rows} rows")
     answer({"file": options.out, "rows": rows})
@@ -274,7 +278,8 @@ def _export(options: argparse.Namespace, stores: list[DatasetStore]) -> int:
 
     if not options.out:
         raise ConfigError("--out is missing: the folder that is written")
-    files, grasps = export(stores[0], options.to, Path(options.out))
+    with busy("export"):
+        files, grasps = export(stores[0], options.to, Path(options.out))
     print(f"{options.out}: {grasps} grasps of {files} pairs of hand and object")
     answer({"folder": options.out, "grasps": grasps, "pairs": files})
     return EXIT_OK

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import argparse
-import dataclasses
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -102,5 +101,5 @@ def _list(options: argparse.Namespace) -> int:
         physics = f"{entry.mass:g} kg, friction {entry.friction:g}, {entry.verify}"
         print(f"{entry.name:24} {entry.hand:20} {grasps:4} grasps  {physics:32} {entry.source}")
     print(f"{options.library}: {len(rows)} records, {sum(grasps for _, grasps in rows)} grasps")
-    answer([{**dataclasses.asdict(entry), "grasps": grasps} for entry, grasps in rows])
+    answer([{**vars(entry), "grasps": grasps} for entry, grasps in rows])
     return EXIT_OK

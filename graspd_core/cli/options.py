@@ -113,6 +113,7 @@ def summary(result: GraspResult, wanted: int, different: int) -> str:
         f"load {timing.load:.2f} s, sdf {timing.sdf:.2f} s, optimise {timing.optimise:.2f} s, "
         f"verify {timing.verify:.2f} s, total {timing.total:.2f} s"
         + (f", first verified after {timing.first_verified:.2f} s" if timing.first_verified else "")
+        + (f"; object of {result.tried_mass:.2g} kg" if result.tried_mass else "")
     )
     for rank, grasp in enumerate(result.grasps[: min(good, _FIRST)]):
         figures = [

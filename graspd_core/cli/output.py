@@ -15,7 +15,7 @@ import threading
 import time
 from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, is_dataclass
 from typing import Any, TypeVar, cast
 
 from graspd_core.types import Progress, Stage
@@ -69,7 +69,9 @@ def answer(document: Any) -> None:
 
 
 def _plain(value: Any) -> Any:
-    """Return the JSON-ready form of an array, a set or a mapping, and of a path or another value its text."""
+    """Return the JSON-ready form of a dataclass, a mapping, an array or a set, and of another value its text."""
+    if is_dataclass(value):
+        return vars(value)
     if isinstance(value, Mapping):
         return dict(value)
     return value.tolist() if hasattr(value, "tolist") else sorted(value) if isinstance(value, set) else str(value)

@@ -11,6 +11,7 @@ import subprocess
 import sys
 import termios
 import time
+from collections import Counter
 from pathlib import Path
 from typing import Any
 
@@ -23,6 +24,7 @@ from graspd_core.cli.running import EXIT_BAD_INPUT, EXIT_OK
 from graspd_core.io.grasps_json import load_document
 from graspd_core.mesh.mesh_files import surface_samples
 from graspd_core.mesh.shapes import make_shape
+from graspd_dataset.inspect_dataset import HandCount
 
 QUICK = ["shape:box", "-n", "1", "--preset", "fast"]
 # Commands that serve a page or write a script have no result to give as JSON.
@@ -63,6 +65,7 @@ def test_quiet_leaves_the_result_alone(capsys: pytest.CaptureFixture[str]):
     assert main(["synthesize", *QUICK, "--quiet"]) == EXIT_OK
     out, err = capsys.readouterr()
     assert out.startswith("1 of 1 grasps")
+    assert "; object of 0.77 kg\n" in out
     assert err == ""
     # What is wrong is told, and the next command speaks again.
     assert main(["synthesize", "shape:bxo", "--quiet"]) == EXIT_BAD_INPUT
@@ -114,9 +117,11 @@ def test_json_of_lists(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
 def test_json_takes_what_commands_hold(capsys: pytest.CaptureFixture[str]):
     with output.output_of(argparse.Namespace(json=True)):
         print("for a person")
-        answer({"path": Path("a"), "vector": np.arange(2), "names": {"b", "a"}})
+        counted = HandCount(verdicts=Counter({"verified": 2}))
+        answer({"path": Path("a"), "vector": np.arange(2), "names": {"b", "a"}, "counted": counted})
     out, err = capsys.readouterr()
-    assert json.loads(out) == {"path": "a", "vector": [0, 1], "names": ["a", "b"]}
+    counts = {"blocks": 0, "size": 0, "verdicts": {"verified": 2}, "objects": []}
+    assert json.loads(out) == {"path": "a", "vector": [0, 1], "names": ["a", "b"], "counted": counts}
     assert err == "for a person\n"
 
 
