@@ -23,7 +23,8 @@ def shown(value: object) -> str:
 def choices(name: object, valid: Iterable[str], more: str = "") -> str:
     """Return the end of a message about an unknown name: the valid one that is near, else all, and what `more` is."""
     names = [*valid]
-    near = difflib.get_close_matches(str(name), names, 1, _NEAR)
+    # A file may hold any value as a name.
+    near = difflib.get_close_matches(name, names, 1, _NEAR) if isinstance(name, str) else ()
     return f"did you mean {near[0]!r}?" if near else f"valid: {', '.join(names)}{more}"
 
 

@@ -64,6 +64,7 @@ def test_a_preset_file_changes_only_what_it_names(tmp_path: Path):
         ),
         ("# A comment.\nclosed_form:\n  delta_end: low", ["bad.yaml:3: closed_form.delta_end: expected float"]),
         ("robust: {}\ncertainty: {probability: 2}", ["bad.yaml:2: certainty.probability: 2.0"]),
+        (f"? 0x{'f' * 5000}\n: 1", ["bad.yaml:1: unknown key", "huge int", "valid: certainty"]),
         ("resolution: fine", ["resolution", "expected int", "'fine'"]),
         ("resolution: 32.5", ["resolution", "expected int", "32.5"]),
         ("resolution: true", ["resolution", "expected int", "True"]),
