@@ -32,7 +32,7 @@ def loop(blocks: Sequence[Block]) -> tuple[float, float, int]:
     plan_grasps(scene, hand, count=2, preset=blocks[0].config)
     wall, cpu, rows = time.perf_counter(), time.process_time(), 0
     for block in blocks:
-        rows += len(plan_grasps(scene, hand, count=block.count, seed=block.seed, preset=block.config).grasps)
+        rows += len(plan_grasps(scene, hand, count=block.count, seed=block.seed, preset=block.config).tried)
     return time.perf_counter() - wall, time.process_time() - cpu, rows
 
 

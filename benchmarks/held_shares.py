@@ -67,7 +67,7 @@ def grasps_of_view(case: CameraView) -> list[dict[str, Any]]:
     as_tried, loose = altered(own, mass=tried.mass), out_of_place(protocol)
     assert asked is not None
     rows = []
-    for grasp in (grasp for grasp in result.grasps if grasp.verdict is Verdict.VERIFIED):
+    for grasp in (grasp for grasp in result.tried if grasp.verdict is Verdict.VERIFIED):
         holds = [[item.hold(grasp, lambda: False) for item in stage.items] for stage in asked.stages]
         *places, slippery = (hold is not None and hold.passed for hold in holds[0])
         shapes = [hold.passed for hold in holds[1] if hold is not None] if len(holds) > 1 else []

@@ -66,7 +66,7 @@ def fill(library: GraspLibrary, objects: int, hand_name: str, count: int) -> Non
     for number in range(len(there), objects):
         scene = planned_scene(shapes[number % len(shapes)])
         if scene not in PLANNED:
-            PLANNED[scene] = plan_grasps(scene, hand, count=count, preset=config).grasps
+            PLANNED[scene] = plan_grasps(scene, hand, count=count, preset=config).tried
         scale = float(random.uniform(0.7, 1.3))
         copy = {"name": f"object{number}", "scale": scale, "mesh_sha256": f"{number:064}"}
         entry = replace(entry_of(scene.object, hand, "standard"), **copy)

@@ -86,7 +86,7 @@ def main() -> None:
     }
     for name, picture in pictures.items():
         path = options.figures / f"{name}.png"
-        save_png(picture, path)
+        save_png(path, picture)
         print(f"{path}: {path.stat().st_size / 1000:.0f} kB")
 
 

@@ -73,7 +73,7 @@ def soak(folder: Path, seconds: float) -> Record:
     from graspd_core.mesh.shapes import make_shape
 
     for shape in ("sphere", "mug", "box"):
-        save_mesh(make_shape(shape), folder / f"{shape}.obj")
+        save_mesh(folder / f"{shape}.obj", make_shape(shape))
     notes, log = folder / "node.jsonl", (folder / "node.log").open("w")
     parameters = ["--ros-args", "-p", "cloud_policy:=off", "-p", "queue_size:=4"]
     run_node = [sys.executable, str(PARTS), "node", str(notes), *parameters]

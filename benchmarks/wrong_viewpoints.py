@@ -115,7 +115,7 @@ def outcome(seen: Seen, form: str, cloud: PointCloud, place: Vector) -> str:
         result = plan_grasps(scene, hand, count=2, measure=False)
     except GraspdError as error:
         return "refused as seen from elsewhere" if "did not stand at" in str(error) else "refused otherwise"
-    verified = [grasp for grasp in result.grasps if grasp.verdict is Verdict.VERIFIED]
+    verified = [grasp for grasp in result.tried if grasp.verdict is Verdict.VERIFIED]
     if not verified or seen.truth is None:
         return "verified, truth unknown" if verified else "none verified"
     truth = build_scene(seen.truth, mass=PROTOCOL_MASS)

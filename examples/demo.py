@@ -154,7 +154,7 @@ def picture(mug: TriangleMesh, hand: TriangleMesh, path: Path) -> None:
     """Two views side by side."""
     scene = [(mug, MUG_COLOUR), (hand, HAND_COLOUR)]
     views = [render_shaded(scene, T_world_camera=look_at(eye, (0.0, 0.0, 0.0))) for eye in VIEWS]
-    save_png(np.hstack(views), path)
+    save_png(path, np.hstack(views))
 
 
 def start_node(directory: Path) -> subprocess.Popen:
@@ -184,7 +184,7 @@ def run(directory: Path, process: subprocess.Popen) -> None:
     time.sleep(0.3)  # the first messages after a match can still be lost
     say(f"node ready after {time.monotonic() - begun:.1f} s")
     mug = make_shape("mug")
-    save_mesh(mug, directory / "mug.obj")
+    save_mesh(directory / "mug.obj", mug)
 
     result, hand = robot.request("a mug as a mesh path", lambda: robot.mesh.publish(String(data="mug.obj")))
     shutil.copy(directory / result["file"], directory / "grasps.json")

@@ -37,7 +37,7 @@ def row(name: str, config: PlanConfig, source: str) -> str:
         values = [grasp.metrics[metric] for grasp in held if grasp.metrics]
         return float(np.mean([value for value in values if value is not None])) if values else float("nan")
 
-    tried = len(result.grasps)
+    tried = len(result.tried)
     depth, epsilon = mean("penetration") * 1e3, mean("epsilon")
     return f"{name:<12}{len(held):>3} of {tried:<4}{depth:>8.2f} mm{epsilon:>9.3f}{result.timing.total:>8.2f} s"
 

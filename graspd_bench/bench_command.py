@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 import argparse
-import sys
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from graspd_core.cli.options import add_plugin_option
+from graspd_core.cli.output import answer, bar, busy, print_error, print_note
 from graspd_core.cli.running import EXIT_INTERRUPTED, EXIT_OK, Interrupt
 from graspd_core.errors import ConfigError
 
@@ -63,7 +63,7 @@ def add_command(commands: Any) -> None:
 
 def run(options: argparse.Namespace) -> int:
     """Run the command. Return the exit status: 0, 1 if something is wrong, 130 after Ctrl-C. Finished cases stay."""
-    from graspd_bench.result_store import read_results, write_results
+    from graspd_bench.result_store import read_results, results_document, write_results
     from graspd_bench.run_studies import faults_of, make_plan, records_of, run_plan, studies_of
     from graspd_bench.study import Request
     from graspd_core.io.grasps_json import check_writable
@@ -103,10 +103,11 @@ def run(options: argparse.Namespace) -> int:
             lines(job.study, record)
     if interrupt.came():
         kept = f"{len(plan.done)} of {len(plan.jobs)} cases are kept in {options.out}"
-        print(f"graspd: interrupted; {kept}", file=sys.stderr)
+        print_error(f"interrupted; {kept}")
         return EXIT_INTERRUPTED
     every = [record for own in records_of(plan).values() for record in own]
     write_results(options.out / "results.json", every)
+    answer(results_document(every))
     _report(options, plan)
     if old is not None:
         from graspd_bench.figures import comparison
@@ -114,7 +115,7 @@ def run(options: argparse.Namespace) -> int:
         print(f"\n{comparison(old, every)}")
     faults = faults_of(plan)
     for line in faults:
-        print(f"graspd: failed: {line}", file=sys.stderr)
+        print_error(f"failed: {line}")
     return EXIT_FAULTS if faults else EXIT_OK
 
 
@@ -122,7 +123,8 @@ def _report(options: argparse.Namespace, plan: Plan) -> None:
     from graspd_bench.run_studies import report_of
     from graspd_bench.tables import fill, written
 
-    sections = report_of(plan, options.chart)
+    with busy("report"):
+        sections = report_of(plan, options.chart)
     # Every object's table is long, and what a first page shows is part of the whole.
     shown = [written(parts) for name, parts in sections.items() if name not in ("bench-objects", "bench")]
     print("\n\n".join(filter(None, shown)))
@@ -144,18 +146,14 @@ class Lines:
         self.plan, self.processes = plan, processes
 
     def __enter__(self) -> Lines:
-        self._bar: Any = None
         total, done = len(self.plan.jobs), len(self.plan.done)
         if done:
-            print(f"graspd: {done} of {total} cases had finished before", file=sys.stderr)
+            print_note(f"{done} of {total} cases had finished before")
         if self.plan.missing and self.processes:
             minutes = self.plan.seconds(self.processes) / 60
             told = f"{len(self.plan.missing)} cases, about {minutes:.0f} minutes on {self.processes} quiet cores"
-            print(f"graspd: {told}", file=sys.stderr)
-        if sys.stderr.isatty():
-            from tqdm import tqdm
-
-            self._bar = tqdm(total=total, initial=done, desc="cases", file=sys.stderr)
+            print_note(told)
+        self._bar = bar("cases", total, done)
         return self
 
     def __call__(self, study: str, record: dict[str, Any]) -> None:
@@ -168,7 +166,7 @@ class Lines:
         else:
             took = f"{record.get('case_cpu', 0.0):.1f} CPU s"
             where = f"{len(self.plan.done)}/{len(self.plan.jobs)} {study} {record['label']}"
-            print(f"graspd: {where}: {came}, {took}", file=sys.stderr, flush=True)
+            print_note(f"{where}: {came}, {took}")
 
     def __exit__(self, *_: object) -> None:
         if self._bar is not None:

@@ -5,6 +5,7 @@ They are light, printable, and told apart by shape as well as by colour.
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -15,14 +16,15 @@ from typing import Any
 import numpy as np
 
 from graspd_bench.figures import (
-    FEW,
     Row,
     by_name,
+    is_few,
     is_preset,
     is_sweep_value,
     parent_of,
     pareto_front,
     rows,
+    share_interval,
     short_name,
     spread,
 )
@@ -165,11 +167,16 @@ PANELS = (
 )
 # What a log axis shows of less than this [cm].
 _LEAST = 0.01
+# Objects that a chart names. It counts more of them.
+_NAMED = 4
 
 
 @dataclass(frozen=True)
 class Point:
-    """One preset on one panel: middle and quartiles over objects on both axes, and whether any of its grasps held."""
+    """One preset on one panel: low, middle and high on both axes, and whether any of its grasps held.
+
+    They are the middle and quartiles over objects, or over the grasps of a single one. A share has its 95 % interval.
+    """
 
     name: str
     method: str
@@ -186,17 +193,37 @@ def draw_charts(records: Sequence[Record], path: Path) -> dict[str, Path]:
     found = rows(records)
     swept = [row for row in found if is_sweep_value(row.name)]
     presets = by_name(row for row in found if is_preset(row.name))
-    few = {name: group for name, group in presets.items() if name in FEW}
+    few = {name: group for name, group in presets.items() if is_few(name)}
+    about, planned = (about_records(records, kind) for kind in ("raw", "verified"))
     drawn = {
-        "speed": draw_speed(presets, path),
-        "short": draw_speed(few, path.with_name(f"{path.name}_short")),
-        "planned": draw_planned(by_name(rows(records, "verified")), path.with_name(f"{path.name}_planned")),
+        "speed": draw_speed(presets, path, about),
+        "short": draw_speed(few, path.with_name(f"{path.name}_short"), about),
+        "planned": draw_planned(by_name(rows(records, "verified")), path.with_name(f"{path.name}_planned"), planned),
         "ladder": draw_sweeps(swept, path.with_name(f"{path.name}_ladder")) if swept else None,
     }
     return {name: png for name, png in drawn.items() if png}
 
 
-def draw_planned(presets: dict[str, list[Row]], path: Path) -> Path | None:
+def about_records(records: Sequence[Record], kind: str) -> str:
+    """Return hands, objects, numbers of grasps and what bars mean, of a chart's records in two lines."""
+    shown = [r for r in records if r.get("kind") == kind and not r["error"] and is_preset(r["name"])]
+    if not shown:
+        return ""
+    hands, objects = ([*dict.fromkeys(Path(r[key]).name for r in shown)] for key in ("hand", "object"))
+    asked = Counter[str]()
+    for record in shown:
+        asked[record["name"]] += record["count"]
+    few, most = min(asked.values()), max(asked.values())
+    things = ", ".join(objects) if len(objects) <= _NAMED else f"{len(objects)} objects"
+    number = f"{few}" if few == most else f"{few} to {most}"
+    # Times are those of whole runs.
+    bars = "objects" if len(objects) > 1 else "grasps" if kind == "raw" else ""
+    shares = ", the 95 % interval of a share" if kind == "raw" else ""
+    told = f"; bars: quartiles over {bars}{shares}" if bars else ""
+    return f"{', '.join(hands)}; {things}\nn = {number} grasps a preset{told}"
+
+
+def draw_planned(presets: dict[str, list[Row]], path: Path, about: str = "") -> Path | None:
     """Draw seconds per verified grasp against seconds to the first, both as planned. None if there is nothing."""
     panel = Panel("cpu_per_verified", "CPU seconds per verified grasp, all included")
     points = points_of(presets, "first_cpu", panel)
@@ -206,23 +233,26 @@ def draw_planned(presets: dict[str, list[Row]], path: Path) -> Path | None:
         axis = axes[0][0]
         _draw_panel(axis, points, panel)
         axis.set_xscale("linear")
-        axis.set_xlabel("CPU seconds to the first verified grasp")
+        axis.set_xlabel(f"CPU seconds to the first verified grasp\n{about}".strip())
         axis.set_xlim(left=0.0)
         names = [p.name for p in points]
         place_labels(axis, [(p.x[1], p.y[1]) for p in points], names, [method_row(p.method).colour for p in points])
         return save(made, path)
 
 
-def draw_speed(presets: dict[str, list[Row]], path: Path) -> Path | None:
-    """Draw a panel for every figure of accuracy, against time for a raw grasp. None where there is nothing to draw."""
+def draw_speed(presets: dict[str, list[Row]], path: Path, about: str = "") -> Path | None:
+    """Draw a panel for every figure of accuracy, against time for a raw grasp. None where there is nothing to draw.
+
+    `about` says of which hands, objects and how many grasps.
+    """
     panels = [(panel, points) for panel in PANELS if (points := points_of(presets, "cpu_per_grasp", panel))]
     if not panels:
         return None
     with figure(4.6 * len(panels), 4.4, ncols=len(panels), squeeze=False) as (made, axes):
-        for axis, (panel, points) in zip(axes[0], panels, strict=True):
-            _draw_panel(axis, points, panel)
-        made.supxlabel("CPU seconds per raw grasp (one thread, log scale)", fontsize=9)
-        _legend(made, list(dict.fromkeys(row.method for group in presets.values() for row in group)))
+        fronts = [_draw_panel(axis, points, panel) for axis, (panel, points) in zip(axes[0], panels, strict=True)]
+        made.supxlabel(f"CPU seconds per raw grasp (one thread, log scale)\n{about}".strip(), fontsize=9)
+        shown = [point for _, points in panels for point in points]
+        _legend(made, shown, front=max(fronts) > 1)
         for axis, (_, points) in zip(axes[0], panels, strict=True):
             names, colours = [short_name(p.name) for p in points], [method_row(p.method).colour for p in points]
             place_labels(axis, [(p.x[1], p.y[1]) for p in points], names, colours)
@@ -236,13 +266,20 @@ def points_of(presets: dict[str, list[Row]], time: str, panel: Panel) -> list[Po
         x, y = spread(group, time), spread(group, panel.figure)
         if x and y:
             heights = (y.low, y.mean if panel.mean else y.median, y.high)
+            if panel.mean:
+                low, high = share_interval(
+                    round(sum((row.values[panel.figure] or 0.0) * row.asked for row in group)),
+                    sum(row.asked for row in group),
+                )
+                heights = (min(low, y.mean), y.mean, max(high, y.mean))
             low, mid, high = (max(height * panel.factor, _LEAST if panel.log else 0.0) for height in heights)
             held = any(row.held for row in group)
             points.append(Point(name, group[0].method, (x.low, x.median, x.high), (low, mid, high), held))
     return points
 
 
-def _draw_panel(axis: Any, points: Sequence[Point], panel: Panel) -> None:
+def _draw_panel(axis: Any, points: Sequence[Point], panel: Panel) -> int:
+    """Draw the points of a panel and their front. Return how many points the front has."""
     place = {p.name: (p.x[1], p.y[1]) for p in points}
     for p in points:
         (x, y), colour, parent = place[p.name], method_row(p.method).colour, parent_of(p.name)
@@ -251,7 +288,18 @@ def _draw_panel(axis: Any, points: Sequence[Point], panel: Panel) -> None:
         bars = {"xerr": _bars(*p.x), "yerr": _bars(*p.y)}
         axis.errorbar(x, y, **bars, fmt="none", ecolor=colour, elinewidth=1.0, alpha=0.45, zorder=3)
         filling = "white" if parent else colour
-        axis.plot(x, y, method_row(p.method).marker, color=colour, ms=7, mew=1.3, mfc=filling, ls="none", zorder=5)
+        axis.plot(
+            x,
+            y,
+            method_row(p.method).marker,
+            color=colour,
+            ms=7,
+            mew=1.3,
+            mfc=filling,
+            ls="none",
+            zorder=5,
+            clip_on=False,
+        )
     # What holds nothing sinks into nothing either: it is drawn, but it beats nobody.
     spots = np.array([place[p.name] for p in points if p.held] or list(place.values()))
     front = spots[pareto_front(spots * [1.0, 1.0 if panel.less_is_better else -1.0])]
@@ -259,29 +307,47 @@ def _draw_panel(axis: Any, points: Sequence[Point], panel: Panel) -> None:
     axis.set_xscale("log")
     axis.set_ylabel(panel.label)
     axis.margins(0.18, 0.1)
+    _few_ticks(axis.xaxis)
     if panel.log:
         axis.set_yscale("log")
+        _few_ticks(axis.yaxis)
     else:
         low, high = axis.get_ylim()
-        axis.set_ylim((0.0, high) if panel.less_is_better else (max(-4.0, low), 104.0))
+        axis.set_ylim((0.0, high) if panel.less_is_better else (max(0.0, low), 100.0))
     way = "left and down" if panel.less_is_better else "left and up"
     axis.set_title(f"better: {way}", fontsize=7.5, color="#666666")
+    return len(front)
+
+
+def _few_ticks(axis: Any) -> None:
+    """Label a logarithmic axis with round numbers that stand apart. Over less than a decade it has no powers of ten."""
+    from matplotlib.ticker import FuncFormatter, LogLocator, MaxNLocator, NullFormatter
+
+    low, high = axis.get_view_interval()
+    axis.set_major_locator(
+        MaxNLocator(4) if high < 10 * low else LogLocator(subs=(1.0, 3.0) if high < 300 * low else (1.0,))
+    )
+    axis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
+    axis.set_minor_formatter(NullFormatter())
 
 
 def _bars(low: float, middle: float, high: float) -> list[list[float]]:
     return [[max(0.0, middle - low)], [max(0.0, high - middle)]]
 
 
-def _legend(made: Any, methods: Sequence[str]) -> None:
+def _legend(made: Any, points: Sequence[Point], *, front: bool) -> None:
+    """Name what is drawn, and nothing else."""
     from matplotlib.lines import Line2D
 
     plain = {"ls": "none", "ms": 7, "mew": 1.3}
     handles = [
         Line2D([], [], marker=method_row(m).marker, color=method_row(m).colour, label=method_row(m).label, **plain)
-        for m in methods
+        for m in dict.fromkeys(point.method for point in points)
     ]
-    handles.append(Line2D([], [], marker="o", color="#666666", mfc="white", label="ablation", **plain))
-    handles.append(Line2D([], [], color=FRONT, lw=1.2, alpha=0.6, label="Pareto front"))
+    if any(parent_of(point.name) for point in points):
+        handles.append(Line2D([], [], marker="o", color="#666666", mfc="white", label="ablation", **plain))
+    if front:
+        handles.append(Line2D([], [], color=FRONT, lw=1.2, alpha=0.6, label="Pareto front"))
     made.legend(handles=handles, loc="outside upper center", ncols=len(handles), frameon=False, fontsize=8.5)
 
 
@@ -301,7 +367,7 @@ def draw_sweeps(found: Sequence[Row], path: Path) -> Path:
             axis.set_xticks(list(sweep_values), [f"{sweep_value:g}" for sweep_value in sweep_values])
             axis.minorticks_off()
             axis.set_xlabel(_LABELS[name])
-            axis.set_ylim(-4.0, 104.0)
+            axis.set_ylim(0.0, 100.0)
             second.grid(False)
             second.tick_params(axis="y", colors=_TIME, labelright=second is seconds[-1])
         for second in seconds:
@@ -314,6 +380,6 @@ def draw_sweeps(found: Sequence[Row], path: Path) -> Path:
 
 def _draw_line(axis, sweep_values: dict[float, list[Row]], name: str, factor: float, colour: str, line: str) -> None:
     over = {sweep_value: found for sweep_value, group in sweep_values.items() if (found := spread(group, name))}
-    axis.plot(list(over), [s.mean * factor for s in over.values()], line, color=colour, ms=4.5, lw=1.4)
+    axis.plot(list(over), [s.mean * factor for s in over.values()], line, color=colour, ms=4.5, lw=1.4, clip_on=False)
     low, high = ([getattr(s, end) * factor for s in over.values()] for end in ("low", "high"))
     axis.fill_between(list(over), low, high, color=colour, alpha=0.12, lw=0)

@@ -21,7 +21,7 @@ from graspd_bench.rendering.depth_noise import DEFAULT, NONE, DepthNoise
 from graspd_bench.rendering.tabletop import CAMERA, ring_poses, tabletop, views_of
 from graspd_bench.stress.broken_meshes import thin_cup
 from graspd_bench.study import PROTOCOL_MASS, Case, Picture, Record, Request, Sections, raw_grasps
-from graspd_core.errors import ConfigError, GraspdError
+from graspd_core.errors import ConfigError, GraspdError, choices
 from graspd_core.hands.fingers import find_fingers
 from graspd_core.hands.kinematics import make_kinematics, points_in_base
 from graspd_core.hands.library import load_hand
@@ -319,7 +319,7 @@ MAPS: Mapping[str, Map] = {
 def map_cases(request: Request) -> tuple[MapCase, ...]:
     """Return the cases of the requested maps. Raises ConfigError: there is no such map."""
     if unknown := [name for name in request.cases if name not in MAPS]:
-        raise ConfigError(f"unknown map {unknown[0]!r}; valid: {', '.join(MAPS)}")
+        raise ConfigError(f"unknown map {unknown[0]!r}; {choices(unknown[0], MAPS)}")
     names = request.cases or (tuple(MAPS)[1:2] if request.quick else tuple(MAPS))
     seeds = request.seeds or (SEEDS[:1] if request.quick else SEEDS)
     # Both methods on one object after the other: what is built of it is remembered.

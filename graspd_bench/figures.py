@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Collection, Iterable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from statistics import median
 from typing import Any
@@ -12,6 +13,7 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from graspd_bench.study import Record
+from graspd_core.optimize.plan_config import preset_names
 from graspd_core.verify.metrics import METRICS
 
 # Presets of the first page: those that people plan with, the published method, its repaired form and a baseline.
@@ -38,6 +40,11 @@ def is_hand(name: str) -> bool:
 def is_preset(name: str) -> bool:
     """Return whether a name is of a preset, neither of a sweep value nor of a hand."""
     return not is_sweep_value(name) and not is_hand(name)
+
+
+def is_few(name: str) -> bool:
+    """Return whether a preset is on the first page: one of `FEW`, or a user's own."""
+    return is_preset(name) and (name in FEW or name not in preset_names())
 
 
 def is_sweep_value(name: str) -> bool:
@@ -72,7 +79,7 @@ class Row:
 
     `values` has the medians of `_grasp_figures` over the grasps, the shares of `TRIAL_FIGURES` of the requested grasps,
     and seconds: `cpu_per_grasp` of the optimiser, `cpu_with_scene`, `cpu_per_verified` (`spent` over `held`),
-    `first_cpu` and `first_wall` until the first verified grasp.
+    `first_cpu` and `first_wall` until the first verified grasp. `quartiles` are those over the grasps.
     """
 
     name: str
@@ -83,6 +90,7 @@ class Row:
     held: int
     spent: float
     values: dict[str, float | None]
+    quartiles: dict[str, tuple[float, float]] = field(default_factory=dict)
 
 
 @dataclass(frozen=True)
@@ -114,6 +122,8 @@ def _row(group: Sequence[Record], ran: Collection[str]) -> Row:
     figures = [_grasp_figures(grasp) for grasp in grasps]
     names = _grasp_figures({})
     values: dict[str, float | None] = {name: _median(figure[name] for figure in figures) for name in names}
+    known = {name: [value for figure in figures if (value := figure[name]) is not None] for name in names}
+    quartiles = {name: tuple(np.percentile(some, [25, 75]).tolist()) for name, some in known.items() if some}
     for trial in TRIAL_FIGURES:
         outcomes = [_inner(grasp, trial, "share" if trial == "noisy" else "passed") for grasp in grasps]
         tried = any(outcome is not None for outcome in outcomes) if grasps else trial in ran
@@ -129,16 +139,28 @@ def _row(group: Sequence[Record], ran: Collection[str]) -> Row:
     values["peak_mb"] = max((r["peak_mb"] for r in group), default=None)
     values["rounds"] = _median(float(r["rounds"]) if "rounds" in r else None for r in group)
     one, given = group[0], sum(r["given"] for r in group)
-    return Row(one["name"], one["object"], one["method"], asked, given, held, spent, values)
+    return Row(one["name"], one["object"], one["method"], asked, given, held, spent, values, quartiles)
 
 
 def spread(rows: Iterable[Row], figure: str) -> Spread | None:
-    """Return a figure's spread over objects, or None where no object has it."""
-    values = [value for row in rows if (value := row.values.get(figure)) is not None]
+    """Return a figure's spread over objects, that over the grasps of a single one, or None where no object has it."""
+    known = [row for row in rows if row.values.get(figure) is not None]
+    values = [row.values[figure] or 0.0 for row in known]
     if not values:
         return None
     low, middle, high = np.percentile(values, [25, 50, 75])
+    if len(values) == 1:
+        low, high = known[0].quartiles.get(figure, (low, high))
     return Spread(float(middle), float(low), float(high), float(np.mean(values)), len(values))
+
+
+def share_interval(held: int, asked: int) -> tuple[float, float]:
+    """Return the 95 % interval of a share (Wilson 1927)."""
+    z, share = 1.96, held / asked
+    middle = share + z * z / (2 * asked)
+    half = z * math.sqrt(share * (1 - share) / asked + z * z / (4 * asked * asked))
+    low, high = ((middle + side * half) / (1 + z * z / asked) for side in (-1.0, 1.0))
+    return max(low, 0.0), min(high, 1.0)
 
 
 def per_verified(rows: Sequence[Row]) -> float | None:

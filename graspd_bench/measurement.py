@@ -236,14 +236,14 @@ def run_verified(cell: Cell) -> dict[str, Any]:
     result = plan_grasps(scene, hand, count=cell.count, seed=cell.seed, preset=cell.settings, progress=told)
     taken = {name: value - began[name] for name, value in _now().items()}
     return {
-        "given": len(result.grasps),
-        "held": sum(grasp.verdict is Verdict.VERIFIED for grasp in result.grasps),
+        "given": len(result.tried),
+        "held": sum(grasp.verdict is Verdict.VERIFIED for grasp in result.tried),
         "first_verified": told.first,
         "rounds": told.rounds,
         "outcome": result.outcome.name,
         "cpu": {"total": taken["cpu"]},
         "wall": {"total": taken["wall"], "optimise": result.timing.optimise, "verify": result.timing.verify},
-        "grasps": [{"verdict": str(grasp.verdict), "reason": grasp.reason} for grasp in result.grasps],
+        "grasps": [{"verdict": str(grasp.verdict), "reason": grasp.reason} for grasp in result.tried],
     }
 
 

@@ -63,9 +63,14 @@ def read_record(folder: Path, study: str, case: Case, code: str | None, *, faile
     return record if (failed or not record.get("error")) and code in (None, record.get("code")) else None
 
 
+def results_document(records: Sequence[Record]) -> dict[str, Any]:
+    """Return records as one JSON-ready document."""
+    return {"format": FORMAT, "version": VERSION, "records": records}
+
+
 def write_results(path: Path, records: Sequence[Record]) -> None:
     """Write all records to one file."""
-    save_text(path, json.dumps({"format": FORMAT, "version": VERSION, "records": records}, allow_nan=False) + "\n")
+    save_text(path, json.dumps(results_document(records), allow_nan=False) + "\n")
 
 
 def read_results(path: Path) -> list[Record]:

@@ -22,7 +22,7 @@ from graspd_bench.result_store import bench_version, head, read_record, write_re
 from graspd_bench.study import Case, Picture, Record, Request, Study
 from graspd_bench.study_registry import STUDIES
 from graspd_bench.tables import sourced
-from graspd_core.errors import ConfigError
+from graspd_core.errors import ConfigError, choices
 from graspd_dataset.run_records import failure, finite, forget_peak, peak_mb
 
 # How often a stop is looked for [s].
@@ -207,7 +207,7 @@ def studies_of(names: Sequence[str]) -> dict[str, Study]:
     Raises ConfigError, which lists the valid names, if there is no such study.
     """
     if unknown := [name for name in names if name not in (*STUDIES, ALL)]:
-        raise ConfigError(f"unknown suite {unknown[0]!r}; valid suites: {', '.join(STUDIES)}, {ALL}")
+        raise ConfigError(f"unknown suite {unknown[0]!r}; {choices(unknown[0], (*STUDIES, ALL))}")
     usual = [name for name, study in STUDIES.items() if study.usual]
     return {name: STUDIES[name] for given in names for name in (usual if given == ALL else [given])}
 

@@ -8,7 +8,7 @@ from pathlib import Path
 from graspd_bench.figures import hand_row
 from graspd_bench.measurement import TRIALS, USUAL, Cell, Kind
 from graspd_bench.study import Request, all_shapes, find_objects
-from graspd_core.errors import ConfigError
+from graspd_core.errors import ConfigError, choices
 from graspd_core.hands.library import hand_names
 from graspd_core.optimize.plan_config import PlanConfig, load_preset, method_row, override, preset_names
 
@@ -154,7 +154,7 @@ def _steps(config: PlanConfig) -> int:
 def _trials(request: Request, usual: tuple[str, ...]) -> tuple[str, ...]:
     for name in request.trials:
         if name not in TRIALS:
-            raise ConfigError(f"unknown trial {name!r}; valid trials: {', '.join(TRIALS)}")
+            raise ConfigError(f"unknown trial {name!r}; {choices(name, TRIALS)}")
     return request.trials or usual
 
 

@@ -7,7 +7,7 @@ import re
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
-from graspd_bench.figures import FEW, Row, by_name, is_hand, is_preset, per_verified, rows, spread
+from graspd_bench.figures import Row, by_name, is_few, is_hand, is_preset, per_verified, rows, spread
 from graspd_bench.study import Picture, Record, Sections
 from graspd_bench.suites import DECADES
 from graspd_core.errors import ConfigError
@@ -174,7 +174,7 @@ def pace_table(records: Sequence[Record]) -> str:
 def main_sections(records: Sequence[Record], chart: Path | None) -> Sections:
     """Return the few rows of a first page, the whole table, planned runs, and every object."""
     drawn = drawn_charts(records, chart)
-    few = [record for record in records if record["name"] in FEW]
+    few = [record for record in records if is_few(record["name"])]
     return {
         "bench": [drawn.get("short"), summary_table(few)],
         "bench-all": [drawn.get("speed"), summary_table(records), missing(records)],

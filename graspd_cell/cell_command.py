@@ -5,12 +5,12 @@ from __future__ import annotations
 import argparse
 import atexit
 import gc
-import sys
 from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from graspd_core.cli.options import add_address
+from graspd_core.cli.output import answer, print_error, print_note, waiting
 from graspd_core.cli.running import EXIT_INTERRUPTED, EXIT_OK, Interrupt
 from graspd_core.errors import ConfigError
 
@@ -81,7 +81,7 @@ def run(options: argparse.Namespace) -> int:
         _greet(live, interrupt.came)
         picker = Picker(robot, source, arm, hand, world.layout, cancelled=interrupt.came)
         try:
-            for attempt in picker.empty_the_bin(options.attempts or 2 * options.count + 3):
+            for attempt in waiting(picker.empty_the_bin(options.attempts or 2 * options.count + 3), "pick"):
                 attempts.append(attempt)
                 report = robot.referee()
                 _tell(live, attempt, report)
@@ -91,13 +91,14 @@ def run(options: argparse.Namespace) -> int:
                 elif film is not None:
                     film.begin()
         except Cancelled as error:
-            print(f"graspd: {error}", file=sys.stderr)
+            print_error(error)
         finally:
             if live is not None:
                 live.page.close()
     places = robot.referee().places
     left = [name for name, place in places.items() if place != world.layout.place.name]
     print(f"{summary(attempts)}; left: {', '.join(left) or 'nothing'}; {picker.why_ended or 'interrupted'}", flush=True)
+    answer({"attempts": attempts, "left": left})
     if interrupt.came():
         return EXIT_INTERRUPTED
     return EXIT_LEFT if left else EXIT_OK
@@ -121,7 +122,7 @@ def _refuse(options: argparse.Namespace) -> None:
 
 def _greet(live: LiveCell | None, stop: Callable[[], bool]) -> None:
     if live is not None:
-        print(f"graspd: {live.page.url} - the arm begins when it is open", file=sys.stderr, flush=True)
+        print_note(f"{live.page.url} - the arm begins when it is open")
         live.page.wait_for_visitor(_PATIENCE, stop)
 
 

@@ -94,7 +94,7 @@ class Film:
         frames = [cell_picture(self._robot, self._moments[k]) for k in places]
         rows = [np.concatenate(frames[k : k + _ROW], axis=1) for k in range(0, FRAMES, _ROW)]
         path.parent.mkdir(parents=True, exist_ok=True)
-        save_png(np.concatenate(rows, axis=0), path)
+        save_png(path, np.concatenate(rows, axis=0))
 
 
 class LiveCell:

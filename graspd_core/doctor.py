@@ -16,6 +16,8 @@ from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from typing import Any
 
+from graspd_core.cli.output import answer, waiting
+
 PROBE_TIMEOUT = 60.0  # Seconds. A cold disk takes several for torch or Open3D.
 _SETUP = "run `make setup` in the checkout, or pip install graspd again"
 _CLOUDS = "only clouds need it: pip install 'graspd[clouds]'"
@@ -105,7 +107,7 @@ def run_checks() -> list[Check]:
         ("ROS 2 (rclpy)", _ROS, "only the node needs it: make setup (docs/ros.md)", False),
     ]
     with ThreadPoolExecutor(max_workers=2) as pool:
-        probed = list(pool.map(lambda probe: try_code(*probe), probes))
+        probed = list(waiting(pool.map(lambda probe: try_code(*probe), probes), "check", len(probes)))
     return [_check_python(), *_check_system_libraries(), *probed, _check_cache()]
 
 
@@ -139,7 +141,8 @@ def add_command(commands: Any) -> None:
 def main() -> int:
     """Print the report. Returns 0 when all that is needed works, else 1."""
     checks = run_checks()
-    sys.stdout.write(format_checks(checks) + "\n")
+    print(format_checks(checks))
+    answer(checks)
     return 0 if all(check.ok for check in checks if check.needed) else 1
 
 

@@ -1,7 +1,11 @@
 """Errors of wrong use. Failing to find a grasp is an `Outcome`, never an exception."""
 
+import difflib
 import reprlib
+from collections.abc import Iterable
 
+# How alike a name and the one that was meant are at least, of 0 to 1.
+_NEAR = 0.65
 _SHORT = reprlib.Repr()
 _SHORT.maxlevel, _SHORT.maxlist, _SHORT.maxtuple, _SHORT.maxdict, _SHORT.maxset = 3, 6, 6, 6, 6
 _SHORT.maxstring = _SHORT.maxother = 120
@@ -14,6 +18,14 @@ def shown(value: object) -> str:
     # An integer of more than 4300 digits has no decimal form.
     except ValueError:
         return f"a huge {type(value).__name__}"
+
+
+def choices(name: object, valid: Iterable[str], more: str = "") -> str:
+    """Return the end of a message about an unknown name: the valid one that is near, else all, and what `more` is."""
+    names = [*valid]
+    # A file may hold any value as a name.
+    near = difflib.get_close_matches(name, names, 1, _NEAR) if isinstance(name, str) else ()
+    return f"did you mean {near[0]!r}?" if near else f"valid: {', '.join(names)}{more}"
 
 
 class GraspdError(Exception):

@@ -288,17 +288,18 @@ class AuditCount:
 
 @dataclass(frozen=True)
 class GraspResult:
-    """The result of a run: always an outcome with its `message`, and the grasps in rank order, verified ones first.
+    """The result of a run: always an outcome with its `message`, and what was tried in rank order, verified ones first.
 
-    `support` is what the object stood on, None for a floating one. `audits` is always zero, and goes with 0.3.
-    `next_view` is `T_object_camera` [m] of a further view of the hidden side. It is set if grasps hold on the likeliest
-    shape and none is sure enough. `refused` counts by reason the candidates that a restriction did not admit. `mass` is
-    the object's mass in the trials [kg] if the hand could not hold the assumed one, else None. `tried_mass` is its mass
-    in all trials [kg].
+    `grasps` has those that did not fail, at most the `count` that were asked for, and `failed` those that did. `tried`
+    has both, and what was found beyond `count`. `support` is what the object stood on, None for a floating one.
+    `audits` is always zero, and goes with 0.3. `next_view` is `T_object_camera` [m] of a further view of the hidden
+    side. It is set if grasps hold on the likeliest shape and none is sure enough. `refused` counts by reason the
+    candidates that a restriction did not admit. `mass` is the object's mass in the trials [kg] if the hand could not
+    hold the assumed one, else None. `tried_mass` is its mass in all trials [kg].
     """
 
     outcome: Outcome
-    grasps: tuple[Grasp, ...]
+    tried: tuple[Grasp, ...]
     timing: Timing
     seed: int
     method: str
@@ -310,3 +311,14 @@ class GraspResult:
     refused: Mapping[str, int] = field(default_factory=dict)
     mass: float | None = None
     tried_mass: float | None = None
+    count: int | None = None
+
+    @property
+    def grasps(self) -> tuple[Grasp, ...]:
+        """The grasps that did not fail, verified ones first, at most as many as were asked for."""
+        return tuple(grasp for grasp in self.tried if grasp.verdict is not Verdict.FAILED)[: self.count]
+
+    @property
+    def failed(self) -> tuple[Grasp, ...]:
+        """The candidates that failed a trial, in rank order. Each has a `reason`."""
+        return tuple(grasp for grasp in self.tried if grasp.verdict is Verdict.FAILED)

@@ -66,7 +66,7 @@ def make_block(block: Block, hand: bytes, shared: bytes) -> MadeBlock:
     model: HandModel = _kept(block.hand_content, hand)
     request: dict[str, Any] = {"preset": block.config, "verify": block.verify, "measure": block.measure != "none"}
     result = plan_grasps(scene, model, count=block.count, seed=block.seed, **request)
-    grasps = result.grasps if block.measure != "all" else all_measured(scene, model, result.grasps)
+    grasps = result.tried if block.measure != "all" else all_measured(scene, model, result.tried)
     # What the hand could not lift was tried at less than the mass that was assumed.
     target = scene.object if result.mass is None else scene.object.at_mass(result.mass)
     asked = {"block": block.key, "asked": block.asked, "outcome": result.outcome.name, "message": result.message}

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import argparse
-import sys
 import time
 from collections import Counter
 from dataclasses import replace
@@ -11,6 +10,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from graspd_core.cli.options import add_plugin_option
+from graspd_core.cli.output import answer, bar, busy, print_error, print_note
 from graspd_core.cli.running import EXIT_INTERRUPTED, EXIT_OK, Interrupt
 from graspd_core.errors import ConfigError
 
@@ -92,11 +92,13 @@ def _make(options: argparse.Namespace) -> int:
     blocks = blocks_of(request)
     missing = missing_blocks(blocks, store, retry_failed=options.retry_failed)
     there = f"{len(blocks) - len(missing)} of {len(blocks)} blocks are there or failed before"
-    print(f"graspd: {there}", file=sys.stderr)
+    print_note(there)
     if options.dry_run:
         from graspd_dataset.block_rows import dry_run
 
-        print(dry_run(missing, limits, options.workers))
+        told = dry_run(missing, limits, options.workers)
+        print(told)
+        answer({"blocks": len(missing), "estimate": told})
         return EXIT_OK
     record = begin_run(store, request, len(blocks), any_code=options.any_code)
     with Interrupt() as interrupt:
@@ -106,7 +108,7 @@ def _make(options: argparse.Namespace) -> int:
     write_run(store, with_unrecorded(store, record))
     _finish(store)
     if interrupt.came():
-        print(f"graspd: interrupted; the same command goes on, {store.shown} keeps what is done", file=sys.stderr)
+        print_error(f"interrupted; the same command goes on, {store.shown} keeps what is done")
         return EXIT_INTERRUPTED
     return EXIT_FAULTS if lines.wrong else EXIT_OK
 
@@ -141,9 +143,11 @@ def _finish(store: DatasetStore) -> None:
 
     if not store.list("grasps"):
         return
-    stats = stats_of(store)
+    with busy("count"):
+        stats = stats_of(store)
     store.write("README.md", data_card(store, stats).encode())
     print(stats_table(stats))
+    answer({"dataset": store.shown, **vars(stats)})
 
 
 def _request(options: argparse.Namespace) -> DatasetRequest:
@@ -173,10 +177,7 @@ class Lines:
         self._bar: Any = None
 
     def __enter__(self) -> Lines:
-        if sys.stderr.isatty():
-            from tqdm import tqdm
-
-            self._bar = tqdm(total=self._blocks, desc="blocks", file=sys.stderr)
+        self._bar = bar("blocks", self._blocks)
         return self
 
     def __call__(self, what: Any, report: Report) -> None:
@@ -186,7 +187,7 @@ class Lines:
         if report.failed:
             self.wrong += 1
             name = getattr(what, "source", None) or f"{what.object.source} {what.hand} seed {what.seed}"
-            print(f"graspd: {report.failed}: {name}: {report.error}", file=sys.stderr, flush=True)
+            print_error(f"{report.failed}: {name}: {report.error}")
         elif not isinstance(what, DatasetObject):
             self._done += 1
             self._rows, self._verified = self._rows + report.rows, self._verified + report.verified
@@ -197,7 +198,7 @@ class Lines:
             self._bar.update(self._done - self._bar.n)
         elif time.monotonic() > self._told + _LINES:
             self._told = time.monotonic()
-            print(f"graspd: {self._done}/{self._blocks} blocks, {self._text()}", file=sys.stderr, flush=True)
+            print_note(f"{self._done}/{self._blocks} blocks, {self._text()}")
 
     def _text(self) -> str:
         seconds = max(time.monotonic() - self._began, 1e-9)
@@ -214,27 +215,31 @@ class Lines:
         if self._bar is not None:
             self._bar.close()
         elif self._done:
-            print(f"graspd: {self._done}/{self._blocks} blocks, {self._text()}", file=sys.stderr, flush=True)
+            print_note(f"{self._done}/{self._blocks} blocks, {self._text()}")
 
 
 def _stats(options: argparse.Namespace, stores: list[DatasetStore]) -> int:
     from graspd_dataset.inspect_dataset import reason_lines, stats_of, stats_table
 
-    stats = stats_of(stores[0])
+    with busy("count"):
+        stats = stats_of(stores[0])
     print("\n".join([stats_table(stats), "", *reason_lines(stats)]))
+    answer({"dataset": stores[0].shown, **vars(stats)})
     return EXIT_OK
 
 
 def _validate(options: argparse.Namespace, stores: list[DatasetStore]) -> int:
     from graspd_dataset.inspect_dataset import faults_of_dataset, recorded_hashes
 
-    faults = list(faults_of_dataset(stores[0]))
+    with busy("validate"):
+        faults = list(faults_of_dataset(stores[0]))
     if not faults:
         paths, known = stores[0].list("grasps"), recorded_hashes(stores[0])
         without = sum(path not in known for path in paths)
         told = f"; {without} without a hash on record" if without else ""
         print(f"{stores[0].shown}: {len(paths)} blocks, no fault{told}")
     print("\n".join(faults), end="\n" if faults else "")
+    answer({"dataset": stores[0].shown, "faults": faults})
     return EXIT_FAULTS if faults else EXIT_OK
 
 
@@ -245,7 +250,8 @@ def _merge(options: argparse.Namespace, stores: list[DatasetStore]) -> int:
     if not options.out:
         raise ConfigError("--out is missing: where the merged data set goes")
     out = DatasetStore(options.out)
-    copied, common = merge(stores, out)
+    with busy("merge"):
+        copied, common = merge(stores, out)
     print(f"{out.shown}: {copied} blocks copied, {common} were there or in several")
     _finish(out)
     return EXIT_OK
@@ -259,9 +265,11 @@ def _sample(options: argparse.Namespace, stores: list[DatasetStore]) -> int:
     if not options.out.endswith(".parquet"):
         raise ConfigError(f"--out {options.out}: a .parquet file is written")
     check_writable(Path(options.out))
-    content, rows = sample(stores[0], options.count, options.seed, options.verdict)
+    with busy("sample"):
+        content, rows = sample(stores[0], options.count, options.seed, options.verdict)
     save_bytes(Path(options.out), content)
     print(f"{options.out}: {rows} rows")
+    answer({"file": options.out, "rows": rows})
     return EXIT_OK
 
 
@@ -270,8 +278,10 @@ def _export(options: argparse.Namespace, stores: list[DatasetStore]) -> int:
 
     if not options.out:
         raise ConfigError("--out is missing: the folder that is written")
-    files, grasps = export(stores[0], options.to, Path(options.out))
+    with busy("export"):
+        files, grasps = export(stores[0], options.to, Path(options.out))
     print(f"{options.out}: {grasps} grasps of {files} pairs of hand and object")
+    answer({"folder": options.out, "grasps": grasps, "pairs": files})
     return EXIT_OK
 
 

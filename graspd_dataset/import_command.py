@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 import argparse
-import sys
 from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from graspd_core.cli.output import answer, busy, print_note
 from graspd_core.cli.running import EXIT_OK, EXIT_TOO_FEW
 from graspd_core.config import VERIFICATIONS
 from graspd_core.errors import ConfigError
@@ -57,19 +57,23 @@ def run(options: argparse.Namespace) -> int:
     if single and len(targets) > 1:
         raise ConfigError(f"{options.out}: one file for {len(targets)} objects; give a directory")
     check_writable(options.out if single else options.out / "probe")
-    status = EXIT_OK
+    status, files = EXIT_OK, []
     for (mesh, scale), imported in targets.items():
         factors = {"mass": options.mass, "friction": options.friction, "scale": scale}
         scene = load_scene(mesh, resolution=config.resolution, **factors)
-        result = _result(scene, hand, imported, config, options.verify)
+        with busy("complete"):
+            result = _result(scene, hand, imported, config, options.verify)
         path = options.out if single else options.out / f"{scene.object.sha256[:16]}.json"
         save_result(path, result, scene.object, hand, config)
-        status = status if result.grasps else EXIT_TOO_FEW
-        held = sum(grasp.verdict is Verdict.VERIFIED for grasp in result.grasps)
+        status = status if result.tried else EXIT_TOO_FEW
+        held = sum(grasp.verdict is Verdict.VERIFIED for grasp in result.tried)
         tried = f", {held} verified" if options.verify != "none" else ""
-        print(f"{path}: {len(result.grasps)} of {len(imported)} grasps of {mesh}{tried}")
+        print(f"{path}: {len(result.tried)} of {len(imported)} grasps of {mesh}{tried}")
+        counts = {"given": len(imported), "grasps": len(result.tried), "verified": held}
+        files.append({"file": path, "object": mesh, **counts, "refused": result.refused, "warnings": result.warnings})
         for line in (*(f"{count} refused: {why}" for why, count in result.refused.items()), *result.warnings):
-            print(f"graspd: {line}", file=sys.stderr)
+            print_note(line)
+    answer(files)
     return status
 
 

@@ -151,7 +151,7 @@ def moved_result(result: GraspResult, T_new_old: Matrix) -> GraspResult:
     """Return a result with its postures, contacts, support and next view in another frame. Nothing else has a frame."""
     return replace(
         result,
-        grasps=tuple(moved_grasp(grasp, T_new_old) for grasp in result.grasps),
+        tried=tuple(moved_grasp(grasp, T_new_old) for grasp in result.tried),
         support=None if result.support is None else moved_plane(result.support, T_new_old),
         next_view=None if result.next_view is None else T_new_old @ result.next_view,
     )

@@ -82,7 +82,7 @@ class _Run:
 
     @property
     def grasps(self) -> tuple[Grasp, ...]:
-        return self.planned.result.grasps
+        return self.planned.result.tried
 
 
 class RecentRuns:
@@ -142,13 +142,13 @@ def unlike(grasps: Iterable[Grasp], excluded: Sequence[Matrix]) -> list[Grasp]:
 
 def without(result: GraspResult, excluded: Sequence[Matrix], count: int) -> GraspResult:
     """Return a run's result without grasps like those excluded, at most `count` of the good ones."""
-    left = unlike(result.grasps, excluded)
+    left = unlike(result.tried, excluded)
     good = [grasp for grasp in left if grasp.verdict is not Verdict.FAILED]
     failed = [grasp for grasp in left if grasp.verdict is Verdict.FAILED]
     outcome = result.outcome
     if outcome in (Outcome.SUCCEEDED, Outcome.TOO_FEW):
         outcome = Outcome.SUCCEEDED if len(good) >= count else Outcome.TOO_FEW
-    return replace(result, outcome=outcome, grasps=(*good[:count], *failed))
+    return replace(result, outcome=outcome, tried=(*good[:count], *failed))
 
 
 def _alike(a: Matrix, b: Matrix) -> bool:
@@ -259,7 +259,7 @@ class Planner:
             plan |= {"deadline": max(request.time_left(), 1e-3), "restrictions": restrictions}
             count = settings.num_grasps + len(excluded)
             result = plan_grasps(scene, self._hand, count=count, verify=settings.verify, **plan)
-            result = replace(result, grasps=tuple(map(arrived, result.grasps)))
+            result = replace(result, tried=tuple(map(arrived, result.tried)))
         if excluded:
             result = without(result, excluded, settings.num_grasps)
         mass, assumed = result.mass or 0.0, False

@@ -11,7 +11,7 @@ from collections.abc import Sequence
 
 from graspd_core.types import Grasp, Verdict
 from graspd_core.verify.metrics import METRICS
-from graspd_viewer.drawing import VERDICTS
+from graspd_viewer.drawing import FORCE, GUESSED, HAND, NORMAL, OBJECT, TURN, VERDICTS, WEAKEST
 
 ALL = "all"
 # What is unverified although it was tried: it holds on the likeliest shape, and is not as sure as was asked for.
@@ -23,6 +23,10 @@ ORDERS = ("rank", "score", "probability", "displacement", *METRICS)
 # Columns of the table, and how many rows are shown about the chosen one.
 _COLUMNS, _AROUND = ("payload", "penetration", "contact_area"), 2
 BLOCK = "<div style='font-size:0.8em;line-height:1.5;padding:0 0.8em'>"
+_LEGEND = (
+    ("object", OBJECT, "■"), ("guessed part", GUESSED, "■"), ("hand", HAND, "■"), ("normal at a contact", NORMAL, "➔"),
+    ("force, 8 mm for a newton", FORCE, "➔"), ("weakest push", WEAKEST, "➔"), ("axis of its turn", TURN, "➔"),
+)  # fmt: skip
 _OTHER_FIGURES = {
     "score": "the optimiser's own measure, larger is better; it ranks grasps of one file before any trial",
     "probability": "of holding on the true object, where cameras saw it",
@@ -71,6 +75,16 @@ def label(grasp: Grasp, rank: int) -> str:
 
 def _likely(grasp: Grasp, before: str) -> str:
     return "" if grasp.probability is None else f"{before}{100 * grasp.probability:.0f} %"
+
+
+def legend_html() -> str:
+    """Return the colours of the scene with their names, of which every arrow has one."""
+    patches = (
+        f"<span style='white-space:nowrap;margin-right:0.8em'>"
+        f"<span style='color:rgb({', '.join(str(round(255 * c)) for c in colour)})'>{mark}</span> {name}</span>"
+        for name, colour, mark in _LEGEND
+    )
+    return f"{BLOCK}{' '.join(patches)}</div>"
 
 
 def table_html(grasps: Sequence[Grasp], ranks: Sequence[int], chosen: int | None) -> str:

@@ -2,15 +2,16 @@
 
 from __future__ import annotations
 
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from graspd_core.types import Grasp
 from graspd_viewer.drawing import STAGES, Mechanics, contact_parts, force_parts, posture_at, weakest_parts
-from graspd_viewer.grasp_list import ALL, FILTERS, ORDERS, figures_html, label, listed, table_html
+from graspd_viewer.grasp_list import ALL, FILTERS, ORDERS, figures_html, label, legend_html, listed, table_html
 from graspd_viewer.scene_nodes import SceneNodes
-from graspd_viewer.server import LatestJobs
+from graspd_viewer.server import LatestJobs, name_tab
 from graspd_viewer.session import Session
 from graspd_viewer.trial_controls import TrialControls
 
@@ -32,7 +33,7 @@ class GraspTab:
     """Widgets of the tab and their actions. `jobs` draws everything, in one thread."""
 
     def __init__(self, server: Any, jobs: LatestJobs, nodes: SceneNodes) -> None:
-        self._jobs, self._nodes = jobs, nodes
+        self._server, self._jobs, self._nodes = server, jobs, nodes
         self._session: Session | None = None
         self._mechanics: Mechanics | None = None
         self._ranks: list[int] = []
@@ -52,6 +53,7 @@ class GraspTab:
         marks = tuple((float(at), name) for at, name in enumerate(STAGES))
         self._stage = gui.add_slider("Way", 0.0, 3.0, 0.01, 2.0, marks=marks, hint="from the retreat to the squeeze")
         self.trial = TrialControls(gui, self._jobs, self._nodes)
+        gui.add_html(legend_html())
         self._table = gui.add_html("")
         self._figures = gui.add_html("")
         with gui.add_folder("What is shown", expand_by_default=False):
@@ -91,6 +93,8 @@ class GraspTab:
         self._mechanics = None
         notes = "".join(f"\n\n*{_plain(note)}*" for note in session.notes[:6])
         self._title.content = f"**{_plain(session.title)}**, {_plain(session.hand.name)}{notes}"
+        seen = session.title if session.scene is None else Path(session.scene.object.source).name or session.title
+        name_tab(self._server, f"{seen}, {session.hand.name} - graspd")
         self._nodes.show(session)
         self._list()
         self._draw_slice()

@@ -273,7 +273,7 @@ class PlanTab:
         )  # fmt: skip
         self._live.end()
         self._saved = (json.dumps(result_document(result, scene.object, hand, config), indent=1) + "\n").encode()
-        self._show(make_session(title, hand, result.grasps, scene, config, seen, result.warnings))
-        good = sum(grasp.verdict is Verdict.VERIFIED for grasp in result.grasps)
+        self._show(make_session(title, hand, result.tried, scene, config, seen, result.warnings))
+        good = sum(grasp.verdict is Verdict.VERIFIED for grasp in result.tried)
         ending = result.message or result.outcome.value
         self._say(f"{good} of {request.count} grasps in {result.timing.total:.1f} s: {ending}", 1.0)

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import contextlib
 import io
+import json
 import socket
 import threading
 import time
@@ -101,6 +102,14 @@ def start_server(host: str, port: int) -> Any:
     _refuse_tunnels(server)
     _limit_uploads(server)
     return server
+
+
+def name_tab(server: Any, title: str) -> None:
+    """Name the tab of the page in every visitor's browser. viser has no public way to do so."""
+    from viser._messages import RunJavascriptMessage
+
+    told = RunJavascriptMessage(source=f"document.title = {json.dumps(title)}")
+    server.gui._websock_interface.queue_message(told)
 
 
 def quiet() -> contextlib.AbstractContextManager[Any]:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import argparse
-import sys
 import threading
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -11,6 +10,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from graspd_core.cli.options import add_address
+from graspd_core.cli.output import print_note
 from graspd_core.cli.running import EXIT_OK, Interrupt, Watched
 from graspd_core.errors import ConfigError
 from graspd_core.types import GraspResult
@@ -28,7 +28,7 @@ _PATIENCE = 60.0
 def add_command(commands: Any) -> None:
     """Add this command to the parser."""
     parser = commands.add_parser("view")
-    parser.set_defaults(run=run)
+    parser.set_defaults(run=run, json=False)
     parser.add_argument(
         "path", metavar="PATH", type=Path, nargs="?", default=None,
         help="a grasps.json, or the folder of a benchmark; without one, a page to plan on",
@@ -75,7 +75,7 @@ def watched(options: argparse.Namespace, scene: Scene, hand: HandModel, config: 
 
     def show(result: GraspResult) -> None:
         viewer.live.end()
-        viewer.show(make_session(name, hand, result.grasps, scene, config, seen, notes))
+        viewer.show(make_session(name, hand, result.tried, scene, config, seen, notes))
         wait_for_end(viewer.url)
 
     viewer = Viewer(host=options.host, port=options.port, plan=False)
@@ -83,7 +83,7 @@ def watched(options: argparse.Namespace, scene: Scene, hand: HandModel, config: 
         session = make_session(name, hand, (), scene, config, seen, notes)
         viewer.show(session)
         viewer.live.begin(session)
-        print(f"graspd: {viewer.url} - planning begins when it is open", file=sys.stderr, flush=True)
+        print_note(f"{viewer.url} - planning begins when it is open")
         viewer.wait_for_visitor(_PATIENCE)
         yield Watched(viewer.live.watch, viewer.live.progress, show)
     finally:

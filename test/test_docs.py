@@ -112,7 +112,7 @@ def run(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Run:
 
 
 def test_a_mesh(run: Run, tmp_path: Path, capsys: pytest.CaptureFixture[str]):
-    graspd_core.save_mesh(graspd_core.make_shape("box"), tmp_path / "box.obj")
+    graspd_core.save_mesh(tmp_path / "box.obj", graspd_core.make_shape("box"))
     assert run("grasp_a_mesh", "box.obj", "box.json") == 0
     assert "links touch" in capsys.readouterr().out
     assert graspd_core.load_grasps(tmp_path / "box.json")[0].verdict == "verified"
@@ -186,7 +186,7 @@ def test_a_plugin_that_cannot_be_run_is_one_line(tmp_path: Path, name: str, text
 
 def test_many_objects(run: Run, tmp_path: Path, capsys: pytest.CaptureFixture[str]):
     (tmp_path / "meshes").mkdir()
-    graspd_core.save_mesh(graspd_core.make_shape("sphere"), tmp_path / "meshes" / "ball.stl")
+    graspd_core.save_mesh(tmp_path / "meshes" / "ball.stl", graspd_core.make_shape("sphere"))
     for ending in ("succeeded", "done before"):
         assert run("many_objects", "out", "meshes", "nothing.obj", processes=1) == 1
         lines = capsys.readouterr().out.splitlines()

@@ -111,7 +111,7 @@ sys.exit(main(["synthesize", sys.argv[1], "-n", "1", "--preset", "fast", "--out"
 )
 def test_a_mesh_needs_no_open3d_and_a_cloud_names_its_extra(source: str, status: int, error: str, tmp_path: Path):
     ball = graspd_core.make_shape("sphere")
-    graspd_core.save_mesh(ball, tmp_path / "ball.stl")
+    graspd_core.save_mesh(tmp_path / "ball.stl", ball)
     # What a camera at the origin sees.
     seen = np.add(ball.vertices[ball.vertices[:, 2] < -0.01], (0, 0, 0.5))
     np.save(tmp_path / "ball.npy", seen)

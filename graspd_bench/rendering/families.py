@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
-from graspd_core.errors import MeshError
+from graspd_core.errors import MeshError, choices
 from graspd_core.mesh.mesh_files import mass_properties, simplify
 from graspd_core.types import TriangleMesh
 
@@ -46,7 +46,7 @@ class Thing:
 def draw_thing(family: str, seed: int) -> Thing:
     """Draw a thing. Raises MeshError for an unknown family."""
     if family not in FAMILIES:
-        raise MeshError(f"unknown family {family!r}; valid families: {', '.join(FAMILIES)}")
+        raise MeshError(f"unknown family {family!r}; {choices(family, FAMILIES)}")
     rng = np.random.default_rng([sum(map(ord, family)), seed])
     field, size, (light, heavy) = FAMILIES[family](rng)
     mesh = simplify(_surface(field, np.asarray(size, dtype=float)), _FACES)

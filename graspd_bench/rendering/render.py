@@ -89,7 +89,7 @@ def render_shaded(
     return image
 
 
-def save_png(image: UInt8[np.ndarray, "height width 3"], path: str | Path) -> None:
+def save_png(path: str | Path, image: UInt8[np.ndarray, "height width 3"]) -> None:
     """Write an RGB picture (PNG specification: one IHDR, one IDAT of unfiltered rows, IEND)."""
     height, width, _ = image.shape
     rows = np.concatenate([np.zeros((height, 1), np.uint8), image.reshape(height, width * 3)], axis=1)

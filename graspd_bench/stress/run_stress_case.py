@@ -133,7 +133,7 @@ def run_case(case: Case, preset: str = "balanced") -> StressEnding:
             loading = (loaded if loaded > began else time.perf_counter()) - began
             return StressEnding(case.name, type(error).__name__, told, loading, memory=peak_mb())
         planned = time.perf_counter()
-        verified = [grasp for grasp in result.grasps if grasp.verdict is Verdict.VERIFIED]
+        verified = [grasp for grasp in result.tried if grasp.verdict is Verdict.VERIFIED]
         return StressEnding(
             case.name,
             GRASP if verified else result.outcome.name,
@@ -141,7 +141,7 @@ def run_case(case: Case, preset: str = "balanced") -> StressEnding:
             loaded - began,
             planned - loaded,
             peak_mb(),
-            len(result.grasps),
+            len(result.tried),
             len(verified),
             _hold_again(case, result, scene, hand, Path(folder), preset) if verified else 0,
             _finite(result),
@@ -189,8 +189,8 @@ def _held(grasps: Sequence[Grasp], target: ObjectModel, hand: Any) -> int:
 
 def _finite(result: GraspResult) -> bool:
     """Return whether every number of every grasp that did not fail is finite. A trial that diverged may say so."""
-    good = [asdict(grasp) for grasp in result.grasps if grasp.verdict is not Verdict.FAILED]
-    postures = [asdict(posture) for g in result.grasps for posture in (g.pregrasp, g.grasp, g.squeeze)]
+    good = [asdict(grasp) for grasp in result.tried if grasp.verdict is not Verdict.FAILED]
+    postures = [asdict(posture) for g in result.tried for posture in (g.pregrasp, g.grasp, g.squeeze)]
     try:
         json.dumps([good, postures], allow_nan=False, default=lambda numbers: numbers.tolist())
     except ValueError:

@@ -12,7 +12,7 @@ from graspd_bench.stress.broken_meshes import extreme_cases, mesh_cases
 from graspd_bench.stress.run_stress_case import GRASP, Case, StressEnding, faults, run_case
 from graspd_bench.study import Record, Request, Sections
 from graspd_bench.tables import markdown_table
-from graspd_core.errors import ConfigError
+from graspd_core.errors import ConfigError, choices
 from graspd_core.types import Outcome
 
 CASES: dict[str, Case] = {case.name: case for case in (*mesh_cases(), *cloud_cases(), *extreme_cases())}
@@ -38,7 +38,7 @@ def stress_runs(request: Request) -> tuple[StressRun, ...]:
     families = sorted({case.family for case in CASES.values()})
     names = request.cases or (_QUICK if request.quick else ())
     if unknown := [name for name in names if name not in CASES and name not in families]:
-        raise ConfigError(f"unknown case {unknown[0]!r}; valid: {', '.join(families)}, {', '.join(sorted(CASES))}")
+        raise ConfigError(f"unknown case {unknown[0]!r}; {choices(unknown[0], (*families, *sorted(CASES)))}")
     chosen = [case.name for case in CASES.values() if not names or case.name in names or case.family in names]
     return tuple(StressRun(name, request.preset()) for name in chosen)
 

@@ -159,8 +159,8 @@ def run_view(case: CameraView) -> Record:
     truth = build_scene(stage.truth, source=case.thing, mass=mass)
     own = build_world(hand, truth.object, object_parts(truth.object), protocol)
     tenth = altered(own, mass=PROTOCOL_MASS)
-    verified = [grasp for grasp in result.grasps if grasp.verdict is Verdict.VERIFIED]
-    sure = [grasp for grasp in result.grasps if grasp.probability is not None]
+    verified = [grasp for grasp in result.tried if grasp.verdict is Verdict.VERIFIED]
+    sure = [grasp for grasp in result.tried if grasp.probability is not None]
     holds = {id(grasp): hold_trial(own, grasp, protocol) for grasp in (*verified, *sure)}
     first = result.timing.first_verified
     return {

@@ -138,7 +138,7 @@ def run_bench(case: BenchCase) -> Record:
         grasps = grasps_of(document)
     else:
         scene = load_scene(case.object, mass=MASS, resolution=config.resolution)
-        grasps = plan_grasps(scene, hand, count=case.count, seed=case.seed, preset=config, measure=False).grasps
+        grasps = plan_grasps(scene, hand, count=case.count, seed=case.seed, preset=config, measure=False).tried
     ours = [{"verified": grasp.verdict is Verdict.VERIFIED, "reason": grasp.reason} for grasp in grasps]
     with tempfile.TemporaryDirectory(prefix="graspd-bench-") as folder:
         written = Path(folder) / "written"

@@ -83,7 +83,7 @@ def run_frame(case: Frame) -> Record:
         "watertight": bool(is_closed(scene.object.mesh)),
         "scene_s": scene_s,
         "first_s": first,
-        "verified": sum(grasp.verdict is Verdict.VERIFIED for grasp in result.grasps),
+        "verified": sum(grasp.verdict is Verdict.VERIFIED for grasp in result.tried),
         "outcome": result.outcome.name,
         "warnings": list(result.warnings),
     }

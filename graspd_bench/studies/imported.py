@@ -108,7 +108,7 @@ def run_imported(case: ImportedCase) -> Record:
     config, hand = case.config, load_hand(case.hand, candidates=case.config.problem.fine_candidates)
     scene = load_scene(case.object, mass=PROTOCOL_MASS, scale=case.scale, resolution=config.resolution)
     completed = complete_grasps(scene, hand, _theirs(case, hand), config)
-    planned = plan_grasps(scene, hand, count=case.count, seed=case.seed, preset=config, measure=False).grasps
+    planned = plan_grasps(scene, hand, count=case.count, seed=case.seed, preset=config, measure=False).tried
     grasps = {
         "imported": completed.grasps,
         "ranked": raw_grasps(scene, hand, config, case.count, case.seed),

@@ -249,16 +249,16 @@ def _planned(
     began = time.process_time()
     result = plan_grasps(scene, hand, count=1, seed=seed, preset=case.preset, measure=False)
     attempt |= {"plan_s": time.process_time() - began, "neighbours": len(scene.obstacles)}
-    best = result.grasps[0] if result.grasps else None
+    best = result.tried[0] if result.tried else None
     if best is not None and best.verdict is Verdict.VERIFIED:
         attempt["probability"] = best.probability
         return best
-    attempt |= {"ended": NO_GRASP, "reason": _why_none(result), "tried": len(result.grasps)}
+    attempt |= {"ended": NO_GRASP, "reason": _why_none(result), "tried": len(result.tried)}
     return None
 
 
 def _why_none(result: GraspResult) -> str:
-    reasons = Counter(re.sub(r"-?\d+(\.\d+)?", "…", grasp.reason.split(" (")[0]) for grasp in result.grasps)
+    reasons = Counter(re.sub(r"-?\d+(\.\d+)?", "…", grasp.reason.split(" (")[0]) for grasp in result.tried)
     told = "; ".join(f"{reason}: {count}" for reason, count in reasons.most_common(3))
     return told or result.message or str(result.outcome.value)
 
@@ -388,7 +388,7 @@ def film_picture(record: Record, chart: Path) -> Picture | None:
         return None
     path = chart.with_name("piles.png")
     path.parent.mkdir(parents=True, exist_ok=True)
-    save_png(image, path)
+    save_png(path, image)
     return Picture(f"A pile of {record['size']} things is cleared, one frame a lift", path)
 
 

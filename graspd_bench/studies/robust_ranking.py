@@ -48,10 +48,10 @@ def run_robust(case: ObjectCase) -> Record:
     between = time.process_time()
     robust = plan_grasps(scene, hand, count=case.count, seed=case.seed, preset=ranked)
     ended = time.process_time()
-    shares = {g.score: g.metrics["robustness"] for g in robust.grasps if g.metrics and g.verdict is Verdict.VERIFIED}
+    shares = {g.score: g.metrics["robustness"] for g in robust.tried if g.metrics and g.verdict is Verdict.VERIFIED}
     protocol = at_friction(PROTOCOLS["standard"], FRICTION)
     world, errors = build_world(hand, scene.object, parts, protocol), pose_errors(EVALUATION_SEED, EVALUATIONS)
-    verified = [g for g in plain.grasps if g.verdict is Verdict.VERIFIED]
+    verified = [g for g in plain.tried if g.verdict is Verdict.VERIFIED]
     return {
         "shape": thing_name(case.object),
         "plan_cpu_s": between - began,

@@ -155,7 +155,7 @@ def _grasps(case: Seen, scene: Scene, stage: TabletopScene, hand: HandModel) -> 
     holds = [(grasp, hold_trial(world, grasp, protocol)) for grasp in _verified(many)]
     lifts = [lift_trial(table, hand, grasp, protocol) for grasp, hold in holds if hold.passed]
     # Those that hold on the likeliest shape and are less sure, too: how far is the probability right?
-    guessed = [grasp for grasp in many.grasps if grasp.probability is not None]
+    guessed = [grasp for grasp in many.tried if grasp.probability is not None]
     told = [(grasp.probability, hold_trial(world, grasp, protocol).passed) for grasp in guessed]
     timing = first.timing
     return {
@@ -172,7 +172,7 @@ def _grasps(case: Seen, scene: Scene, stage: TabletopScene, hand: HandModel) -> 
 
 
 def _verified(result: GraspResult) -> list[Grasp]:
-    return [grasp for grasp in result.grasps if grasp.verdict is Verdict.VERIFIED]
+    return [grasp for grasp in result.tried if grasp.verdict is Verdict.VERIFIED]
 
 
 def reconstruction_error(scene: Scene, stage: TabletopScene) -> dict[str, Any]:

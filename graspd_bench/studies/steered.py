@@ -92,14 +92,14 @@ def run_steered(case: SteeredCase) -> Record:
     wish = drawn_wish(case, scene)
     plain, plain_s = _timed(case, scene, hand, ())
     found, steered_s = _timed(case, scene, hand, (wish,))
-    good = [grasp for grasp in found.grasps if grasp.verdict is Verdict.VERIFIED]
+    good = [grasp for grasp in found.tried if grasp.verdict is Verdict.VERIFIED]
     return {
         "shape": thing_name(case.object),
         "plain_cpu_s": plain_s,
         "steered_cpu_s": steered_s,
-        "plain": sum(grasp.verdict is Verdict.VERIFIED for grasp in plain.grasps),
+        "plain": sum(grasp.verdict is Verdict.VERIFIED for grasp in plain.tried),
         "held": len(good),
-        "tried": len(found.grasps),
+        "tried": len(found.tried),
         "refused": dict(found.refused),
         "message": found.message,
         # Greatest excess over each wish: negative where all keep to it.

@@ -50,8 +50,8 @@ def run_throughput(case: Throughput) -> Record:
         wall, cpu = time.perf_counter() - wall, time.process_time() - cpu
     finally:
         torch.set_num_threads(before)
-    verified = sum(grasp.verdict is Verdict.VERIFIED for grasp in result.grasps)
-    return {"verified": verified, "tried": len(result.grasps), "wall_s": wall, "cpu_s": cpu}
+    verified = sum(grasp.verdict is Verdict.VERIFIED for grasp in result.tried)
+    return {"verified": verified, "tried": len(result.tried), "wall_s": wall, "cpu_s": cpu}
 
 
 def throughput_sections(records: Sequence[Record], chart: Path | None) -> Sections:

@@ -21,8 +21,8 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from graspd_core.config.mapping import from_mapping, read_yaml
-from graspd_core.errors import ConfigError, shown
+from graspd_core.config.mapping import from_mapping, yaml_values
+from graspd_core.errors import ConfigError, choices, shown
 from graspd_core.hands.model import HandModel, Mount, Primitive
 from graspd_core.hands.readers.urdf import read_urdf
 from graspd_core.hands.readers.xml_io import parse_xml, read_xml
@@ -279,10 +279,11 @@ def read_arm_file(name_or_path: str | Path) -> tuple[Path, ArmFile]:
     text = str(name_or_path)
     if not text.endswith((".yaml", ".yml")):
         if text not in arm_names():
-            raise ConfigError(f"unknown arm {text!r}; known: {', '.join(arm_names())}, or the path of a .yaml file")
+            raise ConfigError(f"unknown arm {text!r}; {choices(text, arm_names(), ', or the path of a .yaml file')}")
         text = str(config_dir() / "arms" / f"{text}.yaml")
     path = Path(text)
-    entries = from_mapping(ArmFile, read_yaml(path), str(path))
+    with yaml_values(path) as values:
+        entries = from_mapping(ArmFile, values, path.name)
     for key in ("urdf", "tip"):
         if not getattr(entries, key):
             raise ConfigError(f"{path}: {key} is missing; keys: {', '.join(ArmFile.__dataclass_fields__)}")

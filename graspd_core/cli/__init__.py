@@ -1,7 +1,7 @@
 """The command line, one file a command. Each command imports heavy libraries when it runs.
 
-graspd synthesize | replay | reconstruct | library | hands | doctor are graspd_core's own. Other packages add commands
-by entry points of the group `graspd.commands`: view, bench, dataset, import and cell.
+graspd synthesize | replay | reconstruct | library | hands | doctor | completion are graspd_core's own. Other packages
+add commands by entry points of the group `graspd.commands`: view, bench, dataset, import and cell.
 """
 
 from __future__ import annotations
@@ -12,12 +12,13 @@ import gc
 import importlib
 import sys
 import time
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from importlib.metadata import entry_points, version
-from typing import NoReturn
+from typing import Any, NoReturn
 
+from graspd_core.cli.output import add_output_options, output_of, print_error
 from graspd_core.cli.running import EXIT_BAD_INPUT, EXIT_INTERRUPTED, SIBLINGS, process_began
-from graspd_core.errors import ConfigError, GraspdError
+from graspd_core.errors import ConfigError, GraspdError, choices
 
 # New objects between two looks for garbage, by default 700. What libraries make when they are imported stays, and
 # looking through it takes a tenth of the time.
@@ -35,12 +36,13 @@ def main(arguments: Sequence[str] | None = None) -> int:
         words = (sys.argv[1:] if arguments is None else list(arguments)) or ["--help"]
         options = (_overview() if words[0].startswith("-") else build_parser(words[0])).parse_args(words)
         options.began = began
-        return int(options.run(options))
+        with output_of(options):
+            return int(options.run(options))
     except (GraspdError, OSError) as error:
-        print(f"graspd: {error}", file=sys.stderr)
+        print_error(error)
         return EXIT_BAD_INPUT
     except KeyboardInterrupt:
-        print("graspd: interrupted", file=sys.stderr)
+        print_error("interrupted")
         return EXIT_INTERRUPTED
     finally:
         if own_process:
@@ -52,7 +54,19 @@ class _Parser(argparse.ArgumentParser):
     """A parser whose errors are a ConfigError like any other: one line, no usage text before it."""
 
     def error(self, message: str) -> NoReturn:
+        # The parser that meets words which none of its commands took knows those commands.
+        if (words := message.removeprefix("unrecognized arguments: ")) != message and words.startswith("--"):
+            known = [option for below in runnable(self) for option in below._option_string_actions]
+            if near := difflib.get_close_matches(words.split()[0].split("=")[0], known, 1):
+                message = f"{message}; did you mean {near[0]}?"
         raise ConfigError(f"{message} (see {self.prog} --help)")
+
+
+class _Commands(argparse._SubParsersAction):
+    """Commands with their summaries, without which they are hidden from completion."""
+
+    def add_parser(self, name: str, **settings: Any) -> argparse.ArgumentParser:
+        return super().add_parser(name, help=_SUMMARIES.get(name, ""), **settings)
 
 
 # The commands of graspd_core, in the order of `graspd --help`.
@@ -63,6 +77,7 @@ _COMMANDS = {
     "library": "graspd_core.cli.library_command",
     "hands": "graspd_core.cli.hands_command",
     "doctor": "graspd_core.doctor",
+    "completion": "graspd_core.cli.completion_command",
 }
 # What `graspd --help` says, which imports no command. Commands of other packages are listed by name.
 _SUMMARIES = {
@@ -72,6 +87,7 @@ _SUMMARIES = {
     "library": "keep verified grasps of known objects in a file",
     "hands": "list the built-in hands, or inspect one",
     "doctor": "check the installation",
+    "completion": "print a script that lets bash, zsh or tcsh complete commands and options",
     "view": "show hands, grasps and results in a browser",
     "bench": "measure presets and methods on objects, with tables and charts",
     "dataset": "make a data set of grasps, or look at one",
@@ -99,13 +115,22 @@ def build_parser(command: str = "") -> argparse.ArgumentParser:
     if command and command not in modules:
         if command in SIBLINGS:
             raise ConfigError(f"{command}: {SIBLINGS[command]} is not installed; run: pip install graspd")
-        near = difflib.get_close_matches(command, modules, 1)
-        hint = f"did you mean {near[0]!r}?" if near else f"valid: {', '.join(modules)}"
-        raise ConfigError(f"unknown command {command!r}; {hint}")
-    commands = parser.add_subparsers(required=True, metavar="COMMAND", dest="command")
+        raise ConfigError(f"unknown command {command!r}; {choices(command, modules)}")
+    commands = parser.add_subparsers(required=True, metavar="COMMAND", dest="command", action=_Commands)
     for name in [command] if command else modules:
         importlib.import_module(modules[name]).add_command(commands)
+    for runs in runnable(parser):
+        add_output_options(runs)
     return parser
+
+
+def runnable(parser: argparse.ArgumentParser) -> Iterator[argparse.ArgumentParser]:
+    """Yield the parsers below one, and that itself, that something is run by."""
+    for action in parser._actions:
+        for below in action.choices.values() if isinstance(action, argparse._SubParsersAction) else ():
+            yield from runnable(below)
+    if parser.get_default("run"):
+        yield parser
 
 
 def _parser() -> _Parser:

@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
+from graspd_core.cli.output import answer, waiting
 from graspd_core.cli.running import EXIT_OK, sibling
 from graspd_core.errors import ConfigError
 from graspd_core.hands.kinematics import link_depths
@@ -41,9 +42,13 @@ def run(options: argparse.Namespace) -> int:
     from graspd_core.hands.library import hand_names, load_hand
 
     torch.set_num_threads(1)
-    for name in hand_names():
-        hand = load_hand(name)
-        print(f"{name}: {hand.num_joints} joints, {len(hand.candidate_points)} contact candidates, {hand.urdf}")
+    names, listed = hand_names(), []
+    for hand in waiting(map(load_hand, names), "hand", len(names)):
+        listed.append({"name": hand.name, "joints": hand.num_joints, "candidates": len(hand.candidate_points)})
+        told = "{name}: {joints} joints, {candidates} contact candidates".format(**listed[-1])
+        print(f"{told}, {hand.urdf}", flush=True)
+        listed[-1]["urdf"] = hand.urdf
+    answer(listed)
     return EXIT_OK
 
 
@@ -64,15 +69,31 @@ def run_inspect(options: argparse.Namespace) -> int:
         raise ConfigError(f"--yaml {options.yaml}: a description names a URDF or MJCF file, not a MANO file")
     hand = load_hand(options.hand, candidates=options.candidates)
     print(as_text(hand))
+    answer(_document(hand))
     if options.picture is not None:
         render = sibling("graspd_bench.rendering.render")
-        render.save_png(render.hand_picture(hand), options.picture)
+        render.save_png(options.picture, render.hand_picture(hand))
         print(f"{options.picture}: open (left) and closed (right), from the side and onto the palm")
     if options.yaml is not None:
         urdf = os.path.relpath(hand.urdf, options.yaml.parent)
         save_text(options.yaml, as_yaml(hand, urdf))
         print(f"{options.yaml}: a hand description to edit; graspd synthesize --hand {options.yaml}")
     return EXIT_OK
+
+
+def _document(hand: HandModel) -> dict[str, Any]:
+    """Return a hand as JSON-ready values, in rad, m and N."""
+    joints = [
+        {"name": name, "lower": lower, "upper": upper, "effort": effort, "open": at_open, "closed": at_closed}
+        for name, lower, upper, effort, at_open, at_closed in zip(
+            hand.joint_names,
+            *(v.tolist() for v in (hand.lower, hand.upper, hand.effort, hand.open_posture, hand.closed_posture)),
+            strict=True,
+        )
+    ]
+    vectors = {name: getattr(hand, name).tolist() for name in ("palm_center", "palm_normal", "approach")}
+    names = {"name": hand.name, "urdf": hand.urdf, "base_link": hand.base_link, "links": hand.link_names}
+    return {**names, "joints": joints, **vectors, "warnings": hand.warnings}
 
 
 def as_text(hand: HandModel) -> str:

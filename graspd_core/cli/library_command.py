@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 import argparse
-import sys
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from graspd_core.cli.options import add_planning_options, planning_options
+from graspd_core.cli.output import Reporter, answer, busy, print_error, print_note
 from graspd_core.cli.running import EXIT_INTERRUPTED, EXIT_OK, EXIT_TOO_FEW, Interrupt
 from graspd_core.errors import ConfigError, MeshError
 
@@ -43,7 +43,7 @@ def _build(options: argparse.Namespace) -> int:
     library = GraspLibrary(options.out)
     library.create()
     library.checked()
-    short = 0
+    short, objects = 0, []
     with Interrupt() as interrupt:
         for source, scale in [(source, scale) for source in sources for scale in options.scales]:
             if interrupt.came():
@@ -51,9 +51,11 @@ def _build(options: argparse.Namespace) -> int:
             try:
                 has = _add_object(options, library, source, scale, hand, config, request, interrupt.came)
             except MeshError as error:
-                print(f"graspd: {error}", file=sys.stderr)
+                print_error(error)
                 has = 0
+            objects.append({"source": source, "scale": scale, "grasps": has})
             short += has < options.count
+    answer({"library": options.out, "objects": objects})
     return EXIT_INTERRUPTED if interrupt.came() else EXIT_TOO_FEW if short else EXIT_OK
 
 
@@ -65,9 +67,10 @@ def _add_object(options: argparse.Namespace, library: GraspLibrary, source: str,
     from graspd_core.planning.plan_grasps import plan_grasps
 
     hand, config, request, stop = rest
-    scene = load_scene(source, mass=options.mass, friction=options.friction, scale=scale)
+    with busy("load"):
+        scene = load_scene(source, mass=options.mass, friction=options.friction, scale=scale)
     for warning in (*scene.object.warnings, *hand.named_warnings):
-        print(f"graspd: {warning}", file=sys.stderr)
+        print_note(warning)
     entry = entry_of(scene.object, hand, options.verify)
     _refuse_name(library, entry)
     has = len(library.grasps(entry, hand))
@@ -75,7 +78,9 @@ def _add_object(options: argparse.Namespace, library: GraspLibrary, source: str,
         print(f"{entry.name}: {has} grasps are there")
         return has
     asked = {**request, "count": options.count - has, "seed": options.seed + has}
-    result = plan_grasps(scene, hand, preset=config, deadline=options.deadline, stop=stop, **asked)
+    with Reporter() as reporter:
+        hooks = {"progress": reporter, "stop": stop}
+        result = plan_grasps(scene, hand, preset=config, deadline=options.deadline, **hooks, **asked)
     has = add_planned(library, scene, hand, config, result, options.verify) or has
     print(f"{entry.name}: {has} of {options.count} grasps, {result.timing.total:.1f} s", flush=True)
     return has
@@ -96,4 +101,5 @@ def _list(options: argparse.Namespace) -> int:
         physics = f"{entry.mass:g} kg, friction {entry.friction:g}, {entry.verify}"
         print(f"{entry.name:24} {entry.hand:20} {grasps:4} grasps  {physics:32} {entry.source}")
     print(f"{options.library}: {len(rows)} records, {sum(grasps for _, grasps in rows)} grasps")
+    answer([{**vars(entry), "grasps": grasps} for entry, grasps in rows])
     return EXIT_OK

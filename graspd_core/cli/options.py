@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import argparse
 import dataclasses
-import sys
 import time
 from collections.abc import Iterator
 from pathlib import Path
@@ -12,6 +11,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from graspd_core.cli.output import print_note
 from graspd_core.cli.running import EXIT_INTERRUPTED, EXIT_OK, EXIT_TOO_FEW
 from graspd_core.config import VERIFICATIONS, SceneConfig, load_scene_config
 from graspd_core.errors import BagError, CloudError, ConfigError, TransformError
@@ -94,20 +94,26 @@ def not_loaded(options: argparse.Namespace, config: PlanConfig, began: float) ->
     return GraspResult(Outcome.DEADLINE, (), Timing(load=taken, total=taken), options.seed, config.method)
 
 
+def not_loaded_document(result: GraspResult) -> dict[str, Any]:
+    """Return what there is of a grasps.json without an object."""
+    return {"outcome": {"name": result.outcome.name, "message": result.outcome.value}, "grasps": []}
+
+
 def summary(result: GraspResult, wanted: int, different: int) -> str:
     """Return a few lines for a person. `different` counts the good grasps that are not copies."""
     from graspd_core.verify.metrics import METRICS
 
     good = good_grasps(result)
-    kind = "unverified" if any(not grasp.trials for grasp in result.grasps) else "verified"
+    kind = "unverified" if any(not grasp.trials for grasp in result.tried) else "verified"
     ending = result.message or result.outcome.value
     copies = f", {different} of them different" if different < good else ""
-    lines = [f"{good} of {wanted} grasps ({kind}{copies}, {len(result.grasps)} tried): {ending}"]
+    lines = [f"{good} of {wanted} grasps ({kind}{copies}, {len(result.tried)} tried): {ending}"]
     timing = result.timing
     lines.append(
         f"load {timing.load:.2f} s, sdf {timing.sdf:.2f} s, optimise {timing.optimise:.2f} s, "
         f"verify {timing.verify:.2f} s, total {timing.total:.2f} s"
         + (f", first verified after {timing.first_verified:.2f} s" if timing.first_verified else "")
+        + (f"; object of {result.tried_mass:.2g} kg" if result.tried_mass else "")
     )
     for rank, grasp in enumerate(result.grasps[: min(good, _FIRST)]):
         figures = [
@@ -213,7 +219,7 @@ def bag_views(path: Path, options: argparse.Namespace) -> Iterator[tuple[BagFram
         try:
             seen = frame.view(transforms, options.frame, place)
             if place == ORIGIN and frame.frame not in told and (doubt := frame_doubt(frame.frame, frame.view().points)):
-                print(f"graspd: {doubt}", file=sys.stderr)
+                print_note(doubt)
             told.add(frame.frame)
             yield frame, seen
         except (CloudError, TransformError) as error:
@@ -239,7 +245,7 @@ def merged_views(path: Path, options: argparse.Namespace) -> tuple[PointCloud, .
         raise BagError(f"{path}: {refusals[0]}")
     if refusals:
         count = len(views) + len(refusals)
-        print(f"graspd: {len(refusals)} of {count} clouds left out, the first {refusals[0]}", file=sys.stderr)
+        print_note(f"{len(refusals)} of {count} clouds left out, the first {refusals[0]}")
     if len(names) > 1:
         raise BagError(f"{path}: clouds in several frames ({', '.join(sorted(names))}); name one with --frame")
     return tuple(views)

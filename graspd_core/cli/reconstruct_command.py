@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import argparse
-import sys
 from pathlib import Path
 from typing import Any
 
@@ -16,6 +15,7 @@ from graspd_core.cli.options import (
     scene_config_of,
     target_of,
 )
+from graspd_core.cli.output import answer, busy, print_note
 from graspd_core.cli.running import EXIT_OK
 
 
@@ -43,11 +43,14 @@ def run(options: argparse.Namespace) -> int:
     settings = scene_config_of(options)
     depth = options.camera is not None or is_depth_image(options.cloud)
     views = tuple(scaled_views(options.cloud, options.camera)) if depth else load_views(options.cloud, options)
-    whole, _, _, warnings = reconstruct_object(views, target_of(options), options.alone, settings)
+    with busy("reconstruct"):
+        whole, _, _, warnings = reconstruct_object(views, target_of(options), options.alone, settings)
     mesh = whole.mesh
-    save_mesh(mesh, options.out)
+    save_mesh(options.out, mesh)
     for warning in (*warnings, *whole.warnings):
-        print(f"graspd: {warning}", file=sys.stderr)
+        print_note(warning)
     extent = mesh.vertices.max(0) - mesh.vertices.min(0)
     print(f"{options.out}: {len(mesh.faces)} faces, {' x '.join(f'{e * 1e3:.0f}' for e in extent)} mm")
+    told = [*warnings, *whole.warnings]
+    answer({"file": options.out, "faces": len(mesh.faces), "extent": extent.tolist(), "warnings": told})
     return EXIT_OK

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import argparse
-import sys
 import time
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -20,10 +19,12 @@ from graspd_core.cli.options import (
     good_grasps,
     merged_views,
     not_loaded,
+    not_loaded_document,
     planning_options,
     scene_config_of,
     target_of,
 )
+from graspd_core.cli.output import Reporter, answer, busy, print_note, waiting
 from graspd_core.cli.running import (
     EXIT_BAD_INPUT,
     EXIT_INTERRUPTED,
@@ -32,7 +33,6 @@ from graspd_core.cli.running import (
     Deadline,
     DeadlinePassed,
     Interrupt,
-    Reporter,
 )
 from graspd_core.config import SceneConfig
 from graspd_core.errors import CloudError, ConfigError, GraspdError, NoObjectError
@@ -80,21 +80,26 @@ def run(options: argparse.Namespace) -> int:
         check_writable(options.out if single else options.out / "probe")
     hand = load_hand(options.hand)
     for warning in hand.named_warnings:
-        print(f"graspd: {warning}", file=sys.stderr)
+        print_note(warning)
     began, statuses, grasps, interrupted = time.perf_counter(), [], 0, False
+    scenes: list[dict[str, Any]] = []
     with Interrupt() as interrupt:
-        for job in _jobs(options):
+        for job in waiting(_jobs(options), "read cloud"):
             # Here, so that it ends a recording of which every cloud is refused, too.
             if interrupted := interrupt.came():
                 break
             try:
-                result = _planned(job, options, hand, config, {**request, "settings": settings, "stop": interrupt.came})
+                result, document = _planned(
+                    job, options, hand, config, {**request, "settings": settings, "stop": interrupt.came}
+                )
             except GraspdError as error:
                 print(f"{job.label}: refused: {error}", flush=True)
+                scenes.append({"label": job.label, "refused": str(error)})
                 # An empty table is an answer. A cloud that cannot be used is bad input.
                 statuses.append(EXIT_TOO_FEW if isinstance(error, NoObjectError) else EXIT_BAD_INPUT)
                 continue
             print(_outcome_line(job, result, options.count), flush=True)
+            scenes.append({"label": job.label, **document})
             grasps += good_grasps(result)
             statuses.append(exit_status(result))
     enough, refused = statuses.count(EXIT_OK), statuses.count(EXIT_BAD_INPUT)
@@ -102,6 +107,7 @@ def run(options: argparse.Namespace) -> int:
         f"{len(statuses)} scenes: {enough} with enough grasps, {len(statuses) - refused - enough} with fewer, "
         f"{refused} refused; {grasps} grasps in {time.perf_counter() - began:.1f} s"
     )
+    answer({"scenes": scenes})
     return EXIT_INTERRUPTED if interrupted else _status(statuses)
 
 
@@ -109,7 +115,7 @@ def _outcome_line(job: _Job, result: GraspResult, count: int) -> str:
     first = result.timing.first_verified
     return (
         f"{job.label}: {sum(len(v.points) for v in job.views)} points, {good_grasps(result)} of {count} grasps "
-        f"({len(result.grasps)} tried): {result.message or result.outcome.value}; "
+        f"({len(result.tried)} tried): {result.message or result.outcome.value}; "
         + (f"first verified after {first:.2f} s, " if first else "")
         + f"total {result.timing.total:.2f} s"
     )
@@ -117,26 +123,30 @@ def _outcome_line(job: _Job, result: GraspResult, count: int) -> str:
 
 def _planned(
     job: _Job, options: argparse.Namespace, hand: HandModel, config: PlanConfig, request: dict[str, Any]
-) -> GraspResult:
-    """Plan on a job's views and write the result if asked for. Raises a GraspdError: they show no usable object."""
-    from graspd_core.io.grasps_json import save_result
+) -> tuple[GraspResult, dict[str, Any]]:
+    """Plan on a job's views and write the result if asked for. Return it, and its document too.
+
+    Raises a GraspdError: the views show no usable object.
+    """
+    from graspd_core.io.grasps_json import result_document, save_result
     from graspd_core.planning.plan_grasps import plan_grasps
 
     began = time.perf_counter()
     deadline = Deadline(options.deadline, began)
     try:
-        with deadline.cuts_short():
+        with deadline.cuts_short(), busy("load"):
             scene = _scene_of(job, options, request.pop("settings"))
     except DeadlinePassed:
-        return not_loaded(options, config, began)
+        result = not_loaded(options, config, began)
+        return result, not_loaded_document(result)
     for warning in scene.object.warnings:
-        print(f"graspd: {job.label}: {warning}", file=sys.stderr)
+        print_note(f"{job.label}: {warning}")
     with Reporter() as reporter:
         result = plan_grasps(scene, hand, preset=config, progress=reporter, deadline=deadline.left(), **request)
     if options.out:
         path = options.out if options.out.suffix == ".json" else options.out / f"{job.name}.json"
         save_result(path, result, scene.object, hand, config)
-    return result
+    return result, result_document(result, scene.object, hand, config)
 
 
 def _jobs(options: argparse.Namespace) -> Iterator[_Job]:

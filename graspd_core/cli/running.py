@@ -1,10 +1,9 @@
-"""A running command: its exit status, progress and deadline, and its response to Ctrl-C."""
+"""A running command: its exit status and deadline, and its response to Ctrl-C."""
 
 from __future__ import annotations
 
 import os
 import signal
-import sys
 import threading
 import time
 from collections.abc import Callable, Iterator
@@ -17,7 +16,7 @@ from types import FrameType
 from typing import Any
 
 from graspd_core.errors import ConfigError
-from graspd_core.types import GraspResult, Progress, ProgressHook, Stage, WatchHook
+from graspd_core.types import GraspResult, ProgressHook, WatchHook
 
 EXIT_OK, EXIT_BAD_INPUT, EXIT_TOO_FEW, EXIT_INTERRUPTED = 0, 2, 3, 130
 
@@ -51,37 +50,6 @@ class Interrupt:
         if self._event.is_set():
             raise KeyboardInterrupt
         self._event.set()
-
-
-class Reporter:
-    """Progress on a terminal as a bar, elsewhere as plain lines, one a stage."""
-
-    def __enter__(self) -> Reporter:
-        self._bar: Any = None
-        self._stage: Stage | None = None
-        return self
-
-    def __call__(self, progress: Progress) -> None:
-        if progress.stage is not self._stage:
-            self._close()
-            self._stage = progress.stage
-            if sys.stderr.isatty() and progress.stage is not Stage.DONE:
-                from tqdm import tqdm
-
-                self._bar = tqdm(total=progress.of, desc=str(progress.stage), file=sys.stderr, leave=False)
-            elif progress.stage is not Stage.DONE:
-                print(f"graspd: {progress.stage} ({progress.elapsed:.1f} s)", file=sys.stderr)
-        if self._bar is not None:
-            self._bar.set_postfix_str(f"{progress.verified} verified" if progress.verified else f"{progress.best:.2f}")
-            self._bar.update(progress.step - self._bar.n)
-
-    def __exit__(self, *_: object) -> None:
-        self._close()
-
-    def _close(self) -> None:
-        if self._bar is not None:
-            self._bar.close()
-            self._bar = None
 
 
 # Seconds from one interruption of the same work to the next.

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import argparse
 import shlex
-import sys
 from contextlib import nullcontext
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -18,13 +17,16 @@ from graspd_core.cli.options import (
     exit_status,
     good_grasps,
     not_loaded,
+    not_loaded_document,
     planning_options,
     restrictions_of,
     scene_config_of,
     summary,
     target_of,
 )
-from graspd_core.cli.running import Deadline, DeadlinePassed, Interrupt, Reporter, Watched, sibling
+from graspd_core.cli.output import Reporter, answer, busy, print_note
+from graspd_core.cli.running import Deadline, DeadlinePassed, Interrupt, Watched, sibling
+from graspd_core.errors import ConfigError
 from graspd_core.types import GraspResult
 
 if TYPE_CHECKING:
@@ -49,6 +51,7 @@ def add_command(commands: Any) -> None:
     sizes.add_argument("--units", choices=tuple(_UNITS), default=None, help="unit of the file's coordinates")
     parser.add_argument("--out", type=Path, default=None, metavar="grasps.json", help="the grasps (docs/format.md)")
     parser.add_argument("--html", type=Path, default=None, metavar="view.html", help="a page that shows them")
+    parser.add_argument("--picture", type=Path, default=None, metavar="grasp.png", help="the best grasp, drawn")
     parser.add_argument("--view", action="store_true", help="watch it in a browser (docs/viewer.md)")
     add_address(parser)
 
@@ -64,11 +67,13 @@ def run(options: argparse.Namespace) -> int:
     request["restrictions"] = restrictions_of(options)
     deadline = Deadline(options.deadline, options.began)
     # A run whose result could not be written would be lost.
-    for path in (options.out, options.html):
+    if options.picture and options.picture.suffix.lower() != ".png":
+        raise ConfigError(f"--picture {options.picture}: a .png file is written")
+    for path in (options.out, options.html, options.picture):
         if path:
             check_writable(path)
     try:
-        with deadline.cuts_short():
+        with deadline.cuts_short(), busy("load"):
             scene = load_scene(
                 options.object,
                 mass=options.mass,
@@ -85,9 +90,10 @@ def run(options: argparse.Namespace) -> int:
         # Nothing is written: results are of an object.
         result = not_loaded(options, config, options.began)
         print(summary(result, options.count, 0))
+        answer(not_loaded_document(result))
         return exit_status(result)
     for warning in (*scene.object.warnings, *hand.named_warnings):
-        print(f"graspd: {warning}", file=sys.stderr)
+        print_note(warning)
     page_of_run = nullcontext(Watched())
     if options.view:
         page_of_run = sibling("graspd_viewer.view_command").watched(options, scene, hand, config)
@@ -104,17 +110,25 @@ def _report(
     options: argparse.Namespace, result: GraspResult, scene: Scene, hand: HandModel, config: PlanConfig
 ) -> None:
     """Write the result to the files asked for, and print a summary."""
-    from graspd_core.io.grasps_json import save_result
+    from graspd_core.io.grasps_json import result_document, save_result
     from graspd_core.verify.metrics import distinct
 
+    answer(result_document(result, scene.object, hand, config))
     if options.out:
         save_result(options.out, result, scene.object, hand, config)
-    if options.html:
+    if options.html or options.picture:
         page = sibling("graspd_viewer.grasp_page")
-        page.save_view(options.html, scene.object.mesh, hand, result.grasps, name=Path(options.object).name)
+        shown = (scene.object.mesh, hand, result.grasps)
+        up = result.support and result.support.normal
+        if options.html:
+            page.save_view(options.html, *shown, name=Path(options.object).name, up=up)
+        if options.picture:
+            page.save_picture(options.picture, *shown, up=up)
     different = len(distinct(result.grasps[: good_grasps(result)], hand))
     print(summary(result, options.count, different))
     if options.out:
         print(f"written: {options.out}; to look at it: graspd view {shlex.quote(str(options.out))}")
     if options.html:
-        print(f"written: {options.html}: the best grasp, for any browser")
+        print(f"written: {options.html}: the grasps, for any browser")
+    if options.picture:
+        print(f"written: {options.picture}: the best grasp")

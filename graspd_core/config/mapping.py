@@ -4,15 +4,17 @@ from __future__ import annotations
 
 import dataclasses
 import math
+import re
 import types
 import typing
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, Literal, TypeVar
 
 import yaml
 
-from graspd_core.errors import ConfigError, shown
+from graspd_core.errors import ConfigError, choices, shown
 
 T = TypeVar("T")
 
@@ -39,22 +41,42 @@ def coerced(
     """Return a mapping's values, each as the type that `hints` names for its key. Raises ConfigError: see above."""
     if not isinstance(values, Mapping):
         raise ConfigError(f"{where}: expected a mapping of {sorted(hints)}, got {shown(values)}")
-    unknown = sorted(map(shown, set(values) - set(hints)))
-    if unknown:
-        raise ConfigError(f"{where}: unknown key {unknown[0]}; valid keys: {', '.join(sorted(hints))}")
+    if unknown := sorted(set(values) - set(hints), key=shown):
+        raise ConfigError(f"{where}: unknown key {shown(unknown[0])}; {choices(unknown[0], sorted(hints))}")
     return {key: _coerce(hints[key], value, f"{where}.{key}", starts.get(key)) for key, value in values.items()}
 
 
-def read_yaml(path: Path) -> Any:
-    """Read the values of a YAML file, an empty mapping for an empty one. Raises ConfigError: missing or malformed."""
+@contextmanager
+def yaml_values(path: Path) -> Iterator[Any]:
+    """Give the values of a YAML file, an empty mapping for an empty one.
 
+    A ConfigError inside that begins with a dotted key, of which the file's name may be the start, gets the path and the
+    line of that key. Raises ConfigError: missing or malformed.
+    """
     try:
-        _, values = parse_yaml(path.read_text(encoding="utf-8"))
+        node, values = parse_yaml(path.read_text(encoding="utf-8"))
     except OSError as error:
         raise ConfigError(f"{path}: {error.strerror or error}") from None
     except (YamlError, UnicodeDecodeError) as error:
         raise ConfigError(f"{path}: not valid YAML: {error}") from None
-    return {} if values is None else values
+    try:
+        yield {} if values is None else values
+    except ConfigError as error:
+        text = str(error).removeprefix(path.name)
+        unknown = re.search(r"unknown key '([^']*)'", text)
+        keys = [*re.sub(r"\[.*", "", text.partition(":")[0]).split("."), *(unknown.groups() if unknown else ())]
+        raise ConfigError(f"{path}:{_line_of(node, [key for key in keys if key])}: {text.lstrip('.: ')}") from None
+
+
+def _line_of(node: yaml.Node | None, keys: list[str]) -> int:
+    """Return the line of the last of nested keys, or of the last one that is there."""
+    line = 1
+    for key in keys:
+        found = [pair for pair in node.value if pair[0].value == key] if isinstance(node, yaml.MappingNode) else []
+        if not found:
+            break
+        line, node = found[-1][0].start_mark.line + 1, found[-1][1]
+    return line
 
 
 def _coerce(hint: Any, value: Any, where: str, start: Any = None, *, signed: bool = False) -> Any:

@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Literal
 
-from graspd_core.config.mapping import from_mapping, read_yaml
+from graspd_core.config.mapping import from_mapping, yaml_values
 from graspd_core.errors import ConfigError
 
 # Below these nothing is left to work with. Every other number is above zero.
@@ -151,20 +151,22 @@ def load_scene_config(path: str | Path) -> SceneConfig:
     Missing ones have their defaults. Raises ConfigError: no such file, malformed YAML, an unknown key (the valid ones
     are listed), or a bad value.
     """
-    path = Path(path)
-    config = from_mapping(SceneConfig, read_yaml(path), where=path.name)
+    with yaml_values(path := Path(path)) as values:
+        config = from_mapping(SceneConfig, values, where=path.name)
+        _refuse_values(config)
+    return config
+
+
+def _refuse_values(config: SceneConfig) -> None:
     for part in dataclasses.fields(config):
         for name, value in dataclasses.asdict(getattr(config, part.name)).items():
-            _refuse(f"{path.name}.{part.name}.{name}", value, _MINIMA.get(name, 0))
+            _refuse(f"{part.name}.{name}", value, _MINIMA.get(name, 0))
     low, high = config.segmentation.roi_low, config.segmentation.roi_high
     if low and high and not all(a < b for a, b in zip(low, high, strict=True)):
-        raise ConfigError(f"{path.name}.segmentation.roi_low: {low} must be below roi_high={high} on every axis")
+        raise ConfigError(f"segmentation.roi_low: {low} must be below roi_high={high} on every axis")
     seen, guessed = config.reconstruction.seen_distance, config.reconstruction.guessed_distance
     if seen >= guessed:
-        raise ConfigError(
-            f"{path.name}.reconstruction.seen_distance: {seen:g} must be below guessed_distance={guessed:g}"
-        )
-    return config
+        raise ConfigError(f"reconstruction.seen_distance: {seen:g} must be below guessed_distance={guessed:g}")
 
 
 def _refuse(where: str, value: Any, least: int) -> None:

@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float
 
-from graspd_core.errors import HandError
+from graspd_core.errors import HandError, choices
 from graspd_core.hands.default_postures import default_palm, default_postures
 from graspd_core.hands.kinematics import link_poses
 from graspd_core.hands.model import HandModel
@@ -96,8 +96,8 @@ def _find(name_or_path: str | Path) -> Path:
             raise HandError(f"{path}: no such file")
         return path
     if text not in hand_names():
-        files = "the path of a .yaml, .urdf, .xml (URDF or MJCF) or .pkl (MANO) file"
-        raise HandError(f"unknown hand {text!r}; known: {', '.join(hand_names())}, or {files}")
+        files = ", or the path of a .yaml, .urdf, .xml (URDF or MJCF) or .pkl (MANO) file"
+        raise HandError(f"unknown hand {text!r}; {choices(text, hand_names(), files)}")
     return config_dir() / "hands" / f"{text}.yaml"
 
 

@@ -56,7 +56,7 @@ def result_document(result: GraspResult, target: ObjectModel, hand: HandModel, c
         "timing": dataclasses.asdict(result.timing),
         "audits": dataclasses.asdict(result.audits),
         "refused": dict(result.refused),
-        "grasps": [_grasp(rank, grasp, hand) for rank, grasp in enumerate(result.grasps)],
+        "grasps": [_grasp(rank, grasp, hand) for rank, grasp in enumerate(result.tried)],
     }
 
 

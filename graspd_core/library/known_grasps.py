@@ -257,7 +257,7 @@ def known_or_planned(
         add_planned(library, scene, hand, config, planned, verify, name)
     except FormatError as error:
         warnings = (*warnings, f"{error}; what was planned is not kept")
-    new = wanted([grasp for grasp in planned.grasps if grasp.usable])
+    new = wanted([grasp for grasp in planned.tried if grasp.usable])
     outcome = planned.outcome
     if outcome in (Outcome.SUCCEEDED, Outcome.NO_CANDIDATES) and found + len(new):
         outcome = Outcome.SUCCEEDED if found + len(new) >= count else Outcome.TOO_FEW
@@ -267,7 +267,8 @@ def known_or_planned(
     return replace(
         planned,
         outcome=outcome,
-        grasps=(*known.grasps, *new, *(grasp for grasp in planned.grasps if not grasp.usable)),
+        tried=(*known.tried, *new, *(grasp for grasp in planned.tried if not grasp.usable)),
+        count=count,
         message="; ".join(filter(None, (told, why))),
         warnings=warnings,
         refused=Counter(known.refused) + Counter(planned.refused),
@@ -291,7 +292,7 @@ def add_planned(
         return 0
     alone = [
         replace(grasp, trials=tuple(trial for trial in grasp.trials if trial.name == "hold"))
-        for grasp in planned.grasps
+        for grasp in planned.tried
         if grasp.verdict is Verdict.VERIFIED
     ]
     target = scene.object if planned.mass is None else scene.object.at_mass(planned.mass)

@@ -8,8 +8,10 @@ from __future__ import annotations
 
 import hashlib
 import os
+import warnings
 from math import ceil, log, log10
 from pathlib import Path
+from typing import cast
 
 import numpy as np
 import torch
@@ -166,11 +168,17 @@ def read_mesh(path: str | Path, *, scale: float = 1.0) -> tuple[TriangleMesh, tu
     return TriangleMesh(mesh.vertices * scale, mesh.faces), warnings
 
 
-def save_mesh(mesh: TriangleMesh, path: str | Path) -> None:
-    """Write a mesh in the format of the path's ending. Raises MeshError for an ending that cannot be written."""
+def save_mesh(path: str | Path | TriangleMesh, mesh: TriangleMesh | str | Path) -> None:
+    """Write a mesh in the format of the path's ending. Raises MeshError for an ending that cannot be written.
+
+    The order of version 0.1, with the mesh first, is taken with a warning until 0.3.
+    """
     import trimesh
 
-    path = Path(path)
+    if isinstance(path, TriangleMesh):
+        warnings.warn("save_mesh(mesh, path) goes with version 0.3; the path comes first", DeprecationWarning, 2)
+        path, mesh = mesh, path
+    path, mesh = Path(cast(str, path)), cast(TriangleMesh, mesh)
     ending = path.suffix.lower().lstrip(".")
     writable = [e for e in MESH_ENDINGS if e != "dae"]
     if ending not in writable:

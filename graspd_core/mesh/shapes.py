@@ -16,7 +16,7 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float
 
-from graspd_core.errors import MeshError
+from graspd_core.errors import MeshError, choices
 from graspd_core.mesh.mesh_files import MESH_ENDINGS, content_hash
 from graspd_core.types import TriangleMesh, joined
 
@@ -40,7 +40,7 @@ HEAD_HALF = (0.045, 0.015, 0.015)
 def make_shape(name: str) -> TriangleMesh:
     """Build the authored shape of that name [m]. Raises MeshError for an unknown name."""
     if name not in SHAPES:
-        raise MeshError(f"unknown shape {name!r}; valid shapes: {', '.join(sorted(SHAPES))}")
+        raise MeshError(f"unknown shape {name!r}; {choices(name, sorted(SHAPES))}")
     return SHAPES[name]()
 
 

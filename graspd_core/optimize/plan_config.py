@@ -20,8 +20,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from graspd_core.config import CertaintyConfig, GraspStagesConfig, ProblemConfig, RobustConfig, RoundsConfig
-from graspd_core.config.mapping import coerced, read_yaml
-from graspd_core.errors import ConfigError, shown
+from graspd_core.config.mapping import coerced, yaml_values
+from graspd_core.errors import ConfigError, choices, shown
 from graspd_core.optimize.closed_form.closed_form_config import ClosedFormConfig, at_budget
 from graspd_core.optimize.graspd2022.graspd2022_config import Graspd2022Config
 from graspd_core.paths import config_dir
@@ -102,7 +102,7 @@ def method_row(name: Any, where: str = "config") -> Method:
     """Return the row of a method. Raises ConfigError: there is no such method."""
     _run_plugins()
     if not isinstance(name, str) or (name not in METHODS and name not in _registered()):
-        raise ConfigError(f"{where}.method: {shown(name)} is not one of {', '.join(method_names())}")
+        raise ConfigError(f"{where}.method: unknown method {shown(name)}; {choices(name, method_names())}")
     if name not in METHODS:
         METHODS[name] = _registered()[name].load()
     return METHODS[name]
@@ -207,8 +207,9 @@ def load_preset(name: str) -> PlanConfig:
     path = Path(name) if by_path else config_dir() / "presets" / f"{name}.yaml"
     if not path.is_file():
         told = f"preset {name}: no such file" if by_path else f"unknown preset {name!r}"
-        raise ConfigError(f"{told}; valid presets: {', '.join(preset_names())}, or a .yaml file")
-    return plan_config(read_yaml(path), where=path.name)
+        raise ConfigError(f"{told}; {choices(name, preset_names(), ', or a .yaml file')}")
+    with yaml_values(path) as values:
+        return plan_config(values, where=path.name)
 
 
 def load_plugin(path: str) -> str:

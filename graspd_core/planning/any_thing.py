@@ -167,9 +167,9 @@ def _thing_plan(
     count, seed = plan.get("count", 1) + 2 * len(lost), plan.get("seed", 0) + len(failed)
     plan = {**plan, "preset": config, "count": count, "seed": seed}
     result = plan_grasps(scene, hand, **plan)
-    left = [grasp for grasp in unlike(result.grasps, lost) if grasp.verdict is not Verdict.FAILED]
+    left = [grasp for grasp in unlike(result.tried, lost) if grasp.verdict is not Verdict.FAILED]
     if not left:
-        reason = result.message or next((g.reason for g in result.grasps if g.reason), "") or result.outcome.value
+        reason = result.message or next((g.reason for g in result.tried if g.reason), "") or result.outcome.value
         return ThingPlan(points, scene, result, None, reason)
     best = max(left, key=lambda grasp: (grasp.verdict is Verdict.VERIFIED, grasp.probability or 0.0))
     reason = "" if best.verdict is Verdict.VERIFIED else result.message or "no grasp is sure enough"

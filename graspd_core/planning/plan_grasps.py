@@ -88,7 +88,7 @@ def plan_grasps(
     stop: StopHook | None = None,
     watch: WatchHook | None = None,
 ) -> GraspResult:
-    """Plan grasps and try them in rank order until `count` pass all trials of the scene. Failed ones come last.
+    """Plan grasps and try them in rank order until `count` pass all trials of the scene.
 
     Args:
         scene: from `load_scene` or `scene_from_views`. Another grid is built if the preset asks for it.
@@ -174,18 +174,18 @@ def _why_few(run: Run, scene: Scene, bound: BoundRestrictions, found: RoundsResu
     told = restrictions_in_words(bound, found.refused, found.good, len(found.grasps))
     if told or result.outcome is not Outcome.TOO_FEW:
         return told
-    if bare := sum(not grasp.trials and not grasp.contacts for grasp in result.grasps):
-        return f"{bare} of {len(result.grasps)} untried candidates touch the object nowhere"
-    told = why_trials_failed(scene, result.grasps)
+    if bare := sum(not grasp.trials and not grasp.contacts for grasp in result.tried):
+        return f"{bare} of {len(result.tried)} untried candidates touch the object nowhere"
+    told = why_trials_failed(scene, result.tried)
     if found.good or found.context is None:
         return told
-    most = greatest_payload(found.context, result.grasps[:_WEIGHED], run.over)
+    most = greatest_payload(found.context, result.tried[:_WEIGHED], run.over)
     return f"{told}; the best of them would hold {most:.2g} kg" if most > LEAST_PAYLOAD else told
 
 
 def _less_sure(scene: Scene, far: Float[np.ndarray, "3"], result: GraspResult) -> GraspResult:
     """Return a result without a sure grasp, with the next best view of the hidden side."""
-    held = sum(grasp.verdict is Verdict.UNVERIFIED for grasp in result.grasps)
+    held = sum(grasp.verdict is Verdict.UNVERIFIED for grasp in result.tried)
     if scene.evidence is None or not held:
         return result
     told, view = f"{held} grasps hold on the likeliest shape, none is sure enough", None

@@ -105,4 +105,5 @@ def result_of(
         message,
         warnings,
         refused=refused or {},
+        count=count,
     )

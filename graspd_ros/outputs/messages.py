@@ -130,7 +130,7 @@ def ending_of(result: GraspResult) -> AnswerEnding:
         return AnswerEnding(GraspArray.SUCCEEDED, ErrorCode.NONE, message, result)
     if result.outcome is Outcome.CANCELLED:
         return AnswerEnding(GraspArray.CANCELLED, ErrorCode.CANCELLED, message, result)
-    some = any(grasp.verdict is not Verdict.FAILED for grasp in result.grasps)
+    some = any(grasp.verdict is not Verdict.FAILED for grasp in result.tried)
     return AnswerEnding(GraspArray.PARTIAL if some else GraspArray.FAILED, _SHORT[result.outcome], message, result)
 
 
@@ -153,7 +153,7 @@ def array_message(
         message.warnings = list(ending.result.warnings)
         if ending.result.next_view is not None:
             message.next_view = PoseStamped(header=header, pose=pose_of_matrix(ending.result.next_view))
-        ranked = enumerate(ending.result.grasps)
+        ranked = enumerate(ending.result.tried)
         message.grasps = [
             grasp_message(grasp, rank, request_id, header, hand, pace, mass=ending.result.tried_mass)
             for rank, grasp in ranked

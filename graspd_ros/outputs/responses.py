@@ -418,7 +418,7 @@ class Responses:
         if request.settings.publish_markers and planned.worked_on:
             settings = request.settings
             look = {"shown": settings.marker_grasps, "parts": settings.marker_parts, "solids": self.drawn(settings)}
-            shown.append(result_markers(result.grasps, hand, request.frame_out, request.stamp, **look))
+            shown.append(result_markers(result.tried, hand, request.frame_out, request.stamp, **look))
         for message in shown:
             self.publishers.publish(message)
         self.publishers.tell("result", request.id, request.source, frame=request.frame_out, file=planned.file, **event)
@@ -495,7 +495,7 @@ def _pace(request: Request) -> Pace:
 
 def presentable(result: GraspResult) -> Grasp | None:
     """Return the best grasp if it is as certain as was asked for, else None, so that no worse one is published."""
-    best = result.grasps[0] if result.grasps else None
+    best = result.tried[0] if result.tried else None
     return best if best is not None and best.usable else None
 
 
@@ -512,8 +512,8 @@ def result_event(result: GraspResult) -> dict[str, Any]:
         "outcome": result.outcome.name.lower(),
         "message": result.message or result.outcome.value,
         "warnings": list(result.warnings),
-        "grasps": len(result.grasps),
-        "verified": sum(grasp.verdict is Verdict.VERIFIED for grasp in result.grasps),
+        "grasps": len(result.tried),
+        "verified": sum(grasp.verdict is Verdict.VERIFIED for grasp in result.tried),
         "timing": dataclasses.asdict(result.timing),
         "audits": dataclasses.asdict(result.audits),
         "best": None if best is None else _summary(best),

@@ -1,5 +1,6 @@
 """Failure maps and charts: cells, records, what is counted from them, and pictures that are the same every time."""
 
+import re
 from collections import Counter
 from dataclasses import asdict, replace
 from itertools import combinations, product
@@ -196,6 +197,41 @@ def test_charts_are_written_and_not_blank(tmp_path: Path, records, planned):
         inked = (np.abs(picture - 1.0) > 0.1).any(-1)
         assert 0.005 < inked.mean() < 0.5, name
         assert ElementTree.parse(tmp_path / "deep" / f"{name}.svg").getroot().tag.endswith("svg")
+
+
+def test_a_comparison_says_what_it_is_of_and_names_nothing_that_is_absent(tmp_path: Path, record):
+    # All that were asked for held: the axis ends at 100 %.
+    all_held = {"given": 4, "held": 4, "grasps": 4 * record()["grasps"][:1]}
+    own = [record("balanced", **all_held), record("mine", **all_held, cpu={"optimise": 2.02, "standard": 3.0})]
+    drawn = charts.draw_charts([*own, record("robust")], tmp_path / "chart")
+    chart, short = (drawn[name].with_suffix(".svg").read_text() for name in ("speed", "short"))
+    for text in (
+        "allegro_right; box",
+        "n = 4 grasps a preset; bars: quartiles over grasps",
+        "closed form",
+    ):
+        assert text in chart
+    assert "<!-- ablation -->" not in chart
+    percents = [float(text) for text in re.findall(r"<!-- ([\d.]+) -->", chart)]
+    assert max(percents) == 100.0
+    # The preset that held less, of which the axis goes farther down, is not among the few.
+    assert ("<!-- 40 -->" in chart, "<!-- 40 -->" in short) == (True, False)
+    one = charts.draw_charts([record("balanced")], tmp_path / "one")["speed"].with_suffix(".svg").read_text()
+    assert "<!-- Pareto front -->" not in one
+    ablation = charts.draw_charts([record("balanced"), record("closed_form_no_patches")], tmp_path / "two")["speed"]
+    assert "<!-- ablation -->" in ablation.with_suffix(".svg").read_text()
+
+
+def test_ticks_of_a_narrow_axis_stand_apart(tmp_path: Path):
+    with charts_style.figure(4.5, 4.5) as (made, axis):
+        axis.plot([0.0266, 0.0284], [1.0, 2.0], "o")
+        axis.set_xscale("log")
+        axis.margins(0.18)
+        charts_style._few_ticks(axis.xaxis)
+        made.canvas.draw()
+        boxes = [t.get_window_extent() for t in axis.get_xticklabels(which="both") if t.get_text() and t.get_visible()]
+    assert 2 <= len(boxes) <= 6
+    assert not [pair for pair in combinations(range(len(boxes)), 2) if boxes[pair[0]].overlaps(boxes[pair[1]])]
 
 
 def test_the_same_figures_draw_the_same_chart(tmp_path: Path, records):

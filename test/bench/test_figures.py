@@ -13,11 +13,13 @@ from graspd_bench import tables as report
 from graspd_bench.figures import (
     by_name,
     comparison,
+    is_few,
     moves,
     parent_of,
     pareto_front,
     per_verified,
     rows,
+    share_interval,
     short_name,
     spread,
 )
@@ -51,6 +53,22 @@ def test_a_grasp_that_was_not_found_counts_as_failed(record):
     assert row.values["cpu_with_scene"] == 0.75
     assert row.values["cpu_per_verified"] == 2.5
     assert row.values["first_wall"] == 8.0
+
+
+def test_the_first_page_has_presets_that_people_plan_with_and_the_users_own():
+    names = ("balanced", "mine", "robust", "closed_form_no_patches", "steps=90", "hand:leap_right")
+    assert [is_few(name) for name in names] == [True, True, False, False, False, False]
+
+
+def test_a_share_has_wilsons_interval_and_one_object_the_quartiles_of_its_grasps(record):
+    assert share_interval(10, 10) == pytest.approx((10 / (10 + 1.96**2), 1.0))
+    assert share_interval(0, 10) == pytest.approx((0.0, 1.96**2 / (10 + 1.96**2)))
+    low, high = share_interval(8, 16)
+    assert low + high == pytest.approx(1.0)
+    one = spread(rows([record()]), "sd_cm")
+    assert one is not None
+    # Of 0.1, 0.3 and 9 cm.
+    assert (one.low, one.median, one.high) == pytest.approx((0.2, 0.3, 4.65))
 
 
 def test_a_method_that_found_nothing_has_held_nothing(record):

@@ -82,7 +82,7 @@ def test_the_key_does_not_depend_on_what_is_not_looked_at(tmp_path: Path):
     assert set(to_mapping(override(PlanConfig(), {"method": "graspd2022"}))) & set(METHODS) == {"graspd2022"}
     for folder in ("here", "there"):
         (tmp_path / folder).mkdir()
-        save_mesh(make_shape("box"), tmp_path / folder / "thing.obj")
+        save_mesh(tmp_path / folder / "thing.obj", make_shape("box"))
     here, there = (replace(CELL, object=str(tmp_path / folder / "thing.obj")) for folder in ("here", "there"))
     assert store.case_key("main", here) == store.case_key("main", there) != key
 
@@ -96,7 +96,7 @@ def test_objects_hands_and_presets_count_by_their_content(tmp_path: Path):
     def keys(name: str, mesh: TriangleMesh, resolution: int) -> str:
         folder = tmp_path / name
         folder.mkdir()
-        save_mesh(mesh, folder / "thing.obj")
+        save_mesh(folder / "thing.obj", mesh)
         (folder / "mine.yaml").write_text(f"resolution: {resolution}\n")
         asked = Plain(str(folder / "thing.obj"), str(folder / "mine.yaml")).asked()
         return json.dumps({**asked, "preset": ""})
@@ -184,7 +184,7 @@ def test_nothing_is_begun_once_stopped(tmp_path: Path, job):
 
 def test_an_object_that_cannot_be_grasped_is_a_cell_with_nothing_held(tmp_path: Path):
     box = make_shape("box")
-    save_mesh(TriangleMesh(box.vertices * 10, box.faces), tmp_path / "crate.ply")
+    save_mesh(tmp_path / "crate.ply", TriangleMesh(box.vertices * 10, box.faces))
     cell = replace(CELL, settings=load_preset("random_closure"), object=str(tmp_path / "crate.ply"), count=1)
     record = run_job(Job("main", replace(cell, trials=("standard",)), run_cell, "1+a"))
     assert (record["error"], record["held"], record["first_verified"]) == ("", 0, None)
@@ -212,7 +212,7 @@ def test_results_are_read_back_and_other_files_refused(tmp_path: Path):
 
 def test_objects_are_shapes_files_and_folders(tmp_path: Path):
     for name in ("b", "a"):
-        save_mesh(make_shape("box"), tmp_path / f"{name}.obj")
+        save_mesh(tmp_path / f"{name}.obj", make_shape("box"))
     (tmp_path / "notes.txt").write_text("no mesh")
     found = find_objects(("shape:mug", str(tmp_path)))
     assert [Path(source).name for source in found] == ["shape:mug", "a.obj", "b.obj"]

@@ -124,9 +124,9 @@ GRASPD = [sys.executable, "-m", "graspd_core.cli", "bench"]
 # Two cells of a few seconds, whose method does next to nothing.
 SMALL = ["--presets", "random_closure", "--objects", "shape:sphere", "--count", "2", "--trials", "standard"]
 BAD: list[tuple[list[str], str]] = [
-    (["--presets", "best"], "unknown preset 'best'; valid presets: accurate, "),
-    (["--suite", "tall"], "unknown suite 'tall'; valid suites: main, "),
-    (["--trials", "standard,gentle"], "unknown trial 'gentle'; valid trials: standard, hard, "),
+    (["--presets", "best"], "unknown preset 'best'; valid: accurate, "),
+    (["--suite", "tall"], "unknown suite 'tall'; did you mean 'all'?"),
+    (["--trials", "standard,gentle"], "unknown trial 'gentle'; valid: standard, hard, "),
     (["--processes", "0"], "processes: 0; at least 1"),
     (["--compare", "nowhere.json"], "nowhere.json: No such file"),
     (["--cases", "empty"], "cases: main does not look at it; valid: "),

@@ -30,7 +30,7 @@ def test_a_shape_has_a_density():
 
 def test_a_folder_of_meshes_needs_a_csv_of_masses(tmp_path: Path):
     for name in ("one", "two"):
-        save_mesh(make_shape("sphere"), tmp_path / f"{name}.obj")
+        save_mesh(tmp_path / f"{name}.obj", make_shape("sphere"))
     with pytest.raises(ConfigError, match=r"no mass of one\.obj; its csv files name none; columns: name, mass_kg"):
         find_sources([str(tmp_path)])
     (tmp_path / "masses.csv").write_text("name,mass_kg,colour\none,0.3,red\ntwo.obj,0.5,blue\n")

@@ -41,14 +41,15 @@ BAD_OBJECTS: dict[str, tuple[Callable[[Path], object], str]] = {
     "nan.npy": (lambda path: np.save(path, np.full((100, 3), np.nan)), "NaN"),
 }
 BAD_OPTIONS: list[tuple[list[str], str]] = [
-    (["--hand", "claw"], "unknown hand 'claw'; known: allegro_left, allegro_right"),
-    (["--preset", "best"], f"unknown preset 'best'; valid presets: {', '.join(preset_names())}"),
-    (["--preset", "mine/best.yaml"], "preset mine/best.yaml: no such file; valid presets: accurate"),
+    (["--hand", "claw"], "unknown hand 'claw'; valid: allegro_left, allegro_right"),
+    (["--preset", "best"], f"unknown preset 'best'; valid: {', '.join(preset_names())}"),
+    (["--preset", "mine/best.yaml"], "preset mine/best.yaml: no such file; valid: accurate"),
     (["-n", "many"], "invalid int value: 'many'"),
     (["--mass", "-0.1"], "mass -0.1 kg must be a positive number"),
     (["--units", "furlong"], "invalid choice: 'furlong' (choose from"),
     (["--scale", "2", "--units", "mm"], "not allowed with argument"),
     (["--verify", "gently"], "invalid choice: 'gently' (choose from"),
+    (["--picture", "grasp.jpg"], "--picture grasp.jpg: a .png file is written"),
     (["--threads", "0"], "threads: 0; at least 1"),
     (["--approach-angle", "20"], "--approach-angle: it needs --approach"),
     (["--roll-tolerance", "20"], "--roll-tolerance: it needs --roll"),
@@ -59,6 +60,10 @@ BAD_OPTIONS: list[tuple[list[str], str]] = [
     (["--arm", "ur5e_like", "--arm-base", "1", "0", "0", "1"], "--arm-base: 4 numbers; valid"),
     (["--arm-base", "1", "0", "0"], "--arm-base: there is no arm"),
     (["--frobnicate"], "unrecognized arguments: --frobnicate"),
+    (["--preste", "fast"], "unrecognized arguments: --preste fast; did you mean --preset?"),
+    (["--hand", "alegro_right"], "unknown hand 'alegro_right'; did you mean 'allegro_right'?"),
+    (["--preset", "balnced"], "unknown preset 'balnced'; did you mean 'balanced'?"),
+    (["--method", "closedform"], "unknown method 'closedform'; did you mean 'closed_form'?"),
 ]
 
 
@@ -87,13 +92,17 @@ def test_a_bad_option_is_named_in_one_line(capsys: pytest.CaptureFixture[str], o
     assert culprit in the_line(capsys)
 
 
-@pytest.mark.parametrize("option", ["--out", "--html"])
+@pytest.mark.parametrize("option", ["--out", "--html", "--picture"])
 def test_an_unwritable_result_is_refused_before_the_run(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], option: str, monkeypatch: pytest.MonkeyPatch
 ):
     monkeypatch.setattr(pipeline, "plan_grasps", lambda *_, **__: pytest.fail("the run was started"))
     (tmp_path / "file").write_text("here")
-    for path, culprit in ((tmp_path, "is a directory"), (tmp_path / "file" / "out", "cannot be written")):
+    (tmp_path / "folder.png").mkdir()
+    for path, culprit in (
+        (tmp_path / "folder.png", "is a directory"),
+        (tmp_path / "file" / "a.png", "cannot be written"),
+    ):
         assert main(["synthesize", "shape:box", option, str(path)]) == EXIT_BAD_INPUT
         line = the_line(capsys)
         assert str(path) in line
@@ -154,7 +163,7 @@ def test_a_scene_file_sets_the_reconstruction(tmp_path: Path, capsys: pytest.Cap
     scene.write_text("reconstruction: {most_faces: 300}")
     for bad in (command, ["synthesize", str(tmp_path / "ball.npy"), "--scene", str(scene)]):
         assert main(bad) == EXIT_BAD_INPUT
-        assert "scene.yaml.reconstruction: unknown key 'most_faces'; valid keys: fit_distance" in the_line(capsys)
+        assert "scene.yaml:1: reconstruction: unknown key 'most_faces'; did you mean 'max_faces'?" in the_line(capsys)
 
 
 def test_an_arm_that_reaches_is_written_and_one_that_does_not_is_told(
@@ -233,8 +242,8 @@ def test_the_first_interrupt_ends_the_run_and_the_second_the_process(number: sig
 def test_the_main_job_in_a_process_of_its_own(tmp_path: Path):
     """A mesh in millimetres on disk in; grasps.json and a page out."""
     box = make_shape("box")
-    save_mesh(TriangleMesh(box.vertices * 1000, box.faces), tmp_path / "box.stl")
-    out = ["--out", "grasps.json", "--html", "view.html"]
+    save_mesh(tmp_path / "box.stl", TriangleMesh(box.vertices * 1000, box.faces))
+    out = ["--out", "grasps.json", "--html", "view.html", "--picture", "grasp.png"]
     options = ["-n", "1", "--units", "mm", "--preset", "fast", "--seed", "1", *out]
     done = subprocess.run([*GRASPD, "synthesize", "box.stl", *options], cwd=tmp_path, capture_output=True, text=True)
     assert done.returncode == EXIT_OK, done.stderr
@@ -245,6 +254,7 @@ def test_the_main_job_in_a_process_of_its_own(tmp_path: Path):
     assert document["seed"] == 1
     assert len(document["grasps"][0]["joint_positions"]) == len(document["hand"]["joint_names"]) == 16
     assert (tmp_path / "view.html").stat().st_size > 100_000
+    assert (tmp_path / "grasp.png").read_bytes().startswith(b"\x89PNG")
     assert "graspd: optimise" in done.stderr
     assert "total" in done.stdout
 
@@ -477,7 +487,7 @@ def test_a_library_is_built_gone_on_with_and_listed(tmp_path: Path, capsys: pyte
     # A mesh that cannot be used keeps no other from being added.
     (tmp_path / "meshes").mkdir()
     (tmp_path / "meshes" / "bad.obj").write_text("v 0 0 0\n")
-    save_mesh(make_shape("capsule"), tmp_path / "meshes" / "capsule.obj")
+    save_mesh(tmp_path / "meshes" / "capsule.obj", make_shape("capsule"))
     assert build(out, str(tmp_path / "meshes")) == 3
     told = capsys.readouterr()
     assert "capsule: 2 of 2 grasps" in told.out
@@ -488,7 +498,7 @@ def test_an_object_that_would_go_by_the_name_of_another_is_refused(tmp_path: Pat
     out, mesh = tmp_path / "known.grasps", make_shape("sphere")
     for folder, size in (("a", 1.0), ("b", 0.9)):
         (tmp_path / folder).mkdir()
-        save_mesh(TriangleMesh(mesh.vertices * size, mesh.faces), tmp_path / folder / "ball.obj")
+        save_mesh(tmp_path / folder / "ball.obj", TriangleMesh(mesh.vertices * size, mesh.faces))
     assert build(out, str(tmp_path / "a" / "ball.obj")) == 0
     assert build(out, str(tmp_path / "b" / "ball.obj")) == 2
     told = capsys.readouterr().err

@@ -50,9 +50,15 @@ def test_a_preset_file_changes_only_what_it_names(tmp_path: Path):
 @pytest.mark.parametrize(
     ("text", "culprits"),
     [
-        ("resolutoin: 32", ["'resolutoin'", "resolution", "closed_form"]),
-        ("closed_form: {delta: 1.0}", ["closed_form", "'delta'", "delta_start"]),
-        ("closed_form: {weights: {tusk: 1.0}}", ["closed_form.weights", "'tusk'", "wrench_resistance"]),
+        ("resolutoin: 32", ["bad.yaml:1: unknown key 'resolutoin'; did you mean 'resolution'?"]),
+        ("closed_form: {delta: 1.0}", ["closed_form", "'delta'", "'delta_end'"]),
+        (
+            "method: closed_form\n\nclosed_form:\n  weights: {tusk: 1.0}",
+            ["bad.yaml:4: closed_form.weights: ", "'tusk'"],
+        ),
+        ("# A comment.\nclosed_form:\n  delta_end: low", ["bad.yaml:3: closed_form.delta_end: expected float"]),
+        ("robust: {}\ncertainty: {probability: 2}", ["bad.yaml:2: certainty.probability: 2.0"]),
+        (f"? 0x{'f' * 5000}\n: 1", ["bad.yaml:1: unknown key", "huge int", "valid: certainty"]),
         ("resolution: fine", ["resolution", "expected int", "'fine'"]),
         ("resolution: 32.5", ["resolution", "expected int", "32.5"]),
         ("resolution: true", ["resolution", "expected int", "True"]),
@@ -140,8 +146,8 @@ def test_one_file_reaches_every_field(tmp_path: Path):
 @pytest.mark.parametrize(
     ("text", "culprits"),
     [
-        ("segmentation: {gab: 0.01}", ["scene.yaml.segmentation", "'gab'", "gap", "voxel"]),
-        ("obstacle: {padding: 0.01}", ["'obstacle'", "obstacles, reconstruction, segmentation"]),
+        ("segmentation: {gab: 0.01}", ["scene.yaml:1: segmentation: ", "'gab'", "did you mean 'gap'?"]),
+        ("obstacle: {padding: 0.01}", ["'obstacle'", "did you mean 'obstacles'?"]),
         ("segmentation: {gap: 0}", ["segmentation.gap", "0.0", "above zero"]),
         ("reconstruction: {max_points: 10}", ["reconstruction.max_points", "10", "at least 1000"]),
         ("reconstruction: {seen_distance: 0.02}", ["seen_distance", "0.02", "guessed_distance=0.02"]),

@@ -73,7 +73,7 @@ def test_contacts_of_a_result_are_the_meshs(shape: str):
     """A third of a mug's were more than ten degrees off, and up to 0.6 mm beside the surface."""
     scene = load_scene(shape)
     found = plan_grasps(scene, load_hand("allegro_right"), count=4, preset="fast", verify="none", measure=False)
-    contacts = [contact for grasp in found.grasps for contact in grasp.contacts]
+    contacts = [contact for grasp in found.tried for contact in grasp.contacts]
     surface = make_surface(scene.object.mesh)
     points, normals = (np.array([getattr(c, key) for c in contacts]) for key in ("position", "normal"))
     assert np.allclose(pressed_points(surface, points, normals)[0], points, atol=1e-6)

@@ -1,6 +1,7 @@
 """A data set that is there: resumed by listing, looked through, merged, sampled, read by others."""
 
 import importlib
+import json
 import shutil
 import subprocess
 import sys
@@ -201,6 +202,10 @@ def test_stats_count_rows_and_reasons(made: DatasetStore, graspd: Run, capsys):
     assert stats.reasons.total() == hand.verdicts["failed"]
     assert graspd("dataset", "stats", made.where) == 0
     assert "| parallel_gripper | 1 | 2 |" in capsys.readouterr().out
+    assert graspd("dataset", "stats", made.where, "--json", "--quiet") == 0
+    document = json.loads(capsys.readouterr().out)
+    assert document["hands"]["parallel_gripper"]["verdicts"] == dict(hand.verdicts)
+    assert document["reasons"] == dict(stats.reasons)
 
 
 def test_others_read_it_in_one_line(made: DatasetStore):

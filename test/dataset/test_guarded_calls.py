@@ -106,7 +106,7 @@ def test_a_block_that_raises_is_written_down_with_its_traceback(store: DatasetSt
 def test_a_mesh_that_came_along_is_the_object(store: DatasetStore, blocks: tuple[Block, ...], tmp_path: Path):
     import graspd_core
 
-    graspd_core.save_mesh(graspd_core.make_shape("box"), tmp_path / "box.ply")
+    graspd_core.save_mesh(tmp_path / "box.ply", graspd_core.make_shape("box"))
     content = (tmp_path / "box.ply").read_bytes()
     thing = replace(blocks[0].object, source="there/box.ply", content="1")
     report, shared = prepare_object(object_job(thing, blocks[0].config), content, store, Limits())

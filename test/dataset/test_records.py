@@ -37,8 +37,8 @@ def test_rows_are_the_grasps_that_were_planned(made: DatasetStore, blocks: tuple
     result = plan_grasps(scene, hand, count=2, seed=blocks[0].seed, preset="fast", measure=False)
     (table,) = [table for _, _, table, told in tables_of(made) if told["block"] == blocks[0].key]
     rows = table.to_pylist()
-    assert [row["verdict"] for row in rows] == [str(grasp.verdict) for grasp in result.grasps]
-    for row, grasp in zip(rows, result.grasps, strict=True):
+    assert [row["verdict"] for row in rows] == [str(grasp.verdict) for grasp in result.tried]
+    for row, grasp in zip(rows, result.tried, strict=True):
         assert row["squeeze_position"] == grasp.squeeze.position.tolist()
         assert row["grasp_joint_positions"] == list(all_joint_positions(hand, grasp.grasp.joint_positions))
         assert [trial["displacement"] for trial in row["trials"]] == [t.displacement for t in grasp.trials]

@@ -97,7 +97,7 @@ def sheet_in_world() -> TriangleMesh:
 
 def mesh_file(name: str, mesh: TriangleMesh) -> Callable[[Path], Path]:
     def make(folder: Path) -> Path:
-        save_mesh(mesh, folder / name)
+        save_mesh(folder / name, mesh)
         return folder / name
 
     return make

@@ -102,15 +102,15 @@ def same(a: Grasp, b: Grasp) -> bool:
 def test_grasps_come_back_as_they_were_put_in(library: GraspLibrary, planned: GraspResult, hand: HandModel):
     entry, grasps = stored(library, hand)
     assert (entry.name, entry.source, entry.hand, entry.verify) == ("sphere", "shape:sphere", hand.name, "standard")
-    good = [grasp for grasp in planned.grasps if grasp.verdict is Verdict.VERIFIED]
+    good = [grasp for grasp in planned.tried if grasp.verdict is Verdict.VERIFIED]
     assert len(grasps) == len(good) == 4
     assert all(map(same, grasps, good))
 
 
 def test_what_is_added_stands_behind_what_was_there(library: GraspLibrary, planned: GraspResult, scene, hand):
     entry, before = stored(library, hand)
-    bad = replace(planned.grasps[0], trials=())
-    assert library.add(entry, scene.object, hand, load_preset("fast"), [planned.grasps[1], bad]) == 5
+    bad = replace(planned.tried[0], trials=())
+    assert library.add(entry, scene.object, hand, load_preset("fast"), [planned.tried[1], bad]) == 5
     _, after = stored(library, hand)
     assert all(map(same, after, (*before, before[1])))
 
@@ -141,7 +141,7 @@ def test_a_changed_file_takes_the_place_of_what_it_was(library: GraspLibrary, sc
     config = load_preset("fast")
     for content in ("old", "new"):
         changed = replace(entry, file_sha256=content, mesh_sha256=content)
-        library.add(changed, scene.object, hand, config, planned.grasps)
+        library.add(changed, scene.object, hand, config, planned.tried)
     assert [found.mesh_sha256 for found, _ in library.entries(source=entry.source)] == ["new"]
 
 
@@ -282,9 +282,9 @@ def test_a_library_that_cannot_be_written_costs_no_grasp(library, scene, hand, m
 
 
 def test_restrictions_are_kept(library: GraspLibrary, scene: Scene, hand: HandModel, planned: GraspResult):
-    first = planned.grasps[0]
+    first = planned.tried[0]
     direction = np.array([0.0, 0.0, 1.0])
-    angles = [angle_of_approach(hand, grasp, direction) for grasp in planned.grasps[:4]]
+    angles = [angle_of_approach(hand, grasp, direction) for grasp in planned.tried[:4]]
     # A cone that some of the four lie in and others do not.
     cone = Steering(approach_direction=(0, 0, 1), approach_angle=(min(angles) + max(angles)) / 2)
     result = known_grasps(library, scene, hand, count=4, restrictions=[cone])
@@ -312,7 +312,7 @@ def test_only_what_comes_near_something_is_tried_again(library, scene, hand, pla
     for gap in (0.25, 0.01, -0.03):
         tried.clear()
         about = at_height(scene, hand, planned, gap)
-        gaps = clearance(about, hand, planned.grasps[:4])
+        gaps = clearance(about, hand, planned.tried[:4])
         assert gaps[0] == pytest.approx(gap, abs=1e-6)
         result = known_grasps(library, about, hand, count=4)
         assert len(tried) == int(((gaps < NEAR) & (gaps >= -0.005)).sum())
@@ -326,9 +326,9 @@ def test_only_what_comes_near_something_is_tried_again(library, scene, hand, pla
 
 def test_what_was_planned_on_a_table_is_kept_as_a_grasp_of_the_object_alone(library, scene, hand, planned):
     about = at_height(scene, hand, planned, 0.1)
-    lifted = replace(planned.grasps[0].trials[0], name="lift")
-    both = replace(planned.grasps[0], trials=(*planned.grasps[0].trials, lifted))
-    assert add_planned(library, about, hand, load_preset("fast"), replace(planned, grasps=(both,)), "standard") == 5
+    lifted = replace(planned.tried[0].trials[0], name="lift")
+    both = replace(planned.tried[0], trials=(*planned.tried[0].trials, lifted))
+    assert add_planned(library, about, hand, load_preset("fast"), replace(planned, tried=(both,)), "standard") == 5
     ((entry, _),) = library.entries()
     assert [trial.name for trial in library.grasps(entry, hand)[-1].trials] == ["hold"]
 
@@ -337,7 +337,7 @@ def test_what_was_planned_on_a_table_is_kept_as_a_grasp_of_the_object_alone(libr
 def ball(library: GraspLibrary, hand: HandModel, planned: GraspResult, tmp_path: Path) -> Path:
     """A mesh file that the library knows."""
     path = tmp_path / "ball.obj"
-    save_mesh(make_shape("sphere"), path)
+    save_mesh(path, make_shape("sphere"))
     add_planned(library, load_scene(path, mass=0.1), hand, load_preset("fast"), planned, "standard")
     return path
 
@@ -386,7 +386,7 @@ def test_what_the_library_lacks_is_named_with_what_it_has(library, hand, ball, l
 
 def test_a_mesh_that_changed_is_told(library: GraspLibrary, hand: HandModel, ball: Path):
     mesh = make_shape("sphere")
-    save_mesh(TriangleMesh(mesh.vertices * 1.2, mesh.faces), ball)
+    save_mesh(ball, TriangleMesh(mesh.vertices * 1.2, mesh.faces))
     for look in (
         lambda: entry_by_name(library, hand, "ball", PHYSICS),
         lambda: entry_by_file(library, hand, ball, 1.0, PHYSICS),
@@ -398,7 +398,7 @@ def test_a_mesh_that_changed_is_told(library: GraspLibrary, hand: HandModel, bal
 def test_two_objects_of_one_name_are_told(library, hand, ball, planned, tmp_path: Path):
     other = tmp_path / "other" / "ball.obj"
     other.parent.mkdir()
-    save_mesh(make_shape("box"), other)
+    save_mesh(other, make_shape("box"))
     add_planned(library, load_scene(other, mass=0.1), hand, load_preset("fast"), planned, "standard")
     with pytest.raises(ConfigError, match=r"ball: the library .* has several: .*ball\.obj, .*ball\.obj; name the mesh"):
         entry_by_name(library, hand, "ball", PHYSICS)

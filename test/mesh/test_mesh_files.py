@@ -37,7 +37,7 @@ def scaled(mesh, factor):
 @pytest.mark.parametrize("ending", ["obj", "stl", "ply", "glb", "off"])
 def test_files_come_back_whole(tmp_path, ending):
     box = make_shape("box")
-    save_mesh(box, tmp_path / f"box.{ending}")
+    save_mesh(tmp_path / f"box.{ending}", box)
     mesh, warnings = check_mesh(load_mesh(tmp_path / f"box.{ending}", scale=2.0), "box")
     assert warnings == ()
     assert len(mesh.faces) == len(box.faces)
@@ -153,7 +153,7 @@ def test_faces_without_area_alone_or_beyond_the_vertices_are_refused():
 @pytest.mark.parametrize("use", ["", "f 515 515 515\n", "f 1 1 515\n"], ids=["unused", "point", "line"])
 def test_a_stray_vertex_is_dropped_aloud_and_counts_nowhere(tmp_path, stray, use):
     box = make_shape("box")
-    save_mesh(box, tmp_path / "box.obj")
+    save_mesh(tmp_path / "box.obj", box)
     text = (tmp_path / "box.obj").read_text() + "v {} {} {}\n".format(*stray) + use
     from_file = load_scene(write(tmp_path / "box.obj", text), mass=0.1, resolution=16)
     faces = [[514, 514, 514]] if use.startswith("f 5") else [[0, 0, 514]] if use else np.zeros((0, 3), int)
@@ -294,7 +294,7 @@ def refusal(path: Path, data: bytes) -> str:
 
 
 def saved(path: Path) -> bytes:
-    save_mesh(make_shape("box"), path)
+    save_mesh(path, make_shape("box"))
     return path.read_bytes()
 
 
@@ -434,3 +434,9 @@ def test_a_broken_file_is_refused(tmp_path: Path, old: str, new: str, message: s
         read_dae(path)
     with pytest.raises(MeshError, match=r"part.dae: not a readable dae mesh"):
         load_mesh(path)
+
+
+def test_the_order_of_an_earlier_version_still_saves_with_a_warning(tmp_path: Path):
+    with pytest.warns(DeprecationWarning, match="the path comes first"):
+        save_mesh(make_shape("box"), tmp_path / "box.ply")
+    assert len(load_mesh(tmp_path / "box.ply").faces) == len(make_shape("box").faces)

@@ -301,7 +301,7 @@ def test_the_first_points_do_not_depend_on_how_many_follow():
 
 def test_no_finger_goes_through_a_large_thin_wall(tmp_path):
     cup = large_cup()
-    save_mesh(cup, tmp_path / "cup.obj")
+    save_mesh(tmp_path / "cup.obj", cup)
     scene, hand = load_scene(tmp_path / "cup.obj"), load_hand("allegro_right")
     shared = [
         grasp.metrics["intersection_volume"]

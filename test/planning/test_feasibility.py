@@ -94,7 +94,7 @@ def test_a_ball_of_70_cm_ends_the_run_before_its_first_step(hand):
     told: list[Stage] = []
     result = plan_grasps(scene, hand, count=2, progress=lambda report: told.append(report.stage))
     assert told == [Stage.DONE]
-    assert (result.outcome, result.grasps) == (Outcome.NO_CANDIDATES, ())
+    assert (result.outcome, result.tried) == (Outcome.NO_CANDIDATES, ())
     assert "70 cm across" in result.message
 
 
@@ -106,13 +106,13 @@ def card_on_table() -> Scene:
 def test_what_is_too_low_for_the_fingers_is_told_with_what_became_of_the_trials(hand, card_on_table):
     result = plan_grasps(card_on_table, hand, count=2, preset="fast", measure=False)
     assert result.outcome is Outcome.TOO_FEW
-    assert not any(grasp.verdict is Verdict.VERIFIED for grasp in result.grasps)
-    assert result.message.startswith(f"{len(result.grasps)} grasps failed their trials: the object ")
+    assert not any(grasp.verdict is Verdict.VERIFIED for grasp in result.tried)
+    assert result.message.startswith(f"{len(result.tried)} grasps failed their trials: the object ")
     assert "; it is 2 mm high on its support" in result.message
 
 
 def test_reasons_are_told_without_numbers_the_most_frequent_first(hand, card_on_table):
-    [held] = plan_grasps(scene_of(make_shape("sphere")), hand, count=1, preset="fast", measure=False).grasps[:1]
+    [held] = plan_grasps(scene_of(make_shape("sphere")), hand, count=1, preset="fast", measure=False).tried[:1]
     reasons = (
         "the object turned 15° under a pull along +x",
         "the object turned 132° under a pull along -y",

@@ -263,27 +263,27 @@ def test_at_less_than_the_assumed_mass_a_grasp_is_less_sure():
 
 def test_of_one_view_a_verified_grasp_is_as_sure_as_asked_for():
     result = planned()
-    verified = [grasp for grasp in result.grasps if grasp.verdict is Verdict.VERIFIED]
+    verified = [grasp for grasp in result.tried if grasp.verdict is Verdict.VERIFIED]
     assert verified
     for grasp in verified:
         assert [trial.name for trial in grasp.trials] == ["hold", "lift", HYPOTHESES]
         assert grasp.probability is not None
         assert grasp.probability >= SURE
-    for grasp in result.grasps:
+    for grasp in result.tried:
         if grasp.verdict is Verdict.UNVERIFIED:
             assert not grasp.usable
             assert grasp.probability is not None
             assert grasp.probability < SURE
-    order = [grasp.verdict for grasp in result.grasps]
+    order = [grasp.verdict for grasp in result.tried]
     assert order == sorted(order, key=[Verdict.VERIFIED, Verdict.UNVERIFIED, Verdict.FAILED].index)
 
 
 def test_who_asks_for_no_certainty_gets_the_trials_of_the_likeliest_shape_and_a_mesh_is_not_doubted():
     result = plan(seen_from(), 0.0)
-    assert all(grasp.probability is None for grasp in result.grasps)
-    assert all(trial.name != HYPOTHESES for grasp in result.grasps for trial in grasp.trials)
+    assert all(grasp.probability is None for grasp in result.tried)
+    assert all(trial.name != HYPOTHESES for grasp in result.tried for trial in grasp.trials)
     result = plan(load_scene("shape:cylinder"), SURE)
-    assert all([trial.name for trial in grasp.trials] == ["hold"] for grasp in result.grasps)
+    assert all([trial.name for trial in grasp.trials] == ["hold"] for grasp in result.tried)
 
 
 def test_what_speaks_against_a_scene_leaves_no_grasp_verified(monkeypatch):
@@ -295,9 +295,9 @@ def test_what_speaks_against_a_scene_leaves_no_grasp_verified(monkeypatch):
     doubted = replace(seen, evidence=replace(seen.evidence, doubts=("are its numbers metres?",)))
     for probability in (0.0, SURE):
         result = plan(doubted, probability)
-        held = [grasp for grasp in result.grasps if grasp.verdict is Verdict.UNVERIFIED]
+        held = [grasp for grasp in result.tried if grasp.verdict is Verdict.UNVERIFIED]
         assert len(held) == 3
-        assert not any(grasp.verdict is Verdict.VERIFIED for grasp in result.grasps)
+        assert not any(grasp.verdict is Verdict.VERIFIED for grasp in result.tried)
         assert all((grasp.probability, grasp.reason) == (DOUBTED_SHARE, "are its numbers metres?") for grasp in held)
         assert "none is sure enough: are its numbers metres?" in result.message
 
@@ -321,7 +321,7 @@ def test_trials_with_less_friction_do_not_cut_the_object_again(monkeypatch):
         lambda *given, **cuts: cut.append(cuts) or convex_parts(*given, **cuts),
     )
     result = plan(seen_from((0.001, 0.0, 0.0)), SURE)
-    assert any(HYPOTHESES in [trial.name for trial in grasp.trials] for grasp in result.grasps)
+    assert any(HYPOTHESES in [trial.name for trial in grasp.trials] for grasp in result.tried)
     assert cut == [COARSE_CUTS]
 
 
@@ -345,16 +345,16 @@ def test_where_no_grasp_is_sure_enough_the_result_says_so_and_where_to_look_from
         "graspd_core.verify.robustness.displaced", lambda grasp, *error: replace(grasp, pregrasp=grasp.squeeze)
     )
     result = plan(seen(), MASS_KNOWN.shapes, rounds=1)
-    assert result.grasps
-    assert not any(grasp.usable for grasp in result.grasps)
-    assert result.grasps[0].verdict is Verdict.UNVERIFIED
+    assert result.tried
+    assert not any(grasp.usable for grasp in result.tried)
+    assert result.tried[0].verdict is Verdict.UNVERIFIED
     assert "none is sure enough" in result.message
     assert ("was guessed" in result.message) == (result.next_view is not None) == hidden
 
 
 def test_far_from_the_origin_the_other_shapes_are_where_the_object_is():
     near, far = planned(), planned((300.0, -200.0, 100.0))
-    assert sum(grasp.usable for grasp in far.grasps) == sum(grasp.usable for grasp in near.grasps) == 3
+    assert sum(grasp.usable for grasp in far.tried) == sum(grasp.usable for grasp in near.tried) == 3
 
 
 @pytest.mark.parametrize("probability", [-0.1, 0.995, float("nan")])

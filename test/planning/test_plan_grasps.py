@@ -46,24 +46,35 @@ def arrays(grasp: Grasp) -> list[np.ndarray]:
 def test_grasps_called_verified_have_passed_and_come_first(result):
     assert result.outcome is Outcome.SUCCEEDED
     assert result.message == Outcome.SUCCEEDED.value
-    verdicts = [grasp.verdict for grasp in result.grasps]
+    verdicts = [grasp.verdict for grasp in result.tried]
     assert verdicts == sorted(verdicts, key=[Verdict.VERIFIED, Verdict.FAILED].index)
     assert verdicts.count(Verdict.VERIFIED) == 2
-    for grasp in result.grasps:
+    for grasp in result.tried:
         (hold,) = grasp.trials
         assert hold.passed == (grasp.verdict is Verdict.VERIFIED) == (grasp.reason == "")
         assert grasp.metrics is not None
         assert grasp.contacts
 
 
+def test_grasps_are_those_that_were_asked_for_and_failed_ones_stand_apart(result):
+    assert [grasp.verdict for grasp in result.grasps] == [Verdict.VERIFIED] * 2
+    assert all(grasp.verdict is Verdict.FAILED and grasp.reason for grasp in result.failed)
+    assert result.tried == (*result.grasps, *result.failed)
+    # More than were asked for may pass where several are tried at once.
+    held = result.grasps[0]
+    more = replace(result, tried=(held, held, held, *result.failed))
+    assert (more.grasps, more.count) == ((held, held), 2)
+    assert replace(more, count=None).grasps == (held,) * 3
+
+
 def test_the_full_length_gives_the_verdicts_of_the_usual_trials(scene, hand, result):
     full = plan_grasps(scene, hand, count=2, seed=3, preset="fast", verify="full")
     early = plan_grasps(scene, hand, count=2, seed=3, preset="fast")
-    late, soon = ([(g.score, g.verdict, g.reason) for g in run.grasps] for run in (full, early))
+    late, soon = ([(g.score, g.verdict, g.reason) for g in run.tried] for run in (full, early))
     assert late == soon
-    holds = [(a.trials[0], b.trials[0]) for a, b in zip(full.grasps, early.grasps, strict=True)]
+    holds = [(a.trials[0], b.trials[0]) for a, b in zip(full.tried, early.tried, strict=True)]
     assert all(a.displacement >= b.displacement for a, b in holds)
-    assert [grasp.trials for grasp in early.grasps] == [grasp.trials for grasp in result.grasps]
+    assert [grasp.trials for grasp in early.tried] == [grasp.trials for grasp in result.tried]
 
 
 def test_on_a_table_a_verified_grasp_has_passed_both_trials(scene, hand, result):
@@ -71,15 +82,15 @@ def test_on_a_table_a_verified_grasp_has_passed_both_trials(scene, hand, result)
     on_table = plan_grasps(replace(scene, support=table), hand, count=1, seed=3, preset="fast")
     assert on_table.outcome is Outcome.SUCCEEDED
     assert on_table.support is table
-    best = on_table.grasps[0]
+    best = on_table.tried[0]
     assert best.verdict is Verdict.VERIFIED
     assert [(trial.name, trial.passed) for trial in best.trials] == [("hold", True), ("lift", True)]
     assert result.support is None
-    assert {trial.name for grasp in result.grasps for trial in grasp.trials} == {"hold"}
+    assert {trial.name for grasp in result.tried for trial in grasp.trials} == {"hold"}
 
 
 def test_joint_limits_hold_exactly_and_quaternions_are_unit(result, hand):
-    for grasp in result.grasps:
+    for grasp in result.tried:
         for posture in (grasp.pregrasp, grasp.grasp, grasp.squeeze):
             assert (posture.joint_positions >= hand.lower).all()
             assert (posture.joint_positions <= hand.upper).all()
@@ -108,14 +119,14 @@ def test_times_add_up(result):
 
 def test_the_same_seed_gives_the_same_grasps_and_another_others(scene, hand, result):
     again = plan_grasps(scene, hand, count=2, seed=3, preset="fast")
-    assert len(again.grasps) == len(result.grasps)
-    for one, other in zip(again.grasps, result.grasps, strict=True):
+    assert len(again.tried) == len(result.tried)
+    for one, other in zip(again.tried, result.tried, strict=True):
         assert all(np.array_equal(a, b) for a, b in zip(arrays(one), arrays(other), strict=True))
         assert (one.score, one.metrics, one.trials) == (other.score, other.metrics, other.trials)
     different = plan_grasps(scene, hand, count=2, seed=4, preset="fast", verify="none")
-    assert not np.array_equal(different.grasps[0].grasp.position, result.grasps[0].grasp.position)
-    assert len(different.grasps) == 2
-    assert all(g.verdict is Verdict.UNVERIFIED and not g.trials and g.metrics for g in different.grasps)
+    assert not np.array_equal(different.tried[0].grasp.position, result.tried[0].grasp.position)
+    assert len(different.tried) == 2
+    assert all(g.verdict is Verdict.UNVERIFIED and not g.trials and g.metrics for g in different.tried)
 
 
 def test_cancelling_ends_the_run_within_a_step(scene, hand, result):
@@ -130,7 +141,7 @@ def test_cancelling_ends_the_run_within_a_step(scene, hand, result):
 
     cancelled = plan_grasps(scene, hand, count=8, preset=ENDLESS, progress=progress, stop=stop.is_set)
     assert cancelled.outcome is Outcome.CANCELLED
-    assert cancelled.grasps == ()
+    assert cancelled.tried == ()
     # It went into the search, which left nothing to try.
     assert cancelled.timing.optimise >= 0.3
     assert len(steps) == 1
@@ -146,7 +157,7 @@ def test_cancelling_while_verifying_keeps_what_is_verified(scene, hand):
         scene, hand, count=3, seed=3, preset="fast", progress=progress, stop=lambda: bool(verified and verified[-1])
     )
     assert result.outcome is Outcome.CANCELLED
-    assert sum(g.verdict is Verdict.VERIFIED for g in result.grasps) == 1
+    assert sum(g.verdict is Verdict.VERIFIED for g in result.tried) == 1
 
 
 @pytest.mark.parametrize("verify", ["standard", "none"])
@@ -154,7 +165,7 @@ def test_a_deadline_is_kept(scene, hand, result, verify: str):
     told: list[Progress] = []
     late = plan_grasps(scene, hand, count=2, preset=ENDLESS, deadline=0.2, verify=verify, progress=told.append)
     assert late.outcome is Outcome.DEADLINE
-    assert late.grasps == ()
+    assert late.tried == ()
     # Neither are all steps done, nor is any grasp tried.
     assert {report.stage for report in told} <= {Stage.OPTIMISE, Stage.DONE}
     assert all(report.step < report.of for report in told[:-1])
@@ -165,7 +176,7 @@ def test_a_run_that_is_over_before_it_begins_begins_nothing(scene, hand):
     cancelled = plan_grasps(scene, hand, count=1, progress=lambda p: told.append(p.stage), stop=lambda: True)
     late = plan_grasps(scene, hand, count=1, progress=lambda p: told.append(p.stage), deadline=1e-9)
     assert (cancelled.outcome, late.outcome) == (Outcome.CANCELLED, Outcome.DEADLINE)
-    assert cancelled.grasps == late.grasps == ()
+    assert cancelled.tried == late.tried == ()
     assert told == [Stage.DONE, Stage.DONE]
 
 
@@ -203,7 +214,7 @@ def test_nobody_waits_for_collision_parts_that_come_too_late(scene, hand, monkey
     finally:
         release.set()
     assert late.outcome is Outcome.DEADLINE
-    assert late.grasps == ()
+    assert late.tried == ()
 
 
 @pytest.mark.parametrize(
@@ -230,9 +241,9 @@ def test_a_candidate_that_touches_nothing_is_no_grasp_where_no_trial_is_asked_fo
     steps = {f"closed_form.{stage}_steps": 1 for stage in ("explore", "refine", "polish")}
     config = override(load_preset("fast"), {"rounds.most": 1, **steps})
     result = plan_grasps(scene, hand, count=16, preset=config, verify="none", measure=False)
-    off = [grasp for grasp in result.grasps if not grasp.contacts]
+    off = [grasp for grasp in result.tried if not grasp.contacts]
     assert off
     assert not any(grasp.usable for grasp in off)
-    assert all(grasp.usable for grasp in result.grasps if grasp.contacts)
-    told = f"{len(off)} of {len(result.grasps)} untried candidates touch the object nowhere"
+    assert all(grasp.usable for grasp in result.tried if grasp.contacts)
+    told = f"{len(off)} of {len(result.tried)} untried candidates touch the object nowhere"
     assert (result.outcome, result.message) == (Outcome.TOO_FEW, told)

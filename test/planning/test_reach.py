@@ -53,8 +53,8 @@ def check_arms(result: GraspResult, hand: HandModel, reach: Reach) -> None:
         rotation_from_quaternion(torch.tensor(reach.quaternion_wxyz, dtype=torch.float64)),
         torch.tensor(reach.position, dtype=torch.float64),
     )
-    assert result.grasps
-    for grasp in result.grasps:
+    assert result.tried
+    for grasp in result.tried:
         assert grasp.arm is not None
         for stage in ("pregrasp", "grasp"):
             links = arm_links(reach.arm, torch.as_tensor(grasp.arm.at(stage))[None])
@@ -102,7 +102,7 @@ def test_starts_are_drawn_where_the_arm_can_come_from(hand: HandModel, table: Sc
 def test_an_object_far_away_is_told_at_once(hand: HandModel, table: Scene):
     result = planned(table, hand, reach_of(table, 5.0))
     assert result.outcome is Outcome.NO_CANDIDATES
-    assert not result.grasps
+    assert not result.tried
     assert "m from the base of panda_like, which brings barrett_like" in result.message
 
 
@@ -136,13 +136,13 @@ def test_poses_far_from_the_origin_are_reached_alike(hand: HandModel):
 def test_the_arm_is_written_and_read(hand: HandModel, table: Scene, reached: GraspResult, tmp_path: Path):
     result = reached
     save_result(tmp_path / "grasps.json", result, table.object, hand, load_preset("balanced"))
-    for written, read in zip(result.grasps, load_grasps(tmp_path / "grasps.json"), strict=True):
+    for written, read in zip(result.tried, load_grasps(tmp_path / "grasps.json"), strict=True):
         assert written.arm is not None
         assert read.arm is not None
         assert (read.arm.joint_names, read.arm.stages) == (written.arm.joint_names, written.arm.stages)
         assert np.array_equal(read.arm.positions, written.arm.positions)
-    bare: tuple[Grasp, ...] = tuple(replace(grasp, arm=None) for grasp in result.grasps)
-    save_result(tmp_path / "bare.json", replace(result, grasps=bare), table.object, hand, load_preset("balanced"))
+    bare: tuple[Grasp, ...] = tuple(replace(grasp, arm=None) for grasp in result.tried)
+    save_result(tmp_path / "bare.json", replace(result, tried=bare), table.object, hand, load_preset("balanced"))
     assert all(grasp.arm is None for grasp in load_grasps(tmp_path / "bare.json"))
 
 

@@ -92,10 +92,10 @@ def test_restrictions_apply_one_after_the_other_in_the_frame_that_they_were_boun
 
 def test_what_is_refused_is_not_tried_and_is_counted(scene, hand):
     found = plan_grasps(scene, hand, count=3, preset="fast", measure=False, restrictions=[Side(0.0), Every(2)])
-    assert found.grasps
-    assert all(g.grasp.position[0] > 0 and g.score == 7.0 for g in found.grasps)
+    assert found.tried
+    assert all(g.grasp.position[0] > 0 and g.score == 7.0 for g in found.tried)
     assert found.refused["by number"] >= 1
-    held = sum(grasp.usable for grasp in found.grasps)
+    held = sum(grasp.usable for grasp in found.tried)
     assert found.message.startswith(f"{held} candidates held, {sum(found.refused.values())} refused: ")
 
 
@@ -110,7 +110,7 @@ def test_every_method_ends_where_a_restriction_leaves_nothing(scene, hand, metho
     if method == "random_closure":
         preset = override(preset, {"random_closure.rounds": 1})
     found = plan_grasps(scene, hand, count=1, preset=preset, restrictions=[Side(9.0)])
-    assert not found.grasps
+    assert not found.tried
     assert found.outcome is Outcome.NO_CANDIDATES
 
 

@@ -125,14 +125,14 @@ def test_a_watched_run_ends_as_one_that_nobody_watches(preset: str):
     scene, hand, seen = load_scene("shape:box"), load_hand("parallel_gripper"), list[Snapshot]()
     watched = plan_grasps(scene, hand, count=3, preset=preset, measure=False, watch=seen.append)
     alone = plan_grasps(scene, hand, count=3, preset=preset, measure=False)
-    assert [g.grasp.position.tolist() for g in watched.grasps] == [g.grasp.position.tolist() for g in alone.grasps]
+    assert [g.grasp.position.tolist() for g in watched.tried] == [g.grasp.position.tolist() for g in alone.tried]
     starts = [s for s in seen if not s.verdicts]
     # The last of each round: the next has other candidates.
     tried = [s for s, after in pairwise([*seen, starts[0]]) if s.verdicts and not after.verdicts]
     assert starts
     assert all(np.isfinite(s.positions).all() and s.joint_positions.shape[1] == hand.num_joints for s in starts)
     told = [verdict for s in tried for verdict in s.verdicts if verdict is not Verdict.UNVERIFIED]
-    assert sorted(told) == sorted(g.verdict for g in watched.grasps)
+    assert sorted(told) == sorted(g.verdict for g in watched.tried)
 
 
 def test_hands_are_seen_where_the_object_is_though_it_is_planned_on_about_its_own_centre():

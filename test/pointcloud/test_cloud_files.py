@@ -37,7 +37,7 @@ def test_cloud_files_come_back(tmp_path, ending):
 
 
 def test_a_ply_with_faces_is_a_mesh(tmp_path):
-    save_mesh(make_shape("box"), tmp_path / "box.ply")
+    save_mesh(tmp_path / "box.ply", make_shape("box"))
     assert not is_cloud_file(tmp_path / "box.ply")
 
 

@@ -28,7 +28,7 @@ def test_things_are_closed_turned_outwards_and_of_a_hand_s_size(family: str):
 
 
 def test_an_unknown_family_is_named_with_the_valid_ones():
-    with pytest.raises(MeshError, match="unknown family 'teapot'; valid families: pear"):
+    with pytest.raises(MeshError, match="unknown family 'teapot'; valid: pear"):
         draw_thing("teapot", 0)
 
 

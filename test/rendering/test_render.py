@@ -102,7 +102,7 @@ def test_pictures_show_every_mesh_in_its_colour(tmp_path):
     assert blue.sum() > 200
     # Seen from +x with z up, −y is on the left.
     assert np.nonzero(blue)[1].mean() < np.nonzero(red)[1].mean()
-    save_png(image, tmp_path / "picture.png")
+    save_png(tmp_path / "picture.png", image)
     import open3d as o3d
 
     assert np.array_equal(np.asarray(o3d.io.read_image(tmp_path / "picture.png")), image)

@@ -371,7 +371,7 @@ class SharedNode:
 def save_shapes(directory: Path) -> None:
     """`sphere.obj` and `mug.obj`, in reach of a node that runs there."""
     for shape in ("sphere", "mug"):
-        save_mesh(make_shape(shape), directory / f"{shape}.obj")
+        save_mesh(directory / f"{shape}.obj", make_shape(shape))
 
 
 @pytest.fixture(scope="session")

@@ -29,8 +29,8 @@ def rigged(*args: Any, seed: int, **kwargs: Any):
         return honest(*args, seed=seed, **kwargs)
     found = honest(*args, seed=seed, **kwargs | {"progress": lambda progress: None})
     doubt = TrialResult(HYPOTHESES, False, 0.0, 0.0, "holds on the likeliest shape only")
-    doubted = tuple(replace(grasp, trials=(*grasp.trials, doubt)) for grasp in found.grasps)
-    return replace(found, grasps=doubted, outcome=Outcome.TOO_FEW)
+    doubted = tuple(replace(grasp, trials=(*grasp.trials, doubt)) for grasp in found.tried)
+    return replace(found, tried=doubted, outcome=Outcome.TOO_FEW)
 
 
 if __name__ == "__main__":

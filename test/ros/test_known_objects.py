@@ -35,7 +35,7 @@ from graspd_ros.worker import StopHook
 def built(tmp_path_factory: pytest.TempPathFactory, hand: HandModel) -> Path:
     """A folder with a mesh and a library that knows it."""
     folder = tmp_path_factory.mktemp("known")
-    save_mesh(make_shape("sphere"), folder / "ball.obj")
+    save_mesh(folder / "ball.obj", make_shape("sphere"))
     library = GraspLibrary(folder / "known.grasps")
     library.create()
     known_or_planned(library, load_scene(folder / "ball.obj", mass=0.1), hand, count=3, preset="fast")
@@ -126,7 +126,7 @@ def test_what_is_missing_is_planned_and_added(folder: Path, hand: HandModel):
 
 def test_a_mesh_that_is_new_is_planned_for_once(folder: Path, hand: HandModel, monkeypatch: pytest.MonkeyPatch):
     node, new = Node(hand), {"source": GraspRequest.MESH, "mesh_uri": "new.obj"}
-    save_mesh(make_shape("capsule"), folder / "new.obj")
+    save_mesh(folder / "new.obj", make_shape("capsule"))
     assert "0 grasps of the library known.grasps, 2 planned" in node.answer(**new).result.message
     monkeypatch.setattr(known_objects, "known_or_planned", None)
     assert "2 grasps of the library known.grasps" in node.answer(**new).result.message
@@ -177,12 +177,12 @@ def test_what_cannot_be_answered_is_named(folder: Path, hand: HandModel, fields,
 
 def test_a_mesh_that_changed_and_a_library_that_was_torn_are_told(built: Path, folder: Path, hand: HandModel):
     mesh, node = make_shape("sphere"), Node(hand)
-    save_mesh(TriangleMesh(mesh.vertices * 1.1, mesh.faces), built / "ball.obj")
+    save_mesh(built / "ball.obj", TriangleMesh(mesh.vertices * 1.1, mesh.faces))
     try:
         with pytest.raises(MeshError, match=r"ball\.obj: the mesh has changed since ball came into the library"):
             node.answer(**known())
     finally:
-        save_mesh(mesh, built / "ball.obj")
+        save_mesh(built / "ball.obj", mesh)
     Path("known.grasps").write_bytes(b"no library" * 1000)
     with pytest.raises(GraspdError, match=r"known\.grasps: torn or no library") as refused:
         node.answer(**known())

@@ -23,13 +23,13 @@ from graspd_ros.parameters import LiveSettings, Settings, check_parameters
         ("busy_policy", "perhaps", "reject, queue, replace"),
         ("cloud_policy", True, "'on' is not one of newest, each, off"),
         ("cloud_policy", 3, "3 is not one of newest, each, off"),
-        ("preset", "no_such_preset", "valid presets"),
+        ("preset", "no_such_preset", "unknown preset 'no_such_preset'; valid: "),
         ("preset", "/no/such/preset.yaml", "preset /no/such/preset.yaml: no such file"),
         ("scene_config", "none.yaml", "none.yaml: No such file"),
         ("roi_min", [0.0, 1.0], "three finite numbers"),
         ("roi_max", [0.0, 1.0, math.nan], "three finite numbers"),
         ("view_point", "here", "three finite numbers"),
-        ("arm", "ur99", "unknown arm 'ur99'; known: "),
+        ("arm", "ur99", "unknown arm 'ur99'; valid: "),
         ("deadline", "soon", "'soon' is no number"),
         ("deadline", True, "True is no number"),
         ("deadline", 0, "0.0; valid: 0.1 to 3600"),
@@ -70,7 +70,8 @@ def test_a_scene_file_sets_the_reconstruction_and_is_refused_by_its_key(tmp_path
     assert len(scene.object.mesh.faces) <= 300
     path.write_text("reconstruction: {most_faces: 300}")
     answer = check_parameters([Parameter("scene_config", value=str(path))])
-    assert answer.reason.startswith("parameter scene_config: scene.yaml.reconstruction: unknown key 'most_faces'")
+    told = f"parameter scene_config: {path}:1: reconstruction: unknown key 'most_faces'"
+    assert answer.reason.startswith(told)
 
 
 @pytest.fixture

@@ -47,9 +47,9 @@ def test_a_request_is_steered_and_earlier_runs_do_not_answer_it(hand):
     again = replace(asked, id="steered", exclude=("free/0",), steering=lambda: steering)
     found = plans.plan(again, never, lambda _: None).result
     assert found.outcome is Outcome.SUCCEEDED
-    for grasp in found.grasps:
+    for grasp in found.tried:
         assert matrix_of_posture(grasp.grasp)[:3, :3][2] @ hand.approach < -np.cos(0.5) + 1e-6
-    assert unlike(found.grasps, [matrix_of_posture(free.grasps[0].grasp)]) == list(found.grasps)
+    assert unlike(found.tried, [matrix_of_posture(free.tried[0].grasp)]) == list(found.tried)
 
 
 def test_a_result_is_told_in_the_frame_that_the_object_was_placed_in(hand):
@@ -59,7 +59,7 @@ def test_a_result_is_told_in_the_frame_that_the_object_was_placed_in(hand):
     asked = request(lambda: load_scene("shape:sphere"), pose=pose)
     planned = planner(hand).plan(asked, never, stages.append)
     assert planned.result.outcome is Outcome.SUCCEEDED
-    best = planned.result.grasps[0]
+    best = planned.result.tried[0]
     assert best.verdict is Verdict.VERIFIED
     assert np.linalg.norm(best.grasp.position - [10.0, 0.0, 0.0]) < 0.25
     assert {report.stage for report in stages} == set(Stage)
@@ -143,20 +143,20 @@ def test_the_next_best_grasp_comes_at_once_from_the_candidates_of_the_same_run(h
     assert first.outcome is Outcome.SUCCEEDED
     second = ask("second", "first/0")
     assert len(loaded) == 1
-    lost = [matrix_of_posture(grasp.grasp) for grasp in first.grasps]
-    assert list(second.grasps) == unlike(first.grasps, lost[:1])[:1]
-    pose = matrix_of_posture(second.grasps[0].grasp)
+    lost = [matrix_of_posture(grasp.grasp) for grasp in first.tried]
+    assert list(second.tried) == unlike(first.tried, lost[:1])[:1]
+    pose = matrix_of_posture(second.tried[0].grasp)
     third = ask("third", "first/0", poses=(("object", pose),))
-    assert unlike(third.grasps, [lost[0], pose]) == list(third.grasps)
+    assert unlike(third.tried, [lost[0], pose]) == list(third.tried)
     # When all are lost, another run begins, and gives none like them.
     before = len(loaded)
-    fourth = ask("fourth", *(f"first/{rank}" for rank in range(len(first.grasps))), "third/0")
+    fourth = ask("fourth", *(f"first/{rank}" for rank in range(len(first.tried))), "third/0")
     assert len(loaded) == before + 1
     assert fourth.outcome is Outcome.SUCCEEDED
-    assert unlike(fourth.grasps, lost) == list(fourth.grasps)
+    assert unlike(fourth.tried, lost) == list(fourth.tried)
     # Seen anew, the object is another: a run, and still none like the lost one.
     fifth = ask("fifth", "first/0", key="cloud 2")
     assert len(loaded) == before + 2
-    assert unlike(fifth.grasps, lost[:1]) == list(fifth.grasps)
+    assert unlike(fifth.tried, lost[:1]) == list(fifth.tried)
     with pytest.raises(RequestError, match="exclude: no grasp 'nobody/0' in the last 16 runs; kept: first, second"):
         ask("sixth", "nobody/0")

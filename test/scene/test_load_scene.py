@@ -26,7 +26,7 @@ from graspd_core.types import Outcome, Plane, TriangleMesh, Verdict
 def test_file_scale_and_value_agree(tmp_path):
     box = make_shape("box")
     millimetres = dataclasses.replace(box, vertices=box.vertices * 1000)
-    save_mesh(millimetres, tmp_path / "box.ply")
+    save_mesh(tmp_path / "box.ply", millimetres)
     from_file = load_scene(tmp_path / "box.ply", scale=1e-3, resolution=16)
     from_value = load_scene(millimetres, scale=1e-3, resolution=16)
     assert from_file.object.volume == pytest.approx(from_value.object.volume, rel=1e-5)

@@ -147,7 +147,7 @@ def result() -> GraspResult:
     """Grasps of the gripper on the box; of the last, the hand is 15 cm away, and its trial says so."""
     scene, hand = load_scene("shape:box"), load_hand("parallel_gripper")
     found = plan_grasps(scene, hand, count=3, preset="fast", measure=True)
-    best = found.grasps[0]
+    best = found.tried[0]
     outward = best.grasp.position / np.linalg.norm(best.grasp.position)
 
     def away(grasp: Grasp) -> Grasp:
@@ -159,7 +159,7 @@ def result() -> GraspResult:
 
     worlds = build_worlds(scene, hand, object_parts(scene.object), PROTOCOLS["standard"])
     bad = replace(away(best), trials=grasp_trials(worlds, away(best)))
-    return replace(found, grasps=(*found.grasps[:3], bad))
+    return replace(found, tried=(*found.tried[:3], bad))
 
 
 @pytest.fixture(scope="session")

@@ -37,6 +37,12 @@ def page(viewer, visit, grasps_file):
     return page
 
 
+def test_the_tab_names_what_is_shown_and_the_legend_every_arrow(page):
+    page.until(lambda: page.tab.title() == "shape:box, parallel_gripper - graspd")
+    for arrow in ("normal at a contact", "force, 8 mm for a newton", "weakest push", "axis of its turn"):
+        page.text(arrow)
+
+
 def test_a_grasp_is_chosen_and_said(page, viewer):
     before = places(viewer)
     page.choose("Grasp", "✗ #3 failed, 3 contacts")

@@ -35,7 +35,7 @@ def changed(grasps_file, tmp_path, **changes):
 def test_a_file_gives_what_was_saved(grasps_file, result):
     session = open_grasps(grasps_file)
     assert session.hand.name == "parallel_gripper"
-    assert [g.verdict for g in session.grasps] == [g.verdict for g in result.grasps]
+    assert [g.verdict for g in session.grasps] == [g.verdict for g in result.tried]
     assert session.scene is not None
     assert session.notes == ()
 
@@ -60,7 +60,7 @@ def test_a_hand_that_does_not_fit_is_refused(grasps_file, tmp_path):
 
 
 def test_the_list_is_filtered_and_sorted_and_escaped(result):
-    grasps = result.grasps
+    grasps = result.tried
     assert listed(grasps, "all", "rank") == [0, 1, 2, 3]
     assert listed(grasps, "failed", "rank") == [3]
     by_epsilon = listed(grasps, "all", "epsilon")
@@ -77,11 +77,11 @@ def test_the_list_is_filtered_and_sorted_and_escaped(result):
 
 
 def test_a_grasp_that_is_less_sure_is_said_with_its_probability(result):
-    held = result.grasps[0]
+    held = result.tried[0]
     under = TrialResult(HYPOTHESES, False, 0.1, 0.1, "fails under 2 of the 5 hypotheses tried")
     less = replace(held, trials=(*held.trials, under), probability=0.75)
     sure, untried = replace(held, probability=0.97), replace(held, trials=())
-    grasps = (less, sure, untried, result.grasps[3])
+    grasps = (less, sure, untried, result.tried[3])
     assert label(less, 0).startswith("~ #0 less sure, 75 %, ")
     assert label(sure, 1).startswith("✓ #1 verified, 97 %, ")
     assert "%" not in label(untried, 2)

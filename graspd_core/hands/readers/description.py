@@ -12,7 +12,7 @@ import yaml
 from jaxtyping import Float
 
 from graspd_core.config.mapping import YamlError, parse_yaml
-from graspd_core.errors import HandError, shown
+from graspd_core.errors import HandError, choices, shown
 from graspd_core.hands.default_postures import default_palm, default_postures
 from graspd_core.hands.kinematics import link_poses
 from graspd_core.hands.model import HandModel, Mount
@@ -47,7 +47,7 @@ class Source:
         for name in data:
             if name not in known:
                 line = self.lines.get(f"{prefix}{name}", 1)
-                raise HandError(f"{self.path}:{line}: unknown key {name!r}; known: {', '.join(known)}")
+                raise HandError(f"{self.path}:{line}: unknown key {name!r}; {choices(name, known)}")
         for name in required:
             if name not in data:
                 raise HandError(f"{self.path}:{self.lines.get(key, 1)}: {prefix}{name} is missing")

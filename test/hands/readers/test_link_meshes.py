@@ -119,7 +119,7 @@ SHOWN = '<visual><origin xyz="0 0 0.03"/><geometry><mesh filename="shown.ply" sc
 
 def hand_of(folder: Path, mesh: TriangleMesh, scale: str, prefix: str = ""):
     """Two fingers on a palm; the first shows a mesh, the second nothing of its own."""
-    save_mesh(mesh, folder / "shown.ply")
+    save_mesh(folder / "shown.ply", mesh)
     palm = '<link name="palm"><collision><geometry><box size="0.08 0.1 0.02"/></geometry></collision></link>'
     fingers = FINGER.format(1, 0.03, SHOWN.format(scale)), FINGER.format(2, -0.03, "")
     (folder / "hand.urdf").write_text(f'<robot name="two">{palm}{"".join(fingers)}</robot>')

@@ -81,10 +81,10 @@ def test_the_side_of_a_hand_is_where_its_fingers_are_and_of_a_gripper_where_it_c
 def test_verified_grasps_are_inside_cone_and_roll_and_the_rest_is_counted(bottle, hand):
     steering = Steering(approach_direction=DOWN + np.array([0.0, 1.0, 0.0]), approach_angle=0.5, roll=0.3)
     found = plan(bottle, hand, steering)
-    assert found.grasps
-    assert found.grasps[0].verdict is Verdict.VERIFIED
+    assert found.tried
+    assert found.tried[0].verdict is Verdict.VERIFIED
     bound = steering.bind(bottle, hand)
-    for grasp in found.grasps:
+    for grasp in found.tried:
         assert angle_of_approach(hand, grasp, np.array([0.0, 1.0, -1.0]) / np.sqrt(2)) <= 0.5 + 1e-6
         assert bound.admit([grasp])[0] is grasp
     if found.refused:
@@ -97,9 +97,9 @@ def test_contacts_lie_in_the_region_whatever_kind_it_is(bottle, hand):
     seen = bottle.object.mesh.vertices[top.distance(bottle.object.mesh.vertices) <= 0]
     for region in (top, Sphere(top.center, 0.08), NearPoints(seen, 0.02)):
         found = plan(bottle, hand, Steering(region=region))
-        good = [grasp for grasp in found.grasps if grasp.verdict is Verdict.VERIFIED]
+        good = [grasp for grasp in found.tried if grasp.verdict is Verdict.VERIFIED]
         assert good, found.message
-        assert all(outside_region(region, grasp) <= CONTACT_TOLERANCE for grasp in found.grasps)
+        assert all(outside_region(region, grasp) <= CONTACT_TOLERANCE for grasp in found.tried)
 
 
 def test_the_untouched_part_is_the_object_outside_the_region(bottle):
@@ -116,13 +116,13 @@ def test_no_link_enters_an_avoided_box(bottle, hand):
     steering = Steering(avoid=[Box((0.0, 0.0, -0.5), (2.0, 2.0, 1.0))])
     free = plan_grasps(bottle, hand, count=6, preset="fast", measure=False)
     stages = ("pregrasp", "grasp", "squeeze")
-    in_box = [entered(hand, [getattr(g, s) for s in stages], steering.avoid).any() for g in free.grasps]
+    in_box = [entered(hand, [getattr(g, s) for s in stages], steering.avoid).any() for g in free.tried]
     assert any(in_box)
     found = plan(bottle, hand, steering)
     assert found.outcome is Outcome.SUCCEEDED, found.message
-    for grasp in found.grasps:
+    for grasp in found.tried:
         assert not entered(hand, [getattr(grasp, s) for s in stages], steering.avoid).any()
-    kept = steering.bind(bottle, hand).admit(free.grasps)
+    kept = steering.bind(bottle, hand).admit(free.tried)
     assert [isinstance(answer, Refusal) for answer in kept] == in_box
 
 
@@ -142,7 +142,7 @@ def test_from_below_the_table_is_said_to_be_impossible_without_a_search_and_from
 def test_what_cannot_be_met_says_which_wish_refused_the_rest(bottle, hand):
     corner = bottle.object.mesh.vertices[bottle.object.mesh.vertices[:, 2].argmin()]
     found = plan(bottle, hand, Steering(approach_direction=DOWN, region=Sphere(corner, 0.002)))
-    assert not found.grasps
+    assert not found.tried
     assert found.message.startswith("0 candidates held")
     assert "with a contact outside the region" in found.message
 
@@ -192,10 +192,10 @@ def test_steering_is_in_the_frame_of_the_scene_far_from_the_origin_too(hand):
     scene = load_scene(moved_mesh(make_shape("bottle"), away))
     top = Sphere(scene.object.mesh.vertices.mean(0), 0.09)
     found = plan(scene, hand, Steering(approach_direction=(1, 0, 0), region=top), count=4)
-    assert found.grasps, found.message
-    assert found.grasps[0].verdict is Verdict.VERIFIED
-    assert max(outside_region(top, grasp) for grasp in found.grasps) <= CONTACT_TOLERANCE
-    assert np.linalg.norm(found.grasps[0].grasp.position - away) < 0.5
+    assert found.tried, found.message
+    assert found.tried[0].verdict is Verdict.VERIFIED
+    assert max(outside_region(top, grasp) for grasp in found.tried) <= CONTACT_TOLERANCE
+    assert np.linalg.norm(found.tried[0].grasp.position - away) < 0.5
 
 
 QUARTER = (np.sqrt(0.5), 0.0, 0.0, np.sqrt(0.5))
