@@ -52,6 +52,8 @@ OTHER_SIDE, MOST_CHANCE = float(np.cos(np.pi / 4)), 0.3
 LEAST_BULGE = 0.05
 # A plane that holds this share of the points is a table; things on it are no farther from it than that [m].
 PLANE_SHARE, PLANE_TRIALS, PLANE_TOLERANCE, THING_HEIGHT = 0.25, 200, 0.01, 0.35
+# No camera sees a table along its plane: it is higher by this share of its distance.
+LEAST_ELEVATION = 0.03
 # Root mean square of a table seen by a camera [m]; points all through the slab would have 0.0058.
 PLANE_NOISE = 0.004
 # Singular values of the camera matrix's equations: the two least are as far apart where the points are not in a plane.
@@ -100,7 +102,7 @@ def check_scene(views: Sequence[PointCloud]) -> None:
         if share > MAX_HIDDEN_SHARE:
             raise _refusal(view.viewpoint, f"{100 * share:.1f} % of its points are hidden from there by others")
         if things_behind(points, view.viewpoint):
-            raise _refusal(view.viewpoint, "things stand on the far side of the table")
+            raise _refusal(view.viewpoint, "it lies in the plane of the table, or objects stand on the far side of it")
 
 
 def check_thing(thing: PointCloud, view: PointCloud, up: Vector | None = None) -> str:
@@ -264,7 +266,10 @@ def _roughness(points: Points, tree: Any) -> float:
 
 
 def things_behind(points: Points, viewpoint: Vector) -> bool:
-    """Tell whether more stands on the far side of a table, over what is seen of it, than on the viewpoint's side."""
+    """Tell whether more stands on the far side of a table, over what is seen of it, than on the viewpoint's side.
+
+    Also True if the viewpoint lies in the plane of the table, as the origin of a robot's base often does.
+    """
     rng = np.random.default_rng(0)
     if len(points) <= NEIGHBOURS:
         return False
@@ -278,13 +283,16 @@ def things_behind(points: Points, viewpoint: Vector) -> bool:
     (x, y, z), (a, b, c) = (points[:: 1 + len(points) // 2000, None].T.astype(np.float32), normals.T.astype(np.float32))
     height = np.abs(x.T * a + y.T * b + z.T * c - (corners[:, 0] * normals).sum(1).astype(np.float32))
     best = int(np.argmax(np.count_nonzero(height < PLANE_TOLERANCE, axis=0)))
-    normal = normals[best] * (1.0 if (viewpoint - corners[best, 0]) @ normals[best] > 0 else -1.0)
+    above = float((viewpoint - corners[best, 0]) @ normals[best])
+    normal = normals[best] * (1.0 if above > 0 else -1.0)
     height = (points - corners[best, 0]) @ normal
     on = np.abs(height) < PLANE_TOLERANCE
     if on.mean() < PLANE_SHARE:
         return False
     if not np.linalg.eigvalsh(np.cov(points[on].T, bias=True))[0] < PLANE_NOISE**2:
         return False
+    if abs(above) < LEAST_ELEVATION * np.median(np.linalg.norm(points[on] - viewpoint, axis=1)):
+        return True
     first = perpendicular(normal)
     flat = points @ np.column_stack([first, np.cross(normal, first)])
     seen = convex_hull(flat[on])

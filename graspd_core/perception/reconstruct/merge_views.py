@@ -39,8 +39,9 @@ MAX_RISE_CELLS = 4.0
 LAYERED_SHARE, LAYERED_SHARE_OF_CAMERA = 0.15, 0.45
 
 # So many points tell whether they enclose a body. Clouds of shapes from all round have 0 to 0.056 (thin walls, noise
-# of 1 mm), single views of `CHOSEN_ON` (graspd_bench/studies/cameras.py) 0.075 to 0.32.
-ENCLOSING_POINTS, MOST_OPEN = 4000, 0.06
+# of 1 mm), single views of `CHOSEN_ON` (graspd_bench/studies/cameras.py) 0.075 to 0.32. Normals of whole scenes may
+# cancel. But these are flat: thrice their volume over area and size is 0.003 to 0.028, of bodies 0.12 or more.
+ENCLOSING_POINTS, MOST_OPEN, LEAST_VOLUME = 4000, 0.06, 0.06
 # Of an all-round cloud: neighbours for a normal, the directions that it is looked at from, and how often that is done.
 NORMAL_NEIGHBOURS, UNPOSED_DIRECTIONS, UNPOSED_PASSES = 24, 150, 3
 # It is thinned to this share of the step. Points that face opposite ways count as twice so many steps apart. Points
@@ -197,8 +198,9 @@ def is_all_round(view: PointCloud) -> bool:
     surfels = orient_unposed(some, point_step([some]))
     place = surfels.points - surfels.points.mean(0)
     moment = surfels.normals.T @ place / np.linalg.norm(place, axis=1).sum()
-    uneven = moment - np.trace(moment) / 3 * np.eye(3)
-    return bool(max(np.linalg.norm(surfels.normals.mean(0)), np.linalg.norm(uneven)) < MOST_OPEN)
+    volume = float(np.trace(moment))
+    uneven = float(np.linalg.norm(moment - volume / 3 * np.eye(3)))
+    return bool(volume > LEAST_VOLUME and max(np.linalg.norm(surfels.normals.mean(0)), uneven) < MOST_OPEN)
 
 
 def orient_unposed(view: PointCloud, step: float) -> Surfels:
