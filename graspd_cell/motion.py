@@ -416,4 +416,6 @@ def timed(arm: Arm, path: Path, speeds: Speeds) -> JointMotion:
     if trajectory is None:
         raise NoMotionError(f"motion: toppra found no times for a path of {len(rows)} rows of {arm.name}")
     times = np.linspace(0.0, trajectory.duration, max(2, 1 + int(np.ceil(trajectory.duration / _PERIOD))))
-    return JointMotion(arm.joint_names, times[1:], trajectory(times)[1:], trajectory(times, 1)[1:])
+    # The spline may swing beyond a limit that the path touches.
+    rows = np.clip(trajectory(times)[1:], arm.lower, arm.upper)
+    return JointMotion(arm.joint_names, times[1:], rows, trajectory(times, 1)[1:])

@@ -18,6 +18,7 @@ from jaxtyping import Float
 from graspd_core.config import SceneConfig
 from graspd_core.errors import CloudError, MeshError
 from graspd_core.hands.model import HandModel
+from graspd_core.mesh.surface_queries import make_surface, surface_distance
 from graspd_core.optimize.plan_config import load_preset
 from graspd_core.perception.cloud.point_cloud import PointCloud
 from graspd_core.perception.obstacles import with_neighbours
@@ -34,6 +35,8 @@ LIKE_DISTANCE, LIKE_TURN = 0.015, 0.26
 OUT_OF_TRIES = "tried in vain too often"
 # What is seen within this of a place where something failed is that thing [m].
 _SAME_PLACE = 0.04
+# Nearly all points of a known solid that stray off it are within this of its surface [m], also at edges.
+_STRAY, _NEARLY_ALL = 0.016, 0.9
 
 
 @dataclass(frozen=True, eq=False)
@@ -102,7 +105,7 @@ def plan_any_thing(
         hand: that grasps.
         settings: of the way from clouds to scenes.
         surface: what all objects stand on, if it is known.
-        solids: what else is known to stand there, by name, frame of the views [m].
+        solids: what else is known to stand there, by name, frame of the views [m]. It is not an object.
         failures: of before. An object is skipped after `tries` of them, and grasps like them are left out.
         tries: the most tries for an object.
         seconds: after which no further object is begun.
@@ -114,7 +117,8 @@ def plan_any_thing(
         ConfigError: see `plan_grasps`.
     """
     began, things, over = time.perf_counter(), list[ThingPlan](), False
-    for points, failed in _in_order(find_things(views, settings and settings.segmentation), failures):
+    seen = [p for p in find_things(views, settings and settings.segmentation) if not _is_solid(p, solids or {})]
+    for points, failed in _in_order(seen, failures):
         if over or len(failed) >= tries:
             told = OUT_OF_TRIES if len(failed) >= tries else "not looked at"
             things.append(ThingPlan(points, reason=told, looked_at=False))
@@ -125,6 +129,13 @@ def plan_any_thing(
             on_thing(things[-1])
         over = things[-1].surety > 1.0 or (seconds is not None and time.perf_counter() - began > seconds)
     return tuple(sorted(things, key=lambda thing: -thing.surety))
+
+
+def _is_solid(points: Float[np.ndarray, "_ 3"], solids: Mapping[str, Sequence[TriangleMesh]]) -> bool:
+    """Whether some points are strays of a known solid."""
+    meshes = [mesh for solid in solids.values() for mesh in solid]
+    away = (surface_distance(make_surface(mesh), points) for mesh in meshes)
+    return any(float(np.quantile(one, _NEARLY_ALL)) < _STRAY for one in away)
 
 
 def _in_order(

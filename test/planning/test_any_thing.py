@@ -63,6 +63,14 @@ def test_nothing_on_the_table_is_no_thing_and_an_empty_cloud_is_told(views: tupl
         plan_any_thing([PointCloud(np.zeros((0, 3)), np.zeros(3))], HAND)
 
 
+def test_what_is_known_to_stand_there_is_no_thing(views: tuple[PointCloud, ...], first: tuple[ThingPlan, ...]):
+    assert first[0].scene is not None
+    known = {"known": [first[0].scene.object.mesh]}
+    left = plan_any_thing(views, HAND, solids=known, failures=[Failure(first[1].place)] * 4, **ASKED)
+    assert [thing.reason for thing in left] == [OUT_OF_TRIES]
+    np.testing.assert_array_equal(left[0].points, first[1].points)
+
+
 def test_alike_is_near_and_turned_by_little():
     def at(x: float, half_turn: float) -> Posture:
         return Posture(np.array([x, 0.0, 0.0]), np.array([np.cos(half_turn), 0.0, 0.0, np.sin(half_turn)]), np.zeros(1))
