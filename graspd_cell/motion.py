@@ -122,12 +122,16 @@ def _hand_surface(hand: HandModel) -> tuple[Points, Int[np.ndarray, "_"]]:
     return dense_samples(hand, count=_SAMPLES)[:2]
 
 
-def hand_balls(arm: Arm, hand: HandModel, joints: Joints) -> Balls:
-    """Return the hand at its joint values, in the frame of the arm's tip."""
+def hand_points(hand: HandModel, joints: Joints) -> tuple[Points, Int[np.ndarray, "_"]]:
+    """Return points of the hand's surface at its joint values, base frame of the hand [m], and their links."""
     points, links = _hand_surface(hand)
     rotations, translations = link_poses(hand, joints)
-    local = np.einsum("nij,nj->ni", np.asarray(rotations)[links], points) + np.asarray(translations)[links]
-    mount = tip_hand(arm, hand)
+    return np.einsum("nij,nj->ni", np.asarray(rotations)[links], points) + np.asarray(translations)[links], links
+
+
+def hand_balls(arm: Arm, hand: HandModel, joints: Joints) -> Balls:
+    """Return the hand at its joint values, in the frame of the arm's tip."""
+    local, mount = hand_points(hand, joints)[0], tip_hand(arm, hand)
     return balls_about(local @ mount.rotation.numpy().T + mount.translation.numpy())
 
 

@@ -1,8 +1,8 @@
 """The next object of a scene: of all objects seen, one with a sure grasp, else the surest ones.
 
 Objects without failures come first, then the highest, since nothing lies on them. An object without failures gets one
-round of the planner. The first verified grasp ends the search, so a request costs little more than one for a single
-object.
+round of the planner. The first verified grasp ends the search. Else it ends after `enough` objects with a grasp, so
+that a request for any of many objects costs little more than one for two of them.
 """
 
 from __future__ import annotations
@@ -95,6 +95,7 @@ def plan_any_thing(
     failures: Sequence[Failure] = (),
     tries: int = 4,
     seconds: float | None = None,
+    enough: int = 2,
     on_thing: Callable[[ThingPlan], None] | None = None,
     **plan: Any,
 ) -> tuple[ThingPlan, ...]:
@@ -109,6 +110,7 @@ def plan_any_thing(
         failures: of before. An object is skipped after `tries` of them, and grasps like them are left out.
         tries: the most tries for an object.
         seconds: after which no further object is begun.
+        enough: after so many objects with a grasp, if none of them is verified, the surest grasp is taken.
         on_thing: called with each object that was looked at.
         plan: of `plan_grasps`. Its `seed` is advanced with every failure of an object.
 
@@ -127,7 +129,9 @@ def plan_any_thing(
         things.append(_thing_plan(points, scene, hand, failed, plan))
         if on_thing is not None:
             on_thing(things[-1])
-        over = things[-1].surety > 1.0 or (seconds is not None and time.perf_counter() - began > seconds)
+        likely = sum(thing.grasp is not None for thing in things) >= enough
+        late = seconds is not None and time.perf_counter() - began > seconds
+        over = likely or late or things[-1].surety > 1.0
     return tuple(sorted(things, key=lambda thing: -thing.surety))
 
 

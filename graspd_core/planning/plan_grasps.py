@@ -13,6 +13,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from graspd_core.config import VERIFICATIONS
+from graspd_core.config.planning_config import LEAST_LIGHT, share_as_light
 from graspd_core.errors import ConfigError
 from graspd_core.hands.model import HandModel
 from graspd_core.hands.surface_points import with_candidates
@@ -41,7 +42,7 @@ from graspd_core.types import (
 )
 from graspd_core.verify.limits import LEAST_PAYLOAD
 from graspd_core.verify.run_clock import Run, result_of
-from graspd_core.verify.verification import greatest_payload, rank_by_robustness, trials_ahead
+from graspd_core.verify.verification import payloads, rank_by_robustness, trials_ahead
 
 # Grasps that are weighed where none of them is verified.
 _WEIGHED = 8
@@ -179,7 +180,7 @@ def _why_few(run: Run, scene: Scene, bound: BoundRestrictions, found: RoundsResu
     told = why_trials_failed(scene, result.tried)
     if found.good or found.context is None:
         return told
-    most = greatest_payload(found.context, result.tried[:_WEIGHED], run.over)
+    most = max(payloads(found.context, result.tried[:_WEIGHED], run.over), default=0.0)
     return f"{told}; the best of them would hold {most:.2g} kg" if most > LEAST_PAYLOAD else told
 
 
@@ -191,6 +192,8 @@ def _less_sure(scene: Scene, far: Float[np.ndarray, "3"], result: GraspResult) -
     told, view = f"{held} grasps hold on the likeliest shape, none is sure enough", None
     if scene.evidence.doubts:
         told += f": {scene.evidence.doubts[0]}"
+    elif result.mass is not None and share_as_light(result.mass, scene.object.mass) < LEAST_LIGHT:
+        told += f": most objects of this volume weigh more than the {result.mass:.2g} kg that they lift; give its mass"
     elif scene.evidence.hidden:
         from graspd_core.perception.reconstruct.hidden_side import next_view
 

@@ -37,6 +37,14 @@ def test_the_first_verified_grasp_ends_the_search_and_all_things_are_told(first:
     assert first[1].reason == "not looked at"
 
 
+@pytest.mark.parametrize("enough", [1, 2])
+def test_without_a_verified_grasp_the_search_ends_after_some_objects(views, enough: int):
+    found = plan_any_thing(views, HAND, enough=enough, verify="none", **ASKED)
+    assert [thing.looked_at for thing in found].count(True) == enough
+    assert found[0].grasp is not None
+    assert found[0].grasp.verdict is Verdict.UNVERIFIED
+
+
 def test_what_failed_comes_last_and_is_given_up_after_some_tries(views, first):
     place = first[0].place
     other = plan_any_thing(views, HAND, failures=[Failure(place)], **ASKED)
