@@ -13,7 +13,6 @@ from jaxtyping import Float
 from torch import Tensor
 
 from graspd_core.config import VERIFICATIONS
-from graspd_core.config.planning_config import LEAST_LIGHT, share_as_light
 from graspd_core.errors import ConfigError
 from graspd_core.hands.model import HandModel
 from graspd_core.hands.surface_points import with_candidates
@@ -192,8 +191,6 @@ def _less_sure(scene: Scene, far: Float[np.ndarray, "3"], result: GraspResult) -
     told, view = f"{held} grasps hold on the likeliest shape, none is sure enough", None
     if scene.evidence.doubts:
         told += f": {scene.evidence.doubts[0]}"
-    elif result.mass is not None and share_as_light(result.mass, scene.object.mass) < LEAST_LIGHT:
-        told += f": most objects of this volume weigh more than the {result.mass:.2g} kg that they lift; give its mass"
     elif scene.evidence.hidden:
         from graspd_core.perception.reconstruct.hidden_side import next_view
 

@@ -197,7 +197,7 @@ def _tried_lighter(
     mass = min(_LIFTED * most, _HALF * scene.object.mass)
     if most <= LEAST_PAYLOAD or run.over():
         return state
-    context = lighter(scene, ahead, state.context, certainty, mass)
+    context = lighter(scene, ahead, state.context, certainty, mass, most)
     strongest = sorted(range(len(best)), key=lambda place: -lifted[place])
     tried = run_trials(run, context, tuple(replace(best[place], trials=()) for place in strongest), count, 0)
     grasps = surest_first((*tried.grasps, *others))

@@ -230,10 +230,10 @@ def hypotheses_of(
     return Hypotheses(tuple(stages), surest, waited_for)
 
 
-def less_sure(hypotheses: Hypotheses, share: float, mass: float) -> Hypotheses:
-    """Return the checks of an object that weighs at most `mass` [kg] with the probability `share`."""
+def less_sure(hypotheses: Hypotheses, share: float, most: float) -> Hypotheses:
+    """Return the checks of an object that weighs at most the payload `most` [kg] with the probability `share`."""
     if share < LEAST_LIGHT:
-        told = f"the hand lifts {mass:.2g} kg, and most objects of this volume weigh more"
+        told = f"the hand lifts {most:.2g} kg, and most objects of this volume weigh more"
         return Hypotheses((), share * MASS_KNOWN.likeliest, doubts=(told,))
     stages = tuple(replace(stage, though_failed=share * stage.though_failed) for stage in hypotheses.stages)
     return replace(hypotheses, stages=stages, probability=share * hypotheses.probability)

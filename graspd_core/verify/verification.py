@@ -124,11 +124,11 @@ def make_trial_context(
 
 
 def lighter(
-    scene: Scene, ahead: TrialsAhead, context: VerificationContext, certainty: CertaintyConfig, mass: float
+    scene: Scene, ahead: TrialsAhead, context: VerificationContext, certainty: CertaintyConfig, mass: float, most: float
 ) -> VerificationContext:
-    """Return the context with an object of less mass [kg] than was assumed. Its grasps are less sure.
+    """Return the context with an object of less `mass` [kg] than was assumed. Its grasps are less sure.
 
-    If most objects of its volume weigh more, none of its grasps can be verified.
+    If most objects of its volume weigh more than the greatest payload `most` [kg], none of its grasps can be verified.
     """
     trials, others = context.trials, [world.altered(mass) for world in ahead.others]
     around = trials.around and altered(trials.around, mass=mass)
@@ -136,7 +136,7 @@ def lighter(
     known = replace(scene, object=replace(scene.object, mass_assumed=False))
     hypotheses = hypotheses_of(known, others, trials, certainty.probability)
     if hypotheses is not None and not hypotheses.doubts:
-        hypotheses = less_sure(hypotheses, share_as_light(mass, scene.object.mass), mass)
+        hypotheses = less_sure(hypotheses, share_as_light(most, scene.object.mass), most)
     return replace(context, trials=trials, hypotheses=hypotheses)
 
 
