@@ -104,7 +104,7 @@ class Pace:
     grasp: ExecutionPace = field(default_factory=ExecutionPace)
     patience: float = 3.0
     settle: float = 0.4
-    least_probability: float = 0.2
+    least_probability: float = 0.05
 
 
 @dataclass(eq=False)

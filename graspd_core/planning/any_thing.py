@@ -1,8 +1,8 @@
 """The next object of a scene: of all objects seen, one with a sure grasp, else the surest ones.
 
 Objects without failures come first, then the highest, since nothing lies on them. An object without failures gets one
-round of the planner. The first verified grasp ends the search. Else it ends after `enough` objects with a grasp, so
-that a request for any of many objects costs little more than one for two of them.
+round of the planner. The first verified grasp ends the search. Else it ends after `enough` objects with a likely
+grasp, so that a request for any of many objects costs little more than one for two of them.
 """
 
 from __future__ import annotations
@@ -35,6 +35,8 @@ LIKE_DISTANCE, LIKE_TURN = 0.015, 0.26
 OUT_OF_TRIES = "tried in vain too often"
 # What is seen within this of a place where something failed is that thing [m].
 _SAME_PLACE = 0.04
+# Of a likely grasp.
+_LIKELY = 0.5
 # Nearly all points of a known solid that stray off it are within this of its surface [m], also at edges.
 _STRAY, _NEARLY_ALL = 0.016, 0.9
 
@@ -78,6 +80,11 @@ class ThingPlan:
         return self.points.mean(0)
 
     @property
+    def is_likely(self) -> bool:
+        """Whether its grasp holds likelier than not, as far as anybody weighed that."""
+        return self.grasp is not None and (self.grasp.probability is None or self.grasp.probability >= _LIKELY)
+
+    @property
     def surety(self) -> float:
         """Probability that its grasp holds, more than one for a verified grasp, less than zero for none."""
         if self.grasp is None:
@@ -110,7 +117,7 @@ def plan_any_thing(
         failures: of before. An object is skipped after `tries` of them, and grasps like them are left out.
         tries: the most tries for an object.
         seconds: after which no further object is begun.
-        enough: after so many objects with a grasp, if none of them is verified, the surest grasp is taken.
+        enough: after so many objects with a likely grasp, none of them verified, the surest grasp is taken.
         on_thing: called with each object that was looked at.
         plan: of `plan_grasps`. Its `seed` is advanced with every failure of an object.
 
@@ -129,7 +136,7 @@ def plan_any_thing(
         things.append(_thing_plan(points, scene, hand, failed, plan))
         if on_thing is not None:
             on_thing(things[-1])
-        likely = sum(thing.grasp is not None for thing in things) >= enough
+        likely = sum(thing.is_likely for thing in things) >= enough
         late = seconds is not None and time.perf_counter() - began > seconds
         over = likely or late or things[-1].surety > 1.0
     return tuple(sorted(things, key=lambda thing: -thing.surety))
