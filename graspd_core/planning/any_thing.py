@@ -1,8 +1,8 @@
 """The next object of a scene: of all objects seen, one with a sure grasp, else the surest ones.
 
 Objects without failures come first, then the highest, since nothing lies on them. An object without failures gets one
-round of the planner. The first verified grasp ends the search. Else it ends after `enough` objects with a likely
-grasp, so that a request for any of many objects costs little more than one for two of them.
+round of the planner. The first verified grasp ends the search. Else it ends after `enough` objects if one
+of them has a likely grasp, so that a request for any of many objects mostly costs no more than one for two of them.
 """
 
 from __future__ import annotations
@@ -117,7 +117,7 @@ def plan_any_thing(
         failures: of before. An object is skipped after `tries` of them, and grasps like them are left out.
         tries: the most tries for an object.
         seconds: after which no further object is begun.
-        enough: after so many objects with a likely grasp, none of them verified, the surest grasp is taken.
+        enough: after so many objects, none with a verified grasp, the surest grasp is taken if it is likely.
         on_thing: called with each object that was looked at.
         plan: of `plan_grasps`. Its `seed` is advanced with every failure of an object.
 
@@ -136,7 +136,7 @@ def plan_any_thing(
         things.append(_thing_plan(points, scene, hand, failed, plan))
         if on_thing is not None:
             on_thing(things[-1])
-        likely = sum(thing.is_likely for thing in things) >= enough
+        likely = sum(thing.looked_at for thing in things) >= enough and any(thing.is_likely for thing in things)
         late = seconds is not None and time.perf_counter() - began > seconds
         over = likely or late or things[-1].surety > 1.0
     return tuple(sorted(things, key=lambda thing: -thing.surety))
