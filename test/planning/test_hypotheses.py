@@ -281,7 +281,7 @@ def test_at_less_than_the_assumed_mass_a_grasp_is_less_sure():
 def test_what_is_tried_at_less_mass_begins_with_the_strongest():
     seen, hand = seen_from(), load_hand("allegro_right")
     worlds = build_worlds(seen, hand, object_parts(seen.object), PROTOCOLS["standard"])
-    context, grasps = verification.VerificationContext(worlds, None), planned().grasps[:4]
+    context, grasps = verification.VerificationContext(worlds, None), planned().tried[:4]
     lifted = verification.payloads(context, grasps, lambda: False)
     alone = [verification.payloads(context, [grasp], lambda: False)[0] for grasp in grasps]
     # Of what is no stronger than one before nothing is told.
