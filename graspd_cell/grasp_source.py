@@ -72,6 +72,8 @@ def cloud_of(view: DepthView) -> PointCloud:
     return cloud_from_depth(view.depth, camera, view.T_base_camera)
 
 
+# Why no thing is left.
+EMPTY = "the bin is empty"
 # Measured surfaces stray so far; things rise at most so far above the floor [m].
 _STRAY, _RISE = 0.006, 0.3
 # The table's top, and how far above it hands keep [m]: arms and cameras are no more exact.
@@ -123,7 +125,7 @@ def _offer(found: Sequence[ThingPlan], seconds: float) -> Offer:
     failed = tuple(Failure(thing.place) for thing in found if thing.grasp is None and thing.looked_at)
     reasons = "; ".join(dict.fromkeys(thing.reason for thing in found if thing.reason))
     if not found or found[0].grasp is None:
-        told, over = reasons or "nothing is seen in the bin", all(thing.reason == OUT_OF_TRIES for thing in found)
+        told, over = reasons or EMPTY, all(thing.reason == OUT_OF_TRIES for thing in found)
         return Offer(None, things=len(found), reason=told, failures=failed, exhausted=over, seconds=seconds)
     best = found[0]
     assert best.grasp is not None

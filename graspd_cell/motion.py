@@ -11,6 +11,7 @@ wheel goes from state to state only: waypoints in between are sent to a server.
 
 from __future__ import annotations
 
+import time
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property, lru_cache
@@ -122,12 +123,16 @@ def _hand_surface(hand: HandModel) -> tuple[Points, Int[np.ndarray, "_"]]:
     return dense_samples(hand, count=_SAMPLES)[:2]
 
 
-def hand_balls(arm: Arm, hand: HandModel, joints: Joints) -> Balls:
-    """Return the hand at its joint values, in the frame of the arm's tip."""
+def hand_points(hand: HandModel, joints: Joints) -> tuple[Points, Int[np.ndarray, "_"]]:
+    """Return points of the hand's surface at its joint values, base frame of the hand [m], and their links."""
     points, links = _hand_surface(hand)
     rotations, translations = link_poses(hand, joints)
-    local = np.einsum("nij,nj->ni", np.asarray(rotations)[links], points) + np.asarray(translations)[links]
-    mount = tip_hand(arm, hand)
+    return np.einsum("nij,nj->ni", np.asarray(rotations)[links], points) + np.asarray(translations)[links], links
+
+
+def hand_balls(arm: Arm, hand: HandModel, joints: Joints) -> Balls:
+    """Return the hand at its joint values, in the frame of the arm's tip."""
+    local, mount = hand_points(hand, joints)[0], tip_hand(arm, hand)
     return balls_about(local @ mount.rotation.numpy().T + mount.translation.numpy())
 
 
@@ -306,7 +311,7 @@ def find_path(mover: Mover, start: Joints, goal: Joints, seconds: float = 5.0) -
     """Return waypoints from one posture to another whose straight connections are clear.
 
     Raises:
-        NoMotionError: the goal is in something, or no way was found in `seconds`.
+        NoMotionError: the goal is in something, or no way was found in `seconds` of this thread.
     """
     ends = np.stack([start, goal])
     # Where the arm stands it stands, whatever it touches there.
@@ -358,7 +363,9 @@ def _planned(mover: Mover, start: Joints, goal: Joints, allowed: np.ndarray, sec
     planner.setRange(0.6)
     planner.setProblemDefinition(problem)
     planner.setup()
-    if str(planner.solve(seconds)) != "Exact solution":
+    # Of the processor's time: what a busy machine takes away says nothing of the way.
+    end = time.thread_time() + seconds
+    if str(planner.solve(base.PlannerTerminationCondition(lambda: time.thread_time() > end))) != "Exact solution":
         return None
     path: Any = problem.getSolutionPath()
     geometric.PathSimplifier(about).simplify(path, 0.3)
@@ -416,4 +423,6 @@ def timed(arm: Arm, path: Path, speeds: Speeds) -> JointMotion:
     if trajectory is None:
         raise NoMotionError(f"motion: toppra found no times for a path of {len(rows)} rows of {arm.name}")
     times = np.linspace(0.0, trajectory.duration, max(2, 1 + int(np.ceil(trajectory.duration / _PERIOD))))
-    return JointMotion(arm.joint_names, times[1:], trajectory(times)[1:], trajectory(times, 1)[1:])
+    # The spline may swing beyond a limit that the path touches.
+    rows = np.clip(trajectory(times)[1:], arm.lower, arm.upper)
+    return JointMotion(arm.joint_names, times[1:], rows, trajectory(times, 1)[1:])

@@ -104,7 +104,7 @@ class Pace:
     grasp: ExecutionPace = field(default_factory=ExecutionPace)
     patience: float = 3.0
     settle: float = 0.4
-    least_probability: float = 0.4
+    least_probability: float = 0.05
 
 
 @dataclass(eq=False)
@@ -258,7 +258,7 @@ class Picker:
         self._wait(self._pace.settle)
         assert taking.offer.grasp is not None
         taking.hold = after_squeeze(self._hand, taking.offer.grasp, self._robot.joints())
-        return grips(taking.hold)
+        return grips(taking.hold, self._hand)
 
     def lift(self, taking: _Taking) -> None:
         """Lift along graspd's path."""

@@ -1,8 +1,8 @@
 """The next object of a scene: of all objects seen, one with a sure grasp, else the surest ones.
 
 Objects without failures come first, then the highest, since nothing lies on them. An object without failures gets one
-round of the planner. The first verified grasp ends the search, so a request costs little more than one for a single
-object.
+round of the planner. The first verified grasp ends the search. Else it ends after `enough` objects if one
+of them has a likely grasp, so that a request for any of many objects mostly costs no more than one for two of them.
 """
 
 from __future__ import annotations
@@ -18,6 +18,7 @@ from jaxtyping import Float
 from graspd_core.config import SceneConfig
 from graspd_core.errors import CloudError, MeshError
 from graspd_core.hands.model import HandModel
+from graspd_core.mesh.surface_queries import make_surface, surface_distance
 from graspd_core.optimize.plan_config import load_preset
 from graspd_core.perception.cloud.point_cloud import PointCloud
 from graspd_core.perception.obstacles import with_neighbours
@@ -34,6 +35,10 @@ LIKE_DISTANCE, LIKE_TURN = 0.015, 0.26
 OUT_OF_TRIES = "tried in vain too often"
 # What is seen within this of a place where something failed is that thing [m].
 _SAME_PLACE = 0.04
+# Of a likely grasp.
+_LIKELY = 0.5
+# Nearly all points of a known solid that stray off it are within this of its surface [m], also at edges.
+_STRAY, _NEARLY_ALL = 0.016, 0.9
 
 
 @dataclass(frozen=True, eq=False)
@@ -75,6 +80,11 @@ class ThingPlan:
         return self.points.mean(0)
 
     @property
+    def is_likely(self) -> bool:
+        """Whether its grasp holds likelier than not, as far as anybody weighed that."""
+        return self.grasp is not None and (self.grasp.probability is None or self.grasp.probability >= _LIKELY)
+
+    @property
     def surety(self) -> float:
         """Probability that its grasp holds, more than one for a verified grasp, less than zero for none."""
         if self.grasp is None:
@@ -92,6 +102,7 @@ def plan_any_thing(
     failures: Sequence[Failure] = (),
     tries: int = 4,
     seconds: float | None = None,
+    enough: int = 2,
     on_thing: Callable[[ThingPlan], None] | None = None,
     **plan: Any,
 ) -> tuple[ThingPlan, ...]:
@@ -102,10 +113,11 @@ def plan_any_thing(
         hand: that grasps.
         settings: of the way from clouds to scenes.
         surface: what all objects stand on, if it is known.
-        solids: what else is known to stand there, by name, frame of the views [m].
+        solids: what else is known to stand there, by name, frame of the views [m]. It is not an object.
         failures: of before. An object is skipped after `tries` of them, and grasps like them are left out.
         tries: the most tries for an object.
         seconds: after which no further object is begun.
+        enough: after so many objects, none with a verified grasp, the surest grasp is taken if it is likely.
         on_thing: called with each object that was looked at.
         plan: of `plan_grasps`. Its `seed` is advanced with every failure of an object.
 
@@ -114,7 +126,8 @@ def plan_any_thing(
         ConfigError: see `plan_grasps`.
     """
     began, things, over = time.perf_counter(), list[ThingPlan](), False
-    for points, failed in _in_order(find_things(views, settings and settings.segmentation), failures):
+    seen = [p for p in find_things(views, settings and settings.segmentation) if not _is_solid(p, solids or {})]
+    for points, failed in _in_order(seen, failures):
         if over or len(failed) >= tries:
             told = OUT_OF_TRIES if len(failed) >= tries else "not looked at"
             things.append(ThingPlan(points, reason=told, looked_at=False))
@@ -123,8 +136,17 @@ def plan_any_thing(
         things.append(_thing_plan(points, scene, hand, failed, plan))
         if on_thing is not None:
             on_thing(things[-1])
-        over = things[-1].surety > 1.0 or (seconds is not None and time.perf_counter() - began > seconds)
+        likely = sum(thing.looked_at for thing in things) >= enough and any(thing.is_likely for thing in things)
+        late = seconds is not None and time.perf_counter() - began > seconds
+        over = likely or late or things[-1].surety > 1.0
     return tuple(sorted(things, key=lambda thing: -thing.surety))
+
+
+def _is_solid(points: Float[np.ndarray, "_ 3"], solids: Mapping[str, Sequence[TriangleMesh]]) -> bool:
+    """Whether some points are strays of a known solid."""
+    meshes = [mesh for solid in solids.values() for mesh in solid]
+    away = (surface_distance(make_surface(mesh), points) for mesh in meshes)
+    return any(float(np.quantile(one, _NEARLY_ALL)) < _STRAY for one in away)
 
 
 def _in_order(

@@ -41,7 +41,7 @@ from graspd_core.types import (
 )
 from graspd_core.verify.limits import LEAST_PAYLOAD
 from graspd_core.verify.run_clock import Run, result_of
-from graspd_core.verify.verification import greatest_payload, rank_by_robustness, trials_ahead
+from graspd_core.verify.verification import payloads, rank_by_robustness, trials_ahead
 
 # Grasps that are weighed where none of them is verified.
 _WEIGHED = 8
@@ -179,7 +179,7 @@ def _why_few(run: Run, scene: Scene, bound: BoundRestrictions, found: RoundsResu
     told = why_trials_failed(scene, result.tried)
     if found.good or found.context is None:
         return told
-    most = greatest_payload(found.context, result.tried[:_WEIGHED], run.over)
+    most = max(payloads(found.context, result.tried[:_WEIGHED], run.over), default=0.0)
     return f"{told}; the best of them would hold {most:.2g} kg" if most > LEAST_PAYLOAD else told
 
 

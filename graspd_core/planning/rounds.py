@@ -26,10 +26,10 @@ from graspd_core.verify.verification import (
     TrialsAhead,
     TriedGrasps,
     VerificationContext,
-    greatest_payload,
     lighter,
     make_trial_context,
     measured,
+    payloads,
     run_trials,
     surest_first,
 )
@@ -188,16 +188,18 @@ def _searched_since(state: RoundsResult, began: float) -> RoundsResult:
 def _tried_lighter(
     run: Run, scene: Scene, ahead: TrialsAhead, state: RoundsResult, certainty: CertaintyConfig, count: int
 ) -> RoundsResult:
-    """Try the best grasps again at a mass that the hand can lift, if the assumed one is too heavy."""
+    """Try the best grasps again, the strongest first, at a mass that they lift, if the assumed one is too heavy."""
     if state.context is None:
         return state
     best, others = state.grasps[:_WEIGHED], state.grasps[_WEIGHED:]
-    most = greatest_payload(state.context, best, run.known_over)
+    lifted = payloads(state.context, best, run.known_over)
+    most = max(lifted, default=0.0)
     mass = min(_LIFTED * most, _HALF * scene.object.mass)
     if most <= LEAST_PAYLOAD or run.over():
         return state
-    context = lighter(scene, ahead, state.context, certainty, mass)
-    tried = run_trials(run, context, tuple(replace(grasp, trials=()) for grasp in best), count, 0)
+    context = lighter(scene, ahead, state.context, certainty, mass, most)
+    strongest = sorted(range(len(best)), key=lambda place: -lifted[place])
+    tried = run_trials(run, context, tuple(replace(best[place], trials=()) for place in strongest), count, 0)
     grasps = surest_first((*tried.grasps, *others))
     return replace(state, context=context, mass=mass, grasps=grasps, first=tried.first)
 

@@ -13,12 +13,12 @@ from collections import deque
 from collections.abc import Callable, Generator, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor, wait
 from contextlib import closing
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import lru_cache, partial
 from itertools import islice
 from typing import TypeVar
 
-from graspd_core.config.planning_config import DOUBTED_SHARE, MASS_ASSUMED, MASS_KNOWN, HeldShares
+from graspd_core.config.planning_config import DOUBTED_SHARE, LEAST_LIGHT, MASS_ASSUMED, MASS_KNOWN, HeldShares
 from graspd_core.errors import GraspdError
 from graspd_core.hands.model import HandModel
 from graspd_core.mesh.convex_parts import convex_parts
@@ -163,7 +163,7 @@ class Hypotheses:
         stages: places, which are cheap to try, then other shapes.
         probability: that a grasp which holds under all of them holds on the true object.
         waited_for: set once a trial waits for its world: there is time for other work.
-        doubts: what speaks against the scene itself. No grasp is tried under anything else then, and none passes.
+        doubts: what speaks against the scene or its mass. No grasp is tried under anything else then, and none passes.
     """
 
     stages: tuple[HypothesisStage, ...]
@@ -228,6 +228,15 @@ def hypotheses_of(
         )
         stages.append(HypothesisStage(shapes, LEAST_SHAPES, shares.fails_shapes))
     return Hypotheses(tuple(stages), surest, waited_for)
+
+
+def less_sure(hypotheses: Hypotheses, share: float, most: float) -> Hypotheses:
+    """Return the checks of an object that weighs at most the payload `most` [kg] with the probability `share`."""
+    if share < LEAST_LIGHT:
+        told = f"the hand lifts {most:.2g} kg, and most objects of this volume weigh more"
+        return Hypotheses((), share * MASS_KNOWN.likeliest, doubts=(told,))
+    stages = tuple(replace(stage, though_failed=share * stage.though_failed) for stage in hypotheses.stages)
+    return replace(hypotheses, stages=stages, probability=share * hypotheses.probability)
 
 
 def one_by_one(stage: HypothesisStage, grasp: Grasp, stop: StopHook) -> Results:

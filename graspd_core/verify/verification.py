@@ -18,7 +18,7 @@ import numpy as np
 import torch
 
 from graspd_core.config import VERIFICATIONS, CertaintyConfig, RobustConfig
-from graspd_core.config.planning_config import LIGHTER_SHARE
+from graspd_core.config.planning_config import share_as_light
 from graspd_core.errors import ConfigError
 from graspd_core.hands.model import HandModel
 from graspd_core.perception.scene import Scene, moved_grasp, near_scene, object_parts
@@ -37,6 +37,7 @@ from graspd_core.verify.robustness import (
     begin_in_thread,
     begin_other_worlds,
     hypotheses_of,
+    less_sure,
     one_by_one,
     results_in_order,
     try_hypotheses,
@@ -123,25 +124,29 @@ def make_trial_context(
 
 
 def lighter(
-    scene: Scene, ahead: TrialsAhead, context: VerificationContext, certainty: CertaintyConfig, mass: float
+    scene: Scene, ahead: TrialsAhead, context: VerificationContext, certainty: CertaintyConfig, mass: float, most: float
 ) -> VerificationContext:
-    """Return the context with an object of less mass [kg] than was assumed. Its grasps are less sure."""
+    """Return the context with an object of less `mass` [kg] than was assumed. Its grasps are less sure.
+
+    If most objects of its volume weigh more than the greatest payload `most` [kg], none of its grasps can be verified.
+    """
     trials, others = context.trials, [world.altered(mass) for world in ahead.others]
     around = trials.around and altered(trials.around, mass=mass)
     trials = replace(trials, alone=altered(trials.alone, mass=mass), around=around)
     known = replace(scene, object=replace(scene.object, mass_assumed=False))
     hypotheses = hypotheses_of(known, others, trials, certainty.probability)
-    if hypotheses is not None:
-        hypotheses = replace(hypotheses, probability=LIGHTER_SHARE * hypotheses.probability)
+    if hypotheses is not None and not hypotheses.doubts:
+        hypotheses = less_sure(hypotheses, share_as_light(most, scene.object.mass), most)
     return replace(context, trials=trials, hypotheses=hypotheses)
 
 
-def greatest_payload(context: VerificationContext, grasps: Sequence[Grasp], stop: StopHook) -> float:
-    """Return the greatest payload of the grasps [kg]."""
-    trials, most = context.trials, LEAST_PAYLOAD
+def payloads(context: VerificationContext, grasps: Sequence[Grasp], stop: StopHook) -> list[float]:
+    """Return the greatest payload of each grasp [kg], zero for one that is no stronger than all before."""
+    trials, found = context.trials, list[float]()
     for grasp in grasps:
-        most = max(most, payload(trials.alone, grasp, trials.protocol, least=FINENESS * most, stop=stop))
-    return most
+        least = FINENESS * max(found, default=LEAST_PAYLOAD)
+        found.append(payload(trials.alone, grasp, trials.protocol, least=max(least, LEAST_PAYLOAD), stop=stop))
+    return found
 
 
 # Kept for the last few scenes and hands, which are hashed by identity.

@@ -76,6 +76,15 @@ def test_times_keep_to_speed_and_acceleration():
     np.testing.assert_allclose(motion.velocities[-1], 0.0, atol=1e-6)
 
 
+def test_a_way_that_touches_a_limit_is_not_sent_beyond_it():
+    arm = load_arm("panda_like")
+    at, away = arm.seed.copy(), arm.seed.copy()
+    at[4], away[4], away[0] = arm.upper[4], arm.upper[4] - 1.0, arm.seed[0] + 0.4
+    motion = timed(arm, np.stack([away, at, away + at - arm.seed, arm.seed]), Speeds())
+    assert (motion.positions <= arm.upper).all()
+    assert motion.positions[:, 4].max() > arm.upper[4] - 0.01
+
+
 def test_an_end_in_something_and_a_walled_in_goal_are_told_by_name():
     arm = load_arm("ur5e_like")
     tip = tip_pose(mover_of("ur5e_like"), arm.seed)[:3, 3]

@@ -3,14 +3,15 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 
 import numpy as np
 import pytest
 
 from graspd_cell.grasp_held import after_squeeze, grips, still_holds
-from graspd_cell.grasp_source import InProcessGrasps, Offer
+from graspd_cell.grasp_source import EMPTY, InProcessGrasps, Offer
 from graspd_cell.picker import Cancelled, Ending, Picker
-from graspd_cell.robot import DepthView, JointMotion
+from graspd_cell.robot import DepthView, JointMotion, JointReading
 from graspd_cell.simulated_robot import SimulatedRobot
 from graspd_core.planning.any_thing import Failure
 
@@ -76,13 +77,14 @@ def test_a_thing_goes_to_the_other_bin_and_the_gates_come_in_order(
         np.testing.assert_allclose(end[count:], np.clip(posture.joint_positions, *limits), atol=1e-9)
 
 
-def test_an_empty_bin_ends_it_with_a_reason(robot_of: RobotOf):
-    robot = robot_of("ur5e_like", "parallel_gripper")
-    world = robot.world
+@pytest.mark.parametrize("seed", [0, 1])
+def test_an_empty_bin_ends_it_as_empty_though_walls_stray(robot_of: RobotOf, seed: int):
+    world = robot_of("ur5e_like", "parallel_gripper").world
+    robot = SimulatedRobot(world, seed=seed)
     source = InProcessGrasps(world.arm, world.hand, world.layout, preset="fast")
     picker = picker_of(robot, source)
     assert list(picker.empty_the_bin()) == []
-    assert picker.why_ended
+    assert picker.why_ended == EMPTY
 
 
 def test_a_thing_that_is_taken_away_is_noticed_while_lifting(robot: SimulatedRobot, monkeypatch: pytest.MonkeyPatch):
@@ -107,19 +109,40 @@ def test_a_thing_that_is_taken_away_is_noticed_while_lifting(robot: SimulatedRob
     assert (np.abs(now - hand.open_posture) / hand.joint_scale).max() < 0.1
 
 
-def test_fingers_that_close_on_nothing_are_told_from_fingers_that_press(pair: tuple[str, str], robot_of: RobotOf):
+@pytest.mark.parametrize("strength", [1.0, 3.0])
+def test_fingers_that_close_on_nothing_or_on_each_other_are_told_from_fingers_that_press(
+    pair: tuple[str, str], robot_of: RobotOf, strength: float
+):
     robot = robot_of(*pair, THING, height=0.05)
     robot.wait(1.0)
     offer = KeptGrasps(robot).next(robot.look(), ())
     grasp, hand = offer.grasp, robot.world.hand
     assert grasp is not None
+    touch, press = grasp.grasp.joint_positions, grasp.squeeze.joint_positions
+    grasp = replace(grasp, squeeze=replace(grasp.squeeze, joint_positions=touch + strength * (press - touch)))
     # Far from everything, at the arm's start.
-    for posture in (grasp.pregrasp, grasp.squeeze):
+    for posture in (grasp.pregrasp, grasp.grasp, grasp.squeeze):
         goal = np.clip(posture.joint_positions, hand.lower, hand.upper)[None]
         robot.follow(JointMotion(hand.joint_names, np.array([1.5]), goal, np.zeros_like(goal)), 5.0)
     robot.wait(0.5)
     hold = after_squeeze(hand, grasp, robot.joints())
-    assert not grips(hold).held or not still_holds(hold, hand, robot.joints()).held
+    assert not grips(hold, hand).held
+
+
+def test_jaws_that_close_further_as_a_thing_turns_between_them_still_hold_it(robot_of: RobotOf):
+    robot = robot_of("ur5e_like", "parallel_gripper", THING, height=0.05)
+    robot.wait(1.0)
+    grasp, hand = KeptGrasps(robot).next(robot.look(), ()).grasp, robot.world.hand
+    assert grasp is not None
+    touch, target = (p.joint_positions for p in (grasp.grasp, grasp.squeeze))
+
+    def reading(covered: float) -> JointReading:
+        """A motor pushes the less, the nearer its joint is to the target."""
+        return JointReading(0.0, hand.joint_names, touch + covered * (target - touch), (1 - covered) * (target - touch))
+
+    hold = after_squeeze(hand, grasp, reading(0.0))
+    assert still_holds(hold, hand, reading(0.5)).held
+    assert not still_holds(hold, hand, reading(0.95)).held
 
 
 @pytest.mark.parametrize("after", [0.5, 2.5, 4.5, 6.5])

@@ -37,6 +37,14 @@ def test_the_first_verified_grasp_ends_the_search_and_all_things_are_told(first:
     assert first[1].reason == "not looked at"
 
 
+@pytest.mark.parametrize("enough", [1, 2])
+def test_without_a_verified_grasp_the_search_ends_after_some_objects(views, enough: int):
+    found = plan_any_thing(views, HAND, enough=enough, verify="none", **ASKED)
+    assert [thing.looked_at for thing in found].count(True) == enough
+    assert found[0].grasp is not None
+    assert found[0].grasp.verdict is Verdict.UNVERIFIED
+
+
 def test_what_failed_comes_last_and_is_given_up_after_some_tries(views, first):
     place = first[0].place
     other = plan_any_thing(views, HAND, failures=[Failure(place)], **ASKED)
@@ -61,6 +69,14 @@ def test_nothing_on_the_table_is_no_thing_and_an_empty_cloud_is_told(views: tupl
     assert plan_any_thing([bare], HAND, **ASKED) == ()
     with pytest.raises(CloudError, match="no points at all"):
         plan_any_thing([PointCloud(np.zeros((0, 3)), np.zeros(3))], HAND)
+
+
+def test_what_is_known_to_stand_there_is_no_thing(views: tuple[PointCloud, ...], first: tuple[ThingPlan, ...]):
+    assert first[0].scene is not None
+    known = {"known": [first[0].scene.object.mesh]}
+    left = plan_any_thing(views, HAND, solids=known, failures=[Failure(first[1].place)] * 4, **ASKED)
+    assert [thing.reason for thing in left] == [OUT_OF_TRIES]
+    np.testing.assert_array_equal(left[0].points, first[1].points)
 
 
 def test_alike_is_near_and_turned_by_little():

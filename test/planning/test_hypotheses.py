@@ -15,7 +15,13 @@ from hypothesis import strategies as st
 from graspd_bench.rendering.tabletop import CAMERA, ring_poses, tabletop, views_of
 from graspd_core import PointCloud, load_hand, load_preset, load_scene, plan_grasps, scene_from_views
 from graspd_core.config import CertaintyConfig
-from graspd_core.config.planning_config import DOUBTED_SHARE, LIGHTER_SHARE, MASS_ASSUMED, MASS_KNOWN
+from graspd_core.config.planning_config import (
+    DOUBTED_SHARE,
+    LEAST_LIGHT,
+    MASS_ASSUMED,
+    MASS_KNOWN,
+    share_as_light,
+)
 from graspd_core.errors import ConfigError
 from graspd_core.mesh.convex_parts import convex_parts
 from graspd_core.perception import scene as scene_module
@@ -255,10 +261,32 @@ def test_at_less_than_the_assumed_mass_a_grasp_is_less_sure():
     worlds = build_worlds(seen, hand, object_parts(seen.object), PROTOCOLS["standard"])
     ahead = verification.TrialsAhead(begin_in_thread("worlds", lambda: worlds), (LaterWorld(lambda: None),))
     context = verification.VerificationContext(worlds, None)
-    less = verification.lighter(seen, ahead, context, CertaintyConfig(), 0.05)
-    assert (less.trials.alone.model.body_mass[less.trials.alone.object_body]) == 0.05
-    assert less.hypotheses is not None
-    assert less.hypotheses.probability == LIGHTER_SHARE * MASS_KNOWN.shapes
+    heavy = seen.object.mass
+    half = verification.lighter(seen, ahead, context, CertaintyConfig(), 0.4 * heavy, 0.5 * heavy)
+    assert half.trials.alone.model.body_mass[half.trials.alone.object_body] == 0.4 * heavy
+    share = share_as_light(0.5, 1.0)
+    assert LEAST_LIGHT < share < 1.0
+    assert half.hypotheses is not None
+    assert half.hypotheses.probability == pytest.approx(share * MASS_KNOWN.shapes)
+    assert half.hypotheses.stages[0].though_failed == pytest.approx(share * MASS_KNOWN.fails_places)
+    # Most things of this volume are heavier than a tenth of the heavy end: no grasp of it is verified.
+    tenth = verification.lighter(seen, ahead, context, CertaintyConfig(), 0.08 * heavy, 0.1 * heavy)
+    assert tenth.hypotheses is not None
+    result, probability = try_hypotheses(tenth.hypotheses, GRASP, lambda: False)
+    assert not result.passed
+    assert "most objects of this volume weigh more" in result.reason
+    assert probability == pytest.approx(share_as_light(0.1, 1.0) * MASS_KNOWN.likeliest)
+
+
+def test_what_is_tried_at_less_mass_begins_with_the_strongest():
+    seen, hand = seen_from(), load_hand("allegro_right")
+    worlds = build_worlds(seen, hand, object_parts(seen.object), PROTOCOLS["standard"])
+    context, grasps = verification.VerificationContext(worlds, None), planned().tried[:4]
+    lifted = verification.payloads(context, grasps, lambda: False)
+    alone = [verification.payloads(context, [grasp], lambda: False)[0] for grasp in grasps]
+    # Of what is no stronger than one before nothing is told.
+    assert all(one in (0.0, own) for one, own in zip(lifted, alone, strict=True))
+    assert max(lifted) >= max(alone) / 1.1
 
 
 def test_of_one_view_a_verified_grasp_is_as_sure_as_asked_for():
