@@ -371,7 +371,7 @@ def test_a_bench_tries_them_beside_ours(exported, tmp_path: Path, graspd, capsys
         (("--import", "x"), "imported: give --import FOLDER, and --hand"),
         (("--import", "nowhere", "--hand", "allegro_right"), "nowhere: no such file or folder"),
         (("--import", "x", "--hand", "allegro_right", "--trials", "luck"), "trials: 'luck'; valid: standard"),
-        (("steered", "--import", "x"), "imported: steered does not look at it"),
+        (("steered", "--import", "x"), "imported: not used by steered"),
     ],
 )
 def test_a_bench_without_what_it_needs_is_refused(tmp_path: Path, graspd, capsys, words: tuple[str, ...], message: str):
