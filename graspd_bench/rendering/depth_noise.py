@@ -114,8 +114,8 @@ class DepthCamera:
 
 
 # d415 and d435 are stereo cameras with a narrow and a wide lens (Intel's tuning guide: 0.08 pixels). Structured light
-# has disparity in steps of 1/8 pixel (Khoshelham and Elberink 2012). The error of time of flight hardly grows with depth
-# (Tölgyessy et al. 2021: 1 to 2 mm up to 1 m). At an edge it mixes foreground and background.
+# has disparity in steps of 1/8 pixel (Khoshelham and Elberink 2012). The error of time of flight hardly grows with
+# depth, and edges mix foreground and background (Tölgyessy et al. 2021: 1 to 2 mm up to 1 m).
 CAMERAS = {
     "d415": DepthCamera(PinholeCamera(640, 480, 616.0, 616.0, 319.5, 239.5), DEFAULT),
     "d435": DepthCamera(
@@ -204,7 +204,7 @@ def _shadow(depth: Depth, camera: PinholeCamera, baseline: float) -> Bool[np.nda
 
 
 def _grazing(depth: Depth, camera: PinholeCamera, limit: float, edge: np.ndarray, rng: np.random.Generator):
-    """Return the pixels without depth because of a small viewing angle. Edge pixels are exempt: their normal is wrong."""
+    """Return the pixels without depth because of a small viewing angle. Edges are exempt, having no normal."""
     if not limit:
         return np.zeros(depth.shape, dtype=bool)
     rays = np.nan_to_num(camera_rays(camera))
