@@ -209,10 +209,7 @@ def noise_at(times: float) -> DepthNoise:
 
 @lru_cache(maxsize=1)
 def _seen(thing: str, elevation: float, noise: float, seed: int, resolution: int) -> tuple[ObjectModel, Scene]:
-    """Return the true object, and the scene reconstructed from one view. `elevation` is in degrees.
-
-    Raises CloudError: the view shows no usable object.
-    """
+    """Return the true object, and the scene of one view at `elevation` [deg]. Raises CloudError: no usable object."""
     stage = tabletop(thing, yaw=_YAW)
     poses = ring_poses(1, elevation=float(np.deg2rad(elevation)), azimuth=float(_AZIMUTH))
     views = views_of(stage, CAMERA, poses, noise_at(noise), seed)
@@ -338,7 +335,6 @@ def cases_of(name: str, method: str) -> tuple[MapCase, ...]:
 
 
 def run_map(case: MapCase) -> Record:
-    """Return the figures of one case."""
     cells = [asdict(cell) for cell in run_on(MAPS[case.map].run, case)]
     return {"cells": cells, "held": max(cell["held"] for cell in cells)}
 

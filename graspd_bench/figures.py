@@ -200,8 +200,7 @@ def _inner(grasp: dict[str, Any], trial: str, figure: str) -> float | None:
 def pareto_front(points: Float[np.ndarray, "points axes"]) -> Bool[np.ndarray, "points"]:
     """Return which points are on the Pareto front, if less is better on every axis.
 
-    A point is not on the front if another is no worse on every axis and better on one. Equal points do not exclude
-    each other.
+    A point is off the front if another is no worse on every axis and better on one. Equal points are both on it.
     """
     no_worse = (points[:, None] <= points[None]).all(-1)
     better = (points[:, None] < points[None]).any(-1)

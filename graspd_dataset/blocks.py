@@ -51,7 +51,7 @@ class DatasetObject:
 
     @property
     def asked(self) -> dict[str, Any]:
-        """The content without names, JSON-ready."""
+        """Inputs that identify the object, JSON-ready. Names of files are not among them."""
         return {"content": self.content, "scale": self.scale, "mass": self.mass, "friction": self.friction}
 
     @cached_property

@@ -148,7 +148,7 @@ def inner_contacts(hand: HandModel, per_link: int) -> Int[np.ndarray, "contacts"
 
 
 def _facing(hand: HandModel) -> Float[np.ndarray, "candidates"]:
-    """Return for each candidate the cosine between its normal and its closing motion (on the palm: the palm's normal)."""
+    """Return each candidate's cosine between its normal and its closing motion (on the palm: the palm's normal)."""
     links = hand.candidate_link
     early, late = (
         link_poses(hand, hand.open_posture + share * (hand.closed_posture - hand.open_posture)) for share in (0.4, 0.6)
@@ -334,10 +334,7 @@ def cooling(progress: float) -> float:
 
 
 def jump(uniform: Float[Tensor, "*batch"], temperature: float) -> Float[Tensor, "*batch"]:
-    """Return jumps from −1 to 1 by Ingber's distribution (1989), from uniform numbers in [0, 1).
-
-    Most jumps are about as large as the temperature.
-    """
+    """Map uniform numbers in [0, 1) to jumps from −1 to 1 by Ingber's distribution (1989). Most are of size T."""
     side = 2 * uniform - 1
     return side.sign() * temperature * ((1 + 1 / temperature) ** side.abs() - 1)
 

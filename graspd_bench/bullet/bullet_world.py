@@ -165,7 +165,7 @@ class BulletWorld:
 
     Attributes:
         hand: the hand.
-        parts: text of an OBJ file with the object's convex parts [m], in its frame of centre of mass and principal axes.
+        parts: text of an OBJ file with the convex parts [m], in the frame of centre of mass and principal axes.
         mass: mass of the object [kg].
         center_of_mass: centre of mass in the object frame [m].
         axes: principal axes of inertia, the rotation `R_object_principal`.

@@ -75,10 +75,7 @@ def render_shaded(
     width: int = 640,
     height: int = 480,
 ) -> UInt8[np.ndarray, "height width 3"]:
-    """Return an RGB picture of coloured meshes on white. Light comes from the camera and from +z.
-
-    The colour of a mesh is RGB from 0 to 1.
-    """
+    """Return a picture of meshes with RGB colours (0 to 1) on white. Light comes from the camera and from +z."""
     together = joined(*(mesh for mesh, _ in meshes))
     colours = np.repeat(np.array([rgb for _, rgb in meshes], dtype=float), [len(m.faces) for m, _ in meshes], axis=0)
     distance, face, normal = _cast(together, camera_of_view(width, height), T_world_camera)

@@ -282,10 +282,7 @@ def _shape(name: str, **settings: Any) -> Callable[[Path], Scene]:
 
 
 def _poisoned(channel: int, value: float) -> Callable[[Path], Scene]:
-    """Return a loader of a scene whose SDF has a bad value at a node on the surface, where fingers sample it.
-
-    Channel 0 is the distance, channels 1 to 3 are its gradient.
-    """
+    """Return a loader of a scene whose SDF has a bad value at a node on the surface, where fingers sample it."""
 
     def scene(folder: Path) -> Scene:
         clean = load_scene("shape:cylinder")
