@@ -184,7 +184,7 @@ def _prepare(warm: bool) -> None:
         plan_grasps(load_scene("shape:sphere"), load_hand("allegro_right"), count=1, preset="fast")
 
 
-# Name for all studies that need only shipped files.
+# Name for all studies whose field `usual` is true.
 ALL = "all"
 
 
@@ -206,7 +206,7 @@ class Plan:
 
 
 def studies_of(names: Sequence[str]) -> dict[str, Study]:
-    """Return the named studies, each once. `all` stands for all studies that need only shipped files.
+    """Return the named studies, each once. `all` stands for all studies whose field `usual` is true.
 
     Raises ConfigError: there is no such study. The message lists the valid names.
     """

@@ -141,7 +141,7 @@ class Study:
         came: returns the result of a record without faults, in a few words.
         alone: whether every case gets a new process without warm-up.
         patience: returns the seconds until a case counts as hung.
-        usual: whether `graspd bench all` includes the study. Such studies need only shipped files.
+        usual: whether `graspd bench all` includes the study. It must then need only shipped files.
         failures: whether `sections` also needs the records of failed cases.
     """
 

@@ -66,7 +66,7 @@ def fill(document: Path, sections: Mapping[str, Sequence[str | Picture]]) -> lis
             text = section.sub(lambda found, new=new: f"{found[1]}{new}\n{found[2]}", text, count=1)
             filled.append(name)
     if not filled:
-        raise ConfigError(f"{document}: has none of the sections {', '.join(sections)}; valid: <!-- bench:begin --> …")
+        raise ConfigError(f"{document}: has none of the sections {', '.join(sections)}; add <!-- NAME:begin --> …")
     save_text(document, text)
     return filled
 

@@ -82,12 +82,12 @@ def entry(values: Any, key: str, where: str) -> Any:
         raise FormatError(f"{where}: {shown(values)}; expected a mapping with the key {key!r}")
     if key not in values:
         known = ", ".join(sorted(str(name)[:40] for name in values)[:20])
-        raise FormatError(f"{where}: the key {key!r} is missing; keys there: {known or 'none'}")
+        raise FormatError(f"{where}: the key {key!r} is missing; present keys: {known or 'none'}")
     return values[key]
 
 
 def quaternion_of(value: Any, where: str) -> Float[np.ndarray, "4"]:
-    """Return a unit quaternion, wxyz. Raises FormatError: not four numbers, or a length more than 0.01 off 1."""
+    """Return a unit quaternion, wxyz. Raises FormatError: not four numbers, or the length is not 1 within 0.01."""
     quaternion = numbers_of(value, (4,), where)
     length = float(np.linalg.norm(quaternion))
     if abs(length - 1) > _UNIT:
@@ -111,7 +111,7 @@ def joints_by_name(values: Any, hand: HandModel, where: str) -> Float[np.ndarray
     for name, follows in zip(names, all_joint_positions(hand, joints), strict=True):
         given = float(numbers_of(values.get(name, follows), (), f"{where}: {name}"))
         if abs(given - follows) > _COUPLED:
-            raise FormatError(f"{where}: joint {name!r} is {given:.4g}; valid: {follows:.4g}, by its coupling")
+            raise FormatError(f"{where}: joint {name!r} is {given:.4g}; valid: {follows:.4g}, as it is coupled")
     return joints
 
 

@@ -216,7 +216,7 @@ def _row(own: Sequence[Record]) -> list[str]:
 
 
 def _share(own: Sequence[Record], name: str) -> str:
-    """Return how many verified grasps held, with a 90 % interval. It resamples views, as a view's errors correlate."""
+    """Return how many verified grasps held, with a 90 % interval over resampled views (a view's errors correlate)."""
     pairs = np.array([(r[name], r["verified"]) for r in own])
     if not pairs[:, 1].sum():
         return "–"

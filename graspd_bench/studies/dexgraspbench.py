@@ -211,7 +211,7 @@ def evaluate(case: BenchCase, written: Path, xml: Path, paths: Sequence[Path]) -
 
 
 def _run(command: Sequence[str], folder: Path, patience: float) -> str:
-    """Run a command in `folder`. Return its last line of output. Raises ConfigError: it failed, or ran too long [s]."""
+    """Run a command for up to `patience` [s]. Return its last line of output. Raises ConfigError: it failed."""
     kept = {name: value for name, value in os.environ.items() if not name.startswith(("PYTHON", "VIRTUAL_ENV"))}
     try:
         done = subprocess.run(

@@ -140,7 +140,7 @@ def test_what_is_not_there_is_told_in_a_line(tmp_path: Path, capsys):
     assert "not a checkout of DexGraspBench: src/main.py is missing" in told(tmp_path / "none")
     folder = checkout(tmp_path / "bench")
     assert "python: '/no/python' is not a program" in told(folder, python="/no/python")
-    assert "python: not given; --python PATH" in told(folder, python="")
+    assert "python: not given; give --python PATH" in told(folder, python="")
     assert "hand 'leap_right'; valid: allegro_right" in told(folder, "--hand", "leap_right")
     (folder / "src" / "main.py").write_text("import no_such_library\n")
     line = told(folder)

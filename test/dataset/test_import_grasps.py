@@ -332,7 +332,7 @@ def test_coupled_joints_may_be_named_and_must_follow():
     values = dict(zip(all_joint_names(hand), all_joint_positions(hand, joints).tolist(), strict=True))
     assert np.abs(joints_by_name(values, hand, "x") - joints).max() < 1e-12
     coupled = next(mimic.name for mimic in hand.mimics)
-    with pytest.raises(FormatError, match=f"joint '{coupled}' is .*; valid: .*, by its coupling"):
+    with pytest.raises(FormatError, match=f"joint '{coupled}' is .*; valid: .*, as it is coupled"):
         joints_by_name({**values, coupled: values[coupled] + 0.1}, hand, "x")
 
 
@@ -367,8 +367,8 @@ def test_a_bench_tries_them_beside_ours(exported, tmp_path: Path, graspd, capsys
 @pytest.mark.parametrize(
     ("words", "message"),
     [
-        (("imported",), "imported: give --import FOLDER, and --hand"),
-        (("--import", "x"), "imported: give --import FOLDER, and --hand"),
+        (("imported",), "imported: give both --import FOLDER and --hand"),
+        (("--import", "x"), "imported: give both --import FOLDER and --hand"),
         (("--import", "nowhere", "--hand", "allegro_right"), "nowhere: no such file or folder"),
         (("--import", "x", "--hand", "allegro_right", "--trials", "luck"), "trials: 'luck'; valid: standard"),
         (("steered", "--import", "x"), "imported: not used by steered"),
