@@ -5,8 +5,8 @@ Hand, mass and steps are the same: a frozen hand, 1 kg, 35 steps of 1/240 s, 9.8
 product of Bullet's two coefficients, 3 times 3. Nothing bounces. In Bullet the hand's restitution of 0 prevents it.
 
 `gravity_trial` measures how far gravity moves an object within 2 s while the hand squeezes it. The displacement trial
-of the papers has a frozen hand, without motors and effort limits, and its 0.15 s are too short to show a slow slip.
-Hand, object and physics of `gravity_trial` are those of the hold trial.
+of the papers has a frozen hand, without motors and effort limits. Its 0.15 s are too short to show a slow slip. Hand,
+object and physics of `gravity_trial` are those of the hold trial.
 
 `dropped` and `settle` let objects come to rest on a table. `lift_out` is the lift trial with one of these objects. The
 other objects are free bodies. All final poses are kept, so that the next lift can continue from them.

@@ -191,7 +191,7 @@ def _shadow(depth: Depth, camera: PinholeCamera, baseline: float) -> Bool[np.nda
     """Return the pixels that a second lens, `baseline` [m] to the right, cannot see because a nearer point hides them.
 
     In the second image a point appears f B / z pixels further left. A pixel is hidden if a pixel to its right in the
-    same row appears at the same place there or further left.
+    row does not appear further right there.
     """
     if not baseline:
         return np.zeros(depth.shape, dtype=bool)

@@ -1,7 +1,7 @@
 """Study `simulators`: hold and displacement trials of the same grasps in MuJoCo and in PyBullet. Do they agree?
 
 The study uses the first grasps of the optimiser's own ranking. No trial filters them. Each is tried a second time with
-the hand displaced by up to 5 mm and 5°, as in the noisy trial, so that some grasps fail.
+the hand displaced by up to 5 mm and 5°, as in the noisy trial. So some grasps fail.
 """
 
 from __future__ import annotations
