@@ -155,7 +155,7 @@ def spread(rows: Iterable[Row], figure: str) -> Spread | None:
 
 
 def share_interval(held: int, asked: int) -> tuple[float, float]:
-    """Return the 95 % interval of a share (Wilson 1927)."""
+    """Return the 95 % interval of the share `held` / `asked` (Wilson 1927)."""
     z, share = 1.96, held / asked
     middle = share + z * z / (2 * asked)
     half = z * math.sqrt(share * (1 - share) / asked + z * z / (4 * asked * asked))

@@ -64,7 +64,7 @@ def read_record(folder: Path, study: str, case: Case, code: str | None, *, faile
 
 
 def results_document(records: Sequence[Record]) -> dict[str, Any]:
-    """Return records as one JSON-ready document."""
+    """Return the content of results.json, JSON-ready."""
     return {"format": FORMAT, "version": VERSION, "records": records}
 
 

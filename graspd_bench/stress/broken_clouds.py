@@ -301,7 +301,6 @@ def with_an_arm(shape: str) -> Views:
 
 
 def thrice(shape: str) -> Views:
-    """Return the same view three times."""
     (view,) = _seen(tabletop(shape, yaw=_YAW))
     return [view, view, view]
 
