@@ -81,7 +81,7 @@ def _measured() -> Iterator[Case]:
 
 
 def _refused() -> Iterator[Case]:
-    """Yield cases of clouds without an object. An error is expected."""
+    """Yield cases of clouds without an object. No grasp is expected."""
     refused = (
         ("empty", "no point at all", lambda: [_cloud(np.zeros((0, 3)))], ("CloudError",)),
         ("no-view", "a list of no views", lambda: [], ("CloudError",)),
