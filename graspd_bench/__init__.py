@@ -1,1 +1,1 @@
-"""The benchmark: studies, charts and tables, and code that only they use."""
+"""The benchmark: studies, their charts and tables, and the code that only studies use."""

@@ -1,4 +1,4 @@
-"""`graspd bench`: runs every study, resumes it, and writes figures, tables, charts and pages."""
+"""The command `graspd bench`: it runs or resumes studies, and writes their figures, tables, charts and pages."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ EXIT_FAULTS = 1
 
 
 def add_command(commands: Any) -> None:
-    """Add this command to the parser's."""
+    """Add this command to the parser."""
     parser = commands.add_parser("bench")
     parser.set_defaults(run=run)
     parser.add_argument("studies", nargs="*", metavar="STUDY", help="main (default), all, or others of docs/bench.md")
@@ -62,7 +62,7 @@ def add_command(commands: Any) -> None:
 
 
 def run(options: argparse.Namespace) -> int:
-    """Run the command. Return the exit status: 0, 1 if something is wrong, 130 after Ctrl-C. Finished cases stay."""
+    """Run the command. Return the exit status: 0, 1 if a case has faults, 130 after Ctrl-C. Finished cases stay."""
     from graspd_bench.result_store import read_results, results_document, write_results
     from graspd_bench.run_studies import faults_of, make_plan, records_of, run_plan, studies_of
     from graspd_bench.study import Request
@@ -71,7 +71,7 @@ def run(options: argparse.Namespace) -> int:
     if options.processes < 1:
         raise ConfigError(f"processes: {options.processes}; at least 1")
     words = list(options.studies)
-    # One study is followed by a folder.
+    # The word after `dexgraspbench` is the folder of its checkout, not a study.
     after = words.index("dexgraspbench") + 1 if "dexgraspbench" in words else len(words)
     checkout = "".join(words[after : after + 1])
     del words[after : after + 1]
@@ -125,7 +125,7 @@ def _report(options: argparse.Namespace, plan: Plan) -> None:
 
     with busy("report"):
         sections = report_of(plan, options.chart)
-    # Every object's table is long, and what a first page shows is part of the whole.
+    # The tables of single objects are long, and the section `bench` repeats a part of `bench-all`.
     shown = [written(parts) for name, parts in sections.items() if name not in ("bench-objects", "bench")]
     print("\n\n".join(filter(None, shown)))
     wrong = []
@@ -134,13 +134,13 @@ def _report(options: argparse.Namespace, plan: Plan) -> None:
             fill(document, sections)
         except ConfigError as error:
             wrong.append(error)
-    # One page that cannot be filled leaves the others filled.
+    # Every document is filled before the first error is raised.
     if wrong:
         raise wrong[0]
 
 
 class Lines:
-    """Progress over cases: a bar on a terminal, elsewhere a line for each case. The first line tells the duration."""
+    """Progress over cases: a bar on a terminal, otherwise a line per case. The first line estimates the duration."""
 
     def __init__(self, plan: Plan, processes: int) -> None:
         self.plan, self.processes = plan, processes

@@ -1,7 +1,7 @@
-"""Failure maps, which show where methods stop working. `MAPS` is the registry.
+"""Failure maps: heat maps that show under which conditions methods fail. `MAPS` is the registry.
 
-A case is one planning and the cells that its grasps are tried in: friction and mass, the object's size, a single depth
-view, or the wall of a cup. The heat maps show the share held in every cell, and where half of it is lost.
+The axes are friction and mass, object size, view and noise, or wall and grid. A case plans once and tries its grasps in
+one or more cells of a map. A cell shows the share of grasps that held. A line marks where it falls below one half.
 """
 
 from __future__ import annotations
@@ -38,26 +38,26 @@ from graspd_core.verify.hold_trial import hold_trial
 from graspd_core.verify.world import PROTOCOLS, Protocol, at_friction, build_world
 from graspd_dataset.run_records import markdown_table
 
-# Where a cell lies on an axis of its map: a number, or the name of an object.
+# The place of a cell on an axis: a number, or the name of an object.
 Place = float | str
 
-# What an empty place among the grasps asked for is called.
+# Reasons of failure for requested grasps that do not exist.
 NOT_FOUND, NO_SCENE = "no grasp found", "no scene"
 
 
 @dataclass(frozen=True)
 class MapCase(Case):
-    """One planning, and the cells that its grasps are tried in.
+    """One planning run, and the cells in which its grasps are tried.
 
     Attributes:
         map: name of the map.
-        preset: settings of the method.
+        preset: preset of the method.
         thing: name of the object.
         across: place of all its cells on the horizontal axis.
         up: places of its cells on the vertical axis.
-        count: requested raw grasps, each of which is tried in every cell.
-        seed: of everything that is drawn.
-        hand: by name.
+        count: number of requested raw grasps. Each is tried in every cell.
+        seed: random seed of the planner and the sensor noise.
+        hand: name of the hand.
     """
 
     map: str
@@ -77,12 +77,12 @@ class MapCase(Case):
 
 @dataclass(frozen=True)
 class MapCell:
-    """The results of one case's grasps in one cell.
+    """Results of one case's grasps in one cell.
 
     Attributes:
-        up: its place on the vertical axis.
-        held: grasps that passed the hold trial.
-        reasons: why the others failed, and how many for each. A grasp that was not found has a reason, too.
+        up: place of the cell on the vertical axis.
+        held: number of grasps that passed the hold trial.
+        reasons: number of failed grasps by reason. Grasps that were not found count as failed.
     """
 
     up: Place
@@ -90,12 +90,12 @@ class MapCell:
     reasons: Mapping[str, int]
 
 
-# What a map does for each of its cases. A scene that is refused raises a GraspdError.
+# Runs a case of a map. It raises GraspdError if no scene can be built.
 Run = Callable[[MapCase], tuple[MapCell, ...]]
 
 
 def run_on(run: Run, case: MapCase) -> tuple[MapCell, ...]:
-    """Return the cells of a case. If its scene is refused, all of its grasps are lost for that reason."""
+    """Run a case. If its scene cannot be built, all of its grasps fail for that reason."""
     try:
         return run(case)
     except GraspdError as error:
@@ -105,18 +105,16 @@ def run_on(run: Run, case: MapCase) -> tuple[MapCell, ...]:
 
 @lru_cache(maxsize=4)
 def settings(preset: str) -> PlanConfig:
-    """Return settings by name."""
     return load_preset(preset)
 
 
 @lru_cache(maxsize=4)
 def hand_for(name: str, candidates: int) -> HandModel:
-    """Return a hand with so many contact candidates."""
     return load_hand(name, candidates=candidates)
 
 
 def plan(case: MapCase, scene: Scene) -> tuple[HandModel, tuple[Grasp, ...]]:
-    """Return the hand and the first grasps of the method's own ranking, none filtered by a trial."""
+    """Return the hand, and the first grasps of the method's own ranking. No trial filters them."""
     config = settings(case.preset)
     hand = hand_for(case.hand, config.problem.fine_candidates)
     return hand, raw_grasps(scene, hand, config, case.count, case.seed)
@@ -125,7 +123,7 @@ def plan(case: MapCase, scene: Scene) -> tuple[HandModel, tuple[Grasp, ...]]:
 def try_grasps(
     case: MapCase, up: Place, hand: HandModel, target: ObjectModel, grasps: Sequence[Grasp], protocol: Protocol
 ) -> MapCell:
-    """Run the hold trial of every grasp on `target`."""
+    """Run the hold trial of every grasp on `target`. Return the results as the cell at `up`."""
     if not grasps:
         return MapCell(up, 0, {NOT_FOUND: case.count})
     world = build_world(hand, target, object_parts(target), protocol)
@@ -141,7 +139,7 @@ _YAW, _AZIMUTH = 0.3, np.deg2rad(20.0)
 
 
 def run_friction_mass(case: MapCase) -> tuple[MapCell, ...]:
-    """Plan at the friction of the case, for 0.1 kg, and try at every mass."""
+    """Plan with the case's friction and a mass of 0.1 kg. Try the grasps at every mass [kg]."""
     config = settings(case.preset)
     scene = load_scene(
         f"shape:{case.thing}", mass=PROTOCOL_MASS, friction=float(case.across), resolution=config.resolution
@@ -152,7 +150,7 @@ def run_friction_mass(case: MapCase) -> tuple[MapCell, ...]:
 
 
 def run_size(case: MapCase) -> tuple[MapCell, ...]:
-    """Plan and try on the shape, scaled so that its least width is that share of the hand's span, at 0.1 kg."""
+    """Plan and try on a scaled shape of 0.1 kg. Its least width is the fraction `case.across` of the hand's span."""
     config = settings(case.preset)
     width = float(case.across) * _span(case.hand, config.problem.fine_candidates)
     scale = width / least_width(make_shape(case.thing))
@@ -162,20 +160,20 @@ def run_size(case: MapCase) -> tuple[MapCell, ...]:
 
 
 def least_width(mesh: TriangleMesh) -> float:
-    """Return the least extent along the axes of a mesh [m]. For the authored shapes the hand must span it."""
+    """Return the least extent of a mesh along its x, y and z axes [m]. The hand must open at least this wide."""
     return float(np.ptp(mesh.vertices, axis=0).min())
 
 
 def hand_span(hand: HandModel) -> float:
-    """Return the greatest distance between two fingertips that joints within their limits allow [m].
+    """Return the greatest distance between two fingertips within the joint limits [m].
 
-    It is the greatest of a few thousand seeded postures, about a millimetre below the true one.
+    It is the maximum over 4096 seeded random postures, about 1 mm below the true value.
     """
     fingers = find_fingers(hand)
     draw = torch.Generator().manual_seed(0)
     lower, upper = torch.as_tensor(hand.lower), torch.as_tensor(hand.upper)
     shares = torch.rand(_POSTURES, hand.num_joints, generator=draw, dtype=torch.float64)
-    # The greatest distances are at limits: half of the postures have every joint at one of its ends.
+    # The greatest distances occur at joint limits, so half of the postures have every joint at a limit.
     shares[::2] = shares[::2].round()
     kinematics = make_kinematics(hand, dtype=torch.float64)
     tips = points_in_base(
@@ -190,7 +188,7 @@ def _span(hand: str, candidates: int) -> float:
 
 
 def run_view(case: MapCase) -> tuple[MapCell, ...]:
-    """Plan on the reconstruction of one view at that elevation [deg], and try on the true object in its place."""
+    """Plan on the reconstruction of one view. Try on the true object. `case.across` is the elevation [deg]."""
     (noise,) = case.up
     truth, scene = _seen(case.thing, float(case.across), float(noise), case.seed, settings(case.preset).resolution)
     hand, grasps = plan(case, scene)
@@ -198,9 +196,9 @@ def run_view(case: MapCase) -> tuple[MapCell, ...]:
 
 
 def noise_at(times: float) -> DepthNoise:
-    """Return the usual sensor with its errors and losses so many times as large, none at all at zero.
+    """Return the default depth noise with errors and losses scaled by `times`, or no noise if `times` is 0.
 
-    Its resolution, its range and the angles at which it goes blind stay, because they are no noise.
+    Resolution, range and grazing angle are not scaled, because they are not noise.
     """
     if not times:
         return NONE
@@ -211,10 +209,7 @@ def noise_at(times: float) -> DepthNoise:
 
 @lru_cache(maxsize=1)
 def _seen(thing: str, elevation: float, noise: float, seed: int, resolution: int) -> tuple[ObjectModel, Scene]:
-    """Return the true object and the scene of one view of it, the same for every method.
-
-    Raises CloudError if the view shows no usable object.
-    """
+    """Return the true object, and the scene of one view at `elevation` [deg]. Raises CloudError: no usable object."""
     stage = tabletop(thing, yaw=_YAW)
     poses = ring_poses(1, elevation=float(np.deg2rad(elevation)), azimuth=float(_AZIMUTH))
     views = views_of(stage, CAMERA, poses, noise_at(noise), seed)
@@ -223,7 +218,7 @@ def _seen(thing: str, elevation: float, noise: float, seed: int, resolution: int
 
 
 def run_wall(case: MapCase) -> tuple[MapCell, ...]:
-    """Plan on a cup with walls of so many millimetres, on a grid of that resolution and no finer."""
+    """Plan on a cup. `case.up` is its wall thickness [mm], `case.across` the resolution of its SDF grid."""
     (wall,) = case.up
     scene = on_grid(cup(float(wall)), int(case.across))
     hand, grasps = plan(case, scene)
@@ -232,27 +227,27 @@ def run_wall(case: MapCase) -> tuple[MapCell, ...]:
 
 @lru_cache(maxsize=1)
 def cup(wall: float) -> Scene:
-    """Return a cup with walls of so many millimetres."""
+    """Return a scene with a cup whose wall is `wall` [mm] thick."""
     return build_scene(thin_cup(wall * 1e-3), mass=PROTOCOL_MASS, source=f"cup of {wall:g} mm")
 
 
 def on_grid(scene: Scene, resolution: int) -> Scene:
-    """Return the same scene with the distances of another grid, even if it is much too coarse."""
+    """Return the scene with its SDF on a grid of `resolution`, even if that is far too coarse."""
     return replace(scene, sdf=build_sdf(scene.object.mesh, resolution=resolution))
 
 
-# Methods side by side, each by the preset that stands for it. The published settings hold nothing anywhere, and the
-# repaired ones take seven times as long as their short form.
+# The compared methods and their presets. With the published settings of graspd2022 no grasp holds in any cell. Its
+# repaired settings take seven times as long as the short ones.
 METHODS: Mapping[str, str] = {"closed_form": "balanced", "graspd2022": "graspd2022_short"}
-# Raw grasps of a cell and a seed, shared evenly among its objects.
+# Raw grasps per cell and seed, divided evenly among the cell's objects.
 COUNT, SEEDS = 16, (0, 1, 2)
-# Objects that the map of sizes has a row each for.
+# Objects of the size map, one row each.
 _SIZED = ("sphere", "box", "cylinder")
 
 
 @dataclass(frozen=True)
 class MapAxis:
-    """An axis: what it shows, and the places of its cells, from left to right or from the bottom up."""
+    """One axis of a map: its label, and the places of its cells, from left to right or from bottom to top."""
 
     label: str
     places: tuple[Place, ...]
@@ -263,11 +258,11 @@ class Map:
     """One heat map.
 
     Attributes:
-        title: what it shows.
-        across, up: its axes.
-        things: objects. A cell is of all of them, unless they are what an axis shows.
-        run: runs a case.
-        together: whether one planning serves all cells of a column.
+        title: title of the map.
+        across, up: horizontal and vertical axis.
+        things: objects. Every cell sums over all of them, unless each row is one object.
+        run: function that runs a case.
+        together: whether one planning run serves all cells of a column.
     """
 
     title: str
@@ -279,7 +274,7 @@ class Map:
 
     @property
     def rows(self) -> bool:
-        """Return whether every row has an object of its own."""
+        """Return whether each row of the map is one object."""
         return self.up.places == self.things
 
 
@@ -322,13 +317,13 @@ def map_cases(request: Request) -> tuple[MapCase, ...]:
         raise ConfigError(f"unknown map {unknown[0]!r}; {choices(unknown[0], MAPS)}")
     names = request.cases or (tuple(MAPS)[1:2] if request.quick else tuple(MAPS))
     seeds = request.seeds or (SEEDS[:1] if request.quick else SEEDS)
-    # Both methods on one object after the other: what is built of it is remembered.
+    # The methods run one after another on each object, so that the second reuses the cached object.
     pairs = (zip(*(cases_of(name, method) for method in METHODS), strict=True) for name in names)
     return tuple(replace(case, seed=seed) for pair in pairs for cases in pair for seed in seeds for case in cases)
 
 
 def cases_of(name: str, method: str) -> tuple[MapCase, ...]:
-    """Return all cases of a map with one method and the first seed, those on the same object side by side."""
+    """Return all cases of a map with one method and the first seed, grouped by object."""
     drawn = MAPS[name]
     count = COUNT if drawn.rows else COUNT // len(drawn.things)
     cases = []
@@ -340,28 +335,27 @@ def cases_of(name: str, method: str) -> tuple[MapCase, ...]:
 
 
 def run_map(case: MapCase) -> Record:
-    """Return the figures of one case."""
     cells = [asdict(cell) for cell in run_on(MAPS[case.map].run, case)]
     return {"cells": cells, "held": max(cell["held"] for cell in cells)}
 
 
 def map_seconds(case: MapCase) -> float:
-    """Return the CPU seconds of a case, roughly."""
+    """Return the estimated CPU time of a case [s]."""
     each = {"balanced": 0.1, "graspd2022_short": 0.45}.get(case.preset, 1.0)
     return 0.5 + case.count * (each + 0.05 * len(case.up))
 
 
 Shares = Mapping[tuple[Place, Place], float]
 
-# Nuñez, Anderton and Renslow (2018): even in lightness, and alike to those who see no red or green.
+# Nuñez, Anderton and Renslow (2018): lightness is uniform, and red-green colour-blind viewers see it alike.
 _COLOURS = "cividis"
 _CELL, _EDGE = 0.52, "#D55E00"
 
 
 def draw_map(drawn: Map, methods: Mapping[str, Shares], path: Path) -> Path:
-    """Draw one panel for each method, by its caption. Return the PNG's path.
+    """Draw a map with one panel for each method. `methods` holds shares by caption. Return the PNG's path.
 
-    Cells without a record stay white. Rows and columns in which no panel has any are left out.
+    Cells without a record are white. Rows and columns without any record are left out.
     """
     drawn = _known(drawn, methods)
     columns, rows = len(drawn.across.places), len(drawn.up.places)
@@ -411,7 +405,7 @@ def _panel(axis: Any, drawn: Map, shares: Shares) -> Any:
 
 
 def _border(axis: Any, grid: Any) -> None:
-    """Draw a line between cells of which one holds at least half of its grasps and the other less."""
+    """Draw a line between neighbouring cells if only one of them holds at least half of its grasps."""
     works, known = grid >= 50, np.isfinite(grid)
     beside = (works[:, 1:] != works[:, :-1]) & known[:, 1:] & known[:, :-1]
     above = (works[1:] != works[:-1]) & known[1:] & known[:-1]
@@ -427,7 +421,7 @@ def _written(place: Place) -> str:
 
 
 def map_sections(records: Sequence[Record], chart: Path | None) -> Sections:
-    """Return a picture for each map, under the marker of its name, and all failures by reason."""
+    """Return a section with a picture for each map, and a section with the failures of all maps by reason."""
     sections: dict[str, list[str | Picture | None]] = {}
     body = []
     for name, drawn in MAPS.items():
@@ -445,7 +439,7 @@ def map_sections(records: Sequence[Record], chart: Path | None) -> Sections:
 
 
 def shares(records: Sequence[Record]) -> dict[tuple[Place, Place], float]:
-    """Return the share of the requested grasps that held, all objects together, by place across and up."""
+    """Return the share of requested grasps that held, over all objects, by place (across, up)."""
     held, asked = Counter[tuple[Place, Place]](), Counter[tuple[Place, Place]]()
     for record in records:
         for cell in record["cells"]:
@@ -455,7 +449,7 @@ def shares(records: Sequence[Record]) -> dict[tuple[Place, Place], float]:
 
 
 def reasons(records: Sequence[Record]) -> Counter[str]:
-    """Return why grasps failed, and how many each."""
+    """Return the number of failed grasps by reason."""
     return sum((Counter(cell["reasons"]) for record in records for cell in record["cells"]), Counter[str]())
 
 

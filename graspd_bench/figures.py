@@ -1,4 +1,4 @@
-"""Figures of records: by name (a preset, a sweep value) and object, then over objects, then against an earlier run."""
+"""Figures of records: by name (preset, sweep value or hand) and object, over objects, and against an earlier run."""
 
 from __future__ import annotations
 
@@ -16,9 +16,9 @@ from graspd_bench.study import Record
 from graspd_core.optimize.plan_config import preset_names
 from graspd_core.verify.metrics import METRICS
 
-# Presets of the first page: those that people plan with, the published method, its repaired form and a baseline.
+# Presets of the first page: the usual ones for planning, the published method, its repaired form, and a baseline.
 FEW = ("fast", "balanced", "accurate", "graspd2022", "graspd2022_repaired", "random_closure")
-# The first that fits a name tells its parent. A parent has none.
+# Prefixes of ablations and their parents. The first prefix that fits a name counts. Parents have no parent.
 _ABLATIONS = (("closed_form_", "balanced"), ("graspd2022_no_", "graspd2022_repaired"))
 
 
@@ -28,17 +28,17 @@ def parent_of(name: str) -> str | None:
 
 
 def hand_row(hand: str) -> str:
-    """Return the name of the cells by which hands are compared."""
+    """Return the name of a hand's cells in study `hands`, such as `hand:leap_right`."""
     return f"hand:{Path(hand).stem}"
 
 
 def is_hand(name: str) -> bool:
-    """Return whether a name is of cells by which hands are compared, as `hand:leap_right`."""
+    """Return whether a name is of a hand's cells, such as `hand:leap_right`."""
     return name.startswith("hand:")
 
 
 def is_preset(name: str) -> bool:
-    """Return whether a name is of a preset, neither of a sweep value nor of a hand."""
+    """Return whether a name is of a preset, and not of a sweep value or a hand."""
     return not is_sweep_value(name) and not is_hand(name)
 
 
@@ -48,12 +48,12 @@ def is_few(name: str) -> bool:
 
 
 def is_sweep_value(name: str) -> bool:
-    """Return whether a name is of a sweep value, as `steps=90`, and not of a preset."""
+    """Return whether a name is of a sweep value, such as `steps=90`."""
     return "=" in name
 
 
 def short_name(name: str) -> str:
-    """Return a label for the chart. An ablation goes by what it lacks."""
+    """Return the label of a preset in charts. For an ablation it is the name without the method."""
     parent = parent_of(name)
     if parent is None:
         return name
@@ -61,25 +61,25 @@ def short_name(name: str) -> str:
     return name.removeprefix(method).replace("_", " ")
 
 
-# Shares of grasps that passed a trial. A grasp that was not found did not pass.
+# Trials whose figure is the share of requested grasps that passed. A grasp that was not found has not passed.
 TRIAL_FIGURES = ("standard", "hard", "noisy")
-# Displacements that trials measured [cm], by figure: which trial.
+# The trial that measured each displacement figure [cm].
 _DISPLACEMENTS = {"sd_cm": "sd", "gravity_cm": "gravity"}
 
 
 @dataclass(frozen=True)
 class Row:
-    """Figures of one name on one object, all seeds together. None where there is none.
+    """Figures of one name (preset, sweep value or hand) on one object, over all seeds.
 
     Attributes:
-        asked: requested grasps.
-        given: grasps found.
-        held: grasps that passed the standard hold trial.
-        spent: CPU seconds of the optimiser and of those trials.
-
-    `values` has the medians of `_grasp_figures` over the grasps, the shares of `TRIAL_FIGURES` of the requested grasps,
-    and seconds: `cpu_per_grasp` of the optimiser, `cpu_with_scene`, `cpu_per_verified` (`spent` over `held`),
-    `first_cpu` and `first_wall` until the first verified grasp. `quartiles` are those over the grasps.
+        asked: number of requested grasps.
+        given: number of grasps found.
+        held: number of grasps that passed the standard hold trial.
+        spent: CPU time of the optimiser and of those trials [s].
+        values: figures by name, None if not measured. They are medians of `_grasp_figures` over grasps, shares of
+            requested grasps by `TRIAL_FIGURES`, and seconds: `cpu_per_grasp` of the optimiser, `cpu_with_scene`,
+            `cpu_per_verified` (`spent` / `held`), `first_cpu` and `first_wall` until the first verified grasp.
+        quartiles: lower and upper quartile over the grasps, by figure.
     """
 
     name: str
@@ -95,7 +95,7 @@ class Row:
 
 @dataclass(frozen=True)
 class Spread:
-    """Median, quartiles and mean over objects, and how many there were."""
+    """Median, quartiles (`low`, `high`) and mean of a figure over objects, and the number of objects."""
 
     median: float
     low: float
@@ -105,9 +105,9 @@ class Spread:
 
 
 def rows(records: Iterable[Record], kind: str = "raw") -> list[Row]:
-    """Return a row for every name and object, in the order of the records. Cells that raised are left out."""
+    """Return a row for every name and object, in the order of the records. Failed cells are left out."""
     groups: dict[tuple[str, str], list[Record]] = {}
-    # Where nothing was found there is no trace of the trials: those of the other records are meant, and the first.
+    # A record without grasps does not show its trials. It then counts as tried in those of all other records.
     ran = {TRIAL_FIGURES[0]}
     for record in records:
         if record.get("kind") == kind and not record["error"]:
@@ -128,7 +128,7 @@ def _row(group: Sequence[Record], ran: Collection[str]) -> Row:
         outcomes = [_inner(grasp, trial, "share" if trial == "noisy" else "passed") for grasp in grasps]
         tried = any(outcome is not None for outcome in outcomes) if grasps else trial in ran
         values[trial] = sum(outcome or 0.0 for outcome in outcomes) / asked if tried else None
-    # Planned runs have one total. Raw ones count what a plan would have spent, the best of trials only.
+    # Planned runs have one total. Raw runs count what a plan would spend: the optimiser and the standard trial.
     spent = sum(r["cpu"].get("total", r["cpu"].get("optimise", 0.0) + r["cpu"].get("standard", 0.0)) for r in group)
     values["cpu_per_grasp"] = sum(r["cpu"].get("optimise", r["cpu"].get("total", 0.0)) for r in group) / asked
     prepared = sum(r["cpu"].get("scene", 0.0) for r in group)
@@ -143,7 +143,7 @@ def _row(group: Sequence[Record], ran: Collection[str]) -> Row:
 
 
 def spread(rows: Iterable[Row], figure: str) -> Spread | None:
-    """Return a figure's spread over objects, that over the grasps of a single one, or None where no object has it."""
+    """Return the spread of a figure over the rows. With one row, quartiles are over its grasps. None without values."""
     known = [row for row in rows if row.values.get(figure) is not None]
     values = [row.values[figure] or 0.0 for row in known]
     if not values:
@@ -155,7 +155,7 @@ def spread(rows: Iterable[Row], figure: str) -> Spread | None:
 
 
 def share_interval(held: int, asked: int) -> tuple[float, float]:
-    """Return the 95 % interval of a share (Wilson 1927)."""
+    """Return the 95 % interval of the share `held` / `asked` (Wilson 1927)."""
     z, share = 1.96, held / asked
     middle = share + z * z / (2 * asked)
     half = z * math.sqrt(share * (1 - share) / asked + z * z / (4 * asked * asked))
@@ -164,16 +164,16 @@ def share_interval(held: int, asked: int) -> tuple[float, float]:
 
 
 def per_verified(rows: Sequence[Row]) -> float | None:
-    """Return CPU seconds of optimiser and trials for each grasp that held, all objects together, or None if none did.
+    """Return the CPU time of optimiser and trials per held grasp, over all objects [s]. None if no grasp held.
 
-    It is not a mean over objects, because one on which nothing held has cost seconds, too.
+    This is no mean over objects, because an object on which no grasp held has also cost time.
     """
     held = sum(row.held for row in rows)
     return sum(row.spent for row in rows) / held if held else None
 
 
 def by_name(rows: Iterable[Row]) -> dict[str, list[Row]]:
-    """Return the rows of each name."""
+    """Group rows by name."""
     groups: dict[str, list[Row]] = {}
     for row in rows:
         groups.setdefault(row.name, []).append(row)
@@ -198,16 +198,16 @@ def _inner(grasp: dict[str, Any], trial: str, figure: str) -> float | None:
 
 
 def pareto_front(points: Float[np.ndarray, "points axes"]) -> Bool[np.ndarray, "points"]:
-    """Return which points are on the front where less is better on every axis.
+    """Return which points are on the Pareto front, if less is better on every axis.
 
-    A point is off it when another is no worse on every axis and better on one. Equal points are on it together.
+    A point is off the front if another is no worse on every axis and better on one. Equal points are both on it.
     """
     no_worse = (points[:, None] <= points[None]).all(-1)
     better = (points[:, None] < points[None]).any(-1)
     return np.asarray(~(no_worse & better).any(0))
 
 
-# Figures compared: heading, digits, and the least change worth a line (a share of the old value, or absolute).
+# Figures to compare: heading, digits, and the least reported change, relative to the old value and absolute.
 FIGURES = {
     "standard": ("held", 3, 0.0, 0.001),
     "hard": ("held hard", 3, 0.0, 0.001),
@@ -222,7 +222,7 @@ FIGURES = {
 
 @dataclass(frozen=True)
 class Move:
-    """One figure that changed. None where it is missing."""
+    """Change of one figure between two runs. `old` or `new` is None if that run has no such figure."""
 
     kind: str
     name: str
@@ -233,7 +233,7 @@ class Move:
 
 
 def moves(old: Sequence[Record], new: Sequence[Record]) -> list[Move]:
-    """Return what changed: for each name over all objects that both runs have ("all"), then object by object."""
+    """Return the changed figures of each name: over the objects that both runs have ("all"), then by object."""
     found: list[Move] = []
     for kind in ("raw", "verified"):
         before = {(row.name, row.object): row for row in rows(old, kind)}
@@ -273,7 +273,7 @@ def _mean(group: Sequence[Row], figure: str) -> float | None:
 
 
 def comparison(old: Sequence[Record], new: Sequence[Record]) -> str:
-    """Return the moves of cells as a table. Names that only one of the runs has are listed below it."""
+    """Return a text table of the changed figures. Below it are the cells that only one of the two runs has."""
     old, new = ([record for record in records if "kind" in record] for records in (old, new))
     lines = [f"{'cells':9} {'preset':32} {'object':22} {'figure':22} {'old':>9} {'new':>9}  change"]
     for move in moves(old, new):

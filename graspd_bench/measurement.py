@@ -1,6 +1,6 @@
-"""Cells of the suites: a kind of run, settings, an object, a hand and a seed, and the code that runs them.
+"""Cells of the suites, and the functions that run them. A cell is a kind of run with settings, object, hand and seed.
 
-Its trials have the names of `--trials` (docs/metrics.md). Lengths are in the unit of their name, [cm] and [deg].
+Trials have the names that `--trials` accepts (docs/metrics.md). Suffixes of figures give their units, such as `_cm`.
 """
 
 from __future__ import annotations
@@ -36,13 +36,13 @@ from graspd_core.verify.prepared_grasp import make_metrics_context
 from graspd_core.verify.world import PROTOCOLS, build_world
 from graspd_dataset.run_records import Stopwatch, thing_name
 
-# One trial of one grasp: figures by name.
+# Runs one trial of a grasp and returns its figures by name.
 Trial = Callable[[Grasp], dict[str, Any]]
 
 
 @dataclass(frozen=True)
 class Tried:
-    """What a trial needs: the hand, the object and its convex parts."""
+    """The input of a trial: the hand, the object, and the object's convex parts."""
 
     hand: HandModel
     target: ObjectModel
@@ -103,14 +103,14 @@ TRIALS: Mapping[str, Callable[[Tried], Trial]] = {
     "noisy": _noisy,
     "bullet": _second,
 }
-# What a raw cell goes through unless told otherwise: the noisy trial takes eight times as long as the others.
+# Default trials of a raw cell. The noisy trial is not among them, because it takes eight times as long as the others.
 USUAL = ("standard", "hard", "sd", "gravity")
 
 
 Kind = Literal["raw", "verified", "pace", "start"]
 _RUNS = 3
 
-# What `graspd synthesize` does, without a cache, from the first import on.
+# A new process that does what `graspd synthesize` does, from the first import on.
 _FRESH = """
 import sys, time
 import torch; torch.set_num_threads(1)
@@ -129,14 +129,14 @@ class Cell(Case):
     """One run of the suites.
 
     Attributes:
-        kind: what is run: "raw" grasps each tried, "verified" ones planned, "pace" of the optimiser alone, "start":
-            the first verified grasp of a fresh process.
-        name: of the settings: a preset, or a sweep value.
-        settings: the settings themselves.
+        kind: "raw" tries every raw grasp, and "verified" plans verified grasps. "pace" times the optimiser alone, and
+            "start" times the first verified grasp of a new process.
+        name: name of the settings: a preset, a sweep value, or a hand.
+        settings: the settings.
         object: a mesh file or shape:NAME.
         hand: name or path.
-        seed: of the method.
-        count: requested grasps.
+        seed: random seed of the method.
+        count: number of requested grasps.
         trials: names of the trials of every raw grasp.
     """
 
@@ -172,12 +172,12 @@ class Cell(Case):
 
 
 def run_cell(cell: Cell) -> Record:
-    """Return the figures of one cell."""
+    """Run a cell of any kind. Return its figures."""
     return {"raw": run_raw, "verified": run_verified, "pace": run_pace, "start": run_start}[cell.kind](cell)
 
 
 def run_raw(cell: Cell) -> dict[str, Any]:
-    """Return the figures of one raw cell. Grasps that a method does not find are not listed, and count as failed."""
+    """Run the trials and metrics of raw grasps. Grasps that the method does not find are not listed."""
     stopwatch = Stopwatch()
     hand = load_hand(cell.hand, candidates=cell.settings.problem.fine_candidates)
     with stopwatch("scene"):
@@ -187,7 +187,7 @@ def run_raw(cell: Cell) -> dict[str, Any]:
     with stopwatch("parts"):
         tried = Tried(hand, scene.object, object_parts(scene.object))
     results: list[dict[str, Any]] = [{"score": grasp.score, "links": len(grasp.contacts)} for grasp in grasps]
-    # A method that finds nothing has paid for its scene and its search only.
+    # Without grasps no trial is run, so only scene and search cost time.
     first: dict[str, float] | None = None
     for name in cell.trials if grasps else ():
         with stopwatch(f"world {name}"):
@@ -196,7 +196,7 @@ def run_raw(cell: Cell) -> dict[str, Any]:
             with stopwatch(name):
                 result[name] = trial(grasp)
             if name == "standard" and first is None and result[name]["passed"]:
-                # The parts are built beside the optimiser in `plan_grasps`: in CPU seconds they count all the same.
+                # `plan_grasps` builds the parts in parallel to the optimiser. Their CPU seconds count nevertheless.
                 first = {"cpu": sum(stopwatch.cpu.values()), "wall": sum(stopwatch.wall.values())}
     context = make_metrics_context(scene.object, hand)
     for grasp, result in zip(grasps, results, strict=True):
@@ -214,7 +214,7 @@ def run_raw(cell: Cell) -> dict[str, Any]:
 
 
 class _First:
-    """A progress hook that notes when the first grasp was verified, and how often the optimiser was started."""
+    """Progress hook that records the time of the first verified grasp, and the number of optimiser rounds."""
 
     def __init__(self, began: dict[str, float]) -> None:
         self.began, self.first, self.rounds, self._stage = began, None, 0, Stage.LOAD
@@ -228,7 +228,7 @@ class _First:
 
 
 def run_verified(cell: Cell) -> dict[str, Any]:
-    """Return the figures of one planned run: how many of `count` were verified, and the cost of all of it."""
+    """Plan `count` verified grasps. Return how many were verified, and the CPU and wall time of the whole run [s]."""
     hand = load_hand(cell.hand)
     began = _now()
     told = _First(began)
@@ -252,9 +252,9 @@ def _now() -> dict[str, float]:
 
 
 def run_pace(cell: Cell) -> dict[str, Any]:
-    """Return CPU seconds of one batch and of a grasp-step, the least of three batches after one that is not counted.
+    """Time one batch of raw grasps. Return its CPU and wall time [s], and its `grasp_steps`.
 
-    A grasp-step is one step of one start, which is most of the optimiser's work.
+    The times are those of the fastest of three batches. An uncounted batch runs first.
     """
     hand = load_hand(cell.hand, candidates=cell.settings.problem.fine_candidates)
     scene = load_scene(cell.object, mass=PROTOCOL_MASS, resolution=cell.settings.resolution)
@@ -269,7 +269,7 @@ def run_pace(cell: Cell) -> dict[str, Any]:
 
 
 def grasp_steps(cell: Cell) -> int | None:
-    """Return steps times starts of one batch of the closed form, or None for other methods."""
+    """Return the number of optimiser steps of a batch, summed over starts. None if the method is not closed_form."""
     s = cell.settings.settings
     if not isinstance(s, ClosedFormConfig):
         return None
@@ -278,7 +278,7 @@ def grasp_steps(cell: Cell) -> int | None:
 
 
 def run_start(cell: Cell) -> dict[str, Any]:
-    """Return the seconds from the start of a process to its first verified grasp, without caches on disk."""
+    """Time a new process from its start to its first verified grasp [s]. The disk cache is off."""
     environment = {**os.environ, "GRASPD_CACHE": "off", "OMP_NUM_THREADS": "1"}
     command = [sys.executable, "-c", _FRESH, cell.object, cell.hand, str(cell.seed)]
     began = time.perf_counter()

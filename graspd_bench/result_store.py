@@ -1,4 +1,4 @@
-"""Records on disk, one file each, whose key is everything that was asked for, and all records of a run in one file."""
+"""Records of cases on disk, one file per case. The key of a record is a hash of the case. results.json holds all."""
 
 from __future__ import annotations
 
@@ -17,23 +17,23 @@ from graspd_core.io.grasps_json import save_text
 from graspd_dataset.run_records import code_version, commit, finite
 
 FORMAT, VERSION = "graspd/bench", 2
-# Files of this package that the figures of every study depend on.
+# Files of graspd_bench that the figures of every study depend on.
 _COUNTED = ("baselines/*.py", "rendering/*.py", "trials.py")
 
 
 def case_key(study: str, case: Case) -> str:
-    """Return a hash of everything that a case asks, hexadecimal. The version of the code is recorded beside it."""
+    """Return the SHA-256 of the study's name and all inputs of a case, hexadecimal. The code version is not in it."""
     return hashlib.sha256(json.dumps({"study": study, **case.asked()}, sort_keys=True).encode()).hexdigest()
 
 
 def case_file(study: str, case: Case) -> str:
-    """Return the name of a record's file: readable words, then a part of its key."""
+    """Return the file name of a case's record: the study, the label, and the first digits of the key."""
     words = re.sub(r"[^A-Za-z0-9_.=-]+", "_", f"{study}-{case.label}")
     return f"{words[:120]}-{case_key(study, case)[:12]}.json"
 
 
 def head(study: str, case: Case, code: str) -> Record:
-    """Return the part of a record that is known before the run."""
+    """Return the fields of a record that are known before the run."""
     return {
         **case.shown(),
         "study": study,
@@ -48,12 +48,12 @@ def head(study: str, case: Case, code: str) -> Record:
 
 
 def write_record(folder: Path, study: str, case: Case, record: Record) -> None:
-    """Write a record. Its file appears whole or not at all, even if the process is killed."""
+    """Write the record of a case. The file is written completely or not at all, even if the process is killed."""
     save_text(folder / case_file(study, case), json.dumps(finite(record), indent=1, allow_nan=False) + "\n")
 
 
 def read_record(folder: Path, study: str, case: Case, code: str | None, *, failed: bool = False) -> Record | None:
-    """Return the record of a case under `code` (None: under any), or None. Failed ones are left out unless `failed`."""
+    """Return the record of a case made by `code` (None: any version), or None. Skip failed records unless `failed`."""
     try:
         record = json.loads((folder / case_file(study, case)).read_text(encoding="utf-8"))
     except (OSError, ValueError):
@@ -64,12 +64,11 @@ def read_record(folder: Path, study: str, case: Case, code: str | None, *, faile
 
 
 def results_document(records: Sequence[Record]) -> dict[str, Any]:
-    """Return records as one JSON-ready document."""
+    """Return the content of results.json, JSON-ready."""
     return {"format": FORMAT, "version": VERSION, "records": records}
 
 
 def write_results(path: Path, records: Sequence[Record]) -> None:
-    """Write all records to one file."""
     save_text(path, json.dumps(results_document(records), allow_nan=False) + "\n")
 
 
@@ -77,7 +76,7 @@ def read_results(path: Path) -> list[Record]:
     """Return the records of a results file.
 
     Raises:
-        FormatError: it cannot be read, is of another format, or of an unknown version.
+        FormatError: the file cannot be read, has another format, or has an unknown version.
     """
     try:
         whole = json.loads(path.read_text(encoding="utf-8"))
@@ -93,5 +92,5 @@ def read_results(path: Path) -> list[Record]:
 
 
 def bench_version(sources: tuple[str, ...]) -> str:
-    """Return `code_version` of graspd_core and of the files of graspd_bench that the globs `sources` name."""
+    """Return the code version of a study. It hashes graspd_core, `_COUNTED`, and `sources`: globs in graspd_bench."""
     return code_version(tuple(f"graspd_bench/{pattern}" for pattern in (*_COUNTED, *sources)))

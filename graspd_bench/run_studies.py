@@ -1,6 +1,6 @@
-"""Runs of studies: makes the cases, skips finished ones, runs the rest, and writes the results to pages.
+"""Runs of studies: make the cases, skip finished cases, run the others, and collect the sections of pages.
 
-Each worker process does one case after the other, so that a death costs one case.
+Each worker process runs one case after another. If a worker dies, only its current case is lost.
 """
 
 from __future__ import annotations
@@ -25,19 +25,23 @@ from graspd_bench.tables import sourced
 from graspd_core.errors import ConfigError, choices
 from graspd_dataset.run_records import failure, finite, forget_peak, peak_mb
 
-# How often a stop is looked for [s].
+# Interval at which a run checks whether to stop [s].
 _POLL = 0.2
-# One thread each, so that CPU seconds are comparable. Nothing remembered on disk, so that every case builds its own.
+# One thread per process makes CPU seconds comparable. The disk cache is off, so every case computes everything anew.
 ENVIRONMENT = {"OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1", "MKL_NUM_THREADS": "1", "GRASPD_CACHE": "off"}
 
 
 @dataclass(frozen=True)
 class Job:
-    """A case, the function that runs it, and the study and code of its record.
+    """A case of a study that is to be run.
 
     Attributes:
-        alone: in a process of its own, cold.
-        patience: seconds until it counts as hung.
+        study: name of the study.
+        case: the case.
+        run: function that runs the case.
+        code: code version for the record.
+        alone: whether the case gets a new process without warm-up.
+        patience: seconds until the case counts as hung.
     """
 
     study: str
@@ -51,10 +55,10 @@ class Job:
 def run_cases(
     jobs: Sequence[Job], folder: Path, processes: int, stop: Callable[[], bool] = lambda: False
 ) -> Iterator[tuple[Job, Record]]:
-    """Run jobs on `processes` workers and yield each as it ends. Its record is on disk by then.
+    """Run jobs on `processes` workers. Yield each job and its record when the job ends. The record is then on disk.
 
-    Ends early, its workers killed, once `stop` is true. A worker that dies (as out of memory) or hangs gives a record
-    with that error, and another takes its place.
+    If `stop` returns true, kill the workers and end early. If a worker dies (such as out of memory) or hangs, write a
+    record with that error and start another worker.
     """
     waiting = deque(jobs)
     idle: list[_Worker] = []
@@ -82,7 +86,7 @@ def run_cases(
 
 
 class _Worker:
-    """A spawned process, the pipe to it, and its job."""
+    """A worker process, the pipe to it, and its current job."""
 
     def __init__(self, folder: Path, *, warm: bool) -> None:
         context = get_context("spawn")
@@ -103,7 +107,7 @@ class _Worker:
             self.pipe.send(job)
 
     def receive(self, folder: Path) -> Record:
-        """Return the record that it answers with. If it died, the record says so."""
+        """Return the record that the worker sends. If the worker died, write and return a record of that failure."""
         try:
             return self.pipe.recv()
         except (EOFError, ConnectionResetError):
@@ -112,7 +116,7 @@ class _Worker:
             return self._write(folder, failure(died, "died"))
 
     def lost(self, folder: Path) -> Record:
-        """Kill it and return a record that says that it hung."""
+        """Kill the worker. Write and return a record that says that it hung."""
         self.end()
         return self._write(folder, failure(TimeoutError(f"no end after {self.job.patience:.0f} s"), "hung"))
 
@@ -127,10 +131,10 @@ class _Worker:
 
 
 def _work(pipe: connection.Connection, folder: Path, warm: bool) -> None:
-    """Do jobs until there are no more."""
-    # A Ctrl-C reaches the whole group of processes. The parent decides what it means.
+    """Run jobs from a pipe until the pipe closes. Write each record and send it back."""
+    # Ctrl-C reaches the whole process group. Only the parent handles it.
     signal.signal(signal.SIGINT, signal.SIG_IGN)
-    # Libraries greet on stdout, which is the parent's for its tables.
+    # Libraries print greetings to stdout, where the parent prints its tables.
     os.dup2(os.open(os.devnull, os.O_WRONLY), 1)
     threading.Thread(target=_end_with_parent, daemon=True).start()
     _prepare(warm)
@@ -143,9 +147,9 @@ def _work(pipe: connection.Connection, folder: Path, warm: bool) -> None:
 
 
 def run_job(job: Job) -> Record:
-    """Return the record of one job, run in this process. An exception is recorded, so one bad case ends no benchmark.
+    """Run a job in this process and return its record. An exception becomes an error record and is not raised.
 
-    Everything is built anew, so that no case uses what another left in memory.
+    Caches in memory are cleared first, so no case uses results of another.
     """
     from graspd_core.runtime import disk_cache
 
@@ -168,7 +172,7 @@ def _end_with_parent() -> None:
 
 
 def _prepare(warm: bool) -> None:
-    """Set one thread, and do first-use work of the libraries, which no case among others is to pay for."""
+    """Set one torch thread. If `warm`, plan once, so that the first case does not pay for loading libraries."""
     import torch
 
     torch.set_num_threads(1)
@@ -180,13 +184,13 @@ def _prepare(warm: bool) -> None:
         plan_grasps(load_scene("shape:sphere"), load_hand("allegro_right"), count=1, preset="fast")
 
 
-# Every study that needs nothing that is not shipped.
+# Name for all studies whose field `usual` is true.
 ALL = "all"
 
 
 @dataclass(frozen=True)
 class Plan:
-    """All jobs of a command, and the records of those that have finished before."""
+    """All jobs of a command, the folder of their records, and the records of finished jobs."""
 
     folder: Path
     jobs: tuple[Job, ...]
@@ -197,14 +201,14 @@ class Plan:
         return tuple(job for job in self.jobs if job not in self.done)
 
     def seconds(self, processes: int) -> float:
-        """Return the seconds that the missing cases take on quiet cores, roughly."""
+        """Return the estimated wall time of the missing cases on idle cores [s]."""
         return sum(STUDIES[job.study].seconds(job.case) for job in self.missing) / processes
 
 
 def studies_of(names: Sequence[str]) -> dict[str, Study]:
-    """Return studies by their names, each once. `all` are those that need nothing from the user.
+    """Return the named studies, each once. `all` stands for all studies whose field `usual` is true.
 
-    Raises ConfigError, which lists the valid names, if there is no such study.
+    Raises ConfigError: there is no such study. The message lists the valid names.
     """
     if unknown := [name for name in names if name not in (*STUDIES, ALL)]:
         raise ConfigError(f"unknown suite {unknown[0]!r}; {choices(unknown[0], (*STUDIES, ALL))}")
@@ -215,19 +219,19 @@ def studies_of(names: Sequence[str]) -> dict[str, Study]:
 def make_plan(
     studies: dict[str, Study], request: Request, folder: Path, *, any_code: bool = False, failed: bool = False
 ) -> Plan:
-    """Plan the jobs of some studies.
+    """List the jobs of some studies, and read the records of finished ones.
 
     Args:
-        any_code: records of other versions of the code count as finished, too.
-        failed: so do those of cases that failed.
+        any_code: whether records of other code versions count as finished.
+        failed: whether records of failed cases count as finished.
 
     Raises:
-        GraspdError: the request names something unknown, or something that no study uses.
+        GraspdError: the request has an unknown name, or a field that none of the studies uses.
     """
     taken = {field for study in studies.values() for field in study.takes}
     for field, usual in vars(Request()).items():
         if getattr(request, field) != usual and field not in taken:
-            raise ConfigError(f"{field}: {', '.join(studies)} does not look at it; valid: {', '.join(sorted(taken))}")
+            raise ConfigError(f"{field}: not used by {', '.join(studies)}; valid: {', '.join(sorted(taken))}")
     jobs, done = [], {}
     for name, study in studies.items():
         code = bench_version(study.sources)
@@ -240,14 +244,14 @@ def make_plan(
 
 
 def run_plan(plan: Plan, processes: int, stop: Callable[[], bool] = lambda: False) -> Iterator[tuple[Job, Record]]:
-    """Run what is missing. Yield each job as it ends, and add it to those that are done."""
+    """Run the missing jobs. Yield each job and its record when it ends, and add the record to `plan.done`."""
     for job, record in run_cases(plan.missing, plan.folder, processes, stop):
         plan.done[job] = record
         yield job, record
 
 
 def records_of(plan: Plan) -> dict[str, list[Record]]:
-    """Return the records by study, in the order of the cases."""
+    """Return the finished records of each study, in the order of its cases."""
     found: dict[str, list[Record]] = {job.study: [] for job in plan.jobs}
     for job in plan.jobs:
         if job in plan.done:
@@ -256,7 +260,7 @@ def records_of(plan: Plan) -> dict[str, list[Record]]:
 
 
 def report_of(plan: Plan, chart: Path | None) -> dict[str, Sequence[str | Picture]]:
-    """Return sections of all studies that have records, by marker. Charts are drawn where a path is given."""
+    """Return the sections of all studies with records, by marker. If `chart` is a path, draw charts as well."""
     sections: dict[str, Sequence[str | Picture]] = {}
     for name, records in records_of(plan).items():
         study = STUDIES[name]
@@ -267,7 +271,7 @@ def report_of(plan: Plan, chart: Path | None) -> dict[str, Sequence[str | Pictur
 
 
 def faults_of(plan: Plan) -> list[str]:
-    """Return what is wrong, a line for each fault."""
+    """Return the faults of all finished jobs, one line per fault."""
     return [
         f"{job.study} {job.case.label}: {fault}"
         for job in plan.jobs

@@ -1,4 +1,4 @@
-"""Benchmarks: their cases, the function that runs one of them, and the use of the records."""
+"""Base classes of the studies: a study, its cases, a user's request, and grasps of one object."""
 
 from __future__ import annotations
 
@@ -21,34 +21,34 @@ from graspd_dataset.run_records import thing_name
 
 Record = dict[str, Any]
 
-# What objects weigh where nobody says [kg]: the convention of DexGraspBench, which figures compare with.
+# Default mass of objects [kg]. It is DexGraspBench's convention, so that figures can be compared.
 PROTOCOL_MASS = 0.1
 
 
 @dataclass(frozen=True)
 class Picture:
-    """A chart on disk, and what it shows."""
+    """A chart on disk, with a title that says what it shows."""
 
     title: str
     png: Path
 
 
-# Parts of a page's sections by the name of their marker: Markdown and pictures.
+# Sections of a page by the name of their marker. The parts of a section are Markdown texts and pictures.
 Sections = Mapping[str, Sequence[str | Picture | None]]
 
 
 @dataclass(frozen=True)
 class Case:
-    """One run. Its fields called `object`, `hand` and `preset`, where it has such, count by their content."""
+    """Base class of one run of a study. Files in the fields `object`, `hand` and `preset` are compared by content."""
 
     @property
     def label(self) -> str:
-        """Return its name in progress and in the name of its file, from the fields that are not empty."""
+        """Return the name of the case for progress lines and file names. It joins all fields that are not empty."""
         values = (getattr(self, field.name) for field in fields(self))
         return " ".join(thing_name(value) for value in values if isinstance(value, str | int | float) and value != "")
 
     def asked(self) -> Record:
-        """Return all that the run depends on but the code, JSON-ready. Runs that ask for the same share a record."""
+        """Return all inputs of the run except the code, JSON-ready. Cases with equal inputs share one record."""
         said = asdict(self)
         if "object" in said:
             said["object"] = [thing_name(said["object"]), object_hash(said["object"])]
@@ -59,29 +59,29 @@ class Case:
         return said
 
     def shown(self) -> Record:
-        """Return what the record says of the case."""
+        """Return the fields of the case that its record holds."""
         return asdict(self)
 
 
 @dataclass(frozen=True)
 class Request:
-    """What a caller wants to run. Empty and None stand for the study's own choice.
+    """What a user asks to run. A field that is empty or None takes the study's default.
 
     Attributes:
-        presets: names or files.
-        objects: shape:NAME, mesh files, or folders of them.
+        presets: names or files of presets.
+        objects: shape:NAME, mesh files, or folders of mesh files.
         cases: names or families of the study's own cases.
-        seeds: of every case.
-        count: grasps of a case.
-        hand: name or path.
-        trials: of raw grasps.
-        quick: a small run that takes minutes.
+        seeds: random seeds. Every case is run with each seed.
+        count: number of grasps of a case.
+        hand: name or path of the hand.
+        trials: names of the trials of raw grasps.
+        quick: whether to run a small selection that takes minutes.
         imported: file or folder of imported grasps.
-        joint_order: of the joints in its npy files, by name.
+        joint_order: joint names in the order of the imported npy files.
         checkout: folder of DexGraspBench.
-        python: program that runs it.
-        armature: try its hand with our armature, too.
-        grasps: file of our grasps to use instead of planned ones.
+        python: Python program that runs DexGraspBench.
+        armature: whether to also run DexGraspBench's hand with our armature.
+        grasps: file of our grasps to use instead of planning.
     """
 
     presets: tuple[str, ...] = ()
@@ -107,7 +107,7 @@ class Request:
                 raise ConfigError(f"seed: {seed}; valid: 0 to 2^31 - 1")
 
     def preset(self, usual: str = "balanced") -> str:
-        """Return the only preset. Raises ConfigError: there are several, or it is unknown."""
+        """Return the requested preset, or `usual`. Raises ConfigError: several presets, or an unknown one."""
         if len(self.presets) > 1:
             raise ConfigError(f"presets: {', '.join(self.presets)}; this study takes one at a time")
         name = (self.presets or (usual,))[0]
@@ -116,33 +116,33 @@ class Request:
 
 
 def error_of(record: Record) -> tuple[str, ...]:
-    """Return the error that a case ended in."""
+    """Return the error of a failed case as the only item, or ()."""
     return (record["error"],) if record["error"] else ()
 
 
 def held_of(record: Record) -> str:
-    """Return the results of a case, in a few words."""
+    """Return the result of a case in a few words, such as "7/8 held"."""
     return f"{record['held']}/{record['count']} held" if "held" in record else "measured"
 
 
 @dataclass(frozen=True)
 class Study:
-    """One benchmark.
+    """One study of the benchmark.
 
     Attributes:
-        about: its question, one line.
-        cases: makes the cases of a request. Raises GraspdError: the request has unknown names.
-        run: runs a case and returns its figures, in a process that does one case after another. A function of a module.
-        sections: makes of records, and the path that charts begin with (None: draw none), the sections of pages.
-        failures: whether the sections need records of failed cases, too.
-        sources: files of graspd_bench, by glob, that figures depend on beside graspd_core.
-        takes: names of the fields of `Request` that it uses.
-        seconds: CPU seconds of a case, roughly.
-        faults: returns what is wrong with a record, a line each.
-        came: returns the results of a record that has no fault, in a few words.
-        alone: whether every case has a process of its own, cold.
-        patience: seconds until a case counts as hung.
-        usual: whether it is part of `graspd bench all`, because it needs only shipped files.
+        about: the question of the study, in one line.
+        cases: returns the cases of a request. Raises GraspdError if the request has unknown names.
+        run: runs a case and returns its figures. It must be a module-level function, because workers unpickle it.
+        sections: returns page sections from records and a path prefix for charts. With None it draws no charts.
+        sources: glob patterns of the files in graspd_bench that its figures depend on.
+        takes: names of the `Request` fields that the study uses.
+        seconds: returns the estimated CPU time of a case [s].
+        faults: returns the faults of a record, one line per fault.
+        came: returns the result of a record without faults, in a few words.
+        alone: whether every case gets a new process without warm-up.
+        patience: returns the seconds until a case counts as hung.
+        usual: whether `graspd bench all` includes the study. It must then need only shipped files.
+        failures: whether `sections` also needs the records of failed cases.
     """
 
     about: str
@@ -161,22 +161,23 @@ class Study:
 
 
 def all_shapes() -> tuple[str, ...]:
-    """Return the authored shapes as objects."""
+    """Return the sources of all built-in shapes, as `shape:NAME`."""
     return tuple(f"shape:{name}" for name in SHAPES)
 
 
 def find_objects(sources: Sequence[str]) -> tuple[str, ...]:
-    """Return the same as `object_sources`. Raises MeshError also where two of them have the same name."""
+    """Return the objects that `object_sources` finds. Raises MeshError: no such object, or two with equal names."""
     found = object_sources(sources)
     names = [thing_name(source) for source in found]
     if twice := sorted({name for name in names if names.count(name) > 1}):
-        raise MeshError(f"two objects are called {twice[0]!r}: results go by that name")
+        same = ", ".join(source for source in found if thing_name(source) == twice[0])
+        raise MeshError(f"objects {same} share the name {twice[0]!r}; rename one of them")
     return found
 
 
 @dataclass(frozen=True)
 class ObjectCase(Case):
-    """`count` grasps of an object (a mesh file or shape:NAME) with a hand, a preset and a seed."""
+    """A case of `count` grasps of an object (a mesh file or shape:NAME) with a hand, a preset and a seed."""
 
     object: str
     preset: str
@@ -189,13 +190,13 @@ class ObjectCase(Case):
         return load_preset(self.preset)
 
     def load(self, friction: float = 0.6) -> tuple[HandModel, Scene]:
-        """Return the hand and the scene."""
+        """Return the hand, and a scene with the object alone, at 0.1 kg and the given Coulomb friction."""
         hand = load_hand(self.hand, candidates=self.config.problem.fine_candidates)
         return hand, load_scene(self.object, mass=PROTOCOL_MASS, resolution=self.config.resolution, friction=friction)
 
 
 def object_cases(request: Request, objects: Sequence[str], count: int, quick_count: int = 2) -> tuple[ObjectCase, ...]:
-    """Return a case for each object and seed. A small run has only the first object, with fewer grasps."""
+    """Return a case for each object and seed. A quick request takes one default object and `quick_count` grasps."""
     things = find_objects(request.objects or objects[: 1 if request.quick else None])
     count, hand = request.count or (quick_count if request.quick else count), request.hand or "allegro_right"
     seeds = request.seeds or (0,)
@@ -203,5 +204,5 @@ def object_cases(request: Request, objects: Sequence[str], count: int, quick_cou
 
 
 def raw_grasps(scene: Scene, hand: HandModel, config: PlanConfig, count: int, seed: int) -> tuple[Grasp, ...]:
-    """Return the first grasps of a method's own ranking, none filtered by a trial."""
+    """Return the first `count` grasps of the method's own ranking. No trial filters them."""
     return find_candidates(PlannerInput(scene, hand, count, seed, config, Hooks())).grasps[:count]

@@ -1,6 +1,6 @@
-"""All studies, a row each. `graspd bench NAME` runs one. To add one, write its file and its row.
+"""Registry of all studies. `graspd bench NAME` runs a study. To add a study, write its file and a row here.
 
-Packages that graspd_bench does not know add theirs by entry points of the group `graspd.studies`.
+Other packages add studies through entry points of the group `graspd.studies`.
 """
 
 from __future__ import annotations

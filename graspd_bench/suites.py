@@ -1,4 +1,4 @@
-"""The suites of cells: presets on objects, settings swept, hands compared, and the counts that they are made of."""
+"""Suites of cells: all presets on all objects, sweeps of settings, and a comparison of hands."""
 
 from __future__ import annotations
 
@@ -12,19 +12,19 @@ from graspd_core.errors import ConfigError, choices
 from graspd_core.hands.library import hand_names
 from graspd_core.optimize.plan_config import PlanConfig, load_preset, method_row, override, preset_names
 
-# Verified grasps that a planned cell asks for, and the batch that pace is taken at.
+# Number of verified grasps of a planned cell, and batch size of a pace cell.
 VERIFIED, BATCH = 8, 32
-# Grasps of a raw cell by which hands are compared, and of a sweep over decades.
+# Grasps of a raw cell in the studies `hands` and `decades`.
 HAND_COUNT = 8
-# Presets that people plan with.
+# Presets that users plan with.
 PLANNED = ("fast", "balanced", "accurate")
-# What `balanced` is compared with: the same effort in every round.
+# Variant of `balanced` with the same effort in every round, for comparison.
 STEADY = "balanced_steady"
-# Orders the verified grasps in another way: its raw grasps are those of `balanced`.
+# This preset is skipped: it only orders verified grasps differently, and its raw grasps are those of `balanced`.
 _RANKED = "robust"
-# Of settings with more steps than this a raw cell is asked for fewer grasps: they take seconds each.
+# If settings have more steps than `_LONG`, a raw cell takes `_LONG_COUNT` grasps, because each takes seconds.
 _LONG, _LONG_COUNT = 2000, 4
-# A grasp of settings with more steps than this takes three times as long.
+# With more steps than this, a grasp takes three times as long again.
 _LONGEST = 7000
 # Trials of the settings sweeps.
 _SWEEP_TRIALS = ("standard",)
@@ -32,14 +32,14 @@ _SWEEP_OBJECTS = ("shape:box", "shape:mug", "shape:bowl", "shape:hammer")
 _SWEEP_PRESET = "balanced"
 _QUICK_OBJECTS = ("shape:sphere", "shape:box", "shape:mug")
 _QUICK_COUNT = 4
-# The others take minutes a cell.
+# Presets of a quick run. The others take minutes per cell.
 _QUICK_PRESETS = ("fast", "balanced", "accurate", "random_closure", "graspd2022_short")
 
-# CPU seconds of one grasp by method, on a quiet core. Of long settings, and of other methods, below.
+# CPU seconds per grasp by method, on an idle core. `cell_seconds` has those of long settings and of other methods.
 _SECONDS = {"closed_form": 0.05, "graspd2022": 1.2, "annealing": 3.3, "random_closure": 0.3}
 
 _STEPS = {"explore": 50, "refine": 80, "polish": 50}
-# Sweep values: what is changed, and to what. All else stays at `balanced`.
+# Sweeps: each value is a set of changes to `balanced`.
 SWEEPS: Mapping[str, Sequence[Mapping[str, int]]] = {
     "candidates": [{"problem.candidates": n} for n in (32, 64, 128, 256, 512)],
     "directions": [{"problem.directions": n} for n in (6, 12, 24, 48, 96)],
@@ -49,7 +49,7 @@ SWEEPS: Mapping[str, Sequence[Mapping[str, int]]] = {
         for share in (0.2, 0.5, 1.0, 2.0, 4.0)
     ],
 }
-# Three decades: title, preset, setting and its values. The preset's own is among them.
+# Sweeps over three decades: title, preset, setting, and its values. They include the preset's own value.
 DECADES = (
     (
         "Grasp'D, stiffness [N/m]",
@@ -64,7 +64,7 @@ DECADES = (
 
 
 def main_suite(request: Request) -> tuple[Cell, ...]:
-    """Return every preset on every object: raw grasps, verified ones, the pace of the optimiser, and a fresh start."""
+    """Return the cells of study `main`: raw and verified grasps of presets on objects, pace cells, and a start cell."""
     names = (name for name in preset_names() if name != _RANKED)
     defaults = [name for name in names if not request.quick or name in _QUICK_PRESETS]
     presets = {name: load_preset(name) for name in request.presets or defaults}
@@ -76,7 +76,7 @@ def main_suite(request: Request) -> tuple[Cell, ...]:
     for thing in find_objects(request.objects or (_QUICK_OBJECTS if request.quick else all_shapes())):
         for name, config in presets.items():
             cells += _cells(request, "raw", name, config, thing, _count(request, config), trials)
-        # The closed form's own presets are what `plan_grasps` is used with. The others are only compared raw.
+        # Users call `plan_grasps` with presets of closed_form. The others are compared by raw grasps only.
         for name, config in planned.items():
             cells += _cells(request, "verified", name, config, thing, _QUICK_COUNT if request.quick else VERIFIED)
     if not request.objects:
@@ -88,7 +88,7 @@ def main_suite(request: Request) -> tuple[Cell, ...]:
 
 
 def sweep_suite(request: Request) -> tuple[Cell, ...]:
-    """Return each of four settings from poor to rich, one at a time."""
+    """Return raw cells that sweep four settings, one at a time. All other settings are those of `balanced`."""
     base = load_preset(_SWEEP_PRESET)
     count, trials = _count(request, base), _trials(request, _SWEEP_TRIALS)
     return tuple(
@@ -101,7 +101,7 @@ def sweep_suite(request: Request) -> tuple[Cell, ...]:
 
 
 def decades_suite(request: Request) -> tuple[Cell, ...]:
-    """Return stiffness and friction over three decades, to show how far they can be wrong before a method fails."""
+    """Return raw cells that sweep contact settings over three decades. They show how wrong a setting may be."""
     count, trials = request.count or HAND_COUNT, _trials(request, _SWEEP_TRIALS)
     return tuple(
         cell
@@ -121,7 +121,7 @@ def decades_suite(request: Request) -> tuple[Cell, ...]:
 
 
 def hands_suite(request: Request) -> tuple[Cell, ...]:
-    """Return every built-in hand with one preset."""
+    """Return raw cells of every built-in hand with the preset `balanced`."""
     base, count = load_preset(_SWEEP_PRESET), request.count or (_QUICK_COUNT if request.quick else HAND_COUNT)
     trials = _trials(request, _SWEEP_TRIALS)
     return tuple(
@@ -133,12 +133,12 @@ def hands_suite(request: Request) -> tuple[Cell, ...]:
 
 
 def sweep_name(sweep: str, changes: Mapping[str, int]) -> str:
-    """Return the name of a sweep value's cells: the sweep and its value (steps: all of them together)."""
+    """Return the name of a sweep value's cells, such as `steps=90`. The value is the sum of the changed settings."""
     return f"{sweep}={sum(changes.values()):g}"
 
 
 def cell_seconds(cell: Cell) -> float:
-    """Return the CPU seconds of a cell, roughly, as measured on one thread of a quiet core."""
+    """Return the estimated CPU time of a cell on one thread of an idle core [s]."""
     if cell.kind != "raw":
         return {"verified": 1.5, "pace": 8.0, "start": 6.0}[cell.kind]
     each = _SECONDS.get(cell.settings.method, 1.0)

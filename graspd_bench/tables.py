@@ -1,4 +1,4 @@
-"""Records as Markdown tables, and texts for the marked sections of pages."""
+"""Markdown tables of records, and insertion of texts into the marked sections of pages."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from graspd_dataset.run_records import markdown_table
 
 
 def provenance(command: str, records: Sequence[Record]) -> str:
-    """Return one line on where figures come from: the command, days, commits, code, machine and duration."""
+    """Return a sentence on the origin of figures: command, dates, commits, code versions, machines and CPU time."""
 
     def of(name: str) -> str:
         return ", ".join(sorted({str(record.get(name) or "unknown") for record in records}))
@@ -30,13 +30,13 @@ def provenance(command: str, records: Sequence[Record]) -> str:
 
 
 def sourced(command: str, records: Sequence[Record], sections: Sections) -> dict[str, Sequence[str | Picture]]:
-    """Return sections that are not empty, each with the line that says where its figures come from."""
+    """Return the sections that are not empty. Append to each the sentence of `provenance`."""
     filled = {name: [part for part in parts if part] for name, parts in sections.items()}
     return {name: [*parts, provenance(command, records)] for name, parts in filled.items() if parts}
 
 
 def written(parts: Sequence[str | Picture], document: Path | None = None) -> str:
-    """Return the parts of a section as Markdown. Pictures are links from the document, left out where there is none."""
+    """Return the parts of a section as Markdown. Pictures become links relative to `document`. None drops pictures."""
     texts = []
     for part in parts:
         if isinstance(part, str):
@@ -48,10 +48,10 @@ def written(parts: Sequence[str | Picture], document: Path | None = None) -> str
 
 
 def fill(document: Path, sections: Mapping[str, Sequence[str | Picture]]) -> list[str]:
-    """Rewrite the marked sections of a document and leave the others. Return the names of those rewritten.
+    """Replace the marked sections of a document by new texts. Return the names of the replaced sections.
 
-    A section stands between `<!-- NAME:begin -->` and `<!-- NAME:end -->`. Raises ConfigError if the document cannot be
-    read, or has none of the sections.
+    A section stands between `<!-- NAME:begin -->` and `<!-- NAME:end -->`.
+    Raises ConfigError: the document cannot be read, or has none of the sections.
     """
     try:
         text = document.read_text(encoding="utf-8")
@@ -59,14 +59,14 @@ def fill(document: Path, sections: Mapping[str, Sequence[str | Picture]]) -> lis
         raise ConfigError(f"{document}: {error.strerror or error}") from None
     filled = []
     for name, parts in sections.items():
-        # On lines of their own: a document may also speak of its markers.
+        # A marker fills a whole line, because the text of a document may also mention a marker.
         section = re.compile(rf"^(<!-- {name}:begin -->\n).*?^(<!-- {name}:end -->)$", re.DOTALL | re.MULTILINE)
         if section.search(text):
             new = written(parts, document)
             text = section.sub(lambda found, new=new: f"{found[1]}{new}\n{found[2]}", text, count=1)
             filled.append(name)
     if not filled:
-        raise ConfigError(f"{document}: has none of the sections {', '.join(sections)}; valid: <!-- bench:begin --> …")
+        raise ConfigError(f"{document}: has none of the sections {', '.join(sections)}; add <!-- NAME:begin --> …")
     save_text(document, text)
     return filled
 
@@ -82,7 +82,7 @@ _SUMMARY = ("standard", "hard", "sd_cm", "penetration_mm", "contact_area_cm2", "
 
 
 def _columns() -> list[tuple[str, str, str]]:
-    """Return the columns of both tables: heading, figure, format. A summary has means over objects."""
+    """Return the columns of the tables: heading, name of the figure in `Row.values`, and number format."""
     return [
         ("held", "standard", "{:.0%}"),
         ("held, hard", "hard", "{:.0%}"),
@@ -96,12 +96,12 @@ def _columns() -> list[tuple[str, str, str]]:
 
 
 def summary_table(records: Sequence[Record]) -> str:
-    """Return a row for each preset: means over its objects, of raw grasps."""
+    """Return a table with a row for each preset: means over objects, of raw grasps."""
     return _summary("preset", by_name(row for row in rows(records) if is_preset(row.name)))
 
 
 def hands_table(records: Sequence[Record]) -> str:
-    """Return a row for each hand with the same preset: means over objects, and the object on which fewest held."""
+    """Return a table with a row for each hand: means over objects, and the object on which fewest grasps held."""
     found = by_name(row for row in rows(records) if is_hand(row.name))
     worst = [min(group, key=lambda row: row.held / row.asked) for group in found.values()]
     hands = {name.removeprefix("hand:"): group for name, group in found.items()}
@@ -109,7 +109,7 @@ def hands_table(records: Sequence[Record]) -> str:
 
 
 def _summary(kind: str, found: Mapping[str, Sequence[Row]], last: tuple[str, list[str]] | None = None) -> str:
-    """Return a row for each name, with a last column if there is one to add, or nothing where there are no names."""
+    """Return a table with a row for each name, or "" without names. `last` is an extra column: heading and cells."""
     if not found:
         return ""
     columns = [column for column in _columns() if column[1] in _SUMMARY and _known(found, column[1])]
@@ -124,7 +124,7 @@ def _summary(kind: str, found: Mapping[str, Sequence[Row]], last: tuple[str, lis
 
 
 def object_tables(records: Sequence[Record]) -> str:
-    """Return a table for each preset: medians over each object's grasps, and their means."""
+    """Return a table for each preset: medians over the grasps of each object, and the mean over objects."""
     blocks = []
     for name, group in by_name(row for row in rows(records) if is_preset(row.name)).items():
         columns = [column for column in _columns() if _known({name: group}, column[1])]
@@ -139,7 +139,7 @@ def object_tables(records: Sequence[Record]) -> str:
 
 
 def planned_table(records: Sequence[Record]) -> str:
-    """Return a row for each preset of planned runs: verified grasps and their cost, with trials."""
+    """Return a table of planned runs with a row for each preset: verified grasps, and their cost with trials."""
     body = []
     for name, group in by_name(rows(records, "verified")).items():
         held, asked = sum(row.held for row in group), sum(row.asked for row in group)
@@ -155,7 +155,7 @@ def planned_table(records: Sequence[Record]) -> str:
 
 
 def pace_table(records: Sequence[Record]) -> str:
-    """Return the figures of the optimiser alone, and of a fresh process."""
+    """Return a table of the optimiser's cost per raw grasp, and of the first verified grasp of a new process."""
     body = []
     for r in records:
         if r["error"]:
@@ -172,7 +172,7 @@ def pace_table(records: Sequence[Record]) -> str:
 
 
 def main_sections(records: Sequence[Record], chart: Path | None) -> Sections:
-    """Return the few rows of a first page, the whole table, planned runs, and every object."""
+    """Return the sections of study `main`: the short table, all presets, planned runs, and single objects."""
     drawn = drawn_charts(records, chart)
     few = [record for record in records if is_few(record["name"])]
     return {
@@ -184,12 +184,12 @@ def main_sections(records: Sequence[Record], chart: Path | None) -> Sections:
 
 
 def ladder_sections(records: Sequence[Record], chart: Path | None) -> Sections:
-    """Return the chart of the settings sweeps."""
+    """Return the section of study `ladder`: the chart of the settings sweeps."""
     return {"bench-ladder": [drawn_charts(records, chart).get("ladder")]}
 
 
 def decades_sections(records: Sequence[Record], chart: Path | None) -> Sections:
-    """Return a table for each setting: the share of requested raw grasps that held, all objects together."""
+    """Return a table for each setting: how many of the requested raw grasps held, summed over objects."""
     groups = by_name(rows(records))
     blocks = []
     for title, _, setting, values in DECADES:
@@ -201,12 +201,12 @@ def decades_sections(records: Sequence[Record], chart: Path | None) -> Sections:
 
 
 def hands_sections(records: Sequence[Record], chart: Path | None) -> Sections:
-    """Return the table of the hands."""
+    """Return the section of study `hands`: one table."""
     return {"bench-hands": [hands_table(records)]}
 
 
 def drawn_charts(records: Sequence[Record], chart: Path | None) -> Mapping[str, Picture]:
-    """Return the charts that the records have figures for, by name, none without a path."""
+    """Draw the charts for which the records have figures. Return them by name. Draw none if `chart` is None."""
     if chart is None:
         return {}
     from graspd_bench.charts import draw_charts
@@ -215,7 +215,7 @@ def drawn_charts(records: Sequence[Record], chart: Path | None) -> Mapping[str, 
 
 
 def metrics_table() -> str:
-    """Return a row for each metric: its name, unit and definition."""
+    """Return a table with a row for each metric: name, unit and definition."""
     return markdown_table(
         ["metric", "unit in files", "definition"],
         [[f"`{name}`", row.unit, row.description] for name, row in METRICS.items()],
@@ -223,7 +223,7 @@ def metrics_table() -> str:
 
 
 def missing(records: Sequence[Record]) -> str:
-    """Return a sentence on objects that the means of some presets leave out, empty where there are none."""
+    """Return a sentence that names presets whose means lack some objects, or "" if there is no such preset."""
     found = by_name(row for row in rows(records) if is_preset(row.name))
     objects = {r["object"] for r in records if r["kind"] == "raw" and is_preset(r["name"])}
     fewer = [f"`{name}` of {len(group)}" for name, group in found.items() if len(group) < len(objects)]

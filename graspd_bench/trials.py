@@ -1,16 +1,15 @@
-"""Trials beside the hold trial: displacement and drop in MuJoCo, and things that lie free on a table.
+"""More trials in MuJoCo: displacement under gravity with a frozen and with a driven hand, and lifts out of a pile.
 
-The displacement trial shows whether the figure comes from the grasp or from the engine. It has the same frozen hand, 1
-kg, 35 steps of 1/240 s under 9.8 m/s². MuJoCo's friction is per pair and is here what Bullet makes of two 3s. Nothing
-bounces, as in Bullet, where a hand of restitution 0 stops that.
+`displacement_trial` repeats PyBullet's displacement trial in MuJoCo, to show how much its figure depends on the engine.
+Hand, mass and steps are the same: a frozen hand, 1 kg, 35 steps of 1/240 s, 9.8 m/s². The friction of a pair is the
+product of Bullet's two coefficients, 3 times 3. Nothing bounces. In Bullet the hand's restitution of 0 prevents it.
 
-The drop trial measures how far gravity moves an object in a hand that squeezes it, after 2 s. The papers' displacement
-knows neither motors nor effort limits. Its hand is frozen, and its 0.15 s are over before a slow slip shows. Hand,
-object and physics are those of the hold trial.
+`gravity_trial` measures how far gravity moves an object within 2 s while the hand squeezes it. The displacement trial
+of the papers has a frozen hand, without motors and effort limits. Its 0.15 s are too short to show a slow slip. Hand,
+object and physics of `gravity_trial` are those of the hold trial.
 
-Things on a table are dropped until they rest, and a hand lifts one of them out. This is the lift trial in a world
-without simplifications. The object rests on the support and on the others, which are as free as it is. The poses of all
-of them afterwards are kept, so that the next lift continues from there.
+`dropped` and `settle` let objects come to rest on a table. `lift_out` is the lift trial with one of these objects. The
+other objects are free bodies. All final poses are kept, so that the next lift can continue from them.
 """
 
 from __future__ import annotations
@@ -60,13 +59,13 @@ _PAIR_FRICTION = (FRICTION**2, 0.0, 0.0)
 
 @dataclass(frozen=True, eq=False)
 class FrozenWorld:
-    """A hand without joints and a free object of 1 kg, compiled.
+    """Compiled MuJoCo model of a hand without joints and a free object of 1 kg.
 
     Attributes:
-        model: the `mujoco.MjModel`. Every link of the hand is a body that is put where a posture says.
+        model: the `mujoco.MjModel`. Every link of the hand is a mocap body.
         hand: the hand.
         object_body: body id of the object.
-        center_of_mass: of the object, in its own frame [m].
+        center_of_mass: centre of mass of the object, in the object frame [m].
     """
 
     model: Any
@@ -98,7 +97,7 @@ def build_frozen_world(hand: HandModel, target: ObjectModel, parts: Sequence[Tri
 def displacement_trial(
     world: FrozenWorld, posture: Posture, *, directions: Float[np.ndarray, "directions 3"] = DIRECTIONS
 ) -> float:
-    """Return how far the object's centre of mass moves [m] in 35 steps of 1/240 s, mean over gravity's directions."""
+    """Return how far the object's centre of mass moves in 35 steps of 1/240 s [m], mean over gravity directions."""
     import mujoco
 
     moved = []
@@ -128,23 +127,21 @@ def _place_links(world: FrozenWorld, data: Any, posture: Posture) -> None:
 
 
 DROP_GRAVITY, DURATION = 9.8, 2.0
-# A trial along one direction ends here, and what never was in the hand counts as this too [m].
+# The trial along one direction ends at this displacement [m]. An object that was never held counts as moved so far.
 LOST = 0.1
-# A direction ends when its displacement is known to this [m].
+# The trial along one direction ends when its final displacement is known with this tolerance [m].
 TOLERANCE = 1e-4
-# Checks that a speed is taken over. How many times the change of what it foretells has to fit into the tolerance.
+# Number of checks over which a speed is computed. Safety factor on the change of the predicted displacement.
 _WINDOW, _SAFETY = 2, 4
 
 
 def gravity_trial(world: World, grasp: Grasp, protocol: Protocol, *, stop: Callable[[], bool] = lambda: False) -> float:
-    """Return the displacement [m] of the object's centre of mass from the trial's start, mean over six gravity
-    directions.
+    """Return the displacement of the object's centre of mass [m], mean over six gravity directions.
 
     The hand closes and squeezes as in the hold trial. Then gravity acts on the object along ±x, ±y, ±z in turn for 2 s.
-    The result is at most 10 cm. An object that moved so far is lost, and one that the hold trial would refuse is lost
-    from the start. A direction ends when the displacement that its speed predicts for 2 s no longer changes, to 0.1 mm.
-    The result is that prediction, unless the protocol asks for the full length. Directions that `stop` cut short count
-    with what they reached.
+    An object that moves 10 cm is lost and counts as 10 cm. So does a grasp that the hold trial would refuse.
+    A direction ends early when the displacement predicted for 2 s is constant within 0.1 mm. Then it is the result.
+    With `protocol.full_length` no direction ends early. If `stop` returns true, the displacement so far counts.
     """
     import mujoco
 
@@ -163,7 +160,7 @@ def gravity_trial(world: World, grasp: Grasp, protocol: Protocol, *, stop: Calla
 
 
 def _fall(world: World, data: Any, protocol: Protocol, stop: Callable[[], bool]) -> float:
-    """Simulate 2 s, or until the displacement is known or the object lost. Return the displacement then [m]."""
+    """Simulate gravity for 2 s, or until the final displacement is known or the object lost. Return it [m]."""
     import mujoco
 
     checks, states = round(DURATION / protocol.timestep / CHECK_EVERY), list[ObjectState]()
@@ -182,7 +179,7 @@ def _fall(world: World, data: Any, protocol: Protocol, stop: Callable[[], bool])
 
 
 def _end(states: list[ObjectState], checks: int) -> Float[np.ndarray, "3"] | None:
-    """Return where the centre of mass will be at the end, as soft contacts creep evenly, or None if that is unknown."""
+    """Predict the centre of mass after 2 s from the even creep of soft contacts [m]. None if it is not yet certain."""
     recent = states[-2 * _WINDOW - 1 :]
     if len(recent) <= 2 * _WINDOW or not all(s.speed < CREEPING.speed and s.spin < CREEPING.spin for s in recent):
         return None
@@ -198,22 +195,22 @@ def _end(states: list[ObjectState], checks: int) -> Float[np.ndarray, "3"] | Non
 
 _FLOOR, _WALL = "floor", "wall"
 _GRAVITY = 9.81
-# What falls slowly neither bounces nor passes through thin walls: as in honey, it falls at 0.6 m/s [1/s], and turns as
-# slowly [1/s]. What has fallen is left in thinner honey, or balls would roll for minutes.
+# Damping of translation and rotation per mass and inertia [1/s]. Falling objects are damped strongly, to 0.6 m/s, so
+# that they neither bounce nor pass through thin walls. Objects at rest are damped less, so that balls stop rolling.
 _FALLING, _RESTING = (16.0, 16.0), (1.0, 4.0)
-# At rest for so many steps in a row, all of them slower than this [m/s], [rad/s].
+# Objects are at rest after `_STILL` steps in a row in which all are slower than `_SPEED` [m/s] and `_SPIN` [rad/s].
 _SPEED, _SPIN, _STILL = 0.002, 0.05, 50
 Pose = Float[np.ndarray, "4 4"]
 
 
 @dataclass(frozen=True)
 class Lifted:
-    """The result of a lift.
+    """Result of lifting one of several objects.
 
     Attributes:
-        result: of the lift trial.
-        poses: of all things afterwards, in their order, seen from the table [m].
-        hand: where the hand ended, likewise. None where it never moved.
+        result: result of the lift trial.
+        poses: final poses of all objects in the table frame, in the order of the input.
+        hand: final posture of the hand in the table frame. None if the hand never moved.
     """
 
     result: TrialResult
@@ -224,17 +221,17 @@ class Lifted:
 def settle(
     bodies: Sequence[FreeBody], *, wall: float | None = None, seconds: float = 4.0, protocol: Protocol | None = None
 ) -> tuple[Pose, ...]:
-    """Let things come to rest on the table z = 0.
+    """Let objects come to rest on the table z = 0.
 
     Args:
-        bodies: where they begin, not in each other.
-        wall: half the side of a square fence about the origin, within which they fall slowly. Without it they lie
-            where they are and come to rest [m].
-        seconds: the most of simulated time.
-        protocol: physics.
+        bodies: objects at their start poses. They must not overlap.
+        wall: half the side of a square fence around the origin [m]. Objects fall slowly within it. None: there is no
+            fence, and the objects already lie on the table.
+        seconds: limit of the simulated time [s].
+        protocol: physics settings. None takes those of the standard trial.
 
     Returns:
-        The poses at the end, the same for the same bodies.
+        The final poses. They are the same for the same bodies.
     """
     import mujoco
 
@@ -272,13 +269,13 @@ def _damp(model: Any, names: Sequence[str], slow: float, turn: float) -> None:
 
 
 def dropped(models: Sequence[ObjectModel], seed: int, wall: float, *, stays: bool = False) -> tuple[FreeBody, ...]:
-    """Return things at rest on the table z = 0 that fell one above the other into a fence, which is then removed.
+    """Drop objects into a square fence on the table z = 0, then remove the fence. Return the objects at rest.
 
     Args:
-        models: the things, in the order of their fall.
-        seed: of their turns and places.
-        wall: half the side of the fence about the origin [m].
-        stays: the fence is not removed.
+        models: the objects, from the lowest to the highest before the fall.
+        seed: random seed of their orientations and places.
+        wall: half the side of the fence around the origin [m].
+        stays: whether to keep the fence.
     """
     generator = torch.Generator().manual_seed(seed)
     turns = random_rotations(len(models), generator, torch.float64).numpy()
@@ -295,18 +292,17 @@ def dropped(models: Sequence[ObjectModel], seed: int, wall: float, *, stays: boo
 
 
 def posed(bodies: Sequence[FreeBody], poses: Sequence[Pose]) -> tuple[FreeBody, ...]:
-    """Return the things at other poses."""
     return tuple(replace(body, pose=pose) for body, pose in zip(bodies, poses, strict=True))
 
 
 def lift_out(
     hand: HandModel, bodies: Sequence[FreeBody], index: int, grasp: Grasp, protocol: Protocol, settings: LiftSettings
 ) -> Lifted:
-    """Close the hand on one of the things, all of them as they lie on the table z = 0, and lift it.
+    """Close the hand on the object `bodies[index]` among others on the table z = 0, and lift it.
 
     Args:
-        grasp: in the frame of the table.
-        protocol: physics, and how far the thing may slip in the hand.
+        grasp: the grasp, in the table frame.
+        protocol: physics settings, and how far the object may slip in the hand.
     """
     target, others = bodies[index], [body for k, body in enumerate(bodies) if k != index]
     model, parts = placed(target)
@@ -321,7 +317,7 @@ def lift_out(
 
 
 class _Watch:
-    """A hook that keeps the last step's poses, seen from the table, which sinks in a lift (lift_trial.py)."""
+    """Hook that keeps the poses of the last step, in the table frame. A lift lowers the table (lift_trial.py)."""
 
     def __init__(self, world: World) -> None:
         self._world = world
@@ -338,7 +334,7 @@ class _Watch:
 
 
 def placed(body: FreeBody) -> tuple[ObjectModel, tuple[TriangleMesh, ...]]:
-    """Return a thing with its parts as it lies, in the world frame."""
+    """Return the object and its convex parts, transformed to the world frame."""
     turn, place = body.pose[:3, :3], body.pose[:3, 3]
 
     def there(mesh: TriangleMesh) -> TriangleMesh:

@@ -130,5 +130,6 @@ def load_thing(source: ThingSource) -> Thing:
         if source.mass is None:
             model = model.at_mass(SHAPE_DENSITY * model.volume)
     if not model.volume > 0:
-        raise MeshError(f"{source.source}: encloses no volume")
+        told = f"{source.source}: volume {model.volume:.3g} m³"
+        raise MeshError(f"{told}; valid: a closed mesh whose faces point outwards")
     return Thing(source.name, model, object_parts(model), simplify(model.mesh, _SEEN_FACES))

@@ -1,1 +1,1 @@
-"""Data sets of grasps on Ray, and grasps of others."""
+"""Data sets of grasps, made on Ray. Import and export of grasps in formats of other projects."""

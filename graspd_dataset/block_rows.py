@@ -1,4 +1,4 @@
-"""A block in this process: the prepared object, its planned grasps, and the rows of their file."""
+"""Work on a block in this process: prepare the object, plan its grasps, and build the rows of the block's file."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ from graspd_dataset.ray_engine import pickled_hand
 from graspd_dataset.record_schema import arrow_schema, object_schema
 from graspd_dataset.run_records import code_version, forget_peak, peak_mb
 
-# Scenes and hands that a process keeps, so that consecutive blocks share what is built for them.
+# Number of scenes and hands that a process keeps, so that consecutive blocks share what was computed for them.
 _KEPT = 4
 _loaded: OrderedDict[str, Any] = OrderedDict()
 
@@ -37,7 +37,8 @@ _loaded: OrderedDict[str, Any] = OrderedDict()
 def make_ready(thing: DatasetObject, content: bytes | None, config: PlanConfig) -> ReadyObject:
     """Load an object and prepare it for optimiser and trials.
 
-    `content` is its file's, if the file lies on another machine. Raises GraspdError: it cannot be read or used.
+    `content` holds the bytes of the object's file if the file is on another machine. Otherwise it is None.
+    Raises GraspdError: the object cannot be read or used.
     """
     _one_thread()
     disk_cache.forget()
@@ -57,7 +58,7 @@ def make_ready(thing: DatasetObject, content: bytes | None, config: PlanConfig) 
 
 
 def make_block(block: Block, hand: bytes, shared: bytes) -> MadeBlock:
-    """Plan a block's grasps. `hand` is a pickled HandModel, `shared` as `ReadyObject` has it."""
+    """Plan the grasps of a block. `hand` is a pickled HandModel, `shared` comes from `ReadyObject.shared`."""
     _one_thread()
     forget_peak()
     began = time.process_time()
@@ -67,7 +68,7 @@ def make_block(block: Block, hand: bytes, shared: bytes) -> MadeBlock:
     request: dict[str, Any] = {"preset": block.config, "verify": block.verify, "measure": block.measure != "none"}
     result = plan_grasps(scene, model, count=block.count, seed=block.seed, **request)
     grasps = result.tried if block.measure != "all" else all_measured(scene, model, result.tried)
-    # What the hand could not lift was tried at less than the mass that was assumed.
+    # If the hand cannot lift the assumed mass, the trials use a smaller one. The rows hold that mass.
     target = scene.object if result.mass is None else scene.object.at_mass(result.mass)
     asked = {"block": block.key, "asked": block.asked, "outcome": result.outcome.name, "message": result.message}
     return MadeBlock(
@@ -82,18 +83,18 @@ def make_block(block: Block, hand: bytes, shared: bytes) -> MadeBlock:
 
 
 def all_measured(scene: Scene, hand: HandModel, grasps: Sequence[Grasp]) -> tuple[Grasp, ...]:
-    """Return grasps with metrics, failed ones too."""
+    """Return the grasps with metrics added where they are missing, also for failed grasps."""
     context = make_metrics_context(scene.object, hand)
     return tuple(grasp if grasp.metrics else replace(grasp, metrics=measure(context, grasp.grasp)) for grasp in grasps)
 
 
 def failure_kind(grasp: Grasp) -> str:
-    """Return the kind of failure of a failed grasp, for counting."""
+    """Return the kind of failure of a failed grasp (`kind_of_reason` of its first failed trial)."""
     return kind_of_reason(*next((trial.name, trial.reason) for trial in grasp.trials if not trial.passed))
 
 
 def kind_of_reason(trial: str, reason: str) -> str:
-    """Return the failed trial and its reason without numbers, for counting."""
+    """Return "trial: reason" without numbers and units, so that equal kinds of failure can be counted."""
     words = [word for word in reason.split() if not any(sign.isdigit() for sign in word)]
     return f"{trial}: {' '.join(word for word in words if word not in ('cm', 'mm', 'm', 'N'))}"
 
@@ -105,7 +106,7 @@ def _one_thread() -> None:
 
 
 def _kept(key: str, pickled: bytes) -> Any:
-    """Return the unpickled object, the same one while it is kept, because worlds are remembered by identity."""
+    """Return the unpickled value. It stays the same instance, because worlds are cached by the identity of scenes."""
     if key not in _loaded:
         _loaded[key] = pickle.loads(pickled)
     _loaded.move_to_end(key)
@@ -138,7 +139,7 @@ def _table(block: Block, target: ObjectModel, hand: HandModel, grasps: Sequence[
 
 
 def _row(grasp: Grasp, hand: HandModel) -> dict[str, Any]:
-    """Return the columns of a grasp. The rest is the same in the whole block."""
+    """Return those columns of a grasp that differ within a block."""
     row: dict[str, Any] = {
         "verdict": str(grasp.verdict),
         "reason": grasp.reason,
@@ -170,7 +171,7 @@ def _object_file(target: ObjectModel) -> bytes:
 
 
 def dry_run(blocks: Sequence[Block], limits: Limits, workers: int | None) -> str:
-    """Return count, hours and bytes of the blocks, a line each."""
+    """Make one block of each hand. Return the estimated grasps, CPU hours and megabytes of all blocks as text."""
     if not blocks:
         return "nothing is missing"
     workers = workers or os.cpu_count() or 1

@@ -1,4 +1,4 @@
-"""Blocks of grasps, of which a data set consists, each known by the content of its request."""
+"""Blocks of grasps. A data set consists of blocks, and the key of a block is a hash of its request."""
 
 from __future__ import annotations
 
@@ -27,19 +27,19 @@ _DIGITS = 32
 
 
 def content_key(asked: Any) -> str:
-    """Return the key of JSON-ready values."""
+    """Return the key of JSON-ready values: the first 128 bits of their SHA-256 in hexadecimal."""
     return hashlib.sha256(json.dumps(asked, sort_keys=True).encode()).hexdigest()[:_DIGITS]
 
 
 @dataclass(frozen=True)
 class DatasetObject:
-    """An object at a scale.
+    """An object at one scale.
 
     Attributes:
         source: shape:NAME or a mesh file.
         content: hash of the shape's or the file's content.
         scale: factor on the file's coordinates.
-        mass: [kg]. None: the heavy end of what the volume allows.
+        mass: mass [kg]. None assumes the upper end of what the volume allows.
         friction: Coulomb coefficient.
     """
 
@@ -51,29 +51,29 @@ class DatasetObject:
 
     @property
     def asked(self) -> dict[str, Any]:
-        """The content, which does not depend on names."""
+        """Inputs that identify the object, JSON-ready. Names of files are not among them."""
         return {"content": self.content, "scale": self.scale, "mass": self.mass, "friction": self.friction}
 
     @cached_property
     def key(self) -> str:
-        """Key of the content."""
+        """Key of the object: a hash of `asked`."""
         return content_key(self.asked)
 
 
 @dataclass(frozen=True)
 class Block:
-    """One call of `plan_grasps`, whose candidates are written together.
+    """One call of `plan_grasps`. Its candidates are written to one file.
 
     Attributes:
-        object: what is grasped.
-        hand: name or path.
-        hand_content: hash of its files.
-        preset: name of the settings.
-        config: the settings.
-        verify: the trials.
-        measure: which grasps get their metrics.
-        seed: of the plan.
-        count: verified grasps wanted.
+        object: the object to grasp.
+        hand: name or path of the hand.
+        hand_content: hash of the hand's files.
+        preset: name of the preset.
+        config: the settings of the preset.
+        verify: name of the trials.
+        measure: which grasps get metrics: verified, all or none.
+        seed: random seed of the plan.
+        count: number of verified grasps wanted.
     """
 
     object: DatasetObject
@@ -88,12 +88,12 @@ class Block:
 
     @property
     def hand_name(self) -> str:
-        """Name of the hand's partition."""
+        """Name of the hand, as in the folder `hand=NAME` of the data set."""
         return thing_name(self.hand)
 
     @property
     def asked(self) -> dict[str, Any]:
-        """All that the rows depend on except the code, JSON-ready."""
+        """All inputs of the rows except the code version, JSON-ready."""
         return {
             "schema": SCHEMA_VERSION,
             "object": self.object.asked,
@@ -107,7 +107,7 @@ class Block:
 
     @cached_property
     def key(self) -> str:
-        """Key of the content, and the name of its file."""
+        """Key of the block: a hash of `asked`. The block's file has this name."""
         return content_key(self.asked)
 
 
@@ -116,19 +116,19 @@ class DatasetRequest:
     """The requested content of a data set.
 
     Attributes:
-        objects: shape:NAME, mesh files, or folders of them.
+        objects: shape:NAME, mesh files, or folders of mesh files.
         hands: names or paths.
-        per_object: verified grasps wanted of every object, scale and hand.
-        block: verified grasps wanted of a block.
-        preset: name or file.
-        seed: of the first block of every object and hand, and of the random scales.
+        per_object: number of verified grasps wanted for every object, scale and hand.
+        block: number of verified grasps wanted in one block.
+        preset: name or file of the preset.
+        seed: random seed of the first block of every object and hand, and of the random scales.
         scales: factors on every object's coordinates.
-        random_scales: how many more factors each object gets, and the range that they are drawn from, evenly in their
-            logarithm.
-        mass: [kg]. None assumes the heavy end of what each volume allows.
+        random_scales: number of additional random factors per object, and their least and greatest value. Their
+            logarithms are drawn uniformly.
+        mass: mass of every object [kg]. None assumes the upper end of what each volume allows.
         friction: Coulomb coefficient.
-        verify: the trials.
-        measure: which grasps get their metrics.
+        verify: name of the trials.
+        measure: which grasps get metrics: verified, all or none.
 
     Raises:
         ConfigError: a number is out of range.
@@ -155,17 +155,14 @@ class DatasetRequest:
             raise ConfigError(f"measure: {self.measure!r}; valid: {', '.join(MEASURED)}")
         number, low, high = self.random_scales
         if number < 0 or not 0 < low <= high < np.inf:
-            raise ConfigError(f"random-scales: {number} {low:g} {high:g}; valid: a number, and 0 < LOW <= HIGH")
+            raise ConfigError(f"random-scales: {number} {low:g} {high:g}; valid: N >= 0 and 0 < LOW <= HIGH")
         for name, value in [("scales", s) for s in self.scales] + [("mass", self.mass), ("friction", self.friction)]:
             if value is not None and not (np.isfinite(value) and value > 0):
                 raise ConfigError(f"{name}: {value!r}; it must be a positive number")
 
 
 def blocks_of(request: DatasetRequest) -> tuple[Block, ...]:
-    """Return the blocks of a data set, those of an object together.
-
-    Raises GraspdError: no such object, hand or preset.
-    """
+    """Return the blocks of a data set, grouped by object. Raises GraspdError: no such object, hand or preset."""
     config = load_preset(request.preset)
     hands = {name: hand_hash(name) for name in request.hands}
     preset = Path(request.preset).stem if request.preset.endswith((".yaml", ".yml")) else request.preset
@@ -179,7 +176,7 @@ def blocks_of(request: DatasetRequest) -> tuple[Block, ...]:
 
 
 def by_object(blocks: Sequence[Block]) -> list[tuple[DatasetObject, list[Block]]]:
-    """Group blocks by their objects, in their order."""
+    """Group blocks by object. Both the groups and their blocks keep their order."""
     groups: dict[str, tuple[DatasetObject, list[Block]]] = {}
     for block in blocks:
         groups.setdefault(block.object.key, (block.object, []))[1].append(block)
@@ -191,7 +188,7 @@ def _split(total: int, most: int) -> list[int]:
 
 
 def _objects(request: DatasetRequest) -> list[DatasetObject]:
-    """Return every object at every scale, each once."""
+    """Return every object at every scale, without duplicates."""
     found: dict[str, DatasetObject] = {}
     for source in object_sources(request.objects):
         content = object_hash(source)

@@ -1,4 +1,4 @@
-"""Imported grasps completed to graspd's own. Postures that their format lacks are found as for a planned grasp."""
+"""Completion of imported grasps. Postures that a file lacks are computed as for a planned grasp."""
 
 from __future__ import annotations
 
@@ -22,22 +22,23 @@ from graspd_core.types import Grasp, Posture
 from graspd_dataset.finger_closing import CLOSE_STEPS, make_closing
 from graspd_dataset.foreign_grasps import ImportedGrasp
 
-# A joint may be so far beyond its limit [rad] or [m]: limits are rounded differently in other descriptions.
+# Tolerance of joint limits [rad] or [m], because other descriptions of a hand round its limits differently.
 _BEYOND = 1e-3
-# A hand so deep in the object, or so far off, does not grasp it [m]. The share of grasps that makes a frame doubtful,
-# and the fewest grasps that can.
+# A hand deeper in the object than `_DEEP`, or farther off than `_OFF`, does not grasp it [m]. The frame is doubtful if
+# this is so for `_NEARLY_ALL` of at least `_FEWEST` grasps.
 _DEEP, _OFF, _NEARLY_ALL, _FEWEST = 0.005, 0.005, 0.8, 5
-# Grasps at once. Each takes a megabyte on the way.
+# Grasps per batch. Each needs a megabyte of temporary memory.
 _AT_ONCE = 128
 
 
 @dataclass(frozen=True)
 class CompletedGrasps:
-    """Grasps of one object, in the order of their files, unverified.
+    """Unverified grasps of one object, in the order of their files.
 
     Attributes:
-        refused: how many were refused, by reason.
-        frame_doubt: a sentence if the poses are hardly those of the hand's base link, else empty.
+        grasps: the accepted grasps.
+        refused: number of refused grasps by reason.
+        frame_doubt: a warning that the poses seem to be in a wrong frame. Empty if they do not.
     """
 
     grasps: tuple[Grasp, ...]
@@ -48,11 +49,11 @@ class CompletedGrasps:
 def complete_grasps(
     scene: Scene, hand: HandModel, imported: Sequence[ImportedGrasp], config: PlanConfig
 ) -> CompletedGrasps:
-    """Close the hands whose joints are not known, and find each missing pregrasp and squeeze.
+    """Close the hands without joint values, and compute each missing pregrasp and squeeze.
 
-    Postures of a file are kept to the digit. Squeezes are targets, so they may exceed the joint limits. Refused are
-    grasps that their own file calls failed, grasps beyond the joint limits, and grasps without a squeeze that touch
-    with fewer than two links.
+    Postures from a file are kept exactly. Squeezes are targets, so they may exceed the joint limits. A grasp is refused
+    if its file marks it as failed, or if a joint is beyond its limits. It is also refused if the file gives no squeeze
+    and fewer than two links touch the object.
     """
     faults = [grasp.refused or beyond_limits(grasp, hand) for grasp in imported]
     kept = [grasp for grasp, fault in zip(imported, faults, strict=True) if not fault]
@@ -69,7 +70,7 @@ def complete_grasps(
                 own[row] = grasp
         for theirs, ours in zip(some, own, strict=True):
             if theirs.squeeze is None and len(ours.contacts) < 2:
-                faults.append("no squeeze to be found: fewer than two links touch the object")
+                faults.append("no squeeze can be computed: fewer than two links touch the object")
             else:
                 grasps.append(_merged(theirs, ours))
     doubt = frame_doubt(scene, hand, [grasp.grasp for grasp in kept if grasp.closed])
@@ -77,7 +78,7 @@ def complete_grasps(
 
 
 def frame_doubt(scene: Scene, hand: HandModel, postures: Sequence[Posture]) -> str:
-    """Say that nearly all postures are deep in the object or do not touch it, as those of another frame are."""
+    """Return a warning if 80 % of at least five hands are deep in the object, or 80 % are off it. Otherwise ""."""
     if len(postures) < _FEWEST:
         return ""
     points = [
@@ -93,11 +94,11 @@ def frame_doubt(scene: Scene, hand: HandModel, postures: Sequence[Posture]) -> s
     what = f"{deep} of {len(postures)} grasps are more than {_DEEP * 1000:g} mm deep in the object"
     if off > deep:
         what = f"{off} of {len(postures)} grasps are more than {_OFF * 1000:g} mm off the object"
-    return f"{what}: their poses are hardly those of the base link {hand.base_link!r} of {hand.name}; check the frame"
+    return f"{what}: the poses do not seem to be those of base link {hand.base_link!r} of {hand.name}; check the frame"
 
 
 def beyond_limits(grasp: ImportedGrasp, hand: HandModel) -> str:
-    """Return which joint is beyond its limits at the grasp or the pregrasp, empty for none."""
+    """Return a sentence that names the joint farthest beyond its limits at grasp or pregrasp. Empty if none is."""
     for posture in filter(None, (grasp.grasp, grasp.pregrasp)):
         beyond = np.maximum(hand.lower - posture.joint_positions, posture.joint_positions - hand.upper)
         if beyond.max(initial=0.0) > _BEYOND:
@@ -111,7 +112,7 @@ def _poses(problem: Problem, postures: Sequence[Posture]) -> Poses:
 
 
 def _merged(theirs: ImportedGrasp, ours: Grasp) -> Grasp:
-    """Return our grasp with the file's postures, to the digit."""
+    """Return our grasp with the file's postures in place of ours, unchanged."""
     grasp = theirs.grasp
     if not theirs.closed:
         grasp = replace(grasp, joint_positions=ours.grasp.joint_positions)
@@ -121,7 +122,7 @@ def _merged(theirs: ImportedGrasp, ours: Grasp) -> Grasp:
 
 
 def by_object(imported: Sequence[ImportedGrasp]) -> dict[tuple[str, float], tuple[ImportedGrasp, ...]]:
-    """Group grasps by their object, mesh and scale, in the order of the first of each."""
+    """Group grasps by mesh and scale of their object. Groups are in the order of their first grasp."""
     found: dict[tuple[str, float], list[ImportedGrasp]] = {}
     for grasp in imported:
         found.setdefault((grasp.mesh, grasp.scale), []).append(grasp)

@@ -1,4 +1,4 @@
-"""`graspd dataset`: make a data set of grasps on Ray, resumable, or inspect one."""
+"""The command `graspd dataset`: it makes a data set of grasps on Ray, or inspects one. Runs can be resumed."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ if TYPE_CHECKING:
 
 
 EXIT_FAULTS = 1
-# Seconds between two plain lines of progress, and between two writes of what a run took.
+# Seconds between two lines of progress, and between two writes of the run record.
 _LINES, _RECORDS = 10.0, 30.0
 
 
@@ -73,7 +73,8 @@ def run(options: argparse.Namespace) -> int:
     if action not in _ACTIONS:
         return _make(options)
     if not places or (action not in ("merge",) and len(places) > 1):
-        raise ConfigError(f"dataset {action}: {len(places)} data sets; valid: {'some' if action == 'merge' else 'one'}")
+        valid = "one or more" if action == "merge" else "exactly one"
+        raise ConfigError(f"dataset {action}: {len(places)} data sets; valid: {valid}")
     return _ACTIONS[action](options, [DatasetStore(place) for place in places])
 
 
@@ -121,7 +122,7 @@ def _run_missing(
     record: RunRecord,
     interrupt: Interrupt,
 ) -> tuple[Lines, RunRecord]:
-    """Run the missing blocks. The record is written from time to time, so that a killed run has one."""
+    """Run the missing blocks, and write the run record every 30 s. Return the progress and the updated record."""
     from graspd_dataset.ray_engine import RayEngine, ray_running
     from graspd_dataset.run_dataset import run_blocks, write_run
 
@@ -137,7 +138,7 @@ def _run_missing(
 
 
 def _finish(store: DatasetStore) -> None:
-    """Write the data card of the present content, and print the numbers."""
+    """Write the data card (README.md) of the stored blocks, and print their counts. Do nothing without blocks."""
     from graspd_dataset.inspect_dataset import stats_of, stats_table
     from graspd_dataset.run_dataset import data_card
 
@@ -165,7 +166,7 @@ def _request(options: argparse.Namespace) -> DatasetRequest:
 
 
 class Lines:
-    """Progress over blocks: a bar on a terminal, otherwise a line now and then. Failures are printed at once."""
+    """Progress over blocks: a bar on a terminal, otherwise a line every 10 s. Failures are printed immediately."""
 
     def __init__(self, blocks: int) -> None:
         self.wrong = 0
@@ -207,7 +208,7 @@ class Lines:
         return f"{told}; {reasons}" if reasons else told
 
     def added_to(self, record: RunRecord, wall: float) -> RunRecord:
-        """Return the record with the work of this session."""
+        """Return the record with the work of this session added. `wall` is its duration [s]."""
         more = {"done": record.done + self._done, "cpu": record.cpu + self._cpu, "wall": record.wall + wall}
         return replace(record, **more, peak_mb=max(record.peak_mb, self._peak), files=record.files | self._files)
 
@@ -263,7 +264,7 @@ def _sample(options: argparse.Namespace, stores: list[DatasetStore]) -> int:
     from graspd_dataset.merge_datasets import sample
 
     if not options.out.endswith(".parquet"):
-        raise ConfigError(f"--out {options.out}: a .parquet file is written")
+        raise ConfigError(f"--out {options.out}; valid: a path that ends with .parquet")
     check_writable(Path(options.out))
     with busy("sample"):
         content, rows = sample(stores[0], options.count, options.seed, options.verdict)

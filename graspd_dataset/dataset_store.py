@@ -1,13 +1,13 @@
-"""Where a data set lies: a directory, or an address that pyarrow knows (s3://bucket/path, gs://, hdfs://).
+"""Storage of a data set: a directory, or an address that pyarrow can open (s3://bucket/path, gs://, hdfs://).
 
-    grasps/hand=HAND/object=CONTENT/KEY.parquet    a block each
-    objects/SHA256.parquet                         a mesh each
+    grasps/hand=HAND/object=CONTENT/KEY.parquet    one block per file
+    objects/SHA256.parquet                         one mesh per file
     failed/KEY.json                                why a block or an object failed
-    runs/KEY.json                                  what a command asked for and what it took
+    runs/KEY.json                                  record of a command: its request and its cost
     README.md                                      the data card
 
-A file appears whole or not at all. The same rows give the same bytes. The record of a run holds the hash of every file
-that it wrote, so that a byte that changed anywhere is found.
+Every file is written completely or not at all. The same rows give the same bytes. The record of a run holds the SHA-256
+of every file that it wrote, so `graspd dataset validate` finds any changed byte.
 """
 
 from __future__ import annotations
@@ -24,12 +24,12 @@ from graspd_core.errors import FormatError, GraspdError
 from graspd_core.runtime.disk_cache import save_bytes
 
 FORMAT, SCHEMA_VERSION = "graspd/dataset", 1
-# Key of graspd's own part of the metadata.
+# Key of graspd's entry in the metadata of a Parquet file.
 _METADATA = b"graspd"
 
 
 def parquet_bytes(table: Any, metadata: Mapping[str, Any]) -> bytes:
-    """Return a pyarrow table as the bytes of a Parquet file, with JSON-ready values in its metadata."""
+    """Return the bytes of a Parquet file with a pyarrow table. `metadata` holds JSON-ready values."""
     import pyarrow.parquet as pq
 
     told = json.dumps({"format": FORMAT, "version": SCHEMA_VERSION, **metadata}, sort_keys=True)
@@ -40,16 +40,16 @@ def parquet_bytes(table: Any, metadata: Mapping[str, Any]) -> bytes:
 
 
 def read_parquet(content: bytes, where: str, columns: Sequence[str] | None = None) -> tuple[Any, dict[str, Any]]:
-    """Read the table of a file, of all columns or some, and its metadata.
+    """Return the pyarrow table and graspd's metadata of a Parquet file. `columns` None reads all columns.
 
-    Raises FormatError: it is no Parquet file of graspd, of an unknown version, or its content was changed.
+    Raises FormatError: the file is not from graspd, has an unknown version, or is damaged. `where` names it.
     """
     import pyarrow as pa
     import pyarrow.parquet as pq
 
     try:
-        # Without a thread of Arrow's, nor a file of Python's for it to read: one that still runs when the process ends
-        # aborts it.
+        # Use no thread of Arrow and no Python file object. An Arrow thread that still runs when the process ends aborts
+        # the process.
         file = pq.ParquetFile(pa.BufferReader(content), page_checksum_verification=True, pre_buffer=False)
         table = file.read(columns, use_threads=False)
     except (pa.ArrowException, OSError, ValueError, MemoryError) as error:
@@ -57,7 +57,7 @@ def read_parquet(content: bytes, where: str, columns: Sequence[str] | None = Non
     try:
         told = json.loads((table.schema.metadata or {})[_METADATA])
     except (KeyError, ValueError):
-        raise FormatError(f"{where}: not a file of `graspd dataset`: it says nothing of its origin") from None
+        raise FormatError(f"{where}: not written by `graspd dataset`: its metadata has no graspd entry") from None
     if told.get("format") != FORMAT or told.get("version") != SCHEMA_VERSION:
         raise FormatError(f"{where}: {told.get('format')} version {told.get('version')!r}; known: {SCHEMA_VERSION}")
     return table, told
@@ -65,18 +65,18 @@ def read_parquet(content: bytes, where: str, columns: Sequence[str] | None = Non
 
 T = TypeVar("T")
 
-# Tries of a request to a server, and the pause before the second one, which doubles [s].
+# Number of attempts of a server request, and the pause before the second attempt [s]. The pause doubles each time.
 _TRIES, _PAUSE = 6, 0.2
 # Digits of an object's hash in the name of its directory.
 _SHORT = 16
 
 
 class StorageError(GraspdError):
-    """A data set cannot be read or written: the disk is full, say, or its server does not answer."""
+    """Error: a data set cannot be read or written, because the disk is full or the server does not answer."""
 
 
 class DatasetStore:
-    """Files by their path below a directory or an address. Every failure is a StorageError that names both."""
+    """Files below a directory or an address. Every failure raises a StorageError that names the place and the file."""
 
     def __init__(self, where: str) -> None:
         self.where = str(where).rstrip("/")
@@ -84,17 +84,17 @@ class DatasetStore:
 
     @property
     def shown(self) -> str:
-        """The address without keys and options, for messages and records."""
+        """The directory, or the address without access keys and options, for messages and records."""
         kind, there, rest = self.where.partition("://")
         return f"{kind}://{rest.partition('?')[0].rpartition('@')[2]}" if there else self.where
 
     @property
     def local(self) -> Path | None:
-        """The directory, None for an address."""
+        """The directory. None if the data set is at an address."""
         return None if "://" in self.where else Path(self.where)
 
     def list(self, folder: str) -> list[str]:
-        """Return the paths of all files below a folder, sorted, none if there is no such folder."""
+        """Return the sorted paths of all files below a folder. Empty if there is no such folder."""
         if self.local is not None:
             found = (self.local / folder).rglob("*")
             return sorted(path.relative_to(self.local).as_posix() for path in found if path.is_file())
@@ -106,7 +106,6 @@ class DatasetStore:
         return sorted(item.path.removeprefix(f"{root}/") for item in found if item.type is FileType.File)
 
     def read(self, path: str) -> bytes:
-        """Read a file."""
         if self.local is not None:
             local = self.local / path
             return self._once(path, local.read_bytes)
@@ -119,7 +118,7 @@ class DatasetStore:
         return self._tried(path, read)
 
     def write(self, path: str, content: bytes) -> None:
-        """Write a file, in place of one of the same path."""
+        """Write a file. An existing file of the same path is replaced."""
         if self.local is not None:
             local = self.local / path
             return self._once(path, lambda: save_bytes(local, content))
@@ -132,12 +131,12 @@ class DatasetStore:
         return self._tried(path, write)
 
     def _arrow(self) -> tuple[Any, str]:
-        """Return pyarrow's file system and the path in it."""
+        """Return pyarrow's file system, and the path of the data set in it."""
         if self._system is None:
             from pyarrow import ArrowException
             from pyarrow.fs import FileSystem
 
-            # One request a file, where pyarrow would make three.
+            # This option makes pyarrow send one request per file instead of three.
             once = "allow_delayed_open=true"
             sign = "&" if "?" in self.where else "?"
             address = f"{self.where}{sign}{once}" if self.where.startswith("s3://") else self.where
@@ -157,7 +156,7 @@ class DatasetStore:
             raise StorageError(f"{self.shown}: {path}: {error.strerror or error}") from None
 
     def _tried(self, path: str, work: Callable[[], T]) -> T:
-        """Do a request. A busy server is asked again."""
+        """Do a server request. Repeat it, after growing pauses, if it fails."""
         for number in range(_TRIES):
             try:
                 return work()
@@ -175,26 +174,26 @@ def block_path(hand: str, object_sha256: str, key: str) -> str:
 
 
 def key_of(path: str) -> str:
-    """Return the key in a file's name."""
+    """Return the key of a block, object or record from the path of its file."""
     return PurePosixPath(path).stem
 
 
 def file_hash(content: bytes) -> str:
-    """Return the SHA-256 of a file, as records of runs hold it."""
+    """Return the SHA-256 of a file's content in hexadecimal, as run records hold it."""
     return hashlib.sha256(content).hexdigest()
 
 
 def read_record(store: DatasetStore, path: str) -> dict[str, Any]:
-    """Read the record of a run or a failure. Raises FormatError: it holds no JSON object."""
+    """Read the record of a run or a failure. Raises FormatError: the file is not a JSON object, or is damaged."""
     try:
         record = json.loads(store.read(path))
     except ValueError:
         record = None
     if not isinstance(record, dict) or not isinstance(record.get("files", {}), dict):
-        raise FormatError(f"{store.shown}/{path}: no record of a run or a failure: its content was changed")
+        raise FormatError(f"{store.shown}/{path}: not a record of a run or a failure; expected a JSON object")
     return record
 
 
 def keys_below(store: DatasetStore, folder: str) -> set[str]:
-    """Return the keys of the files of a folder."""
+    """Return the keys of all Parquet and JSON files below a folder."""
     return {key_of(path) for path in store.list(folder) if PurePosixPath(path).suffix in (".parquet", ".json")}

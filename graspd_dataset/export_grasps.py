@@ -1,8 +1,8 @@
-"""Export of a data set: isaac_grasp 1.0 (Isaac Sim, Isaac ROS), GraspGen's training JSON, and DexGraspBench.
+"""Export of a data set to isaac_grasp 1.0 (Isaac Sim, Isaac ROS), GraspGen's training JSON, and DexGraspBench.
 
-Poses are those of the hand's base link in the object's frame, which is the frame of the mesh written beside, in metres.
-DexGraspBench reads a pickled dictionary a grasp, and a folder an object. Its Allegro is Menagerie's right hand, with
-our order of joints. The pose of its qpos is that of a frame in which the palm is turned by the quaternion (0, 1, 0, 1).
+Poses are those of the hand's base link in the object frame, the frame of the exported mesh. Lengths are in metres.
+DexGraspBench reads one pickled dictionary per grasp and one folder per object. Its Allegro is Menagerie's right hand,
+with our joint order. In the frame of its qpos, the palm has the orientation (0, 1, 0, 1), wxyz before normalisation.
 """
 
 from __future__ import annotations
@@ -31,11 +31,11 @@ Row = dict[str, Any]
 
 
 def export(store: DatasetStore, kind: str, out: Path) -> tuple[int, int]:
-    """Write files for every hand and object, and the meshes. Return the numbers of such pairs and of grasps.
+    """Write the grasps of every hand and object pair, and the meshes. Return the numbers of pairs and of grasps.
 
     Raises:
-        ConfigError: no such kind, or a hand that it does not know.
-        FormatError: there is no data set, or a file is spoilt.
+        ConfigError: the format `kind` is unknown, or does not support a hand.
+        FormatError: there is no data set, or a file is damaged.
     """
     if kind not in (*KINDS, DEXGRASPBENCH):
         raise ConfigError(f"to: {kind!r}; valid: {', '.join((*KINDS, DEXGRASPBENCH))}")
@@ -59,7 +59,7 @@ def export(store: DatasetStore, kind: str, out: Path) -> tuple[int, int]:
 
 
 def isaac_grasp(rows: Sequence[Row], mesh: str) -> str:
-    """Return verified grasps in isaac_grasp 1.0, which knows the touching posture but no squeeze."""
+    """Return grasps as isaac_grasp 1.0 YAML. The format has no squeeze. `mesh` is the path that it names."""
 
     def joints(row: Row, stage: str) -> dict[str, float]:
         return dict(zip(row["joint_names"], row[f"{stage}_joint_positions"], strict=True))
@@ -80,14 +80,14 @@ def isaac_grasp(rows: Sequence[Row], mesh: str) -> str:
 
 
 def graspgen(rows: Sequence[Row], mesh: str) -> str:
-    """Return poses of tried grasps and whether each held, failed ones too."""
+    """Return GraspGen JSON: the pose of every verified and failed grasp, and whether the grasp held."""
     transforms = [_matrix(row["grasp_position"], row["grasp_quaternion_wxyz"]).tolist() for row in rows]
     held = [row["verdict"] == "verified" for row in rows]
     grasps = {"transforms": transforms, "object_in_gripper": held}
     return json.dumps({"object": {"file": mesh, "scale": 1.0}, "grasps": grasps}) + "\n"
 
 
-# Ending of the files, the verdicts that are written, and what writes them.
+# Each format's file ending, the verdicts that it includes, and the function that returns the text of a file.
 KINDS: dict[str, tuple[str, tuple[str, ...], Callable[[Sequence[Row], str], str]]] = {
     "isaac": (".yaml", ("verified",), isaac_grasp),
     "graspgen": (".json", ("verified", "failed"), graspgen),
@@ -114,7 +114,7 @@ def _mesh(store: DatasetStore, target: str) -> TriangleMesh:
 
 
 def refuse_hand(name: str) -> None:
-    """Raise ConfigError: DexGraspBench's model of the hand is not known here."""
+    """Raise ConfigError if we do not know DexGraspBench's model of the hand."""
     if name not in PALMS:
         raise ConfigError(f"to dexgraspbench: hand {name!r}; valid: {', '.join(PALMS)}")
 
@@ -124,7 +124,7 @@ def write_dexgraspbench(
 ) -> None:
     """Write the grasps of one hand on one object, and the object: mesh, convex parts, mass and centre of mass.
 
-    That bench takes paths from the folder of its own code. The `objects` belong there, or are named in full.
+    `objects` is the object folder that the grasp files name. DexGraspBench reads it relative to its own code folder.
     """
     name = rows[0]["object_sha256"]
     for number, row in enumerate(rows):
@@ -145,7 +145,7 @@ def write_dexgraspbench(
 
 
 def qpos(row: dict[str, Any], stage: str) -> np.ndarray:
-    """Return a posture in that bench's order: position, quaternion wxyz, joints."""
+    """Return a posture as DexGraspBench's qpos: position [m], quaternion wxyz, joints [rad] or [m]."""
     from scipy.spatial.transform import Rotation
 
     palm = Rotation.from_quat(np.roll(PALMS[row["hand_name"]], -1))
@@ -154,6 +154,6 @@ def qpos(row: dict[str, Any], stage: str) -> np.ndarray:
 
 
 def obj_text(mesh: TriangleMesh) -> str:
-    """Return a mesh as a Wavefront file, to the last digit."""
+    """Return the text of a Wavefront OBJ file, with coordinates at full precision."""
     lines = [f"v {x!r} {y!r} {z!r}" for x, y, z in mesh.vertices.tolist()]
     return "\n".join([*lines, *(f"f {a + 1} {b + 1} {c + 1}" for a, b, c in mesh.faces.tolist())]) + "\n"

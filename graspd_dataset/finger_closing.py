@@ -1,9 +1,8 @@
-"""Closing until contact: every finger turns at its own rate until a link of it touches, as a gripper without sensors.
+"""Closing of a hand until contact: each finger closes at its own rate until one of its links touches something.
 
-A solver for the shared loop, without loss and gradients. The base stands still. Each joint travels towards the limit
-beyond its closed value. A step that would let a link of a finger sink in is halved instead. At a thirty-second of a
-step the joints that move that link stop, and the finger's other joints go on. Links of the hand stop links as the
-object does.
+This is a solver for the shared loop, without loss or gradients. The base does not move. Each joint moves towards the
+limit beyond its closed value. A finger's step is halved if it would push a link into the object or into another link.
+Below 1/32 of a step, the joints that move that link stop, and the finger's other joints continue.
 """
 
 from __future__ import annotations
@@ -25,11 +24,11 @@ from graspd_core.optimize.problem import HandPlacement, Problem, hand_forward
 
 # Steps of a closing from open to closed.
 CLOSE_STEPS = 60
-# A finger whose step is halved to this share has arrived. Steps are full travels of the closing over `close_steps`.
+# A finger has arrived when its step is halved below this fraction. A full step is the closing travel / `close_steps`.
 _ARRIVED = 1 / 32
-# Overlap of proxy spheres beyond that at the start that counts as a collision of the hand with itself [m].
+# Proxy spheres may overlap by this much more than at the start before it counts as self-collision [m].
 _SELF_SLACK = 0.001
-# Joints go past their closed value, up to this many times the travel from open to closed.
+# Joints may pass their closed value: the total travel is up to this multiple of the travel from open to closed.
 _OVERTRAVEL = 2.0
 
 
@@ -38,10 +37,11 @@ class ClosingState:
     """A batch of closing hands.
 
     Attributes:
-        poses: where they are.
-        floor: gaps that count as contact: zero, less where a link sank in already [m].
-        stride: share of a step that each joint tries next, equal for the joints of a finger.
-        blamed: links that the last refused step would have let sink in.
+        poses: current poses of the hands, in the object frame.
+        floor: smallest allowed gap of each link, to the object and to the hand itself [m]. Negative if it was at the
+            start.
+        stride: fraction of a full step that each joint tries next, equal for the joints of a finger.
+        blamed: links that would have gone below their smallest gap in the last refused step.
         stopped: joints that have arrived.
     """
 
@@ -54,15 +54,15 @@ class ClosingState:
 
 @dataclass(frozen=True)
 class Closing:
-    """A closing until contact, from `make_closing`. Its loss is the share of joints that no contact has stopped.
+    """Solver that closes hands until contact, made by `make_closing`. Its loss is the fraction of joints not stopped.
 
     Attributes:
-        rate: what each joint turns in a full step, signed, zero for unmoved ones [rad] or [m].
-        target: the limits that the joints turn to [rad] or [m].
-        moves: which links each joint moves.
-        finger_links: links of each joint's finger.
+        rate: signed travel of each joint in a full step [rad] or [m]. Zero for joints that do not close.
+        target: the limit that each joint moves to [rad] or [m].
+        moves: whether a joint moves a link.
+        finger_links: whether a link belongs to the joint's finger.
         sphere_links: link of each proxy sphere of the problem.
-        close_steps: full steps from open to closed.
+        close_steps: number of full steps from open to closed.
     """
 
     rate: Float[Tensor, "joints"]
@@ -93,7 +93,7 @@ class Closing:
             return state
         joints = state.poses.joints
         turned = torch.where(state.stopped, joints, joints + state.stride * self.rate)
-        # Nobody closes past the limit. Minimum and maximum by the way that each joint turns.
+        # No joint passes its limit. The sign of its rate decides whether the limit is a maximum or a minimum.
         turned = torch.where(self.rate > 0, turned.minimum(self.target), turned.maximum(self.target))
         turned = torch.where(self.rate == 0.0, joints, turned)
         gaps = link_gaps(problem, replace(state.poses, joints=turned), self.sphere_links)
@@ -101,7 +101,7 @@ class Closing:
         refused = self.some(bad, self.finger_links)
         in_refused = self.some(refused, self.finger_links.T)
         blamed = torch.where(in_refused, bad, state.blamed)
-        # After the first refusal a finger halves its steps whether they are taken or not: a bisection.
+        # After its first refused step, a finger halves every step, accepted or not. This is a bisection.
         stride = torch.where(refused | (state.stride < 1.0), 0.5 * state.stride, state.stride)
         arrived = stride < _ARRIVED
         stopped = state.stopped | (arrived & self.some(blamed, self.moves)) | (turned == self.target)
@@ -117,15 +117,15 @@ class Closing:
         return state.poses, 1.0 - state.stopped.to(state.stride).mean(-1)
 
     def some(self, flags: Bool[Tensor, "batch n"], of: Bool[Tensor, "m n"]) -> Bool[Tensor, "batch m"]:
-        """Return whether any flag is set among those that belong to each row of `of`."""
+        """Return for each row of `of` whether a flag is set at any of the row's true entries."""
         return flags.to(self.rate) @ of.to(self.rate).T > 0
 
 
 def make_closing(problem: Problem, hand: HandModel, close_steps: int) -> Closing:
-    """Build the closing of a hand in `close_steps` full steps from its open to its closed posture."""
+    """Build the solver that closes a hand from open to closed posture in `close_steps` full steps."""
     device = problem.hand.lower.device
     travel = hand.closed_posture - hand.open_posture
-    # Joints that hardly differ between the two postures shape the hand, they do not close it.
+    # A joint with nearly equal values in both postures shapes the hand and does not close it.
     travel = np.where(np.abs(travel) > 0.01 * (hand.upper - hand.lower), travel, 0.0)
     moves = moved_links(hand)
     fingers = finger_of(hand)
@@ -141,7 +141,7 @@ def make_closing(problem: Problem, hand: HandModel, close_steps: int) -> Closing
 
 
 def moved_links(hand: HandModel) -> Bool[np.ndarray, "joints links"]:
-    """Return which links each joint moves, through couplings too."""
+    """Return which links each actuated joint moves, directly or through coupled joints."""
     moved = np.zeros((hand.num_joints, hand.num_links), dtype=bool)
     for link in range(1, hand.num_links):
         moved[:, link] = moved[:, hand.link_parent[link]]
@@ -151,7 +151,7 @@ def moved_links(hand: HandModel) -> Bool[np.ndarray, "joints links"]:
 
 
 def finger_of(hand: HandModel) -> Int[np.ndarray, "joints"]:
-    """Return a number for each joint, equal for joints that move a link in common, directly or through others."""
+    """Return the finger number of each joint. Joints that move a common link have the same number, transitively."""
     from scipy.sparse import csr_array
     from scipy.sparse.csgraph import connected_components
 
@@ -161,10 +161,10 @@ def finger_of(hand: HandModel) -> Int[np.ndarray, "joints"]:
 
 @torch.no_grad()
 def link_gaps(problem: Problem, poses: Poses, sphere_links: Int[Tensor, "spheres"]) -> Float[Tensor, "batch 2 links"]:
-    """Return the signed distance of every link to the object and to the rest of the hand (proxy spheres, at most 0)
-    [m].
+    """Return the gaps [m] of every link: its signed distance to the object, then its clearance to other links.
 
-    Adjacent links are never near each other. A link without candidates and solids is infinitely far from all.
+    The clearance is minus the overlap of proxy spheres, so it is never positive. Adjacent links do not count.
+    A gap is infinite if the link has no contact candidates and no solids, or no proxy spheres.
     """
     placed = hand_forward(problem, problem.hand.fine, poses)
     count = placed.links.translation.shape[1]
@@ -176,7 +176,7 @@ def link_gaps(problem: Problem, poses: Poses, sphere_links: Int[Tensor, "spheres
 
 
 def sphere_overlap(problem: Problem, placed: HandPlacement) -> Float[Tensor, "batch spheres"]:
-    """Return the greatest depth of each proxy sphere in one of a link that is not adjacent, zero where clear [m]."""
+    """Return how deep each proxy sphere overlaps spheres of non-adjacent links at most [m]. Zero without overlap."""
     centers = place_points(problem.hand.spheres.matrix, placed.links)
     reach = problem.hand.spheres.radii[:, None] + problem.hand.spheres.radii[None, :]
     depth = (reach - torch.cdist(centers, centers)).clamp_min(0.0) * (problem.hand.spheres.weight > 0)

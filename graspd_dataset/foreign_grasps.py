@@ -1,15 +1,13 @@
-"""Grasps from files of others, in graspd's terms: joints in the hand's own order, poses of its base link.
+"""Readers of other projects' grasp files. They return joints in the hand's order and poses of its base link.
 
-DexGraspBench's npy: a pickled dictionary a grasp, three postures as position, quaternion wxyz and joints by order.
-`runtime/inert_pickle` reads the pickle and runs none of it.
+DexGraspBench (.npy): one pickled dictionary per grasp. It holds three postures, each as position, quaternion wxyz and
+unnamed joint values. `runtime/inert_pickle` reads the pickle without running code from it.
 
-isaac_grasp 1.0 (YAML): a pose of the gripper, joints at the grasp and at the pregrasp by name, no squeeze. The
-gripper's frame is a link of the hand by its name, the last word of a path in a stage. Other words mean its base link.
+isaac_grasp 1.0 (.yaml): the gripper's pose, and named joint values at grasp and pregrasp. There is no squeeze. The
+gripper's frame is a link name, or a USD stage path that ends with one. Any other name means the base link.
 
-GraspGen's JSON: poses of the gripper's base, whether each held there, and no joints. The hand closes from its open
-posture until it touches, and presses as graspd's grasps do.
-
-The ending of a file decides its format.
+GraspGen (.json): poses of the gripper's base and whether each grasp held. There are no joint values.
+`complete_grasps` closes the open hand until it touches the object.
 """
 
 from __future__ import annotations
@@ -32,25 +30,25 @@ from graspd_core.hands.model import AT_ORIGIN, HandModel, all_joint_names, all_j
 from graspd_core.runtime.inert_pickle import NUMPY_NAMES, Inert, array_of, load_inert, read_bounded
 from graspd_core.types import Posture
 
-# A coupled joint may be so far from where it follows to [rad] or [m], and a quaternion's length from one.
+# Tolerances: of a coupled joint around the value that its leader demands [rad] or [m], and of a quaternion's length.
 _COUPLED, _UNIT = 1e-3, 0.01
-# No position, angle or scale is larger. What is computed of such numbers stays finite.
+# The greatest magnitude of a position, angle or scale. Results computed from such numbers stay finite.
 _LARGEST = 1e6
 
 
 @dataclass(frozen=True)
 class ImportedGrasp:
-    """One grasp as a file has it.
+    """One grasp read from a file.
 
     Attributes:
-        name: the file and the place in it.
-        mesh: file of the object or shape:NAME. The poses are in its frame, once it is scaled.
+        name: the file, and the place of the grasp in it.
+        mesh: mesh file of the object, or shape:NAME. Poses are in the frame of the scaled mesh.
         scale: factor on the mesh's coordinates.
-        grasp: the touching posture, of a format without joints the open hand, which is to be closed.
-        pregrasp, squeeze: None if the format has none.
-        closed: whether the joints of `grasp` are those of the file.
-        squeeze_moved: how far the squeeze's base is from the grasp's [m]: graspd keeps it at the grasp's.
-        refused: why its own file calls it no grasp, empty if it does not.
+        grasp: the touching posture. If the format has no joint values, this is the open hand, still to be closed.
+        pregrasp, squeeze: None if the format has no such posture.
+        closed: whether the file gives the joint values of `grasp`.
+        squeeze_moved: distance of the squeeze's base from the grasp's base in the file [m]. graspd drops the offset.
+        refused: reason to refuse the grasp, if its file says that it failed. Otherwise empty.
     """
 
     name: str
@@ -65,7 +63,7 @@ class ImportedGrasp:
 
 
 def numbers_of(value: Any, shape: tuple[int, ...], where: str) -> np.ndarray:
-    """Return a value as numbers of a shape, none of them huge. Raises FormatError: it is something else."""
+    """Return a value as an array of a shape. Raises FormatError: wrong type or shape, NaN, or a magnitude over 1e6."""
     try:
         numbers = np.array(value, dtype=np.float64)
     except (TypeError, ValueError, OverflowError):
@@ -79,17 +77,17 @@ def numbers_of(value: Any, shape: tuple[int, ...], where: str) -> np.ndarray:
 
 
 def entry(values: Any, key: str, where: str) -> Any:
-    """Return a mapping's value of a key. Raises FormatError: it has no such key, or is no mapping."""
+    """Return the value of a key. Raises FormatError: the key is missing, or `values` is not a mapping."""
     if not isinstance(values, Mapping):
         raise FormatError(f"{where}: {shown(values)}; expected a mapping with the key {key!r}")
     if key not in values:
         known = ", ".join(sorted(str(name)[:40] for name in values)[:20])
-        raise FormatError(f"{where}: the key {key!r} is missing; it has {known or 'none'}")
+        raise FormatError(f"{where}: the key {key!r} is missing; present keys: {known or 'none'}")
     return values[key]
 
 
 def quaternion_of(value: Any, where: str) -> Float[np.ndarray, "4"]:
-    """Return a unit quaternion, wxyz. Raises FormatError: it is none."""
+    """Return a unit quaternion, wxyz. Raises FormatError: not four numbers, or the length is not 1 within 0.01."""
     quaternion = numbers_of(value, (4,), where)
     length = float(np.linalg.norm(quaternion))
     if abs(length - 1) > _UNIT:
@@ -98,10 +96,9 @@ def quaternion_of(value: Any, where: str) -> Float[np.ndarray, "4"]:
 
 
 def joints_by_name(values: Any, hand: HandModel, where: str) -> Float[np.ndarray, "joints"]:
-    """Return actuated joint values from named ones, which may include coupled joints.
+    """Return the actuated joint values [rad] or [m] from named values. Names of coupled joints are allowed.
 
-    Raises FormatError: a name is not of the hand, one of its joints is missing, or a coupled one contradicts its
-    leader.
+    Raises FormatError: a name is unknown, an actuated joint is missing, or a coupled joint contradicts its leader.
     """
     if not isinstance(values, Mapping):
         raise FormatError(f"{where}: {shown(values)}; expected joint values by name")
@@ -114,12 +111,12 @@ def joints_by_name(values: Any, hand: HandModel, where: str) -> Float[np.ndarray
     for name, follows in zip(names, all_joint_positions(hand, joints), strict=True):
         given = float(numbers_of(values.get(name, follows), (), f"{where}: {name}"))
         if abs(given - follows) > _COUPLED:
-            raise FormatError(f"{where}: joint {name!r} is {given:.4g}; by the joint that it follows {follows:.4g}")
+            raise FormatError(f"{where}: joint {name!r} is {given:.4g}; valid: {follows:.4g}, as it is coupled")
     return joints
 
 
 def checked_order(order: Sequence[str], hand: HandModel) -> tuple[str, ...]:
-    """Return a joint order that fits the hand. Raises ConfigError: an unknown or a missing joint."""
+    """Return the joint order as a tuple. Raises ConfigError: a joint is unknown, missing, or occurs twice."""
     names = all_joint_names(hand)
     for name in order:
         if name not in names or list(order).count(name) > 1:
@@ -131,40 +128,40 @@ def checked_order(order: Sequence[str], hand: HandModel) -> tuple[str, ...]:
 
 
 def find_beside(named: Any, file: Path, where: str) -> str:
-    """Find a file that another one names, relative to any folder above it. Raises FormatError: it is nowhere."""
+    """Return the path of `named` below the nearest folder above `file` that has it. Raises FormatError: none has."""
     if isinstance(named, str) and named and "\0" not in named:
         for folder in file.resolve().parents:
             if (folder / named).is_file():
                 return str(folder / named)
-    raise FormatError(f"{where}: the object {shown(named)} is not beside the file; name its mesh: --object MESH")
+    raise FormatError(f"{where}: object {shown(named)} is in no folder above the file; give --object MESH")
 
 
-# The palm, our base link, in the frame of the qpos, wxyz, of hands whose model there is another than ours. Their joints
-# are in the order of ours. Of other hands the frame is that of the hand's own file, in which the base link stands.
+# Orientation (wxyz) of our base link, the palm, in the frame of the qpos, for hands that DexGraspBench models with
+# another root frame. Their joint order is ours. For other hands, the qpos frame is the root frame of our hand file.
 PALMS = {"allegro_right": (0.0, 1.0, 0.0, 1.0)}
 STAGES = ("pregrasp", "grasp", "squeeze")
 _WHAT = "file of DexGraspBench"
 
 
 def order_of(hand: HandModel, order: Sequence[str]) -> tuple[str, ...]:
-    """Return the joint order of a qpos: as given, else the known one.
+    """Return the joint order of a qpos: `order`, or the hand's known order if `order` is empty.
 
-    Raises ConfigError: neither, or it does not fit.
+    Raises ConfigError: the order is not known, or does not fit the hand.
     """
     if not order and hand.name not in PALMS:
         names = ",".join(all_joint_names(hand))
-        raise ConfigError(f"joint order: npy files name no joints, that of {hand.name} is not known; such as: {names}")
+        raise ConfigError(f"joint order: not known for {hand.name}, and npy files have no names; give one: {names}")
     return checked_order(order or all_joint_names(hand), hand)
 
 
 def read_dexgraspbench(
     path: Path, content: bytes, hand: HandModel, mesh: str | None, order: Sequence[str]
 ) -> list[ImportedGrasp]:
-    """Read the one grasp of a file, in the frame of the object. `mesh` replaces the one that it names.
+    """Read the single grasp of an npy file, in the object frame. `mesh`, if given, replaces the mesh named in the file.
 
     Raises:
         ConfigError: the joint order is not known or does not fit the hand.
-        FormatError: no npy of a dictionary, asks for code to be run, or an entry is missing or malformed, by its key.
+        FormatError: the file is no npy of one dictionary, its pickle calls code, or an entry is missing or malformed.
     """
     order = order_of(hand, order)
     values = npy_dictionary(path, content)
@@ -178,9 +175,9 @@ def read_dexgraspbench(
 
 
 def npy_dictionary(path: Path, content: bytes) -> dict[Any, Any]:
-    """Return the dictionary of an npy file: plain values, and `Inert` arrays of numbers.
+    """Return the dictionary of an npy file. Its values are plain, or `Inert` arrays of numbers.
 
-    Raises FormatError: it has none.
+    Raises FormatError: the file is not an npy file with one pickled dictionary.
     """
     file = BytesIO(content)
     try:
@@ -198,12 +195,12 @@ def npy_dictionary(path: Path, content: bytes) -> dict[Any, Any]:
     state = held.state if isinstance(held, Inert) else None
     items = state[4] if isinstance(state, tuple) and len(state) == 5 else None
     if not isinstance(items, list) or len(items) != 1 or not isinstance(items[0], dict):
-        raise FormatError(f"{path}: holds no dictionary")
+        raise FormatError(f"{path}: the pickle holds no dictionary; expected one")
     return items[0]
 
 
 def plain_entry(values: dict[Any, Any], key: str, path: Path) -> Any:
-    """Return text, a number, or an array of numbers under a key."""
+    """Return the text, number or array of numbers under a key. Raises FormatError: missing, or another type."""
     value = entry(values, key, f"{path}")
     if not isinstance(value, Inert):
         return value
@@ -234,7 +231,10 @@ def _posture(
     order: Sequence[str],
     path: Path,
 ) -> Posture:
-    """Return a posture of the hand's base link in the frame of the object."""
+    """Return the posture of a stage, as the pose of the hand's base link in the object frame.
+
+    `target` is the object's pose in the file's world frame: position, quaternion wxyz, no joints.
+    """
     from scipy.spatial.transform import Rotation
 
     where = f"{path}: {stage}_qpos"
@@ -249,12 +249,12 @@ def _posture(
     return Posture(into.apply(position + frame.apply(place) - target[0]), np.roll(base.as_quat(), 1), named)
 
 
-# Entries of a rotation matrix may be so far from orthonormal.
+# Tolerance of the entries of R R^T around the identity.
 _ROTATION = 1e-3
 
 
 def read_isaac(path: Path, text: bytes, hand: HandModel, mesh: str | None) -> list[ImportedGrasp]:
-    """Read the grasps of one file. `mesh` replaces the one that it names. Raises FormatError: malformed, by key."""
+    """Read the grasps of one file. `mesh`, if given, replaces the mesh named in it. Raises FormatError: malformed."""
     try:
         _, document = parse_yaml(text.decode())
     except ValueError as error:
@@ -262,7 +262,7 @@ def read_isaac(path: Path, text: bytes, hand: HandModel, mesh: str | None) -> li
     if entry(document, "format", f"{path}") != "isaac_grasp" or document.get("format_version") != 1.0:
         told = f"{shown(document['format'])} {shown(document.get('format_version'))}"
         raise FormatError(f"{path}: format {told}; valid: isaac_grasp 1.0")
-    # Isaac Sim writes the former names, Isaac ROS describes the latter.
+    # Isaac Sim writes keys that end with `_frame_link`, Isaac ROS documents keys that end with `_frame`.
     target, frame = (document.get(f"{of}_frame_link", document.get(f"{of}_frame")) for of in ("object", "gripper"))
     mesh = mesh or find_beside(target, path, f"{path}: object_frame_link")
     frame = str(frame).rpartition("/")[2]
@@ -300,7 +300,7 @@ def _base_of(
 
 
 def read_graspgen(path: Path, text: bytes, hand: HandModel, mesh: str | None) -> list[ImportedGrasp]:
-    """Read the grasps of one file. `mesh` replaces the one that it names. Raises FormatError: malformed, by key."""
+    """Read the grasps of one file. `mesh`, if given, replaces the mesh named in it. Raises FormatError: malformed."""
     try:
         document = json.loads(text)
     except (ValueError, RecursionError) as error:
@@ -310,7 +310,7 @@ def read_graspgen(path: Path, text: bytes, hand: HandModel, mesh: str | None) ->
     scale = float(numbers_of(entry(target, "scale", f"{path}: object"), (), f"{path}: object: scale"))
     poses, held = (entry(grasps, key, f"{path}: grasps") for key in ("transforms", "object_in_gripper"))
     if not isinstance(poses, list) or not isinstance(held, list) or len(poses) != len(held):
-        raise FormatError(f"{path}: grasps: transforms and object_in_gripper are not lists of one length")
+        raise FormatError(f"{path}: grasps: transforms and object_in_gripper; valid: two lists of equal length")
     found = []
     for number, (pose, good) in enumerate(zip(poses, held, strict=True)):
         where = f"{path}: grasp {number}"
@@ -322,7 +322,7 @@ def read_graspgen(path: Path, text: bytes, hand: HandModel, mesh: str | None) ->
 
 
 def _open_at(pose: object, hand: HandModel, where: str) -> Posture:
-    """Return the open hand at a pose `T_object_hand`."""
+    """Return the open hand at a 4 x 4 pose `T_object_hand`. Raises FormatError: it is no rigid transform."""
     from scipy.spatial.transform import Rotation
 
     matrix = numbers_of(pose, (4, 4), f"{where}: transform")
@@ -334,23 +334,23 @@ def _open_at(pose: object, hand: HandModel, where: str) -> Posture:
     return Posture(matrix[:3, 3], quaternion, np.clip(hand.open_posture, hand.lower, hand.upper))
 
 
-# Endings, in the order in which a folder is searched: what describes objects beside npy files is JSON, too.
+# Searched in this order. JSON is last, because folders of npy grasps also hold JSON files that describe objects.
 FORMATS = {".npy": "dexgraspbench", ".yaml": "isaac", ".yml": "isaac", ".json": "graspgen"}
 
 
 def read_foreign(
     place: Path, hand: HandModel, *, mesh: str | None = None, order: Sequence[str] = ()
 ) -> tuple[ImportedGrasp, ...]:
-    """Read all grasps of a file, or of the files of one format below a folder, in the order of their names.
+    """Read all grasps of a file, or of all files of one format below a folder, sorted by file name.
 
     Args:
-        hand: whose grasps they are.
-        mesh: of the object, instead of what the files name.
-        order: joints of an npy's rows of numbers, by name, () if the hand's is known.
+        hand: the hand that the grasps were made for.
+        mesh: mesh of the object. None takes the mesh that each file names.
+        order: joint names in the order of an npy file's joint values. () takes the hand's known order.
 
     Raises:
-        ConfigError: the order is not known, or does not fit the hand.
-        FormatError: there is no such file, or one is malformed.
+        ConfigError: the joint order is not known, or does not fit the hand.
+        FormatError: there is no such file, or a file is malformed.
     """
     found: list[ImportedGrasp] = []
     for path in foreign_files(place):
@@ -366,7 +366,7 @@ def read_foreign(
 
 
 def foreign_files(place: Path) -> tuple[Path, ...]:
-    """Return the files of grasps at a place, which share a format. Raises FormatError: there are none."""
+    """Return the grasp files at a path: the file, or all of one format below a folder. Raises FormatError: none."""
     endings = ", ".join(FORMATS)
     if place.is_file():
         if place.suffix not in FORMATS:

@@ -1,7 +1,7 @@
-"""Blocks on a worker of Ray: the work in a child process with limits, its files written whole by the worker.
+"""Blocks on a Ray worker. A child process with limits does the work, and the worker writes the files.
 
-A block that hangs, crashes, or fills memory harms the child only, and the worker records it. The worker itself loads
-neither torch nor MuJoCo: it passes pickled values on to the child.
+A block that hangs, crashes or fills the memory harms only the child, and the worker records the failure. The worker
+imports neither torch nor MuJoCo. It passes pickled values to the child.
 """
 
 from __future__ import annotations
@@ -17,14 +17,14 @@ from graspd_dataset.dataset_store import DatasetStore, block_path, file_hash
 
 T = TypeVar("T")
 
-# Calls after which the child is replaced, which bounds what libraries leak.
+# The child is replaced after this many calls, which bounds memory leaks of libraries.
 _CALLS = 200
 _KINDS = {TimeoutError: "hung", MemoryError: "memory", ChildProcessError: "died"}
 
 
 @dataclass(frozen=True)
 class Limits:
-    """Limits of one block, or of preparing one object: seconds, and MB of resident memory."""
+    """Limits for making a block or preparing an object: wall time [s] and resident memory [MB]."""
 
     seconds: float = 1800.0
     most_mb: float = 4096.0
@@ -32,18 +32,18 @@ class Limits:
 
 @dataclass(frozen=True)
 class Report:
-    """The result of a block, or of preparing an object.
+    """Report on a block, or on a prepared object.
 
     Attributes:
-        key: of the block or the object.
-        failed: kind of failure (raised, hung, memory, died, lost), empty for a written one.
-        error: what failed.
-        rows, verified: numbers of candidates.
-        failures: numbers of failed candidates by trial and kind of reason.
-        size: of the file [bytes].
-        cpu: seconds.
-        peak_mb: peak of the child's memory.
-        files: hashes of the files that were written, by path.
+        key: key of the block or the object.
+        failed: kind of failure (raised, hung, memory, died, lost). Empty on success.
+        error: description of the failure.
+        rows, verified: number of all candidates, and of verified ones.
+        failures: number of failed candidates by trial and kind of reason.
+        size: size of the file [bytes].
+        cpu: CPU time of the child [s].
+        peak_mb: peak memory of the child [MB].
+        files: SHA-256 of each written file, by path.
     """
 
     key: str
@@ -60,12 +60,12 @@ class Report:
 
 @dataclass(frozen=True)
 class ReadyObject:
-    """A prepared object, for every process that grasps it.
+    """A prepared object, which all blocks of this object share.
 
     Attributes:
-        sha256: of its cleaned mesh.
-        file: bytes of its row in `objects/`.
-        shared: pickled scene and what was built for it: the distance grid, the convex parts.
+        sha256: hash of its cleaned mesh.
+        file: bytes of its file in `objects/`.
+        shared: pickled scene, and the arrays computed for it, such as its SDF grid and convex parts.
     """
 
     sha256: str
@@ -75,15 +75,15 @@ class ReadyObject:
 
 @dataclass(frozen=True)
 class MadeBlock:
-    """A block's file and what it took.
+    """The file of a block, and the cost of making it.
 
     Attributes:
-        object_sha256: of the cleaned mesh.
-        file: bytes of its Parquet file.
-        rows, verified: numbers of candidates.
-        failures: numbers of failed candidates by trial and kind of reason.
-        cpu: seconds of this process.
-        peak_mb: peak of its memory.
+        object_sha256: hash of the object's cleaned mesh.
+        file: bytes of the Parquet file.
+        rows, verified: number of all candidates, and of verified ones.
+        failures: number of failed candidates by trial and kind of reason.
+        cpu: CPU time of this process [s].
+        peak_mb: peak memory of this process [MB].
     """
 
     object_sha256: str
@@ -97,13 +97,13 @@ class MadeBlock:
 
 @dataclass(frozen=True)
 class Job:
-    """A block, or an object to make ready, as it goes to a worker.
+    """A block to make or an object to prepare, in the form that is sent to a worker.
 
     Attributes:
-        key: of the block or the object.
-        asked: for the record of a failure, JSON-ready.
-        pickled: the block, or the pair of an object and the settings.
-        hand: of a block, the name of its hand.
+        key: key of the block or the object.
+        asked: the request, JSON-ready, for the record of a failure.
+        pickled: the pickled block, or the pickled pair of an object and its settings.
+        hand: name of a block's hand. Empty for an object.
     """
 
     key: str
@@ -113,7 +113,7 @@ class Job:
 
 
 def prepare_object(job: Job, content: bytes | None, store: DatasetStore, limits: Limits) -> tuple[Report, bytes]:
-    """Prepare an object and keep its mesh. Return the report, and what its blocks share, empty for a failure."""
+    """Prepare an object and write its mesh file. Return the report and `ReadyObject.shared`, empty after a failure."""
     try:
         ready = call_guarded(limits, ready_of, job.pickled, content)
     except Exception as error:
@@ -124,7 +124,7 @@ def prepare_object(job: Job, content: bytes | None, store: DatasetStore, limits:
 
 
 def run_block(job: Job, hand: bytes, shared: bytes, store: DatasetStore, limits: Limits) -> Report:
-    """Make a block and keep it."""
+    """Make a block and write its file. Return the report, also after a failure."""
     try:
         made = call_guarded(limits, block_of, job.pickled, hand, shared)
     except Exception as error:
@@ -144,7 +144,7 @@ def run_block(job: Job, hand: bytes, shared: bytes, store: DatasetStore, limits:
 
 
 def ready_of(pickled: bytes, content: bytes | None) -> ReadyObject:
-    """Call `make_ready` of an object and settings, in the child."""
+    """Call `make_ready` in the child. `pickled` holds the object and its settings."""
     from graspd_dataset.block_rows import make_ready
 
     thing, config = pickle.loads(pickled)
@@ -152,14 +152,14 @@ def ready_of(pickled: bytes, content: bytes | None) -> ReadyObject:
 
 
 def block_of(pickled: bytes, hand: bytes, shared: bytes) -> MadeBlock:
-    """Call `make_block`, in the child."""
+    """Call `make_block` in the child. `pickled` holds the block."""
     from graspd_dataset.block_rows import make_block
 
     return make_block(pickle.loads(pickled), hand, shared)
 
 
 def failed_report(store: DatasetStore, job: Job, error: BaseException) -> Report:
-    """Record a failure."""
+    """Write the record of a failure. Return its report."""
     from graspd_dataset.run_records import failure
 
     record = failure(error, _KINDS.get(type(error), "raised"))
@@ -169,7 +169,7 @@ def failed_report(store: DatasetStore, job: Job, error: BaseException) -> Report
 
 
 class _Child:
-    """The child of this process, started with the first call."""
+    """The child process of this process. The first call starts it."""
 
     def __init__(self) -> None:
         self._process: WorkerProcess | None = None

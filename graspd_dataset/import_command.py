@@ -1,4 +1,4 @@
-"""`graspd import`: grasps of other projects into grasps.json (docs/dataset.md)."""
+"""The command `graspd import`: it converts grasps of other projects to grasps.json (docs/dataset.md)."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     from graspd_dataset.foreign_grasps import ImportedGrasp
 
 
-# A squeeze whose base is farther from the grasp's is worth a warning [m].
+# A warning counts squeezes whose base is farther than this from the grasp's base [m].
 _MOVED = 1e-4
 
 
@@ -41,7 +41,7 @@ def add_command(commands: Any) -> None:
 
 
 def run(options: argparse.Namespace) -> int:
-    """Import the grasps. Return the exit status: 0, 3 if no grasp of an object is left."""
+    """Import the grasps. Return the exit status: 0, or 3 if an object has no accepted grasp."""
     from graspd_core.hands.library import load_hand
     from graspd_core.io.grasps_json import check_writable, save_result
     from graspd_core.optimize.plan_config import load_preset
@@ -78,7 +78,7 @@ def run(options: argparse.Namespace) -> int:
 
 
 def _result(scene: Scene, hand: HandModel, imported: Sequence[ImportedGrasp], config: Any, verify: str) -> GraspResult:
-    """Return the grasps of one object as a result of a run, verified ones first."""
+    """Return the grasps of one object as a GraspResult. Verified grasps come first unless `verify` is "none"."""
     from graspd_core.planning.plan_grasps import on_surface
     from graspd_core.verify.run_clock import result_of
     from graspd_core.verify.verification import verify_grasps

@@ -1,4 +1,4 @@
-"""Inspection of a data set: its content, why grasps failed, and whether files are whole and no grasp is in it twice."""
+"""Inspection of a data set: counts of grasps, reasons of failure, damaged files and duplicate grasps."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ _REASONS = 8
 
 @dataclass
 class HandCount:
-    """Counts of one hand's rows: by verdict, of blocks, and the objects' hashes."""
+    """Counts of one hand: blocks, bytes, grasps by verdict, and the hashes of its objects."""
 
     blocks: int = 0
     size: int = 0
@@ -33,9 +33,9 @@ class DatasetStats:
     """Counts of a data set.
 
     Attributes:
-        hands: numbers by hand.
-        reasons: numbers of failed grasps by trial and kind of reason.
-        codes: versions of the code that made rows.
+        hands: counts by hand name.
+        reasons: number of failed grasps by trial and kind of reason.
+        codes: versions of the code that made the rows.
         failed: records of blocks and objects that failed and have no file.
     """
 
@@ -54,25 +54,25 @@ class DatasetStats:
 
 
 def tables_of(store: DatasetStore, columns: Sequence[str] | None = None) -> Iterator[tuple[str, bytes, Any, Any]]:
-    """Yield path, bytes, table and metadata of every block, in the order of their paths.
+    """Yield path, bytes, pyarrow table and metadata of every block, sorted by path.
 
-    Raises FormatError: there is no block, or one of them is spoilt.
+    Raises FormatError: there is no block, or a block is damaged.
     """
     paths = store.list("grasps")
     if not paths:
-        raise FormatError(f"{store.shown}: no data set: nothing in grasps/")
+        raise FormatError(f"{store.shown}: no data set; expected .parquet files below grasps/")
     for path in paths:
         content = store.read(path)
         yield path, content, *read_parquet(content, f"{store.shown}/{path}", columns)
 
 
 def stats_of(store: DatasetStore) -> DatasetStats:
-    """Count the rows of a data set. Raises FormatError: as `tables_of`."""
+    """Count the rows of a data set. Raises FormatError: there is no block, or a block is damaged."""
     stats, there = DatasetStats(), set[str]()
     for path, content, table, told in tables_of(store, ("object_sha256", "verdict", "code", "trials")):
         there.add(told["block"])
         stats.codes.update(table["code"].unique().to_pylist())
-        # By its path: a block without a candidate is one too.
+        # The path gives the hand, because a block may have no rows.
         hand = stats.hands.setdefault(path.split("/")[1].removeprefix("hand="), HandCount())
         hand.blocks += 1
         hand.size += len(content)
@@ -88,7 +88,7 @@ def stats_of(store: DatasetStore) -> DatasetStats:
 
 
 def stats_table(stats: DatasetStats) -> str:
-    """Return counts by hand, in Markdown."""
+    """Return the counts of every hand as a Markdown table."""
     body = [
         (
             name,
@@ -106,7 +106,7 @@ def stats_table(stats: DatasetStats) -> str:
 
 
 def reason_lines(stats: DatasetStats) -> list[str]:
-    """Return the most frequent reasons, a line each, and the blocks that failed as a whole."""
+    """Return one line for each of the 8 most frequent reasons, then one for each failed block or object."""
     lines = [f"{number} {reason}" for reason, number in stats.reasons.most_common(_REASONS)]
     return lines + [f"{record['failed']}: {record['asked']['object']}: {record['error']}" for record in stats.failed]
 
@@ -116,17 +116,17 @@ _UNIT_TOLERANCE = 1e-3
 
 
 def faults_of_dataset(store: DatasetStore) -> Iterator[str]:
-    """Yield the faults of a data set, a line each. Raises FormatError: there is no data set."""
+    """Yield the faults of a data set, one line per fault. Raises FormatError: there is no data set."""
     paths, meshes = store.list("grasps"), {key_of(path) for path in store.list("objects")}
     if not paths:
-        raise FormatError(f"{store.shown}: no data set: nothing in grasps/")
+        raise FormatError(f"{store.shown}: no data set; expected .parquet files below grasps/")
     known: dict[str, set[str]] = {}
     try:
         known = recorded_hashes(store)
     except FormatError as error:
         yield str(error)
     there = {key_of(path) for path in paths} | meshes
-    yield from (f"{path}: is missing, but a run has written it" for path in known if key_of(path) not in there)
+    yield from (f"{path}: is missing, but a run wrote it" for path in known if key_of(path) not in there)
     seen: dict[bytes, str] = {}
     for path in paths:
         content = store.read(path)
@@ -139,7 +139,7 @@ def faults_of_dataset(store: DatasetStore) -> Iterator[str]:
         yield from (f"{path}: {fault}" for fault in _file_faults(path, table, told, meshes))
         for digest in row_digests(table):
             if digest in seen:
-                yield f"{path}: a grasp that is in {seen[digest]} too"
+                yield f"{path}: a grasp is also in {seen[digest]}"
                 break
             seen[digest] = path
     for path in store.list("objects"):
@@ -153,7 +153,7 @@ def faults_of_dataset(store: DatasetStore) -> Iterator[str]:
 
 
 def recorded_hashes(store: DatasetStore) -> dict[str, set[str]]:
-    """Return the hashes of all files in records of runs, by path. Raises FormatError: a record is spoilt."""
+    """Return the hashes of files that run records hold, by path. Raises FormatError: a record is damaged."""
     known: dict[str, set[str]] = {}
     for record in (read_record(store, path) for path in store.list("runs")):
         for path, digest in record.get("files", {}).items():
@@ -163,24 +163,24 @@ def recorded_hashes(store: DatasetStore) -> dict[str, set[str]]:
 
 def _changed(path: str, content: bytes, known: Mapping[str, set[str]]) -> Iterator[str]:
     if path in known and file_hash(content) not in known[path]:
-        yield f"{path}: not the bytes that a run has written: its SHA-256 is not the recorded one"
+        yield f"{path}: its content was changed: its SHA-256 is not the recorded one"
 
 
 def row_digests(table: Any) -> list[bytes]:
-    """Return for every row the hash of its object, hand and grasp, whatever block it is in."""
+    """Return for every row the SHA-256 of its object, hand and grasp posture. The block does not count."""
     names = ("object_sha256", "hand_sha256", "grasp_position", "grasp_quaternion_wxyz", "grasp_joint_positions")
     rows = zip(*(table[name].to_pylist() for name in names), strict=True)
     return [hashlib.sha256(repr(row).encode()).digest() for row in rows]
 
 
 def count_by_content(store: DatasetStore) -> tuple[int, int]:
-    """Return the numbers of rows, and of different ones."""
+    """Return the number of rows, and the number of distinct grasps."""
     digests = [digest for _, _, table, _ in tables_of(store) for digest in row_digests(table)]
     return len(digests), len(set(digests))
 
 
 def _file_faults(path: str, table: Any, told: dict[str, Any], meshes: set[str]) -> Iterator[str]:
-    """Yield the faults of one block."""
+    """Yield the faults of one block. `meshes` are the keys of the meshes in `objects/`."""
     import numpy as np
 
     if table.schema.remove_metadata() != arrow_schema():
@@ -188,7 +188,7 @@ def _file_faults(path: str, table: Any, told: dict[str, Any], meshes: set[str]) 
         yield f"its columns are not those of the schema: {', '.join(sorted(names)) or 'other types'}"
         return
     if content_key(told.get("asked")) != key_of(path) or told.get("block") != key_of(path):
-        yield f"it holds the block {told.get('block')}"
+        yield f"its metadata does not match its name: it is of block {told.get('block')}"
     if not table.num_rows:
         return
     hand, target = table["hand_name"][0].as_py(), table["object_sha256"][0].as_py()
@@ -207,4 +207,4 @@ def _file_faults(path: str, table: Any, told: dict[str, Any], meshes: set[str]) 
     trials = table["trials"].to_pylist()
     passed = [bool(own) and all(trial["passed"] for trial in own) for own in trials]
     if passed != [verdict == "verified" for verdict in table["verdict"].to_pylist()]:
-        yield "verdicts that the trials do not bear out"
+        yield "verdicts contradict the trials"

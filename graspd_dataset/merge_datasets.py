@@ -1,4 +1,4 @@
-"""Merging of data sets, block by block, and sampling of rows."""
+"""Merging of data sets block by block, and random sampling of rows."""
 
 from __future__ import annotations
 
@@ -13,15 +13,16 @@ from graspd_dataset.dataset_store import DatasetStore, keys_below, parquet_bytes
 from graspd_dataset.inspect_dataset import tables_of
 from graspd_dataset.record_schema import arrow_schema
 
-# Columns that may differ where two data sets have the same block.
+# Columns that may differ between two data sets' copies of a block.
 _NAMES = ("object_source", "preset", "code")
 
 
 def merge(sources: Sequence[DatasetStore], out: DatasetStore) -> tuple[int, int]:
-    """Copy all blocks, meshes, records of failures and runs to `out`. Return the numbers of blocks copied and common.
+    """Copy all blocks, meshes, and records of failures and runs to `out`.
 
-    Existing files are compared and left, so a stopped merge goes on. Raises FormatError: a file is spoilt, or two data
-    sets hold other rows under the same key.
+    Return the numbers of blocks copied, and of blocks already in `out`. Existing blocks are compared and kept, so an
+    interrupted merge can be repeated.
+    Raises FormatError: a file is damaged, or two blocks of the same key have different rows.
     """
     there = {path.rpartition("/")[2]: path for path in out.list("grasps")}
     copied = common = 0
@@ -50,22 +51,24 @@ def merge(sources: Sequence[DatasetStore], out: DatasetStore) -> tuple[int, int]
 def _refuse_conflict(table: Any, out: DatasetStore, path: str, where: str) -> None:
     other, _ = read_parquet(out.read(path), f"{out.shown}/{path}")
     if not table.drop_columns(list(_NAMES)).equals(other.drop_columns(list(_NAMES))):
-        raise FormatError(f"{where}: other rows than {out.shown}/{path}, which has the same key: keep one of them")
+        raise FormatError(f"{where}: rows differ from {out.shown}/{path}, which has the same key; keep only one")
 
 
 def sample(store: DatasetStore, count: int, seed: int, verdict: str | None = None) -> tuple[bytes, int]:
-    """Draw `count` rows evenly into a Parquet file. Return its bytes and their number, equal for equal rows and seed.
+    """Draw up to `count` rows, all equally likely. Return the bytes of a Parquet file and the number of rows.
+
+    `verdict` limits the draw to rows with that verdict. The same rows and seed give the same sample.
 
     Raises:
-        ConfigError: the count is not valid.
-        FormatError: there is no data set, or a file is spoilt.
+        ConfigError: `count` is less than 1.
+        FormatError: there is no data set, or a file is damaged.
     """
     import pyarrow as pa
 
     if count < 1:
         raise ConfigError(f"count: {count} rows; at least 1")
     drawn: list[tuple[int, str, int]] = []
-    # Once through two columns for the draw, once through those files that hold drawn rows.
+    # The first pass reads two columns and draws rows. The second pass reads the files that hold drawn rows.
     for path, _, table, told in tables_of(store, ("row", "verdict")):
         for row, said in zip(table["row"].to_pylist(), table["verdict"].to_pylist(), strict=True):
             if verdict in (None, said):

@@ -1,4 +1,4 @@
-"""Ray: one of its own on this machine, or an existing cluster, whose tasks run again when a worker is lost."""
+"""Blocks on Ray: a private Ray on this machine, or an existing cluster. Tasks of a lost worker run again."""
 
 from __future__ import annotations
 
@@ -20,24 +20,24 @@ from graspd_dataset.blocks import Block, DatasetObject
 from graspd_dataset.dataset_store import DatasetStore
 from graspd_dataset.guarded_calls import Job, Limits, Report, prepare_object, run_block
 
-# Object store of an embedded Ray [bytes]: an object that is ready takes about 2 MB, and few are at a time.
+# Object store of a private Ray [bytes]. A prepared object takes about 2 MB, and few are stored at a time.
 _OBJECT_STORE = 256 * 2**20
-# How often Ray runs a task again whose worker or node was lost.
+# Number of times that Ray repeats a task after its worker or node was lost.
 _RETRIES = 4
-# Loopback. Of 127.0.0.1 Ray would make the machine's address in its network.
+# A loopback address. Ray replaces 127.0.0.1 by the machine's address in its network.
 _LOOPBACK = "127.0.0.2"
-# Until a cluster has answered [s].
+# Timeout for the connection to a cluster [s].
 _CONNECT = 10.0
-# Begin of the name of Ray's own folder. The number of the driver's process follows.
+# Prefix of the name of a private Ray's folder. The process id of the driver follows.
 _FOLDER = "graspd-ray-"
 
 
 @contextmanager
 def ray_running(address: str | None, workers: int | None, folder: Path | None = None) -> Iterator[Any]:
-    """Connect the module `ray` to a cluster's address, or to a Ray of this process's own that ends with it.
+    """Connect to the cluster at `address`, or start a private Ray if `address` is None. Yield the module `ray`.
 
-    An own one shows no dashboard, reports no use, takes commands only with a random token, and keeps its files in
-    `folder` or a temporary one.
+    A private Ray ends with this context. It has no dashboard, reports no usage, and accepts commands only with a random
+    token. Its files are in `folder`, or in a temporary folder if `folder` is None.
 
     Raises ConfigError: Ray is not installed, or there is no cluster at the address.
     """
@@ -47,7 +47,7 @@ def ray_running(address: str | None, workers: int | None, folder: Path | None = 
         _remove_abandoned(folder or Path(tempfile.gettempdir()))
     before = {name: os.environ.get(name) for name in settings}
     os.environ.update(settings)
-    # Short: the paths of sockets in it may have 107 characters.
+    # The name is short because the paths of sockets in the folder may have at most 107 characters.
     own = Path(tempfile.mkdtemp(prefix=f"{_FOLDER}{os.getpid()}-", dir=folder)) if address is None else None
     try:
         ray = _ray()
@@ -72,7 +72,7 @@ def ray_running(address: str | None, workers: int | None, folder: Path | None = 
 
 
 def _refuse_silent(address: str | None) -> None:
-    """Refuse an address where nothing listens, because Ray would wait for minutes and then end the process."""
+    """Raise ConfigError if nothing listens at the address. Ray would wait for minutes and then end the process."""
     host, _, port = (address or "").removeprefix("ray://").partition(":")
     if not port.isdigit():
         return
@@ -101,31 +101,28 @@ def _ray() -> Any:
 
 
 def pickled_hand(block: Block) -> bytes:
-    """Return the pickled hand of a block."""
     from graspd_core.hands.library import load_hand
 
     return pickle.dumps(load_hand(block.hand, candidates=block.config.problem.fine_candidates))
 
 
 def object_job(thing: DatasetObject, config: PlanConfig) -> Job:
-    """Return an object as a job for a worker."""
     return Job(thing.key, {"object": thing.source, **thing.asked}, pickle.dumps((thing, config)))
 
 
 def block_job(block: Block) -> Job:
-    """Return a block as a job for a worker."""
     asked = {"object": block.object.source, "hand": block.hand, **block.asked}
     return Job(block.key, asked, pickle.dumps(block), block.hand_name)
 
 
 class RayEngine:
-    """A client that submits blocks and objects to Ray, and returns their reports.
+    """Client that submits blocks and objects to Ray, and returns their reports.
 
     Args:
-        ray: the module, connected.
-        store: where files go.
-        limits: of a block and of an object.
-        ship: whether the content of mesh files goes along: to a cluster whose nodes may not see them.
+        ray: the connected module.
+        store: the data set that files are written to.
+        limits: limits for each block and each object.
+        ship: whether to send the content of mesh files, because nodes of a cluster may not be able to read them.
     """
 
     def __init__(self, ray: Any, store: DatasetStore, limits: Limits, *, ship: bool) -> None:
@@ -136,29 +133,29 @@ class RayEngine:
         self._run = ray.remote(**options)(run_block)
 
     def slots(self) -> int:
-        """Return how many tasks run at a time."""
+        """Return the number of tasks that can run at the same time."""
         return max(1, int(self._ray.cluster_resources().get("CPU", 1)))
 
     def submit_object(self, thing: DatasetObject, config: PlanConfig) -> tuple[Any, Any]:
-        """Submit an object. Returns handles of the report, and of what the object's blocks share."""
+        """Submit an object. Return the handles of its report and of its `ReadyObject.shared`."""
         shape = thing.source.startswith("shape:")
         content = Path(thing.source).read_bytes() if self._ship and not shape else None
         return tuple(self._prepare.remote(object_job(thing, config), content, self._store, self._limits))
 
     def submit_block(self, block: Block, shared: Any) -> Any:
-        """Submit a block. Return a handle of the report."""
+        """Submit a block. Return the handle of its report. `shared` is the second handle of `submit_object`."""
         if block.hand_content not in self._hands:
             self._hands[block.hand_content] = self._ray.put(pickled_hand(block))
         return self._run.remote(block_job(block), self._hands[block.hand_content], shared, self._store, self._limits)
 
     def wait(self, handles: Sequence[Any], seconds: float) -> list[Any]:
-        """Return the handles that have ended, as soon as one has."""
+        """Wait up to `seconds` until a task has ended. Return the handle of an ended task in a list, empty if none."""
         return self._ray.wait(list(handles), num_returns=1, timeout=seconds)[0]
 
     def report(self, handle: Any, key: str) -> Report:
-        """Return the report of a handle, lost if its workers or nodes were lost more often than it is run again.
+        """Return the report of a handle. Its kind of failure is `lost` if workers were lost on every attempt.
 
-        Raises StorageError: its file could not be written.
+        Raises StorageError: the file could not be written.
         """
         from ray.exceptions import RayError, RayTaskError
 

@@ -1,4 +1,4 @@
-"""The columns of a data set, one row each: the Parquet schema and the table of docs/dataset.md follow."""
+"""The columns of a data set. The Parquet schema and the table of docs/dataset.md are made from this list."""
 
 from __future__ import annotations
 
@@ -11,12 +11,12 @@ from graspd_dataset.run_records import markdown_table
 
 @dataclass(frozen=True)
 class Column:
-    """One column.
+    """One column of a data set.
 
     Attributes:
-        name: of the column.
-        kind: of its values: string, int32, int64, double, double[3], double[4], double[], string[], contacts or trials.
-        description: with units and frame.
+        name: its name.
+        kind: its type: string, int32, int64, double, double[3], double[4], double[], string[], contacts or trials.
+        description: its meaning, with units and frame.
     """
 
     name: str
@@ -61,7 +61,7 @@ _BEFORE = (
 
 
 def columns() -> tuple[Column, ...]:
-    """Return all columns, with one for every metric of the registry."""
+    """Return all columns. The last ones are the metrics of the registry, one column per metric."""
     metrics = (
         Column(f"metric_{row.key}", "double", f"{row.name.replace('_', ' ')} (docs/metrics.md); null: not measured")
         for row in METRICS.values()
@@ -70,7 +70,7 @@ def columns() -> tuple[Column, ...]:
 
 
 def arrow_schema() -> Any:
-    """Return the pyarrow schema of the rows."""
+    """Return the pyarrow schema of a block's rows, one row per grasp."""
     import pyarrow as pa
 
     vector = pa.list_(pa.float64(), 3)
@@ -100,7 +100,7 @@ def arrow_schema() -> Any:
 
 
 def object_schema() -> Any:
-    """Return the pyarrow schema of the files in `objects/`: one row an object, lengths in metres."""
+    """Return the pyarrow schema of the files in `objects/`. Each file has one row. Lengths are in metres."""
     import pyarrow as pa
 
     return pa.schema(
@@ -116,7 +116,7 @@ def object_schema() -> Any:
 
 
 def schema_table() -> str:
-    """Return the columns in Markdown, for docs/dataset.md."""
+    """Return the table of all columns in Markdown, for docs/dataset.md."""
     return markdown_table(
         ("column", "type", "what it holds"), [(f"`{c.name}`", c.kind, c.description) for c in columns()]
     )

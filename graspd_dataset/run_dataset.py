@@ -1,6 +1,6 @@
-"""Runs of missing blocks, a bounded number at a time: objects prepared ahead, nothing done twice.
+"""Runs of the blocks that a data set lacks. Objects are prepared in advance, and nothing is done twice.
 
-Beside the data lie the record of the command, its cost, and the data card made of it.
+A run also writes a record of its command and cost, and the data card.
 """
 
 from __future__ import annotations
@@ -26,19 +26,19 @@ from graspd_dataset.run_records import code_version, commit
 
 @dataclass(frozen=True)
 class RunRecord:
-    """One command over all its sessions.
+    """Record of one command, summed over all its sessions.
 
     Attributes:
-        command: that can be typed again.
-        code, commit: that ran.
-        made: days.
-        machine: cores, kind and Python.
-        blocks: that it asks for.
-        done: blocks written.
-        cpu: seconds in the processes of blocks.
-        wall: seconds.
-        peak_mb: greatest peak of a process of blocks.
-        files: hashes of the files written, by path.
+        command: the command line, ready to be typed again.
+        code, commit: version of the code that ran.
+        made: date of the first session.
+        machine: number of cores, architecture and Python version.
+        blocks: number of requested blocks.
+        done: number of blocks written.
+        cpu: CPU time of the processes that make blocks [s].
+        wall: duration [s].
+        peak_mb: greatest peak memory of a process that makes blocks [MB].
+        files: SHA-256 of each file written, by path.
     """
 
     command: str
@@ -59,7 +59,7 @@ class RunRecord:
 
 
 def command_of(request: DatasetRequest, out: str) -> str:
-    """Return the command for a request, in as few words as possible."""
+    """Return the command line of a request, without options that have their default value."""
     usual, words = DatasetRequest(request.objects), ["graspd", "dataset", *request.objects]
     for item in fields(request):
         value = getattr(request, item.name)
@@ -71,17 +71,15 @@ def command_of(request: DatasetRequest, out: str) -> str:
 
 
 def begin_run(store: DatasetStore, request: DatasetRequest, blocks: int, *, any_code: bool = False) -> RunRecord:
-    """Return the record of this command, as earlier sessions left it.
+    """Return the record of this command. It continues the record of earlier sessions, if there is one.
 
-    Raises ConfigError: other code made the present content, and that is not wanted.
+    Raises ConfigError: another code version made the data set, and `any_code` is false.
     """
     code = code_version()
     records = run_records(store)
     others = sorted({record.code for record in records} - {code})
     if others and not any_code:
-        raise ConfigError(
-            f"{store.shown}: made by code {others[0]}, this is {code}; --any-code adds to it all the same"
-        )
+        raise ConfigError(f"{store.shown}: made by code {others[0]}, this is {code}; to add to it give --any-code")
     machine = f"{os.cpu_count()} cores, {platform.machine()}, Python {platform.python_version()}"
     new = RunRecord(command_of(request, store.shown), code, commit(), date.today().isoformat(), machine, blocks)
     return next((replace(record, blocks=blocks) for record in records if record.path == new.path), new)
@@ -93,21 +91,21 @@ def write_run(store: DatasetStore, record: RunRecord) -> None:
 
 
 def run_records(store: DatasetStore) -> list[RunRecord]:
-    """Read the records of a data set."""
+    """Read the records of all commands that wrote to a data set."""
     names = {item.name for item in fields(RunRecord)}
     told = [read_record(store, path) for path in store.list("runs")]
     return [RunRecord(**{key: value for key, value in record.items() if key in names}) for record in told]
 
 
 def with_unrecorded(store: DatasetStore, record: RunRecord) -> RunRecord:
-    """Return the record with hashes of files that no record holds, as of a killed session or of earlier code."""
+    """Return the record, with hashes of unrecorded files added. Killed sessions and earlier code leave such files."""
     known = recorded_hashes(store).keys() | record.files.keys()
     paths = [path for folder in ("grasps", "objects") for path in store.list(folder) if path not in known]
     return replace(record, files=record.files | {path: file_hash(store.read(path)) for path in paths})
 
 
 def data_card(store: DatasetStore, stats: DatasetStats) -> str:
-    """Return the README.md of a data set: its content, its making, its licence."""
+    """Return the text of the data card (README.md): content, commands, cost and licence."""
     records = run_records(store)
     own = all(word.startswith("shape:") for record in records for word in _objects(record.command))
     cpu, done = sum(r.cpu for r in records), sum(r.done for r in records)
@@ -163,14 +161,14 @@ def _objects(command: str) -> list[Any]:
     return words[: next(i for i, word in enumerate(words) if word.startswith("--"))]
 
 
-# How often a stop is looked for [s].
+# Interval at which a run checks whether to stop [s].
 _POLL = 0.5
-# Blocks submitted for every one that runs: the next is there when one ends, and a stop drops few.
+# Submitted blocks per slot. A slot then never waits for the next block, and a stop drops few blocks.
 _AHEAD = 2
 
 
 def missing_blocks(blocks: Sequence[Block], store: DatasetStore, *, retry_failed: bool = False) -> list[Block]:
-    """Return the blocks without a file. Failed blocks, or blocks of failed objects, are included on request."""
+    """Return the blocks without a file. Skip failed blocks and blocks of failed objects unless `retry_failed`."""
     there = keys_below(store, "grasps")
     failed = set() if retry_failed else keys_below(store, "failed")
     return [b for b in blocks if b.key not in there and not failed & {b.key, b.object.key}]
@@ -179,9 +177,10 @@ def missing_blocks(blocks: Sequence[Block], store: DatasetStore, *, retry_failed
 def run_blocks(
     blocks: Sequence[Block], engine: RayEngine, stop: Callable[[], bool] = lambda: False
 ) -> Iterator[tuple[Block | DatasetObject, Report]]:
-    """Run blocks and yield each with its report as it ends. Objects too: a failed one drops its blocks.
+    """Prepare objects and run their blocks. Yield each object and block with its report when it ends.
 
-    Raises StorageError: a file could not be written. Earlier files stay.
+    The blocks of a failed object are skipped. Running ends when `stop` returns true.
+    Raises StorageError: a file could not be written. Files written before remain.
     """
     waiting = deque(by_object(blocks))
     preparing: dict[Any, tuple[DatasetObject, list[Block], Any]] = {}

@@ -1,4 +1,4 @@
-"""Records of runs: the code, the commit, the failure, the cost. And tables in Markdown."""
+"""What records of runs hold: code version, commit, failure, CPU time and peak memory. Also Markdown tables."""
 
 from __future__ import annotations
 
@@ -18,16 +18,15 @@ from typing import Any
 import graspd_core
 from graspd_core.mesh.mesh_files import MESH_ENDINGS
 
-# Parts of graspd_core that no figure depends on.
+# Parts of graspd_core that no recorded figure depends on.
 _BESIDE = ("cli", "io", "doctor.py")
 _STATUS, _CLEAR = Path("/proc/self/status"), Path("/proc/self/clear_refs")
 
 
 class Stopwatch:
-    """Seconds by name, summed over all stretches of that name.
+    """Stopwatch that sums CPU and wall time by name [s]. Use `with stopwatch(name):` around the timed code.
 
-    CPU seconds are of the whole process (`time.process_time`). On one thread they measure the work, however busy the
-    machine is.
+    CPU time is that of the whole process (`time.process_time`). On one thread it does not depend on the machine's load.
     """
 
     def __init__(self) -> None:
@@ -45,7 +44,7 @@ class Stopwatch:
 
 
 def forget_peak() -> None:
-    """Start the process's peak of memory anew, if the system can (Linux)."""
+    """Reset the process's peak memory. Do nothing if the system cannot (it needs Linux)."""
     try:
         _CLEAR.write_text("5")
     except OSError:
@@ -53,7 +52,7 @@ def forget_peak() -> None:
 
 
 def peak_mb() -> float:
-    """Return the peak of this process's resident memory since `forget_peak` or its start [MB]."""
+    """Return the peak resident memory of this process [MB], since `forget_peak` or since its start."""
     try:
         line = next(line for line in _STATUS.read_text().splitlines() if line.startswith("VmHWM"))
         return int(line.split()[1]) / 1024
@@ -62,7 +61,7 @@ def peak_mb() -> float:
 
 
 def failure(error: BaseException, kind: str = "raised") -> dict[str, Any]:
-    """Return the record of a case that raised, died or hung."""
+    """Return the record of a failure: its kind (raised, died, hung), the error, and the traceback."""
     where = "".join(traceback.format_exception(error))
     told = " ".join(str(error).split())
     return {"failed": kind, "error": f"{type(error).__name__}: {told}", "traceback": where}
@@ -72,8 +71,8 @@ def failure(error: BaseException, kind: str = "raised") -> dict[str, Any]:
 def code_version(sources: tuple[str, ...] = ()) -> str:
     """Return the package's version and a hash of the sources that figures depend on.
 
-    They are those of graspd_core but for `_BESIDE`, the kernel's C++ among them, and the files that the globs `sources`
-    name beside graspd_core.
+    These are all Python and C++ sources of graspd_core except `_BESIDE`. `sources` adds files by glob patterns relative
+    to the parent folder of graspd_core.
     """
     root = Path(graspd_core.__file__).parent
     files = {path for pattern in ("*.py", "*.cpp", "*.h", "*.hpp") for path in root.rglob(pattern)}
@@ -91,7 +90,7 @@ def code_version(sources: tuple[str, ...] = ()) -> str:
 
 @lru_cache
 def commit() -> str:
-    """Return the short name of the current commit, with a plus for changed files, empty outside a clone."""
+    """Return the short hash of the current commit. A plus marks changed files. Empty outside a git clone."""
     command = ["git", "describe", "--always", "--dirty=+", "--exclude=*"]
     try:
         done = subprocess.run(command, cwd=Path(__file__).parent, capture_output=True, text=True, timeout=10)
@@ -101,14 +100,14 @@ def commit() -> str:
 
 
 def thing_name(source: Any) -> str:
-    """Return an object's name: the shape, or the file without its ending. Other values stay as they are."""
+    """Return a short name: that of a shape, or of a file without its ending. Other values become text."""
     text = f"{source:g}" if isinstance(source, float) else str(source)
     path = Path(text)
     return path.stem if path.suffix[1:].lower() in (*MESH_ENDINGS, "yaml", "yml") else text.removeprefix("shape:")
 
 
 def finite(value: Any) -> Any:
-    """Return the same values, with None for every number that JSON does not know."""
+    """Return the values with None in place of every NaN or infinity, which JSON cannot hold."""
     if isinstance(value, dict):
         return {str(key): finite(item) for key, item in value.items()}
     if isinstance(value, list | tuple):
@@ -119,6 +118,6 @@ def finite(value: Any) -> Any:
 
 
 def markdown_table(headings: Sequence[str], body: Sequence[Sequence[str]]) -> str:
-    """Return a table in Markdown. Cells must not have bars of their own."""
+    """Return a table in Markdown. Cells must not contain the character `|`."""
     lines = [headings, ["---"] * len(headings), *body]
     return "\n".join(f"| {' | '.join(line)} |" for line in lines).replace("| --- |", "|---|").replace(" --- |", "---|")

@@ -1,7 +1,7 @@
-"""A benchmark as one page: speed against accuracy, and behind every point its runs and their grasps.
+"""HTML page of a benchmark: charts of speed against accuracy. A point of a chart opens its runs and their grasps.
 
-The page is one file that needs no network and no library. Results keep figures of grasps, not their postures. A run
-that a visitor asks for is planned again with its own settings and seed, which finds the same grasps.
+The page is one file that needs no network and no library. Results hold figures of grasps, but no postures. To show the
+grasps of a run, the server plans it again with the same settings and seed, which gives the same grasps.
 """
 
 from __future__ import annotations
@@ -42,7 +42,7 @@ from graspd_viewer.session import Session, make_session
 
 Tell = Callable[[str, float], None]
 _TIMES = {"cpu_per_grasp": "CPU seconds per raw grasp", "cpu_per_verified": "CPU seconds per verified grasp"}
-# Of one grasp's record: what is shown, from which part, times what.
+# Figures of a grasp that the page shows: heading, key of the metric, factor, digits.
 _FIGURES = (
     ("penetration mm", "penetration", 1e3, 2),
     ("contact area cm²", "contact_area", 1e4, 1),
@@ -51,10 +51,10 @@ _FIGURES = (
 
 
 def bench_page(folder: Path, *, served: bool = False) -> tuple[str, dict[str, Record]]:
-    """Return the page of a benchmark's folder, and its runs of raw grasps by key, whose grasps a server can show.
+    """Return the HTML page of a benchmark's folder, and the records of its raw runs by key.
 
     Raises:
-        FormatError: the folder has no results that can be read, or none of a preset.
+        FormatError: the folder has no readable results, or no raw grasps of a preset.
     """
     records = read_results(folder / "results.json")
     try:
@@ -64,13 +64,13 @@ def bench_page(folder: Path, *, served: bool = False) -> tuple[str, dict[str, Re
         raise FormatError(f"{folder / 'results.json'}: a record lacks or mistakes {error}") from None
     if not data["panels"]:
         raise FormatError(f"{folder}: holds no raw grasps of a preset; `graspd bench` measures them")
-    # Within a script only this sequence could end it.
+    # Only the sequence `</` could end the script element early.
     text = json.dumps(data, allow_nan=False).replace("</", "<\\/")
     return _PAGE.replace("@TITLE@", html.escape(folder.resolve().name)).replace("@DATA@", text), runs
 
 
 def page_data(runs: Sequence[Record]) -> dict[str, Any]:
-    """Return what the page's script draws: panels of points, and the runs of every name."""
+    """Return the data of the page's script: panels with points, and all runs."""
     presets = by_name(rows(runs))
     panels = [
         {
@@ -113,9 +113,9 @@ def _grasp(grasp: dict[str, Any]) -> dict[str, Any]:
 
 
 def plan_again(record: Record, show: Callable[[Session], None], tell: Tell, stop: StopHook) -> None:
-    """Find a run's grasps anew, try and measure them, and show them.
+    """Plan a run again, try and measure its grasps, and show them. `tell` gets the progress as text and fraction.
 
-    Raises GraspdError: its object or hand is not here.
+    Raises GraspdError: the object or the hand of the run is not available.
     """
     config = plan_config(record["settings"], f"settings of {record['name']}")
     hand = load_hand(record["hand"], candidates=config.problem.fine_candidates)
@@ -141,12 +141,12 @@ def plan_again(record: Record, show: Callable[[Session], None], tell: Tell, stop
 
 @contextmanager
 def serve_page(page: str, host: str, port: int, open_run: Callable[[str], int | None]) -> Iterator[str]:
-    """Serve one page for every path, until the context ends.
+    """Serve the page at every path until the context ends.
 
     Args:
-        page: HTML.
-        host, port: to listen on.
-        open_run: shows the grasps of a run, by its key, and returns the port, None for an unknown run.
+        page: the HTML text.
+        host, port: the address to listen on.
+        open_run: shows the grasps of a run by key. It returns the viewer's port, or None for an unknown run.
 
     Raises:
         ConfigError: the address cannot be listened on.
@@ -181,7 +181,7 @@ class _OnePage(BaseHTTPRequestHandler):
         self.wfile.write(self._content)
 
     def do_POST(self) -> None:
-        """Show the grasps of a run and send the visitor there. A page of another site may not ask."""
+        """Show the grasps of a run and redirect the browser to them. Refuse requests from pages of other sites."""
         named = self.headers.get("Host", "")
         allowed = may_connect(self.headers.get("Origin"), named, self._host)
         port = self._open_run(self.path.rpartition("/")[2]) if allowed else None

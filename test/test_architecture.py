@@ -67,7 +67,7 @@ MAX_PACKAGE_LINES = {
     "graspd_core": 27_270,
     "graspd_ros": 5_200,
     "graspd_bench": 8_800,
-    "graspd_dataset": 2_962,
+    "graspd_dataset": 2_959,
     "graspd_viewer": 2_430,
     "graspd_cell": 3_800,
     "test": 32_705,

@@ -1,1 +1,1 @@
-"""Methods to compare others with."""
+"""Baseline methods, with which graspd's methods are compared."""

@@ -1,19 +1,18 @@
 """A planner after GraspIt!'s eigengrasp planner (Ciocarlie and Allen, IJRR 2009): simulated annealing, then closing.
 
-Eigengrasps are the principal components of how people shape their hands. No such recordings exist for an arbitrary
-hand. Here they are those of seeded random postures between open and closed, in which the fingers mostly close together.
-The first is the hand's closing, the next are differences between fingers.
+Eigengrasps are the principal components of human hand postures. No recordings of postures exist for an arbitrary hand.
+Here the components are those of seeded random postures between open and closed, in which the fingers mostly close
+together. The first component is the closing of the hand, the next ones are differences between fingers.
 
-A chain's state is the base pose and the amplitudes of a few eigengrasps. Its energy is that of GraspIt!. It is the
-mean, over chosen places on the inside of the hand, of their distance to the object and of how far they face away from
-it:
+The state of a chain is the base pose and the amplitudes of a few eigengrasps. Its energy is that of GraspIt!. It is a
+mean over contact locations i on the inside of the hand, of their distance and how far they face away:
 
-    E = mean_i |d_i| + α (1 − n_i · o_i)        α = 50 mm, o_i the unit direction from the place to the object,
+    E = mean_i |d_i| + α (1 − n_i · o_i)        α = 50 mm, o_i: unit direction from location i to the object
 
-States in which the hand collides are refused. The schedule is GraspIt!'s default: T = 10⁶ exp(−7 k^⅛) for k from 30,000
-to 100,000, jumps drawn by Ingber's distribution (1989), energies accepted at T · 10⁶ mm. The best state of each chain
-is then closed until contact, and the best of those by ε are kept. ε is that of Ferrari and Canny for forces that sum to
-one. It is taken over sampled wrenches instead of the hull's faces, which makes it an upper bound. Chains run as one
+States in which the hand collides are rejected. The schedule is GraspIt!'s default: T = 10⁶ exp(−7 k^⅛), k from 30,000
+to 100,000, jumps by Ingber's distribution (1989), energies accepted at T · 10⁶ mm. The best state of each chain is then
+closed until contact, and the best closed grasps by ε are kept. ε is Ferrari and Canny's measure for forces that sum to
+one. It is computed over sampled wrenches instead of the hull's faces, so it is an upper bound. All chains run as one
 batch, without gradients.
 """
 
@@ -48,17 +47,17 @@ class AnnealingConfig:
     """Settings of simulated annealing in a low-dimensional space of hand postures, as in GraspIt!.
 
     Attributes:
-        chains_per_grasp: chains run for each requested grasp. Each gives one grasp, and the best by ε are kept.
-        keep_per_grasp: closed grasps kept for each requested grasp.
-        steps: states tried by each chain.
-        eigengrasps: dimensions of the space of hand postures.
-        contacts_per_link: places on the inside of each link that are drawn to the object.
-        normal_weight: cost of a contact location that faces away from the object, as a distance [m].
-        translation_jump: largest jump of the base [m].
-        rotation_jump: largest turn of the base about each of its axes [rad].
-        posture_jump: largest jump along an eigengrasp, as a share of its range.
+        chains_per_grasp: number of chains for each requested grasp. Each chain gives one grasp.
+        keep_per_grasp: number of closed grasps kept for each requested grasp, the best by ε.
+        steps: number of states that each chain tries.
+        eigengrasps: number of eigengrasps, the dimension of the posture space.
+        contacts_per_link: number of contact locations on the inside of each link.
+        normal_weight: weight α of a location's orientation in the energy [m].
+        translation_jump: largest translation of the base in one step [m].
+        rotation_jump: largest rotation of the base about each of its axes in one step [rad].
+        posture_jump: largest change of an amplitude in one step, as a fraction of its range.
         close_steps: steps of the closing of the best states, from open to closed.
-        directions: number of wrenches against which ε is the least resistance.
+        directions: number of sampled wrenches for ε.
     """
 
     chains_per_grasp: float = 4.0
@@ -74,21 +73,22 @@ class AnnealingConfig:
     directions: int = 256
 
 
-# Random postures, how far fingers differ from the common closing (shares), and joints from their finger (range).
+# Number of random postures. Spread of a finger around the common closing (fraction of the travel from open to closed),
+# and of a joint around its finger (fraction of the joint range).
 _POSTURES, _FINGER_SPREAD, _JOINT_SPREAD = 512, 0.3, 0.05
-# The inside of a group of links: where its surface faces the way that closing moves it (cosine), or comes nearest to
-# facing it. A group that never does by as much as the second has no inside.
+# A candidate is on the inside of its rigid group if the cosine between its normal and its closing motion is `_FACING`,
+# or the group's greatest cosine if that is smaller. A group whose greatest cosine is below `_LEAST_FACING` has none.
 _FACING, _LEAST_FACING = 0.85, 0.5
 
 
 @dataclass(frozen=True, eq=False)
 class PostureSpace:
-    """Postures `center + amplitudes @ basis`, clamped to the joint limits.
+    """Space of postures `center + amplitudes @ basis`, clamped to the joint limits.
 
     Attributes:
-        center: the mean posture [rad] or [m].
-        basis: the eigengrasps, orthonormal rows, in units of joint range.
-        low, high: the range of each amplitude.
+        center: mean posture [rad] or [m].
+        basis: the eigengrasps [rad] or [m]. The rows are orthonormal in units of the joint ranges.
+        low, high: range of each amplitude.
     """
 
     center: Float[np.ndarray, "joints"]
@@ -98,7 +98,7 @@ class PostureSpace:
 
 
 def posture_space(hand: HandModel, dimensions: int, seed: int) -> PostureSpace:
-    """Return the first principal components of random postures, fewer where fewer joints vary."""
+    """Return the space of the first principal components of random postures. It has fewer if few joints vary."""
     rng = np.random.default_rng(seed)
     fingers = finger_of(hand)
     span = hand.upper - hand.lower
@@ -120,10 +120,10 @@ def posture_space(hand: HandModel, dimensions: int, seed: int) -> PostureSpace:
 
 
 def inner_contacts(hand: HandModel, per_link: int) -> Int[np.ndarray, "contacts"]:
-    """Return indices of contact candidates on the inside: those of the palm, and those ahead when their link closes.
+    """Choose contact candidates on the inside of the hand. Return their indices, up to `per_link` per rigid group.
 
-    For each rigid group of links the one nearest to the middle of its inside is taken, then those farthest from the
-    chosen.
+    The inside of the palm faces along its normal, that of a finger along its closing motion. For each group, the first
+    candidate is the one nearest to the middle of its inside. The next are farthest from those already chosen.
     """
     chosen: list[int] = []
     facing = _facing(hand)
@@ -148,7 +148,7 @@ def inner_contacts(hand: HandModel, per_link: int) -> Int[np.ndarray, "contacts"
 
 
 def _facing(hand: HandModel) -> Float[np.ndarray, "candidates"]:
-    """Return the cosine of each candidate's outward normal with its motion in closing, or with the palm's normal."""
+    """Return each candidate's cosine between its normal and its closing motion (on the palm: the palm's normal)."""
     links = hand.candidate_link
     early, late = (
         link_poses(hand, hand.open_posture + share * (hand.closed_posture - hand.open_posture)) for share in (0.4, 0.6)
@@ -169,21 +169,21 @@ def _facing(hand: HandModel) -> Float[np.ndarray, "candidates"]:
 
 # GraspIt!'s default schedule: T₀, cooling rate, dimensions, and the first and last of its steps.
 _T0, _COOLING, _DIMENSIONS, _FIRST, _LAST = 1e6, 7.0, 8, 30_000, 100_000
-# Energies are accepted at this many times the temperature [m].
+# Factor between the temperature and the scale of accepted energy increases [m].
 _ENERGY_SCALE = 1e3
-# Overlap of the hand's proxy spheres that is not yet a collision, beyond that of the open hand [m].
+# The hand's proxy spheres may overlap by this much more than in the open hand [m].
 _SELF_SLACK = 0.002
 _FEWEST_CHAINS, _FEWEST_KEPT = 16, 8
 
 
 @dataclass(frozen=True)
 class ChainState:
-    """States of a batch of chains, and the best that each has reached.
+    """Current and best states of a batch of chains.
 
     Attributes:
-        x: base translation [m], base quaternion, amplitudes.
-        energy: [m], infinite where the state collides.
-        best_x, best_energy: of the best legal state so far.
+        x: current states: base translation [m], base quaternion, amplitudes.
+        energy: current energies [m]. Infinite for a state in collision.
+        best_x, best_energy: best collision-free state so far, and its energy.
     """
 
     x: Float[Tensor, "batch variables"]
@@ -194,17 +194,17 @@ class ChainState:
 
 @dataclass(frozen=True)
 class Annealing:
-    """The annealing as a solver for the shared loop, built by `make_annealing`.
+    """Simulated annealing as a solver for the shared loop, built by `make_annealing`.
 
     Attributes:
-        config: its settings.
-        seed: of the jumps.
-        center, basis, low, high: the space of postures, see `PostureSpace`.
+        config: settings.
+        seed: random seed of the jumps.
+        center, basis, low, high: the posture space, see `PostureSpace`.
         lower, upper: joint limits [rad] or [m].
-        contacts: places the chosen contact locations, see `hands.kinematics.placement`.
-        normals: places their outward normals likewise.
+        contacts: matrix that places the contact locations, see `hands.kinematics.placement`.
+        normals: matrix that places their outward normals.
         sphere_links: link of each proxy sphere of the problem.
-        self_overlap: depth of the hand's proxy spheres in each other that is allowed [m].
+        self_overlap: allowed overlap of the hand's proxy spheres [m].
     """
 
     config: AnnealingConfig
@@ -225,7 +225,7 @@ class Annealing:
         return self.config.steps
 
     def init(self, problem: Problem, starts: Poses) -> ChainState:
-        # The hand begins open: every amplitude is the one nearest to the start's joints.
+        # The amplitudes are the least-squares fit to the start's joints, which are those of the open hand.
         amplitudes = (starts.joints - self.center) @ torch.linalg.pinv(self.basis)
         x = torch.cat([starts.translation, starts.quaternion, amplitudes.clamp(self.low, self.high)], -1)
         energy = self.energy(problem, x)
@@ -237,10 +237,10 @@ class Annealing:
         drawn = torch.rand(len(state.x), 7 + len(self.low), generator=generator).to(state.x)
         tried = self.neighbour(state.x, jump(drawn[:, 1:], temperature))
         energy = self.energy(problem, tried)
-        # From a start that collides every legal state is welcome.
+        # If the current state collides, every collision-free state is accepted.
         rise = torch.where(torch.isfinite(state.energy), energy - state.energy, torch.where(energy < 1e3, -1.0, 1.0))
         taken = drawn[:, 0] < (-rise / (_ENERGY_SCALE * temperature)).exp()
-        # The dear test last, of the few states that would be taken.
+        # The expensive test comes last, for the few states that would be accepted.
         taken = taken.masked_scatter(taken, ~self.pierced(problem, tried[taken]))
         better = taken & (energy < state.best_energy)
         return ChainState(
@@ -254,13 +254,12 @@ class Annealing:
         return self.poses(state.best_x), state.best_energy
 
     def poses(self, x: Float[Tensor, "batch variables"]) -> Poses:
-        """Return the hands of states."""
         return Poses(x[:, :3], x[:, 3:7], (self.center + x[:, 7:] @ self.basis).clamp(self.lower, self.upper))
 
     def neighbour(
         self, x: Float[Tensor, "batch variables"], jumps: Float[Tensor, "batch jumps"]
     ) -> Float[Tensor, "batch variables"]:
-        """Return states a jump away, in units of the largest jumps: three of place, three of turn, then amplitudes."""
+        """Return the states after a jump. `jumps`, from -1 to 1: translation (3), rotation (3), then amplitudes."""
         config = self.config
         translation = x[:, :3] + config.translation_jump * jumps[:, :3]
         half = 0.5 * config.rotation_jump * jumps[:, 3:6]
@@ -271,7 +270,7 @@ class Annealing:
 
     @torch.no_grad()
     def energy(self, problem: Problem, x: Float[Tensor, "batch variables"]) -> Float[Tensor, "batch"]:
-        """Return GraspIt!'s contact energy [m], infinite where the hand collides with object, obstacles or itself."""
+        """Return GraspIt!'s contact energy [m]. It is infinite if the hand hits the object, an obstacle or itself."""
         poses = self.poses(x)
         placed = hand_forward(problem, problem.hand.coarse, poses)
         points = placed.base.apply(place_points(self.contacts, placed.links))
@@ -284,7 +283,7 @@ class Annealing:
         return torch.where(legal & torch.isfinite(energy), energy, torch.inf)
 
     def clear(self, problem: Problem, placed: HandPlacement) -> Bool[Tensor, "batch"]:
-        """Return whether the hand keeps clear of itself and of obstacles."""
+        """Return whether the hand collides neither with itself nor with obstacles."""
         clear = sphere_overlap(problem, placed).amax(-1) <= self.self_overlap
         if problem.obstacles is None:
             return clear
@@ -292,14 +291,14 @@ class Annealing:
 
     @torch.no_grad()
     def pierced(self, problem: Problem, x: Float[Tensor, "batch variables"]) -> Bool[Tensor, "batch"]:
-        """Return whether object and hand overlap, by all of the hand's points and the object's sharp ones."""
+        """Return whether hand and object overlap, tested with all points of the hand and sharp points of the object."""
         if len(x) == 0:
             return torch.zeros(0, dtype=torch.bool, device=x.device)
         return link_gaps(problem, self.poses(x), self.sphere_links)[:, 0].amin(-1) < 0.0
 
 
 def make_annealing(problem: Problem, hand: HandModel, config: AnnealingConfig, seed: int) -> Annealing:
-    """Return the annealing of one hand about one object."""
+    """Build the annealing solver of one hand and one object."""
 
     def tensor(values: np.ndarray) -> Tensor:
         return torch.as_tensor(values).to(problem.hand.lower)
@@ -329,19 +328,19 @@ def make_annealing(problem: Problem, hand: HandModel, config: AnnealingConfig, s
 
 
 def cooling(progress: float) -> float:
-    """Return GraspIt!'s default temperature at a share of its run."""
+    """Return the temperature of GraspIt!'s default schedule. `progress` runs from 0 to 1."""
     k = _FIRST + progress * (_LAST - _FIRST)
     return _T0 * math.exp(-_COOLING * k ** (1 / _DIMENSIONS))
 
 
 def jump(uniform: Float[Tensor, "*batch"], temperature: float) -> Float[Tensor, "*batch"]:
-    """Return Ingber's distribution of jumps (1989) from numbers in [0, 1): from −1 to 1, mostly of the size of T."""
+    """Map uniform numbers in [0, 1) to jumps from −1 to 1 by Ingber's distribution (1989). Most are of size T."""
     side = 2 * uniform - 1
     return side.sign() * temperature * ((1 + 1 / temperature) ** side.abs() - 1)
 
 
 def quaternion_product(a: Float[Tensor, "batch 4"], b: Float[Tensor, "batch 4"]) -> Float[Tensor, "batch 4"]:
-    """Return Hamilton's product, which turns by b, then by a."""
+    """Return the Hamilton product a b (wxyz), which rotates by b first and then by a."""
     w = a[:, :1] * b[:, :1] - (a[:, 1:] * b[:, 1:]).sum(-1, keepdim=True)
     v = a[:, :1] * b[:, 1:] + b[:, :1] * a[:, 1:] + torch.linalg.cross(a[:, 1:], b[:, 1:])
     return torch.cat([w, v], -1)
@@ -350,10 +349,10 @@ def quaternion_product(a: Float[Tensor, "batch 4"], b: Float[Tensor, "batch 4"])
 def sampled_epsilon(
     problem: Problem, contact_set: ContactSet, directions: Float[Tensor, "directions 6"]
 ) -> Float[Tensor, "batch"]:
-    """Return Ferrari and Canny's ε with hard contacts: the least over directions of the greatest over contacts.
+    """Return Ferrari and Canny's ε for hard contacts whose forces sum to one.
 
-    Forces sum to one. It is an upper bound of the true radius, because only these directions are tried. It is zero
-    without force closure.
+    It is the minimum over directions of the greatest support of any contact. This is an upper bound, because only
+    the given directions are tested. It is zero without force closure.
     """
     batch, slots = contact_set.active.shape
     support = wrench_support(
@@ -367,7 +366,10 @@ def sampled_epsilon(
 
 
 def plan(task: PlannerInput) -> PlannerOutput:
-    """Close the best state of each chain until contact and return the best by ε, after the deadline those done."""
+    """Anneal the chains, close the best state of each until contact, and return the best grasps by ε.
+
+    After a deadline the states reached so far are closed.
+    """
     settings, hooks = task.config.settings, task.hooks
     problem = task.problem
     annealing = make_annealing(problem, task.hand, settings, task.seed)
@@ -379,7 +381,7 @@ def plan(task: PlannerInput) -> PlannerOutput:
     legal = torch.nonzero(torch.isfinite(annealed.loss)).flatten()
     if annealed.interrupted == "cancelled" or len(legal) == 0:
         return PlannerOutput(annealed.poses[legal], annealed.interrupted)
-    # What the deadline cut short is closed all the same: open fingers would be no grasps.
+    # States are closed even after a deadline, because hands with open fingers are not grasps.
     closing = make_closing(problem, task.hand, settings.close_steps)
     closed = minimise(closing, problem, annealed.poses[legal], Hooks(stop=hooks.stop))
     contact_set = find_contacts(problem, closed.poses, task.config.grasp_stages.touch_reach)

@@ -1,8 +1,8 @@
-"""The random baseline that every method should beat: come from a random side, close until contact, optimise nothing.
+"""Random baseline that every method should beat. It approaches from random directions and closes until contact.
 
-The palm faces the object's centre of mass from a uniform direction with a uniform roll, fingers open. It moves along
-its normal until the hand first touches. Then the fingers close (`finger_closing`). Nothing is chosen by quality. The
-first hands that touch with enough links and reach through no obstacle are taken. No gradients are used.
+The open hand faces the object's centre of mass from a uniformly random direction, with a random roll. It moves along
+the palm's normal until first contact. Then the fingers close (`finger_closing`). There is no optimisation, and grasps
+are not ranked. The first hands that touch with enough links and keep clear of obstacles are returned.
 """
 
 from __future__ import annotations
@@ -26,11 +26,11 @@ from graspd_dataset.finger_closing import CLOSE_STEPS, Closing, link_gaps, make_
 
 @dataclass(frozen=True)
 class RandomClosureConfig:
-    """Settings of random approaches that close until contact.
+    """Settings of the random baseline.
 
     Attributes:
-        rounds: most rounds of as many approaches as requested grasps, until as many touch well enough.
-        touching: rigid groups of links that must touch.
+        rounds: limit of rounds. A round tries as many approaches as there are requested grasps.
+        touching: number of rigid groups of links that must touch the object.
         close_steps: steps of the closing, from open to closed.
     """
 
@@ -39,12 +39,12 @@ class RandomClosureConfig:
     close_steps: int = CLOSE_STEPS
 
 
-# The advance ends this far from the object, or after so many steps of the nearest distance each [m].
+# The advance ends at this distance from the object [m], or after this many steps of sphere tracing.
 _TOUCHING, _ADVANCES = 0.0003, 60
 
 
 def plan(task: PlannerInput) -> PlannerOutput:
-    """Return closed hands from random sides, from rounds of `count` tries. A round that is cut short gives none."""
+    """Return up to `count` closed hands from random directions. An interrupted round gives no hand."""
     settings, hand, count = task.config.settings, task.hand, task.count
     problem = task.problem
     closing = make_closing(problem, hand, settings.close_steps)
@@ -64,13 +64,12 @@ def plan(task: PlannerInput) -> PlannerOutput:
 
 
 def join(a: Poses, b: Poses) -> Poses:
-    """Return two batches as one."""
     pairs = ((getattr(a, name), getattr(b, name)) for name in ("translation", "quaternion", "joints"))
     return Poses(*(torch.cat(pair) for pair in pairs))
 
 
 def draw_approaches(problem: Problem, hand: HandModel, count: int, seed: int) -> Poses:
-    """Return open hands clear of the object, palms towards its centre of mass, directions and rolls uniform."""
+    """Draw open hands away from the object. The palms face its centre of mass. Directions and rolls are uniform."""
     generator = torch.Generator().manual_seed(seed)
     rotation = random_rotations(count, generator, torch.float64)
     away = problem.object.length + hand_reach(hand)
@@ -86,9 +85,9 @@ def draw_approaches(problem: Problem, hand: HandModel, count: int, seed: int) ->
 
 @torch.no_grad()
 def advance(problem: Problem, closing: Closing, hand: HandModel, poses: Poses) -> Poses:
-    """Return the hands moved along their palms' normals to the first touch, or until the palm is at the centre of mass.
+    """Move the hands along their palm normals until first contact, or until the palm is at the centre of mass.
 
-    Sphere tracing: the hand may always go as far as its least distance from the object.
+    This is sphere tracing: each step is the hand's least distance from the object.
     """
     forwards = poses.base.rotation @ torch.as_tensor(hand.palm_normal).to(problem.hand.lower)
     left = torch.full_like(poses.translation[:, 0], problem.object.length + hand_reach(hand))
@@ -105,7 +104,7 @@ def advance(problem: Problem, closing: Closing, hand: HandModel, poses: Poses) -
 def touching_groups(
     problem: Problem, closing: Closing, hand: HandModel, poses: Poses, reach: float
 ) -> Float[Tensor, "batch"]:
-    """Return how many rigid groups of links are within `reach` [m] of the object."""
+    """Return for each hand how many rigid groups of links are within `reach` [m] of the object."""
     near = link_gaps(problem, poses, closing.sphere_links)[:, 0] <= reach
     groups = torch.as_tensor(hand.link_group, device=near.device)
     found = torch.zeros(len(near), int(groups.max()) + 1, device=near.device, dtype=problem.hand.lower.dtype)
@@ -113,7 +112,7 @@ def touching_groups(
 
 
 def clear_of_obstacles(problem: Problem, poses: Poses) -> Bool[Tensor, "batch"]:
-    """Return which hands reach into no support and no neighbour."""
+    """Return which hands penetrate neither the support nor a neighbour."""
     if problem.obstacles is None:
         return torch.ones(len(poses.joints), dtype=torch.bool, device=poses.joints.device)
     links = forward(problem.hand.kinematics, poses.joints)

@@ -1,1 +1,1 @@
-"""Trials in the second simulator."""
+"""Trials in PyBullet, the second simulator."""

@@ -1,6 +1,6 @@
-"""The hold trial in the second simulator: same stages, gains, effort limits, pulls and limits as `hold_trial`.
+"""The hold trial in PyBullet, with the stages, gains, effort limits, pulls and limits of `hold_trial` in MuJoCo.
 
-docs/metrics.md tells what Bullet does differently, and how that is matched.
+docs/metrics.md describes what Bullet does differently, and how this trial compensates for it.
 """
 
 from __future__ import annotations
@@ -21,11 +21,11 @@ from graspd_core.verify.world import Protocol
 # pyright: reportAttributeAccessIssue=false, reportCallIssue=false
 
 
-# [s]. At MuJoCo's 4 ms, Bullet's sequential impulses let an object creep out of fingers this light, by 10° in 2 s.
+# Time step [s]. With MuJoCo's 4 ms, Bullet's solver lets an object turn by 10° in 2 s in fingers as light as these.
 TIMESTEP = 0.001
 SOLVER_ITERATIONS = 50
 _NAME = "bullet_hold"
-# Steps between looks at the limits: as often as MuJoCo's trial looks, every 0.1 s.
+# Steps between two checks of the limits: every 0.1 s, as in MuJoCo's trial.
 _CHECK_EVERY = 100
 
 
@@ -34,13 +34,13 @@ class _Run:
     """One running simulation.
 
     Attributes:
-        client: PyBullet's client.
+        client: id of the PyBullet client.
         world: hand and object of the simulation.
         protocol: physics settings.
-        body: PyBullet's number of the object.
-        hand: PyBullet's number of the hand.
-        joints: PyBullet's numbers of the hand's joints.
-        worst: greatest travel [m] and turn [rad] so far, updated in place.
+        body: body id of the object.
+        hand: body id of the hand.
+        joints: joint ids of the hand's actuated joints.
+        worst: greatest displacement [m] and rotation [rad] of the object so far. It is updated in place.
     """
 
     client: int
@@ -53,10 +53,10 @@ class _Run:
 
 
 def bullet_hold_trial(world: BulletWorld, grasp: Grasp, protocol: Protocol) -> TrialResult:
-    """Run one hold trial of `protocol` in PyBullet, which ends at the first broken limit.
+    """Run one hold trial in PyBullet. It ends at the first broken limit.
 
     Returns:
-        Worst displacement [m] of the object's centre of mass and worst rotation [rad] over the six directions.
+        The result, with the greatest displacement of the object's centre of mass [m] and the greatest rotation [rad].
 
     Raises:
         SimulatorError: the hand has coupled joints.
@@ -90,13 +90,14 @@ def _result(run: _Run, reason: str) -> TrialResult:
 
 
 def _start(client: int, world: BulletWorld, posture: Posture, protocol: Protocol) -> _Run:
-    """Start with the hand at a posture and the object at rest in its frame."""
+    """Set up the simulation, with the hand at a posture and the object at rest at the origin of the object frame."""
     import pybullet
 
     sliding, torsional, _ = protocol.friction
     body = add_object(client, world, world.mass)
     hand, joints = load_hand_urdf(client, world.hand, protocol.armature)
-    # Bullet multiplies sliding coefficients, and a body's spinning one with the other's sliding one: the hand's rule.
+    # Bullet multiplies the sliding coefficients of a pair, and a body's spinning coefficient with the other's sliding
+    # coefficient. With these values the hand's coefficients apply.
     free = {"linearDamping": 0.0, "angularDamping": 0.0, "restitution": 0.0, "rollingFriction": 0.0}
     pybullet.changeDynamics(
         body, -1, lateralFriction=1.0, spinningFriction=0.0, collisionMargin=0.0, **free, physicsClientId=client
@@ -135,9 +136,9 @@ def _start_penetration(run: _Run) -> float:
 
 
 def _move(run: _Run, start: Posture, end: Posture) -> str:
-    """Move the targets linearly from start to end. Return why the trial is over, empty if it is not."""
+    """Move the targets linearly from `start` to `end`. Return the reason if the trial failed, otherwise ""."""
     steps = round(run.protocol.stage_time / TIMESTEP)
-    # The shorter way round for the base: wxyz and its negative are the same rotation.
+    # A quaternion and its negative are the same rotation. The sign makes the base turn the shorter way.
     sign = 1.0 if start.quaternion_wxyz @ end.quaternion_wxyz >= 0 else -1.0
     for step in range(1, steps + 1):
         a = step / steps
@@ -150,7 +151,7 @@ def _move(run: _Run, start: Posture, end: Posture) -> str:
 
 
 def _pull(run: _Run, posture: Posture, direction: Float[np.ndarray, "3"]) -> str:
-    """Pull at the object's centre of mass as long as the protocol says. Return why the trial is over, or nothing."""
+    """Pull at the object's centre of mass for the hold time. Return the reason if the trial failed, otherwise ""."""
     import pybullet
 
     force = (run.protocol.pull * run.world.mass * direction).tolist()
@@ -171,11 +172,11 @@ def _step(run: _Run, step: int) -> str:
 
 
 def _drive(run: _Run, target: Float[np.ndarray, "joints"]) -> None:
-    """Drive the joints by damped springs towards `target` [rad] for one step.
+    """Drive the joints towards `target` [rad] or [m] for one step, by springs with dampers.
 
-    Bullet's motor aims at a velocity with at most a given force. It gets the velocity at which the damper balances the
-    spring, and the force that spring and damper have now. So it acts as that spring and damper, and cannot overshoot.
-    An explicit torque on fingers this light would need steps of microseconds.
+    Bullet's motor reaches a target velocity with at most a given force. Here the target velocity is the one at which
+    the damper balances the spring. The maximum force is the current force of spring and damper. The motor thus acts as
+    both and cannot overshoot. Explicit torques on fingers as light as these would need time steps of microseconds.
     """
     import pybullet
 
@@ -196,7 +197,7 @@ def _drive(run: _Run, target: Float[np.ndarray, "joints"]) -> None:
 
 
 def _breach(run: _Run) -> str:
-    """Update the worst travel and turn. Return the broken limit, if any."""
+    """Update the greatest displacement and rotation. Return the broken limit, or "" if none is broken."""
     import pybullet
 
     position, quaternion = pybullet.getBasePositionAndOrientation(run.body, physicsClientId=run.client)

@@ -1,11 +1,10 @@
 """Hand and object in PyBullet, the second simulator, and the displacement trial.
 
-The hand is a URDF of its links, joints and collision solids. It is written from the hand's model and not loaded from
-the hand's own file, so that both simulators use the same solids, masses and joint frames. The object is made of convex
-parts.
+The URDF of the hand is written from the HandModel and not read from the hand's own file. Both simulators thus use the
+same solids, masses and joint frames. The object consists of convex parts.
 
-A world here is plain data. Every trial builds its own simulation from it and discards that. Bullet keeps contacts and
-solver state from one trial to the next, and a figure would depend on what ran before.
+A BulletWorld is plain data, from which every trial builds its own simulation. Bullet keeps contacts and solver state
+between trials, so with a shared simulation a figure would depend on earlier trials.
 """
 
 from __future__ import annotations
@@ -35,17 +34,17 @@ from graspd_core.verify.hold_trial import DIRECTIONS
 # pyright: reportAttributeAccessIssue=false, reportCallIssue=false
 
 
-# As in the MuJoCo world: links without a mass get one [kg], and no moment is smaller than this [kg·m²].
+# As in the MuJoCo world: the least mass [kg] and the least moment of inertia [kg·m²] of a link.
 _LEAST_MASS, _LEAST_LINK_MOMENT = 1e-3, 1e-7
 
 
 def load_hand_urdf(client: int, hand: HandModel, armature: float) -> tuple[int, tuple[int, ...]]:
-    """Put a hand with its base fixed into a simulation. Return its body and the number of each actuated joint.
+    """Load a hand with a fixed base. Return its body id and the joint ids of the actuated joints.
 
     Args:
-        client: PyBullet's client.
-        hand: without coupled joints.
-        armature: rotor inertia of every joint [kg·m²]. Bullet has none, so the moved link carries it.
+        client: id of the PyBullet client.
+        hand: a hand without coupled joints.
+        armature: rotor inertia of every joint [kg·m²]. Bullet has no armature, so it is added to the moved link.
 
     Raises:
         SimulatorError: the hand has coupled joints.
@@ -55,7 +54,7 @@ def load_hand_urdf(client: int, hand: HandModel, armature: float) -> tuple[int, 
     if hand.mimics:
         names = ", ".join(mimic.name for mimic in hand.mimics)
         raise SimulatorError(
-            f"{hand.name}: the second simulator knows no coupled joints ({names}); valid: hands without"
+            f"{hand.name}: PyBullet does not support its coupled joints ({names}); valid: hands without them"
         )
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder, "hand.urdf")
@@ -81,7 +80,7 @@ def load_hand_urdf(client: int, hand: HandModel, armature: float) -> tuple[int, 
 
 
 def hand_urdf(hand: HandModel, armature: float) -> str:
-    """Return the URDF text. Links and joints are numbered. Hulls are files named hull<number of the primitive>.obj."""
+    """Return the URDF text. It names links and joints by number, and the mesh of hull i as file hull<i>.obj."""
     robot = ET.Element("robot", name=hand.name)
     for link in range(hand.num_links):
         element = ET.SubElement(robot, "link", name=f"link{link}")
@@ -91,14 +90,14 @@ def hand_urdf(hand: HandModel, armature: float) -> str:
                 _add_collision(element, index, primitive)
         if hand.link_parent[link] >= 0:
             _add_joint(robot, hand, link)
-    # Bullet breaks lines that are longer than some kilobytes.
+    # Indentation keeps lines short, because Bullet breaks lines longer than a few kilobytes.
     ET.indent(robot)
     return ET.tostring(robot, encoding="unicode")
 
 
 def _add_inertia(element: ET.Element, hand: HandModel, link: int, armature: float) -> None:
     inertial = ET.SubElement(element, "inertial")
-    # The base is fixed, and Bullet counts poses from its centre of mass: put that where the base frame is.
+    # Bullet's pose of a body is that of its centre of mass, so the base link's centre of mass is put at the base frame.
     ET.SubElement(inertial, "origin", xyz=_text(hand.link_com[link] if link else np.zeros(3)))
     ET.SubElement(inertial, "mass", value=str(max(float(hand.link_mass[link]), _LEAST_MASS)))
     moments, axes = np.linalg.eigh(0.5 * (hand.link_inertia[link] + hand.link_inertia[link].T))
@@ -130,13 +129,13 @@ def _add_joint(robot: ET.Element, hand: HandModel, link: int) -> None:
     ET.SubElement(element, "origin", xyz=_text(hand.link_offset_translation[link]), rpy=_text(rpy))
     if joint >= 0:
         ET.SubElement(element, "axis", xyz=_text(hand.joint_axis[link]))
-        # Efforts are the trial's affair. Bullet refuses an infinite one.
+        # The trial itself limits the efforts. Bullet does not accept infinite values.
         limits = {"lower": hand.lower[joint], "upper": hand.upper[joint], "effort": 1e3, "velocity": 1e3}
         ET.SubElement(element, "limit", {key: repr(float(value)) for key, value in limits.items()})
 
 
 def roll_pitch_yaw(rotation: Float[np.ndarray, "3 3"]) -> Float[np.ndarray, "3"]:
-    """Return URDF's angles [rad] of a rotation R = Rz(yaw) Ry(pitch) Rx(roll). Where pitch is ±90°, roll is zero."""
+    """Return URDF's roll, pitch and yaw [rad] of R = Rz(yaw) Ry(pitch) Rx(roll). If pitch is ±90°, roll is zero."""
     pitch = np.arctan2(-rotation[2, 0], np.hypot(rotation[0, 0], rotation[1, 0]))
     if np.hypot(rotation[0, 0], rotation[1, 0]) < 1e-9:
         return np.array([0.0, pitch, np.arctan2(-rotation[0, 1], rotation[1, 1])])
@@ -151,12 +150,12 @@ def _text(values: Float[np.ndarray, "n"]) -> str:
 # pyright: reportAttributeAccessIssue=false, reportCallIssue=false
 
 
-# Smallest principal moment of an object, per kilogram [m²]: a ball of 0.5 mm.
+# The least principal moment of an object per kilogram [m²], that of a ball of 0.5 mm.
 _LEAST_MOMENT = 1e-7
-# Of the displacement trial.
+# Settings of the displacement trial.
 SOLVER_ITERATIONS = 150
 HAND_RESTITUTION, OBJECT_RESTITUTION = 0.0, 0.5
-# Gravity's one direction in the papers, object frame: any direction for a mesh that lies anyhow.
+# The single gravity direction of the papers, in the object frame. It is arbitrary, as the orientation of a mesh is.
 OBMAN = np.array([[0.0, 1.0, 0.0]])
 
 
@@ -166,10 +165,10 @@ class BulletWorld:
 
     Attributes:
         hand: the hand.
-        parts: the object's convex parts as the text of an OBJ file, about its centre of mass in its principal axes [m].
-        mass: the object's own [kg].
-        center_of_mass: in the object's frame [m].
-        axes: `R_object_principal`.
+        parts: text of an OBJ file with the convex parts [m], in the frame of centre of mass and principal axes.
+        mass: mass of the object [kg].
+        center_of_mass: centre of mass in the object frame [m].
+        axes: principal axes of inertia, the rotation `R_object_principal`.
         moments: principal moments of inertia per kilogram [m²].
     """
 
@@ -182,7 +181,7 @@ class BulletWorld:
 
 
 def bullet_available() -> bool:
-    """Return whether PyBullet is installed, which has no wheel for Python 3.12."""
+    """Return whether PyBullet is installed. It has no wheel for Python 3.12."""
     return importlib.util.find_spec("pybullet") is not None
 
 
@@ -190,8 +189,8 @@ def build_bullet_world(hand: HandModel, target: ObjectModel, parts: Sequence[Tri
     """Prepare trials of one hand and one object.
 
     Args:
-        hand: any loaded hand.
-        target: gives mass, centre of mass and inertia.
+        hand: the hand.
+        target: the object, which gives mass, centre of mass and inertia.
         parts: convex collision parts of the object, object frame [m].
 
     Raises:
@@ -204,7 +203,7 @@ def build_bullet_world(hand: HandModel, target: ObjectModel, parts: Sequence[Tri
         )
     inertia = 0.5 * (target.inertia + target.inertia.T) / target.mass
     moments, axes = np.diag(inertia), np.eye(3)
-    # A body whose axes are the frame's keeps them: among equal moments rounding would choose.
+    # If the tensor is diagonal, the axes stay those of the frame. For equal moments `eigh` could return any axes.
     if np.any(inertia != np.diag(moments)):
         moments, axes = np.linalg.eigh(inertia)
     axes[:, 2] *= np.sign(np.linalg.det(axes))
@@ -220,11 +219,11 @@ def build_bullet_world(hand: HandModel, target: ObjectModel, parts: Sequence[Tri
 
 @contextmanager
 def simulation(*, timestep: float, solver_iterations: int) -> Iterator[int]:
-    """Open an empty simulation without gravity and yield the number of its PyBullet client.
+    """Open an empty simulation without gravity. Yield the id of its PyBullet client.
 
     Args:
-        timestep: [s].
-        solver_iterations: most iterations a step.
+        timestep: time step [s].
+        solver_iterations: limit of solver iterations per step.
     """
     import pybullet
 
@@ -243,14 +242,14 @@ def simulation(*, timestep: float, solver_iterations: int) -> Iterator[int]:
 
 
 def add_object(client: int, world: BulletWorld, mass: float) -> int:
-    """Put the object with a given mass [kg] where its frame is the simulation's. Return its body.
+    """Add the object with a given mass [kg] so that the object frame is the world frame. Return its body id.
 
-    Bullet's origin of a body is its centre of mass. Other values are PyBullet's defaults: a margin of 1 mm about convex
-    parts, and damping of 4 % a second.
+    Bullet's origin of a body is its centre of mass. Other values are PyBullet's defaults: a collision margin of 1 mm
+    around convex parts, and damping of 4 % per second.
     """
     import pybullet
 
-    # Bullet reads the file a second time, for the body's looks.
+    # Bullet reads the file a second time for the visual shape.
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder, "parts.obj")
         path.write_text(world.parts)
@@ -268,7 +267,7 @@ def add_object(client: int, world: BulletWorld, mass: float) -> int:
 
 
 def add_frozen_hand(client: int, hand: HandModel, posture: Posture) -> tuple[int, ...]:
-    """Add every collision primitive of a hand as a fixed body, where a posture puts it. Return the bodies."""
+    """Add every collision primitive of a hand in a posture as a fixed body. Return the body ids."""
     import pybullet
 
     kinematics = make_kinematics(hand, "cpu", torch.float64)
@@ -307,7 +306,7 @@ def _collision_shape(client: int, primitive: Primitive) -> int:
 
 
 def wavefront(parts: Sequence[TriangleMesh]) -> str:
-    """Return meshes as the text of one OBJ file, an object each. PyBullet makes a convex hull of every one."""
+    """Return the text of an OBJ file with one object per mesh. PyBullet makes a convex hull of each."""
     lines, first = [], 1
     for index, part in enumerate(parts):
         lines.append(f"o part{index}")
@@ -318,7 +317,7 @@ def wavefront(parts: Sequence[TriangleMesh]) -> str:
 
 
 def xyzw(rotation: Float[np.ndarray, "3 3"]) -> list[float]:
-    """Return a rotation as PyBullet's quaternion."""
+    """Return a rotation matrix as a quaternion in PyBullet's order."""
     w, x, y, z = quaternion_from_rotation(torch.as_tensor(np.ascontiguousarray(rotation))).tolist()
     return [x, y, z, w]
 
@@ -326,12 +325,11 @@ def xyzw(rotation: Float[np.ndarray, "3 3"]) -> list[float]:
 def bullet_displacement(
     world: BulletWorld, posture: Posture, *, directions: Float[np.ndarray, "directions 3"] = DIRECTIONS
 ) -> float:
-    """Return the displacement [m] of the object's centre of mass after 35 steps of 1/240 s, mean over gravity's
-    directions.
+    """Return how far gravity moves the object's centre of mass in 35 steps of 1/240 s [m], mean over directions.
 
-    This is ObMan's protocol (Hasson et al., CVPR 2019), the figure that the papers report, implemented from its
-    parameters. Gravity moves an object off a hand that is frozen in its grasp. docs/metrics.md tells where this
-    deviates. An object in free fall moves 10.7 cm, so a figure near it says only that the hand does not hold.
+    The hand is frozen in its grasp. This is ObMan's protocol (Hasson et al., CVPR 2019), which papers report,
+    implemented from its parameters. docs/metrics.md lists the deviations. An object in free fall moves 10.7 cm, so a
+    figure near 10.7 cm only says that the hand does not hold.
     """
     return float(displacements(world, posture, directions).mean())
 
@@ -339,7 +337,7 @@ def bullet_displacement(
 def displacements(
     world: BulletWorld, posture: Posture, directions: Float[np.ndarray, "directions 3"]
 ) -> Float[np.ndarray, "directions"]:
-    """Return the displacement [m] under gravity along each of some unit directions of the object's frame."""
+    """Return the displacement under gravity along each direction [m]. Directions are unit vectors, object frame."""
     import pybullet
 
     moved = np.empty(len(directions))

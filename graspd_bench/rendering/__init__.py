@@ -1,1 +1,1 @@
-"""Pictures, depth images, and scenes with known truth."""
+"""Rendering of pictures and depth images, and scenes whose true geometry is known."""

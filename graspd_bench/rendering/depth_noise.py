@@ -1,10 +1,9 @@
-"""Faults of a depth camera: noise that grows with the square of depth, flying pixels, holes, steps.
+"""Noise model of depth cameras: errors that grow with the square of depth, flying pixels, holes and rounding.
 
-Depth from disparity has a random error of z² / (f B) times that of the disparity (Khoshelham and Elberink 2012).
-Intel's tuning guide for the D400 series gives 0.08 pixels for a D415. With f = 616 pixels and a baseline of B = 55 mm
-that is 0.0024 z². It agrees with the table of real D415 frames that DEFAULT was compared with: 0.9 mm at 0.5 m, 1.3 mm
-at 0.7 m. There the errors correlate by 0.96 between neighbouring pixels and by 0.6 at a distance of eight, because a
-matching window spans many.
+The random error of stereo depth is z² / (f B) times the error of disparity (Khoshelham and Elberink 2012). Intel's
+tuning guide for the D400 series gives 0.08 pixels for a D415. With f = 616 pixels and a baseline of B = 55 mm, this is
+0.0024 z² [m]. DEFAULT was compared with the table in real D415 frames: 0.9 mm at 0.5 m, 1.3 mm at 0.7 m. The errors
+there correlate by 0.96 between neighbouring pixels and by 0.6 over eight pixels, because a matching window spans many.
 """
 
 from __future__ import annotations
@@ -20,31 +19,31 @@ from graspd_core.perception.cloud.camera import PinholeCamera, camera_rays
 
 Depth = Float[np.ndarray, "height width"]
 
-# A step of depth between neighbouring pixels beyond this [m] is an edge of something, not a slope.
+# A depth step between neighbouring pixels greater than this counts as an edge of an object [m].
 EDGE = 0.02
-# Blur of a slow bias, over the height of the image.
+# Blur of the smooth bias, as a fraction of the image height.
 _SLOW = 0.15
 
 
 @dataclass(frozen=True)
 class DepthNoise:
-    """A depth camera's faults, none where all are zero.
+    """Noise of a depth camera. With all defaults there is no noise.
 
     Attributes:
-        floor: standard deviation of depth at no distance [m].
-        quadratic: its growth with the square of depth [1/m]: σ = floor + quadratic z².
+        floor: standard deviation of depth, extrapolated to depth zero [m].
+        quadratic: growth of the standard deviation with depth squared [1/m]: σ = floor + quadratic z².
         correlation: standard deviation of the blur that correlates neighbouring errors [pixels].
-        white: share of the variance that is not correlated, 0 to 1.
-        jitter: standard deviation of the place in the image that a pixel really looks at [pixels].
-        flying: share of the pixels at an edge that lie somewhere between the fore- and the background.
-        edge_loss: share of the pixels at an edge without depth.
-        loss: share of all pixels without depth, in patches.
-        grazing: surfaces seen at a smaller angle to the line of sight lose pixels, all of them at none [rad].
-        baseline: distance between the eyes of a stereo camera [m]. What one of them does not see has no depth.
+        white: uncorrelated share of the variance, 0 to 1.
+        jitter: standard deviation of the lateral error of a pixel [pixels].
+        flying: share of edge pixels with a depth between foreground and background.
+        edge_loss: share of edge pixels without depth.
+        loss: share of all pixels without depth. They form patches.
+        grazing: angle between surface and line of sight below which pixels lose depth [rad]. At angle 0 all do.
+        baseline: distance between the two lenses of a stereo camera [m]. A point that one lens cannot see has no depth.
         step: depth is rounded to multiples of this [m].
-        disparity_step: disparity, focal length times baseline over depth, is rounded to multiples of this [pixels].
+        disparity_step: disparity (focal length x baseline / depth) is rounded to multiples of this [pixels].
         bias: standard deviation at 1 m of an error that is smooth over the image and grows with depth squared [m].
-        nearest, farthest: range beyond which there is no depth [m].
+        nearest, farthest: range outside which there is no depth [m].
     """
 
     floor: float = 0.0
@@ -66,10 +65,10 @@ class DepthNoise:
     def __post_init__(self) -> None:
         for name, value in vars(self).items():
             if not value >= 0:
-                raise CloudError(f"noise: {name}={value}; it must be zero or more")
+                raise CloudError(f"noise: {name}={value}; valid: 0 or more")
         for name in ("white", "flying", "edge_loss", "loss"):
             if getattr(self, name) > 1:
-                raise CloudError(f"noise: {name}={getattr(self, name)} is a share; it must be at most 1")
+                raise CloudError(f"noise: {name}={getattr(self, name)}; valid: 0 to 1")
 
 
 NONE = DepthNoise()
@@ -108,15 +107,15 @@ LEVELS = {"none": NONE, "low": LOW, "default": DEFAULT, "high": HIGH}
 
 @dataclass(frozen=True)
 class DepthCamera:
-    """A kind of depth camera: its lens and its faults."""
+    """A kind of depth camera: its lens and its noise."""
 
     lens: PinholeCamera
     noise: DepthNoise
 
 
-# Stereo of a narrow and of a wide lens (Intel's tuning guide: 0.08 pixels). Structured light with disparity in eighths
-# of a pixel (Khoshelham and Elberink 2012). Time of flight, whose error hardly grows with depth, and which mixes what
-# is before and behind an edge (Tölgyessy et al. 2021: 1 to 2 mm up to 1 m).
+# d415 and d435 are stereo cameras with a narrow and a wide lens (Intel's tuning guide: 0.08 pixels). Structured light
+# has disparity in steps of 1/8 pixel (Khoshelham and Elberink 2012). The error of time of flight hardly grows with
+# depth, and edges mix foreground and background (Tölgyessy et al. 2021: 1 to 2 mm up to 1 m).
 CAMERAS = {
     "d415": DepthCamera(PinholeCamera(640, 480, 616.0, 616.0, 319.5, 239.5), DEFAULT),
     "d435": DepthCamera(
@@ -141,9 +140,9 @@ CAMERAS = {
 
 
 def add_noise(depth: Depth, camera: PinholeCamera, noise: DepthNoise, seed: int) -> Depth:
-    """Return the image that a camera with such faults gives of the true `depth` [m], 0 where it has none.
+    """Add camera noise to a true depth image [m]. The result is 0 where there is no depth.
 
-    Flying pixels appear before the error of depth is added. Holes come last. The same seed gives the same image.
+    Flying pixels are made before the depth error is added. Holes are made last. The same seed gives the same image.
     """
     rng = np.random.default_rng(seed)
     true = np.where(np.isfinite(depth) & (depth > 0), depth, 0.0)
@@ -179,7 +178,7 @@ def _around(depth: Depth) -> tuple[Depth, Depth, Bool[np.ndarray, "height width"
 
 
 def _jittered(depth: Depth, pixels: float, rng: np.random.Generator) -> Depth:
-    """Give each pixel the depth of one nearby, so that outlines become ragged (lateral noise)."""
+    """Replace each pixel's depth by that of a random pixel nearby (lateral noise). Outlines become ragged."""
     if not pixels:
         return depth
     height, width = depth.shape
@@ -189,10 +188,10 @@ def _jittered(depth: Depth, pixels: float, rng: np.random.Generator) -> Depth:
 
 
 def _shadow(depth: Depth, camera: PinholeCamera, baseline: float) -> Bool[np.ndarray, "height width"]:
-    """Return pixels that a second eye, `baseline` to the right, does not see, because something nearer is in its way.
+    """Return the pixels that a second lens, `baseline` [m] to the right, cannot see because a nearer point hides them.
 
-    In that eye's image a point appears f B / z pixels further left. A pixel is hidden if one to its right in the row
-    appears no further right than it does.
+    In the second image a point appears f B / z pixels further left. A pixel is hidden if a pixel to its right in the
+    row does not appear further right there.
     """
     if not baseline:
         return np.zeros(depth.shape, dtype=bool)
@@ -205,7 +204,7 @@ def _shadow(depth: Depth, camera: PinholeCamera, baseline: float) -> Bool[np.nda
 
 
 def _grazing(depth: Depth, camera: PinholeCamera, limit: float, edge: np.ndarray, rng: np.random.Generator):
-    """Return pixels lost because their surface is seen at a small angle. At an edge there is no surface to judge."""
+    """Return the pixels without depth because of a small viewing angle. Edges are exempt, having no normal."""
     if not limit:
         return np.zeros(depth.shape, dtype=bool)
     rays = np.nan_to_num(camera_rays(camera))
@@ -218,7 +217,7 @@ def _grazing(depth: Depth, camera: PinholeCamera, limit: float, edge: np.ndarray
 
 
 def _field(shape: tuple[int, ...], blur: float, white: float, rng: np.random.Generator) -> Depth:
-    """Return normal numbers of unit variance, of which all but a share `white` of the variance is smooth."""
+    """Return random numbers of unit variance. `white` is the uncorrelated share of the variance, the rest is smooth."""
     from scipy.ndimage import gaussian_filter
 
     smooth = gaussian_filter(rng.standard_normal(shape), blur, mode="wrap") / _blurred_scale(shape, blur)
@@ -227,7 +226,7 @@ def _field(shape: tuple[int, ...], blur: float, white: float, rng: np.random.Gen
 
 @lru_cache(maxsize=16)
 def _blurred_scale(shape: tuple[int, ...], blur: float) -> float:
-    """Return the standard deviation of blurred white noise, wrapped around so that it is the same everywhere."""
+    """Return the standard deviation of blurred white noise. The blur wraps around, so it is the same at all pixels."""
     from scipy.ndimage import gaussian_filter
 
     impulse = np.zeros(shape)

@@ -1,8 +1,8 @@
-"""Irregular household things, drawn at random from families of shapes that no rule of completion describes.
+"""Random household objects of irregular shape. No completion rule of the reconstruction describes these shapes.
 
-A thing is the zero level of a signed distance on a grid, so that it is one watertight body. It is made of round cones,
-ellipsoids, boxes and bodies of revolution, blended where they meet. Its mass is drawn from the densities of such
-things, full or hollow. The same family and seed give the same thing.
+The mesh of an object is the zero level set of a signed distance on a grid, so it is one watertight body. It consists of
+round cones, ellipsoids, boxes and bodies of revolution, with smooth blends. The mass is drawn from typical densities of
+such objects, full or hollow. The same family and seed give the same object.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ from graspd_core.types import TriangleMesh
 Points = Float[np.ndarray, "n 3"]
 Distance = Float[np.ndarray, "n"]
 Field = Callable[[Points], Distance]
-# Names of families as objects: family:pear:3 is the third pear.
+# Prefix of such objects in a request: family:pear:3 is the pear of seed 3.
 PREFIX = "family:"
 # Cells along the longest side, and faces of the mesh.
 _CELLS, _FACES = 96, 8000
@@ -31,11 +31,11 @@ _CELLS, _FACES = 96, 8000
 
 @dataclass(frozen=True)
 class Thing:
-    """A drawn thing.
+    """A random object.
 
     Attributes:
-        mesh: watertight, in metres, z up as it stands or hangs.
-        mass: [kg].
+        mesh: watertight mesh [m]. z is up in its usual orientation.
+        mass: mass [kg].
     """
 
     mesh: TriangleMesh
@@ -44,7 +44,7 @@ class Thing:
 
 @lru_cache(maxsize=64)
 def draw_thing(family: str, seed: int) -> Thing:
-    """Draw a thing. Raises MeshError for an unknown family."""
+    """Return the random object of a family and seed. Raises MeshError: unknown family."""
     if family not in FAMILIES:
         raise MeshError(f"unknown family {family!r}; {choices(family, FAMILIES)}")
     rng = np.random.default_rng([sum(map(ord, family)), seed])
@@ -54,27 +54,27 @@ def draw_thing(family: str, seed: int) -> Thing:
 
 
 def _surface(field: Field, half: Float[np.ndarray, "3"]) -> TriangleMesh:
-    """Return the zero level of a field inside the box of half edges `half` [m] about the origin."""
+    """Return the zero level set of a field as a mesh, within a box of half edges `half` [m] around the origin."""
     import igl
 
     half = half + 0.004
     cell = 2 * half.max() / _CELLS
     axes = [np.arange(-h, h + cell, cell) for h in half]
-    # Columns of x first, as marching cubes takes them.
+    # `igl.marching_cubes` expects x to vary fastest.
     z, y, x = np.meshgrid(*axes[::-1], indexing="ij")
     points = np.stack([x.ravel(), y.ravel(), z.ravel()], 1)
     marching: Any = igl.marching_cubes
     vertices, faces = marching(field(points), points, *(len(axis) for axis in axes), 0.0)[:2]
-    # igl counts in an integer type that is not numpy's own of 64 bits.
+    # igl returns an integer type other than numpy's int64.
     faces = faces.astype(np.int32).astype(np.int64)
     a, b, c = vertices[faces].transpose(1, 0, 2)
-    # Outwards where the field grows.
+    # A positive signed volume means that the faces point outwards.
     outwards = np.einsum("ij,ij->", a, np.cross(b, c)) > 0
     return TriangleMesh(np.array(vertices), faces if outwards else faces[:, ::-1])
 
 
 def _cone(*stations: tuple[float, float, float, float]) -> Field:
-    """Return round cones along a polyline of (x, y, z, radius)."""
+    """Return the signed distance of round cones along a polyline of (x, y, z, radius) [m]."""
     nodes = np.array(stations)
 
     def field(points: Points) -> Distance:
@@ -98,7 +98,7 @@ def _box(centre: tuple[float, float, float], half: tuple[float, float, float], r
 
 
 def _revolved(profile: list[tuple[float, float]], flat: float = 1.0) -> Field:
-    """Return a body of (height, radius), rounded at its ends. `flat` shrinks its depth, y."""
+    """Return a body of revolution about z with rounded ends. `profile` lists (height, radius), `flat` scales y."""
     heights, radii = np.array(profile).T
 
     def field(points: Points) -> Distance:
@@ -112,7 +112,7 @@ def _revolved(profile: list[tuple[float, float]], flat: float = 1.0) -> Field:
 
 
 def _blend(*fields: Field, width: float = 0.004) -> Field:
-    """Return the union of bodies, with fillets about so wide [m]."""
+    """Return the smooth union of bodies. `width` is the approximate width of the fillets [m]."""
 
     def field(points: Points) -> Distance:
         joined = fields[0](points)
@@ -129,7 +129,7 @@ def _less(field: Field, hole: Field) -> Field:
     return lambda points: np.maximum(field(points), -hole(points))
 
 
-# A field, the half edges of a box that holds it [m], and the densities of such things [kg/m³].
+# A field, the half edges of its bounding box [m], and the range of densities of such objects [kg/m³].
 Drawn = tuple[Field, tuple[float, float, float], tuple[float, float]]
 
 
@@ -262,4 +262,4 @@ FAMILIES: dict[str, Callable[[np.random.Generator], Drawn]] = {
     "pear": _pear, "banana": _banana, "pitcher": _pitcher, "spray": _spray, "pump": _pump, "detergent": _detergent,
     "tool": _tool, "drill": _drill, "plane": _plane, "animal": _animal, "pan": _pan, "sponge": _sponge, "jar": _jar,
 }  # fmt: skip
-"""What draws a thing of each family."""
+"""Functions that draw an object, by family."""

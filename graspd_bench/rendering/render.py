@@ -1,4 +1,4 @@
-"""Depth images and shaded pictures of meshes by ray casting, without a display, and pictures of a hand.
+"""Rendering by ray casting, without a display: depth images, shaded pictures of meshes, and pictures of a hand.
 
 Camera frames follow the optical convention: z forward, x right, y down.
 """
@@ -27,15 +27,15 @@ AMBIENT = 0.25
 
 
 def camera_of_view(width: int, height: int, field_of_view: float = 0.7) -> PinholeCamera:
-    """Return a centred camera of that vertical field of view [rad]."""
+    """Return a pinhole camera with a centred principal point. `field_of_view` is vertical [rad]."""
     focal = 0.5 * height / float(np.tan(0.5 * field_of_view))
     return PinholeCamera(width, height, focal, focal, (width - 1) / 2, (height - 1) / 2)
 
 
 def look_at(eye: Vector, target: Vector, up: Vector = (0.0, 0.0, 1.0)) -> Float[np.ndarray, "4 4"]:
-    """Return `T_world_camera` of a camera at `eye` that looks at `target` with `up` upwards in its image [m].
+    """Return `T_world_camera` of a camera at `eye` [m] that looks at `target` [m].
 
-    When it looks along `up`, the roll is arbitrary.
+    `up` points upwards in the image. If the camera looks along `up`, its roll is arbitrary.
     """
     forward = np.asarray(target, dtype=float) - np.asarray(eye, dtype=float)
     forward /= np.linalg.norm(forward)
@@ -52,7 +52,7 @@ def look_at(eye: Vector, target: Vector, up: Vector = (0.0, 0.0, 1.0)) -> Float[
 def render_depth(
     mesh: TriangleMesh, camera: PinholeCamera, T_world_camera: Float[np.ndarray, "4 4"]
 ) -> Float[np.ndarray, "height width"]:
-    """Return the distance along the optical axis [m], 0 where the ray meets nothing."""
+    """Return the depth image of a mesh: distances along the optical axis [m], 0 where a ray hits nothing."""
     distance, _, _ = _cast(mesh, camera, T_world_camera)
     return np.where(np.isfinite(distance), distance, 0.0)
 
@@ -60,7 +60,7 @@ def render_depth(
 def render_scene(
     meshes: Sequence[TriangleMesh], camera: PinholeCamera, T_world_camera: Float[np.ndarray, "4 4"]
 ) -> tuple[Float[np.ndarray, "height width"], Int[np.ndarray, "height width"]]:
-    """Return the distance along the optical axis [m], 0 without a hit, and which mesh each ray meets, -1 for none."""
+    """Return the depth image of some meshes [m] (0: no hit), and the index of the mesh at each pixel (-1: no hit)."""
     distance, face, _ = _cast(joined(*meshes), camera, T_world_camera)
     hit = np.isfinite(distance)
     label = np.full(distance.shape, -1)
@@ -75,13 +75,13 @@ def render_shaded(
     width: int = 640,
     height: int = 480,
 ) -> UInt8[np.ndarray, "height width 3"]:
-    """Return a picture of meshes in their colours (RGB, 0 to 1), lit from the camera and from above, on white."""
+    """Return a picture of meshes with RGB colours (0 to 1) on white. Light comes from the camera and from +z."""
     together = joined(*(mesh for mesh, _ in meshes))
     colours = np.repeat(np.array([rgb for _, rgb in meshes], dtype=float), [len(m.faces) for m, _ in meshes], axis=0)
     distance, face, normal = _cast(together, camera_of_view(width, height), T_world_camera)
     hit = np.isfinite(distance)
     view, above = -T_world_camera[:3, 2], np.array([0.0, 0.0, 1.0])
-    # A face is lit whichever way it is wound: towards the viewer.
+    # Normals are flipped towards the viewer, so that the winding of a face does not matter.
     normal = normal * np.where(normal @ view < 0, -1.0, 1.0)[..., None]
     light = AMBIENT + 0.55 * (normal @ view).clip(0) + 0.2 * (normal @ above).clip(0)
     image = np.full((height, width, 3), BACKGROUND, dtype=np.uint8)
@@ -90,7 +90,7 @@ def render_shaded(
 
 
 def save_png(path: str | Path, image: UInt8[np.ndarray, "height width 3"]) -> None:
-    """Write an RGB picture (PNG specification: one IHDR, one IDAT of unfiltered rows, IEND)."""
+    """Write an RGB picture as a PNG file: one IHDR chunk, one IDAT chunk of unfiltered rows, IEND."""
     height, width, _ = image.shape
     rows = np.concatenate([np.zeros((height, 1), np.uint8), image.reshape(height, width * 3)], axis=1)
 
@@ -103,10 +103,10 @@ def save_png(path: str | Path, image: UInt8[np.ndarray, "height width 3"]) -> No
 
 
 def _cast(mesh: TriangleMesh, camera: PinholeCamera, T_world_camera: Float[np.ndarray, "4 4"]):
-    """Return the depth (infinite where nothing is hit), face index and unit face normal of each pixel."""
+    """Return depth [m], face index and unit face normal of each pixel. The depth is infinite without a hit."""
     rotation, position = T_world_camera[:3, :3], T_world_camera[:3, 3]
     rays = camera_rays(camera)
-    # Pixels beyond the lens's range look nowhere.
+    # Pixels outside the range of the lens model have no ray.
     blind = np.isnan(rays[..., 0])
     distance, face, normal = first_hits(
         TriangleMesh(mesh.vertices - position, mesh.faces), np.nan_to_num(rays) @ rotation.T
@@ -116,14 +116,15 @@ def _cast(mesh: TriangleMesh, camera: PinholeCamera, T_world_camera: Float[np.nd
 
 _HAND, _CANDIDATE, _PALM = (0.45, 0.55, 0.75), (0.85, 0.25, 0.15), (0.15, 0.6, 0.2)
 _WIDTH, _HEIGHT = 560, 480
-# Dots for candidates, and the arrow out of the palm, in shares of the hand's size.
+# Radius of the dots at candidates, and length and radius of the palm's arrow, as fractions of the hand's size.
 _DOT, _ARROW, _SHAFT = 0.006, 0.35, 0.012
 
 
 def hand_picture(hand: HandModel) -> UInt8[np.ndarray, "height width 3"]:
-    """Return four views of a hand: above from the side, below onto the palm, left open, right closed.
+    """Return a picture with four views of a hand. The left column shows it open, the right column closed.
 
-    Contact candidates are red dots. A green arrow stands on the palm's centre along its normal.
+    The upper row looks from the side, the lower row at the palm. Red dots are contact candidates. A green arrow marks
+    the palm's centre and normal.
     """
     reach = hand_mesh(hand, hand.open_posture).vertices
     middle, size = 0.5 * (reach.min(0) + reach.max(0)), float(np.ptp(reach, axis=0).max())
@@ -132,7 +133,7 @@ def hand_picture(hand: HandModel) -> UInt8[np.ndarray, "height width 3"]:
     eyes = (side + 0.5 * hand.palm_normal + 0.25 * up, hand.palm_normal + 0.15 * side + 0.1 * up)
     rows = []
     for eye in eyes:
-        # The light comes from z: the world is turned so that the fingers point up.
+        # The hand is turned so that its fingers point along +z, from where the light comes.
         frame = np.column_stack([np.cross(hand.palm_normal, up), hand.palm_normal, up]).T
         pose = look_at(frame @ (2.1 * size * eye / np.linalg.norm(eye)), np.zeros(3), np.array([0.0, 0.0, 1.0]))
         row = []

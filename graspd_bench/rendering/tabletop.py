@@ -1,7 +1,7 @@
-"""Authored scenes on a table with their truth: a shape at rest on z = 0, neighbours beside it, cameras around it.
+"""Synthetic tabletop scenes with known geometry: an object at rest on a table, neighbours, and cameras around it.
 
-World frame: z up, the table's top in the plane z = 0, the object above the origin. Clouds are in that frame too, so a
-grasp that was planned on them can be tried on `truth` as it is.
+World frame: z is up, the table's top is the plane z = 0, and the object is above the origin. Clouds are in this frame
+too, so a grasp planned on a cloud can be tried on `truth` without a transform.
 """
 
 from __future__ import annotations
@@ -25,25 +25,25 @@ from graspd_core.types import Plane, TriangleMesh
 # Half the table's side and its thickness [m].
 TABLE_HALF, TABLE_THICK = 0.4, 0.02
 
-# As a D415 sees: 640 x 480 pixels, 55° across.
+# The depth camera of a RealSense D415: 640 x 480 pixels, horizontal field of view 55°.
 CAMERA = PinholeCamera(640, 480, 616.0, 616.0, 319.5, 239.5)
 
-# Authored shapes that would topple as they are authored.
+# Built-in shapes that would topple in their own orientation.
 LYING = ("capsule", "hammer")
-# Cosine of a pose that counts as standing.
+# An object stands if the cosine between its own z axis and the vertical exceeds this.
 _UPRIGHT = 0.999
 
 
 @dataclass(frozen=True)
 class TabletopScene:
-    """The things on a table, all in the world frame.
+    """An object on a table with its neighbours. All meshes are in the world frame [m].
 
     Attributes:
-        truth: the object to grasp [m].
-        T_world_object: pose of the shape's own frame.
-        obstacles: meshes beside it [m].
-        table: its surface [m].
-        support: its top as a half-space.
+        truth: mesh of the object to grasp.
+        T_world_object: pose of the object's own frame.
+        obstacles: meshes of the neighbours.
+        table: mesh of the table.
+        support: the table's top as a half-space.
     """
 
     truth: TriangleMesh
@@ -54,7 +54,7 @@ class TabletopScene:
 
     @property
     def meshes(self) -> tuple[TriangleMesh, ...]:
-        """Return meshes in the order of the labels of `depth_views`: the object, its neighbours, the table."""
+        """Return all meshes: the object, its neighbours, the table. The labels of `depth_views` are their indices."""
         return (self.truth, *self.obstacles, self.table)
 
 
@@ -64,15 +64,16 @@ def tabletop(
     yaw: float = 0.0,
     obstacles: Sequence[tuple[str | TriangleMesh, float, float]] = (),
 ) -> TabletopScene:
-    """Put a shape by name, or a mesh, on the table.
+    """Put an object on the table. Return the scene.
 
     Args:
-        shape: named ones stand as authored if they would, else lie. A mesh lies where it is lowest.
-        yaw: turn about the vertical [rad].
+        shape: name of a built-in shape, or a mesh. A shape keeps its own orientation if it can stand. Otherwise, and
+            for a mesh, the centre of mass is as low as possible.
+        yaw: rotation about the vertical [rad].
         obstacles: shape, x and y [m] of each neighbour.
 
     Raises:
-        MeshError: an unknown shape.
+        MeshError: unknown shape.
     """
     mesh, pose = _at_rest(shape, yaw)
     others = []
@@ -83,14 +84,14 @@ def tabletop(
 
 
 def on_table(target: TriangleMesh, others: Sequence[TriangleMesh] = ()) -> TabletopScene:
-    """Return a scene of things that lie where they are, on the table."""
+    """Return a scene with the table and the given meshes, which are already in the world frame [m]."""
     return TabletopScene(target, np.eye(4), tuple(others), _table(), Plane(np.array([0.0, 0.0, 1.0]), 0.0))
 
 
 def lowest_pose(mesh: TriangleMesh) -> Float[np.ndarray, "4 4"]:
-    """Return the pose on z = 0 in which the mesh's centre of mass is lowest, which is always one of stable rest.
+    """Return the pose on z = 0 with the lowest centre of mass. It is always stable.
 
-    The facet of the convex hull nearest to the centre of mass has the foot of the perpendicular inside it.
+    The mesh rests on the facet of its convex hull nearest to the centre of mass, whose projection is in that facet.
     """
     from scipy.spatial import ConvexHull
 
@@ -104,15 +105,16 @@ def lowest_pose(mesh: TriangleMesh) -> Float[np.ndarray, "4 4"]:
 
 
 def resting_pose(mesh: TriangleMesh, rng: np.random.Generator) -> Float[np.ndarray, "4 4"]:
-    """Return a pose on z = 0 in which the mesh rests, with a random turn about the vertical.
+    """Draw a stable pose of a mesh on z = 0, with a random yaw.
 
-    Half of those that can stand as they are do so. The others come to rest as they fall, from any direction.
+    A mesh that can stand upright does so with a probability of 0.5. Otherwise stable poses are drawn by the probability
+    that a fall from a random orientation ends in them.
     """
     import trimesh
 
     centre = mass_properties(mesh)[1]
     hull = trimesh.Trimesh(mesh.vertices, mesh.faces).convex_hull
-    # It takes the root of what rounding leaves below zero, of facets that are next to none.
+    # trimesh takes the square root of a rounding error below zero for facets of nearly no area.
     with np.errstate(invalid="ignore"):
         given = {"center_mass": centre, "sigma": 0.0, "n_samples": 1, "threshold": 0.01}
         poses, shares = trimesh.poses.compute_stable_poses(hull, **given)
@@ -130,7 +132,7 @@ def resting_pose(mesh: TriangleMesh, rng: np.random.Generator) -> Float[np.ndarr
 
 
 def crowded(target: TriangleMesh, others: Sequence[TriangleMesh], rng: np.random.Generator) -> tuple[TriangleMesh, ...]:
-    """Return things at rest beside a target, each in a direction of its own, 2 to 5 cm away from all before it."""
+    """Place other objects at rest around a target, each 2 to 5 cm away from all placed before it."""
     from scipy.spatial import KDTree
 
     placed, begun = [target], rng.uniform(0, 2 * np.pi)
@@ -156,10 +158,11 @@ def ring_poses(
     """Return `T_world_camera` of cameras spaced evenly on a horizontal ring, all looking at `target`.
 
     Args:
-        elevation: of the cameras above the horizon, seen from the target [rad].
-        distance: from the target [m].
-        azimuth: of the first camera, from x towards y [rad].
-        target: [m].
+        count: number of cameras.
+        elevation: angle of the cameras above the horizon, seen from the target [rad].
+        distance: distance from the target [m].
+        azimuth: angle of the first camera, from x towards y [rad].
+        target: the point that the cameras look at [m].
     """
     turns = azimuth + 2 * np.pi * np.arange(count) / count
     flat, up = distance * np.cos(elevation), distance * np.sin(elevation)
@@ -173,7 +176,7 @@ def depth_views(
     noise: DepthNoise = NONE,
     seed: int = 0,
 ) -> tuple[tuple[Float[np.ndarray, "height width"], Int[np.ndarray, "height width"]], ...]:
-    """Return the depth image [m] of each pose, and which of `scene.meshes` each pixel truly shows, -1 for none."""
+    """Return for each pose the noisy depth image [m], and the index in `scene.meshes` of each pixel (-1: none)."""
     images = []
     for index, pose in enumerate(poses):
         depth, label = render_scene(scene.meshes, camera, pose)
@@ -188,13 +191,13 @@ def views_of(
     noise: DepthNoise = NONE,
     seed: int = 0,
 ) -> tuple[PointCloud, ...]:
-    """Return what the camera sees from each pose, table and all, in the world frame."""
+    """Return the point cloud of each camera pose, in the world frame. It includes the table."""
     images = depth_views(scene, camera, poses, noise, seed)
     return tuple(cloud_from_depth(depth, camera, pose) for (depth, _), pose in zip(images, poses, strict=True))
 
 
 def moved(mesh: TriangleMesh, transform: Float[np.ndarray, "4 4"]) -> TriangleMesh:
-    """Return the mesh after a rigid motion."""
+    """Return the mesh transformed by a 4 x 4 rigid transform."""
     return TriangleMesh(mesh.vertices @ transform[:3, :3].T + transform[:3, 3], mesh.faces)
 
 

@@ -1,1 +1,1 @@
-"""Objects and clouds with deliberate faults."""
+"""Stress tests: meshes, clouds and settings with deliberate faults."""

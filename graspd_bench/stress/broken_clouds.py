@@ -1,4 +1,4 @@
-"""Clouds with the faults that depth cameras, drivers and clutter cause, of a thing on a table."""
+"""Stress cases: clouds of a tabletop scene, with faults that depth cameras, drivers and clutter cause."""
 
 from __future__ import annotations
 
@@ -41,12 +41,12 @@ _SIDE = ring_poses(1, elevation=0.9, azimuth=-1.57)
 
 
 def cloud_cases() -> tuple[Case, ...]:
-    """Return every faulty cloud, which goes through `scene_from_views`."""
+    """Return all cases of faulty clouds. Their scenes are made by `scene_from_views`."""
     return (*_measured(), *_refused(), *_special())
 
 
 def _measured() -> Iterator[Case]:
-    """Return cases of sensors' and scenes' faults, from which grasps are still expected."""
+    """Yield cases with faults of sensor or scene for which a grasp is still expected."""
     cuboid, mug, cylinder, block = (_true(shape) for shape in ("box", "mug", "cylinder", "l_block"))
     seen = (
         ("single-view", "one view of a box on a table", lambda: _views("box", 1), cuboid),
@@ -81,7 +81,7 @@ def _measured() -> Iterator[Case]:
 
 
 def _refused() -> Iterator[Case]:
-    """Return cases of clouds that hold no object."""
+    """Yield cases of clouds without an object. No grasp is expected."""
     refused = (
         ("empty", "no point at all", lambda: [_cloud(np.zeros((0, 3)))], ("CloudError",)),
         ("no-view", "a list of no views", lambda: [], ("CloudError",)),
@@ -100,7 +100,7 @@ def _refused() -> Iterator[Case]:
 
 
 def _special() -> tuple[Case, ...]:
-    """Return cases with other arguments or bounds."""
+    """Return cases that need other arguments of `scene_from_views`, or other limits of time and memory."""
     return (
         _case(
             "lone-object",
@@ -168,7 +168,7 @@ def _flying() -> Views:
 
 
 def bled() -> Views:
-    """Return a cut by a plane a little too low, which leaves a patch of table about a mug's foot."""
+    """Return a view of a mug whose table was cut off a little too low. A patch of table remains around its foot."""
     stage = tabletop("mug", yaw=_YAW)
     ((depth, label),) = depth_views(stage, CAMERA, _POSES[:1], DEFAULT)
     (view,) = views_of(stage, CAMERA, _POSES[:1], DEFAULT)
@@ -211,7 +211,7 @@ def _misplaced() -> Views:
 
 
 def _shiny() -> Views:
-    """Return views with a hole where each camera looks straight at the object."""
+    """Return views with a hole of 15 mm radius in the middle of the visible object."""
 
     def burn(view: PointCloud) -> PointCloud:
         above = view.points[:, 2] > 0.01
@@ -270,51 +270,50 @@ def _mask() -> Target:
 
 
 def half_out_of_view(shape: str) -> Views:
-    """Return views whose image ends in the middle of the object."""
+    """Return a view whose image ends in the middle of the object."""
     ((depth, label),) = depth_views(tabletop(shape, yaw=_YAW), CAMERA, _POSES[:1], DEFAULT, _SEED)
     middle = int(np.nonzero(label == 0)[1].mean())
     return [cloud_from_depth(np.where(np.arange(CAMERA.width) < middle, depth, 0.0), CAMERA, _POSES[0])]
 
 
 def black_neighbour(shape: str) -> Views:
-    """Return views with a thing beside the object that gives no depth, nor does its place on the table."""
+    """Return a view with a black neighbour beside the object. All its pixels lack depth."""
     stage = tabletop(shape, yaw=_YAW, obstacles=[("cylinder", 0.13, 0.03)])
     ((depth, label),) = depth_views(stage, CAMERA, _POSES[:1], DEFAULT, _SEED)
     return [cloud_from_depth(np.where(label == 1, 0.0, depth), CAMERA, _POSES[0])]
 
 
 def at_the_edge(shape: str) -> Views:
-    """Return views in which the table ends beside the object, towards the camera."""
+    """Return a view in which the table ends beside the object, on the camera's side."""
     stage = tabletop(shape, yaw=_YAW)
     table = stage.table.vertices - np.array([TABLE_HALF - 0.05, 0.0, 0.0])
     return _seen(replace(stage, table=TriangleMesh(table, stage.table.faces)))
 
 
 def beside_a_step(shape: str) -> Views:
-    """Return views in which half of the table is 3 cm higher."""
+    """Return a view in which half of the table is 3 cm higher."""
     return _seen(_with(shape, box((0.3, 0.8, 0.03), (0.23, 0.0, 0.015))))
 
 
 def with_an_arm(shape: str) -> Views:
-    """Return views into which a forearm of half a metre reaches over the table."""
+    """Return a view in which a forearm, 0.5 m long, reaches over the table."""
     return _seen(_with(shape, box((0.09, 0.5, 0.09), (-0.05, -0.38, 0.17))))
 
 
 def thrice(shape: str) -> Views:
-    """Return the same message three times, as three views."""
     (view,) = _seen(tabletop(shape, yaw=_YAW))
     return [view, view, view]
 
 
 def zero_filled(shape: str) -> Views:
-    """Return views in which two pixels of three have no depth, and the driver gives the camera's own place for them."""
+    """Return a view in which two thirds of the points lie at the camera's position, as drivers fill missing depth."""
     (view,) = _seen(tabletop(shape, yaw=_YAW))
     lost = np.random.default_rng(_SEED).random(len(view.points)) < 2 / 3
     return [replace(view, points=np.where(lost[:, None], view.viewpoint, view.points))]
 
 
 def unequal_pair() -> Views:
-    """Return views of a box with a slab of a third of its height against it."""
+    """Return a view of a box that touches a slab of a third of its height."""
     stage = tabletop("box", obstacles=[(box((0.08, 0.05, 0.03), (0.0, 0.0, 0.0)), 0.0702, 0.0)])
     return views_of(stage, CAMERA, ring_poses(1, elevation=0.9, azimuth=-1.57), DEFAULT, _SEED)
 

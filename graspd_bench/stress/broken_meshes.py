@@ -1,6 +1,6 @@
-"""Meshes with the faults of scanners, CAD exports and hand edits, and sound objects at extremes.
+"""Stress cases: meshes with faults of scanners, CAD exports and manual edits, and valid objects at extremes.
 
-The extremes are those of physics, of numbers, and of what a hand can do.
+The extremes concern friction and mass, invalid numbers and grids, and the abilities of the hand.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ from graspd_core.types import TriangleMesh, joined
 _SEED = 7
 _FEW = ("TOO_FEW", "NO_CANDIDATES")
 
-# What must be said of some of them: what was done, or what to do.
+# Words that the message to the user must contain: what was repaired, or what the user can do.
 _TOLD = {
     "debris": "40 ",
     "millions-of-faces": "simplified from ",
@@ -39,12 +39,12 @@ Maker = Callable[[], TriangleMesh]
 
 
 def mesh_cases() -> tuple[Case, ...]:
-    """Return every faulty mesh, which goes through a file and `load_scene`."""
+    """Return all cases of faulty meshes. Each is written to a file and loaded by `load_scene`."""
     return (*_whole(), *_broken())
 
 
 def _whole() -> Iterator[Case]:
-    """Return cases of meshes that are still solids."""
+    """Yield cases of faulty meshes that still describe a solid."""
     whole = (
         ("open-box", "a box without its lid", lambda: _kept("box", lambda corners: corners[..., 2].mean(1) < 0.044)),
         (
@@ -94,7 +94,7 @@ def _whole() -> Iterator[Case]:
 
 
 def _broken() -> Iterator[Case]:
-    """Return cases of meshes that are no solids, or of an absurd size."""
+    """Yield cases of meshes that describe no solid, or have an absurd size."""
     broken = (
         (
             "nan-vertices",
@@ -129,15 +129,15 @@ def _case(name: str, about: str, make: Maker, expect: tuple[str, ...] = (GRASP,)
 
 
 def write_obj(mesh: TriangleMesh, path: Path) -> None:
-    """Write a mesh as it is, even with NaN, where `save_mesh` would refuse or repair it."""
-    # One format for all rows: `np.savetxt` takes four seconds for a million.
+    """Write a mesh unchanged as an OBJ file, even with NaN. `save_mesh` would refuse or repair it."""
+    # One format string for all rows is fast. `np.savetxt` takes four seconds for a million rows.
     vertices = "v %.9g %.9g %.9g\n" * len(mesh.vertices) % tuple(mesh.vertices.ravel().tolist())
     faces = "f %d %d %d\n" * len(mesh.faces) % tuple((mesh.faces + 1).ravel().tolist())
     path.write_text(vertices + faces)
 
 
 def box(size: Sequence[float] | np.ndarray, middle: Sequence[float] | np.ndarray = (0.0, 0.0, 0.0)) -> TriangleMesh:
-    """Return a box with edges of so many metres, as finely cut as the authored one."""
+    """Return a box of edge lengths `size` [m] around `middle`, with as many faces as the built-in box."""
     unit = make_shape("box").vertices
     return _edited("box", lambda points: points / np.abs(unit).max(0) / 2 * np.asarray(size) + np.asarray(middle))
 
@@ -184,7 +184,7 @@ def _folded() -> TriangleMesh:
 
 
 def _slivers() -> TriangleMesh:
-    """Return a box whose faces are each a fan of a hundred triangles along its longest side."""
+    """Return a box in which each triangle is replaced by a fan of a hundred thin triangles."""
     mesh = make_shape("box")
     pieces = []
     for a, b, c in mesh.vertices[mesh.faces]:
@@ -211,7 +211,7 @@ def _fine_mesh(mesh: TriangleMesh, times: int) -> TriangleMesh:
 
 
 def thin_cup(wall: float) -> TriangleMesh:
-    """Return a cup 80 mm high and 66 mm wide, open at the top, with a wall and a bottom of `wall` [m]."""
+    """Return a cup, 80 mm high and 66 mm wide, open at the top. Wall and bottom are `wall` [m] thick."""
     import trimesh
 
     radius, half = 0.033, 0.04
@@ -235,12 +235,12 @@ _NONE = _MAYBE[1:]
 
 
 def extreme_cases() -> tuple[Case, ...]:
-    """Return all cases of physics, numbers and hands."""
+    """Return all cases of the families physics, numbers and hand."""
     return (*physics_cases(), *number_cases(), *hand_cases())
 
 
 def physics_cases() -> Iterator[Case]:
-    """Return cases of friction and mass over their decades, and of objects that look alike from many sides."""
+    """Yield cases with friction and mass from small to large, and cases with symmetric objects."""
     for mu in (0.1, 0.2, 0.3, 0.6, 1.0, 1.5):
         about, expect = f"a box at a friction of {mu:g}", (GRASP,) if mu >= 0.3 else _MAYBE
         yield Case(f"friction-{mu:g}", "physics", about, _shape("box", friction=mu), expect)
@@ -252,7 +252,7 @@ def physics_cases() -> Iterator[Case]:
 
 
 def number_cases() -> tuple[Case, ...]:
-    """Return cases of values that are not numbers where the optimiser looks, unsuitable grids, and no time."""
+    """Return cases with NaN or infinity in the SDF, with unsuitable grids, and with short deadlines."""
     family, box = "numbers", _shape("box")
     coarse, fine = ({"preset": PlanConfig(resolution=nodes)} for nodes in (8, 128))
     return (
@@ -268,7 +268,7 @@ def number_cases() -> tuple[Case, ...]:
 
 
 def hand_cases() -> tuple[Case, ...]:
-    """Return cases of objects beyond the hand."""
+    """Return cases of objects that are too wide, too small or too heavy for the hand."""
     wide, small, heavy = _shape("sphere", scale=10.0), _shape("sphere", scale=0.1), _shape("box", mass=30.0)
     return (
         Case("too-wide", "hand", "a ball of 70 cm across", wide, _NONE, whole=False),
@@ -282,7 +282,7 @@ def _shape(name: str, **settings: Any) -> Callable[[Path], Scene]:
 
 
 def _poisoned(channel: int, value: float) -> Callable[[Path], Scene]:
-    """Return a loader of a scene with a bad value at a node on the surface, where fingers are sure to look."""
+    """Return a loader of a scene whose SDF has a bad value at a node on the surface, where fingers sample it."""
 
     def scene(folder: Path) -> Scene:
         clean = load_scene("shape:cylinder")

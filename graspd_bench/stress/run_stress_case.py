@@ -1,7 +1,7 @@
-"""Stress cases and how they end: the outcome, how long it took, how much memory, what the user saw.
+"""Runs of stress cases. A run records how the case ended, its time and memory, and the message to the user.
 
-A grasp counts as verified only if it holds in a second trial too. That one starts from the file that a user would keep,
-with the object loaded anew and a world built anew.
+Every verified grasp must hold in a second trial. That trial reads the grasps from a saved grasps.json, loads the object
+again, and builds a new world.
 """
 
 from __future__ import annotations
@@ -22,30 +22,30 @@ from graspd_dataset.run_records import peak_mb
 
 Family = Literal["mesh", "cloud", "physics", "numbers", "hand"]
 
-# An ending that is a verified grasp. The others are names of `Outcome` or of a `GraspdError`.
+# The ending of a case with a verified grasp. Other endings are names of an `Outcome` or a `GraspdError`.
 GRASP = "grasp"
-# What a deadline may be overrun by [s].
+# Tolerance of the deadline [s].
 GRACE = 0.5
 
 
 @dataclass(frozen=True, eq=False)
 class Case:
-    """One input that breaks methods.
+    """One input with a deliberate fault.
 
     Attributes:
-        name: unique, words joined by dashes.
-        family: what of it is broken.
-        about: what is wrong, one line.
-        scene: makes the input in a folder of its own and loads it as a user would. It may raise a GraspdError.
-        expect: the endings that are right: "grasp", names of `Outcome` ("TOO_FEW") or of an error ("MeshError").
-        whole: a meaningful solid, or an object that can be seen. Counted in the share that ends in a verified grasp.
-        hand: by name or path.
-        deadline: seconds that planning is given.
-        loading: seconds that loading may take.
-        memory: most that the process may use at its peak, the libraries' own included [MB].
+        name: unique name, words joined by dashes.
+        family: the kind of input that is faulty.
+        about: the fault, in one line.
+        scene: makes the input in a given folder and loads it as a user would. It may raise a GraspdError.
+        expect: valid endings: "grasp", names of `Outcome` ("TOO_FEW"), or names of errors ("MeshError").
+        whole: whether the input describes a graspable object. Only these count in the share of verified grasps.
+        hand: name or path of the hand.
+        deadline: time limit of planning [s].
+        loading: time limit of loading [s].
+        memory: limit of the process's peak memory, including libraries [MB].
         options: further arguments of `plan_grasps`.
-        told: words that the user must read.
-        truth: the true object, in the scene's frame, where the scene is only what cameras saw of it.
+        told: words that the message to the user must contain.
+        truth: returns the true mesh in the scene frame. None unless the scene comes from camera views.
     """
 
     name: str
@@ -65,19 +65,19 @@ class Case:
 
 @dataclass(frozen=True)
 class StressEnding:
-    """The end of a case.
+    """Result of running a case.
 
     Attributes:
-        case: its name.
-        ending: "grasp", the name of an `Outcome` or of a GraspdError, or "crash" or "hang" where it was none of these.
-        message: what the user saw.
-        loading, planning: seconds.
-        memory: peak of the process [MB].
-        tried: grasps that were tried.
-        verified: how many of them held.
-        again: how many of those held in the second trial.
-        finite: no number of the result is NaN or infinite.
-        true: how many verified grasps hold on the true object. None where the case knows no truth.
+        case: name of the case.
+        ending: "grasp", the name of an `Outcome` or a GraspdError, "crash" or "hang".
+        message: the message to the user.
+        loading, planning: duration [s].
+        memory: peak memory of the process [MB].
+        tried: number of returned grasps.
+        verified: number of verified grasps.
+        again: number of verified grasps that hold in the second trial.
+        finite: whether all numbers of the result are finite.
+        true: number of verified grasps that hold on the true object. None if the case has no `truth`.
     """
 
     case: str
@@ -94,7 +94,7 @@ class StressEnding:
 
 
 def faults(case: Case, ending: StressEnding) -> tuple[str, ...]:
-    """Return what is wrong with an ending, one line each, none where all is well."""
+    """Return the faults of an ending, one line per fault. Empty if there is none."""
     wrong = []
     if ending.ending not in case.expect:
         wrong.append(f"ended in {ending.ending}, not in {' or '.join(case.expect)}: {ending.message}")
@@ -116,7 +116,7 @@ def faults(case: Case, ending: StressEnding) -> tuple[str, ...]:
 
 
 def run_case(case: Case, preset: str = "balanced") -> StressEnding:
-    """Run a case in this process."""
+    """Run a case in this process. Return its ending."""
     from graspd_core.hands.library import load_hand
     from graspd_core.planning.plan_grasps import plan_grasps
 
@@ -155,7 +155,7 @@ def _told(result: GraspResult, folder: str) -> str:
 
 
 def _hold_again(case: Case, result: GraspResult, scene: Scene, hand: Any, folder: Path, preset: str) -> int:
-    """Return how many verified grasps hold again, read from a file, on the object loaded and cut into parts anew."""
+    """Save the result, read it back, load the object again, and return how many verified grasps hold again."""
     from graspd_core.io.grasps_json import grasps_of, load_document, save_result
     from graspd_core.optimize.plan_config import load_preset
     from graspd_core.runtime import disk_cache as cache
@@ -176,7 +176,7 @@ def _hold_truly(verified: Sequence[Grasp], scene: Scene, hand: Any, truth: Trian
 
 
 def _held(grasps: Sequence[Grasp], target: ObjectModel, hand: Any) -> int:
-    """Return how many grasps pass the hold trial on an object, in a world of its own."""
+    """Return how many grasps pass the hold trial on an object, in a new world."""
     from graspd_core.verify.hold_trial import hold_trial, out_of_place
     from graspd_core.verify.world import PROTOCOLS, at_friction, build_world
 
@@ -188,7 +188,7 @@ def _held(grasps: Sequence[Grasp], target: ObjectModel, hand: Any) -> int:
 
 
 def _finite(result: GraspResult) -> bool:
-    """Return whether every number of every grasp that did not fail is finite. A trial that diverged may say so."""
+    """Return whether all postures, and all numbers of grasps that did not fail, are finite."""
     good = [asdict(grasp) for grasp in result.tried if grasp.verdict is not Verdict.FAILED]
     postures = [asdict(posture) for g in result.tried for posture in (g.pregrasp, g.grasp, g.squeeze)]
     try:

@@ -1,4 +1,4 @@
-"""All stress cases by name, what the benchmark runs of them, and the endings as Markdown."""
+"""Study `stress`: all stress cases by name, their runs, and the endings as Markdown."""
 
 from __future__ import annotations
 
@@ -16,25 +16,25 @@ from graspd_core.errors import ConfigError, choices
 from graspd_core.types import Outcome
 
 CASES: dict[str, Case] = {case.name: case for case in (*mesh_cases(), *cloud_cases(), *extreme_cases())}
-# Beyond loading and planning, before a process is called hung [s].
+# Time in addition to the limits of loading and planning, before a process counts as hung [s].
 _PATIENCE = 60.0
-# Of a small run: a family of those that take a second each.
+# Families and cases of a quick run. Each case takes a second.
 _QUICK = ("hand", "nan-vertices", "empty")
-# Longer messages end in dots [characters].
+# Messages in the table are cut to this length [characters].
 _MESSAGE = 110
 _HEADINGS = ("case", "what is wrong", "ending", "load s", "plan s", "peak MB", "held/tried", "again", "true", "told")
 
 
 @dataclass(frozen=True)
 class StressRun(study.Case):
-    """A stress case by its name, planned with a preset."""
+    """A stress case, by name, and the preset that it is planned with."""
 
     name: str
     preset: str
 
 
 def stress_runs(request: Request) -> tuple[StressRun, ...]:
-    """Return cases by their names or families, all of them for no name. Raises ConfigError: there is no such case."""
+    """Return the requested cases or families. Without a request, return all. Raises ConfigError: unknown name."""
     families = sorted({case.family for case in CASES.values()})
     names = request.cases or (_QUICK if request.quick else ())
     if unknown := [name for name in names if name not in CASES and name not in families]:
@@ -44,42 +44,42 @@ def stress_runs(request: Request) -> tuple[StressRun, ...]:
 
 
 def run_stress(run: StressRun) -> Record:
-    """Return the record of a case's ending."""
+    """Run a case. Return its ending as a record."""
     return asdict(run_case(CASES[run.name], run.preset))
 
 
 def stress_patience(run: StressRun) -> float:
-    """Return the seconds until a case counts as hung. It is loaded twice, because of the second trial."""
+    """Return the seconds until a case counts as hung. Loading counts twice, because the second trial loads again."""
     case = CASES[run.name]
     return 2 * case.loading + case.deadline + _PATIENCE
 
 
 def ending_of(record: Record) -> StressEnding:
-    """Return the ending that a record tells of, a crash or a hang where its process failed."""
+    """Return the ending in a record. If the process failed, the ending is "crash" or "hang"."""
     if record["error"]:
         return StressEnding(record["name"], "hang" if record["failed"] == "hung" else "crash", record["error"])
     return StressEnding(**{name: record[name] for name in StressEnding.__dataclass_fields__})
 
 
 def stress_faults(record: Record) -> tuple[str, ...]:
-    """Return what is wrong with the ending that a record tells of."""
+    """Return the faults of the ending in a record, one line per fault."""
     return faults(CASES[record["name"]], ending_of(record))
 
 
 def stress_came(record: Record) -> str:
-    """Return the ending and its seconds."""
+    """Return the ending and its duration, in a few words."""
     ending = ending_of(record)
     return f"{ending.ending}, {ending.loading + ending.planning:.1f} s"
 
 
 def stress_sections(records: Sequence[Record], chart: Path | None) -> Sections:
-    """Return what held and every fault, and the table."""
+    """Return the section of the summary, and the section of the tables."""
     endings = {CASES[record["name"]]: ending_of(record) for record in records}
     return {"stress-summary": [summary(endings)], "stress": [stress_table(endings)]}
 
 
 def stress_table(endings: Mapping[Case, StressEnding]) -> str:
-    """Return a table for each family, faults in bold."""
+    """Return a table for each family. Unexpected endings are bold."""
     blocks = []
     for family in dict.fromkeys(case.family for case in endings):
         body = [_line(case, ending) for case, ending in endings.items() if case.family == family]
@@ -88,7 +88,7 @@ def stress_table(endings: Mapping[Case, StressEnding]) -> str:
 
 
 def summary(endings: Mapping[Case, StressEnding]) -> str:
-    """Return what held of all that should, and every fault, a line each."""
+    """Return how many cases ended in a verified grasp, how many grasps held again, and one line per fault."""
     wrong = [f"* `{case.name}`: {fault}" for case, ending in endings.items() for fault in faults(case, ending)]
     lines = [f"{len(endings)} cases, {len(wrong)} faults."]
     for family in dict.fromkeys(case.family for case in endings):
@@ -116,7 +116,7 @@ def _share(family: str, whole: Sequence[tuple[Case, StressEnding]]) -> str:
 
 def _line(case: Case, ending: StressEnding) -> list[str]:
     good = ending.ending in case.expect
-    # That all went well is told by the ending.
+    # The column of the ending already shows success.
     told = ending.message.removeprefix(Outcome.SUCCEEDED.value).removeprefix("; ")
     told = told.replace("|", "\\|").replace("\n", " ")
     return [

@@ -1,1 +1,1 @@
-"""The studies, one file each."""
+"""The studies, one per file."""

@@ -1,7 +1,7 @@
-"""Costs and benefits of an arm: inverse kinematics by itself, and requests with and without the filter by reach.
+"""Study `reach`: inverse kinematics of the arms, and planning with and without the `Reach` restriction.
 
-Things stand or lie on a table. The arm's base stands 40 to 80 cm away in a random direction, turned at random. Without
-the filter, the returned verified grasps are checked afterwards for whether the arm reaches them.
+`Reach` refuses grasps that the arm cannot reach. Objects stand or lie on a table. The arm's base is 40 to 80 cm away,
+in a random direction with a random yaw. Without `Reach`, verified grasps are checked for reachability afterwards.
 """
 
 from __future__ import annotations
@@ -40,19 +40,19 @@ from graspd_core.se3 import SE3, axis_rotation
 from graspd_core.types import ArmPath, Grasp, Plane, Progress, TriangleMesh
 from graspd_dataset.run_records import markdown_table
 
-# Authored shapes that are tried in two places each.
+# Built-in shapes. Each is tried in two scenes.
 SHAPES = ("box", "mug", "hammer", "bottle", "torus", "cylinder", "plate", "l_block", "sphere", "bowl")
 POSES = 1000
 NEAREST, FARTHEST = 0.4, 0.8
-# Poses at once. Starts of each, one after another for those that are left, and steps of each start.
+# Poses per batch, number of starts for each pose, and steps of each start. A next start follows only after a failure.
 _BATCH, _STARTS, _STEPS = 256, 12, 16
-# Of the library: starts at once and steps. Fewer of either find fewer poses.
+# Starts and steps of pytorch-kinematics. Lower numbers reach fewer poses.
 _RETRIES, _ITERATIONS = 20, 50
 
 
 @dataclass(frozen=True)
 class ArmCase(Case):
-    """Inverse kinematics of `poses` that an arm reaches."""
+    """Inverse kinematics of an arm, for `poses` reachable poses."""
 
     arm: str
     poses: int
@@ -60,12 +60,12 @@ class ArmCase(Case):
 
 @dataclass(frozen=True)
 class ReachCase(ObjectCase):
-    """A request for `count` grasps of a thing on a table, with an arm. The seed draws where both are."""
+    """A request for `count` grasps of an object on a table, with an arm. The seed draws the poses of both."""
 
     arm: str = ""
 
     def place(self) -> tuple[HandModel, Scene, Reach]:
-        """Return the hand, the thing as it stands or lies, and the arm."""
+        """Return the hand, the scene with the object standing or lying, and the `Reach` of the arm."""
         rng = np.random.default_rng((self.seed, sum(self.object.encode())))
         hand, scene = self.load()
         side = axis_rotation(np.eye(3)[int(rng.integers(2))], float(rng.choice([0.0, np.pi / 2])))
@@ -83,7 +83,7 @@ class ReachCase(ObjectCase):
 
 
 def reach_cases(request: Request) -> tuple[ArmCase | ReachCase, ...]:
-    """Return every arm alone, and every arm at every thing."""
+    """Return an inverse kinematics case for every arm, and a request for every arm, object and seed."""
     arms = [ArmCase(arm, 256 if request.quick else POSES) for arm in arm_names()]
     things = find_objects(request.objects or [f"shape:{name}" for name in SHAPES])
     seeds = request.seeds or ((0,) if request.objects else (0, 1))
@@ -97,12 +97,11 @@ def reach_cases(request: Request) -> tuple[ArmCase | ReachCase, ...]:
 
 
 def run_reach(case: ArmCase | ReachCase) -> Record:
-    """Run a case of either kind."""
     return measure_arm(load_arm(case.arm), case.poses) if isinstance(case, ArmCase) else _run_request(case)
 
 
 def _run_request(case: ReachCase) -> Record:
-    """Run the request with the filter and without, both with libraries and caches in use."""
+    """Plan without and with `Reach`, after a plan that fills caches. Return CPU times [s] and numbers of grasps."""
     hand, scene, reach = case.place()
     request: dict[str, Any] = {"count": case.count, "seed": case.seed, "preset": case.config, "measure": False}
     plan_grasps(scene, hand, count=1, measure=False, restrictions=[reach])
@@ -130,7 +129,7 @@ def _run_request(case: ReachCase) -> Record:
 
 
 class _Found:
-    """A progress hook that notes each verified grasp, the CPU seconds until it came, and the filter's part of them."""
+    """Progress hook that records each verified grasp, the CPU time until then, and the restriction's part of it [s]."""
 
     def __init__(self, seconds: Sequence[float]) -> None:
         self.found: list[tuple[float, float, Grasp]] = []
@@ -143,7 +142,7 @@ class _Found:
 
 @dataclass(frozen=True, eq=False)
 class _Timed(BoundRestriction):
-    """A reach that notes the CPU seconds of each call to it."""
+    """A `Reach` restriction that records the CPU time of each call [s]."""
 
     reach: Any
     seconds: list[float]
@@ -173,7 +172,7 @@ def came(record: Record) -> str:
 
 
 def reach_sections(records: Sequence[Record], chart: Path | None) -> Sections:
-    """Return both tables as Markdown."""
+    """Return the table of inverse kinematics, and the table and refusals of the requests."""
     alone, asked = ([r for r in records if key in r] for key in ("own", "filtered"))
     return {
         "inverse-kinematics": [_alone_table(alone)] if alone else [],
@@ -214,7 +213,7 @@ def _seconds(ones: Sequence[Record]) -> str:
 
 
 def _reasons(records: Sequence[Record]) -> str:
-    """Return how many candidates were refused, and the kinds of reason."""
+    """Return a sentence that counts refused candidates by kind of reason."""
     kinds: dict[str, int] = {}
     for record in records:
         for reason, count in record["filtered"]["refused"].items():
@@ -224,12 +223,12 @@ def _reasons(records: Sequence[Record]) -> str:
     return f"Refused before any trial: {told or 'none'}."
 
 
-# What reasons have in common, whatever link or joint they name.
+# Words by which reasons are grouped, whatever link or joint they name. The first that occurs counts.
 _KINDS = ("limit on the way", "limit", "in the table", "in the object", "against the hand", "against", "jump")
 
 
 def measure_arm(arm: Arm, poses: int) -> Record:
-    """Measure graspd and, if installed, pytorch-kinematics on the same poses, made from joint values in the limits."""
+    """Measure graspd's inverse kinematics, and that of pytorch-kinematics if installed, on the same reachable poses."""
     q = random_postures(arm, poses, torch.Generator().manual_seed(11))
     target = arm_links(arm, q)[:, arm.tip]
     start_table(arm)
@@ -241,7 +240,7 @@ def measure_arm(arm: Arm, poses: int) -> Record:
 
 
 def _measured(solver: Callable[[SE3], Bool[Tensor, "batch"]], target: SE3) -> Record:
-    """Return the share of poses that are reached, and CPU milliseconds of each."""
+    """Return the share of poses reached, and the CPU time per pose [ms]."""
     solver(target[:_BATCH])
     began, reached = time.process_time(), 0
     for first in range(0, len(target.translation), _BATCH):
@@ -261,10 +260,10 @@ def _own(arm: Arm, target: SE3) -> Bool[Tensor, "batch"]:
 
 
 def _library(arm: Arm) -> Callable[[SE3], Bool[Tensor, "batch"]]:
-    """Return the library's damped least squares within the arm's limits, to the same tolerances."""
+    """Return a solver by pytorch-kinematics: damped least squares within the joint limits, with the same tolerances."""
     import pytorch_kinematics
 
-    # Its reader knows no capsules.
+    # Its URDF reader does not support capsules.
     text = re.sub(r"<collision>.*?</collision>", "", Path(arm.chain.urdf).read_text(), flags=re.DOTALL)
     tip = arm.chain.link_names[arm.tip]
     chain = pytorch_kinematics.build_serial_chain_from_urdf(text.encode(), tip).to(dtype=torch.float64)

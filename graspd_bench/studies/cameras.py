@@ -1,10 +1,9 @@
-"""Study `cameras`: views that nothing was fitted to, of four kinds of cameras and things at rest anyhow, alone or
-crowded.
+"""Study `cameras`: single views by four kinds of cameras, of objects at rest, alone or crowded.
 
-A thing is of a family of irregular things (`rendering/families.py`), an authored shape of a random size, or a scan.
-Every grasp that is verified on the view is tried on the true thing at 0.1 kg and at the thing's own mass. Shares of
-`config/planning_config.py` were taken from families and seeds that are not among those here: `CHOSEN_ON` and seeds
-below 100.
+An object is of a family of irregular shapes (`rendering/families.py`), a built-in shape of a random size, or a scan.
+Every grasp that is verified on the view is tried on the true object, at 0.1 kg and at the object's own mass. Nothing
+was fitted to these views: the shares in `config/planning_config.py` come from the families and shapes of `CHOSEN_ON`
+with seeds below 100.
 """
 
 from __future__ import annotations
@@ -40,17 +39,17 @@ from graspd_core.verify.hold_trial import hold_trial, out_of_place
 from graspd_core.verify.world import PROTOCOLS, altered, build_world
 from graspd_dataset.run_records import markdown_table, thing_name
 
-# Families and shapes that the shares of verified grasps were taken from, with seeds from 0 on. Those here are others.
+# Families and shapes from which the shares of verified grasps were computed, with seeds from 0. This study uses others.
 CHOSEN_ON = ("pear", "pitcher", "pump", "tool", "plane", "sponge", "jar", "box", "cylinder", "mug", "l_block")
 FIRST_SEED, SEEDS = 100, 4
 SHAPES = ("sphere", "capsule", "bowl", "bottle")
-# Densities of authored shapes [kg/m³]: of walls of earthenware, and of other things, hollow or full.
+# Densities of built-in shapes [kg/m³]: of earthenware for `_HOLLOW`, and of all others, hollow or full.
 _WARE, _OTHER = (1500.0, 2500.0), (150.0, 1100.0)
 _HOLLOW = ("mug", "bowl")
-# A camera's elevation [deg] and distance [m]. Of a thing in a crowd it sees more than this share, in one of so
-# many places.
+# Range of a camera's elevation [deg] and distance [m]. In a crowd, camera poses are drawn until one sees more than the
+# share `_SEEN` of the object, at most `_TRIES` times.
 _ELEVATION, _DISTANCE, _SEEN, _TRIES = (30.0, 65.0), (0.5, 1.0), 0.6, 20
-# How a view is planned on: the mass is given or not, and whose surface goes through the points.
+# Ways to plan on a view: with or without a given mass, and with graspd's or Open3D's surface reconstruction.
 ASSUMED, GIVEN, OPEN3D = "mass not given", "mass given", "mass not given, Open3D's Poisson"
 _HEADINGS = [
     "views", "with a verified grasp", "verified grasps", "hold at 0.1 kg", "hold at own mass", "first, median",
@@ -60,7 +59,13 @@ _HEADINGS = [
 
 @dataclass(frozen=True)
 class CameraView(Case):
-    """One view of a thing: a name of a family or a shape, or the path of a scan beside a stats.csv with masses."""
+    """A request for `count` grasps on one view of an object.
+
+    Attributes:
+        thing: name of a family or a shape, or path of a scan. A stats.csv in the scan's folder gives its mass.
+        crowd: whether neighbours stand around the object.
+        way: `ASSUMED`, `GIVEN` or `OPEN3D`.
+    """
 
     thing: str
     seed: int
@@ -73,7 +78,7 @@ class CameraView(Case):
 
     @property
     def kind(self) -> str:
-        """Return irregular, regular or scan."""
+        """Return the kind of object: "irregular" (a family), "regular" (a shape) or "scan"."""
         return "irregular" if self.thing in FAMILIES else "scan" if Path(self.thing).suffix else "regular"
 
     def shown(self) -> Record:
@@ -81,7 +86,7 @@ class CameraView(Case):
 
 
 def camera_cases(request: Request) -> tuple[CameraView, ...]:
-    """Return every thing from some places, with alternating cameras and crowds. Scans are those of --objects."""
+    """Return cases for every object, seed and way, with alternating cameras and crowds. --objects adds scans."""
     things = (*(name for name in FAMILIES if name not in CHOSEN_ON), *SHAPES)
     things += tuple(find_objects(request.objects)) if request.objects else ()
     seeds = request.seeds or range(FIRST_SEED, FIRST_SEED + SEEDS)
@@ -98,7 +103,7 @@ def camera_cases(request: Request) -> tuple[CameraView, ...]:
 
 
 def thing_of(case: CameraView) -> tuple[TriangleMesh, float]:
-    """Return the thing in its own frame, and its mass [kg]."""
+    """Return the true mesh of the object in its own frame [m], and its mass [kg]."""
     if case.kind == "irregular":
         drawn = draw_thing(case.thing, case.seed)
         return drawn.mesh, drawn.mass
@@ -113,7 +118,7 @@ def thing_of(case: CameraView) -> tuple[TriangleMesh, float]:
 
 
 def view_of(case: CameraView) -> tuple[TabletopScene, PointCloud, float, Target | None]:
-    """Return the scene and its view, the thing's mass [kg], and in a crowd which thing is meant."""
+    """Return the scene, its view, the object's mass [kg], and in a crowd the target that selects the object."""
     rng = np.random.default_rng([case.seed, sum(map(ord, thing_name(case.thing) + case.camera)), case.crowd])
     mesh, mass = thing_of(case)
     target = moved(mesh, resting_pose(mesh, rng))
@@ -136,13 +141,13 @@ def view_of(case: CameraView) -> tuple[TabletopScene, PointCloud, float, Target 
 
 
 def _share_seen(scene: TabletopScene, lens: PinholeCamera, pose: np.ndarray) -> float:
-    """Return the share of the thing that the others do not hide."""
+    """Return the fraction of the object's pixels that its neighbours do not hide, seen from a camera pose."""
     pixels = [(render_scene(some.meshes, lens, pose)[1] == 0).sum() for some in (scene, on_table(scene.truth))]
     return float(pixels[0] / max(pixels[1], 1))
 
 
 def run_view(case: CameraView) -> Record:
-    """Plan on the view, and try what is verified on the truth. A refusal is a result with its message."""
+    """Plan on the view, and try the verified grasps on the true object. A GraspdError becomes a `refused` record."""
     stage, cloud, mass, target = view_of(case)
     hand = load_hand(case.hand)
     surface = ReconstructionConfig(poisson="open3d" if case.way == OPEN3D else "grid")
@@ -179,7 +184,7 @@ def run_view(case: CameraView) -> Record:
 
 
 def camera_sections(records: Sequence[Record], chart: Path | None) -> Sections:
-    """Return a row for each way, camera, sight and kind, and how far the stated probability is right."""
+    """Return a table with a row for each way, camera, crowd and kind, and the calibration of the probability."""
     usual = [r for r in records if r["way"] == ASSUMED]
     rows = [(way, [r for r in records if r["way"] == way]) for way in (ASSUMED, GIVEN, OPEN3D)]
     for name, told in (("camera", str), ("crowd", lambda some: "crowded" if some else "alone"), ("kind", str)):
@@ -211,7 +216,7 @@ def _row(own: Sequence[Record]) -> list[str]:
 
 
 def _share(own: Sequence[Record], name: str) -> str:
-    """Return how many of the verified grasps held, with a 90 % interval of resampled views (errors cluster there)."""
+    """Return how many verified grasps held, with a 90 % interval over resampled views (a view's errors correlate)."""
     pairs = np.array([(r[name], r["verified"]) for r in own])
     if not pairs[:, 1].sum():
         return "–"

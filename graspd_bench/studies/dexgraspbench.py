@@ -1,10 +1,10 @@
-"""Our grasps in DexGraspBench's own evaluation, beside the results of our hold trial.
+"""Study `dexgraspbench`: our grasps in DexGraspBench's own evaluation, compared with our hold trial.
 
     graspd bench dexgraspbench FOLDER --python ENVIRONMENT/bin/python
 
-FOLDER is a checkout of the user's with its submodule. The environment has its requirements. Its code runs in a child
-process and is never imported. Our grasps and objects are written to a temporary folder, in its format, with a copy of
-its Allegro where that is changed. Its results are read by a reader that runs nothing (`inert_pickle`).
+FOLDER is the user's checkout of DexGraspBench with its submodule. ENVIRONMENT has its requirements. Its code runs in a
+child process and is never imported. Our grasps and objects are written to a temporary folder in its format, and with
+`--armature` a changed copy of its Allegro. `inert_pickle` reads the results without running code from them.
 """
 
 from __future__ import annotations
@@ -39,12 +39,12 @@ from graspd_dataset.foreign_grasps import STAGES, npy_dictionary, numbers_of, pl
 from graspd_dataset.run_records import markdown_table, thing_name
 
 NAME = "dexgraspbench"
-# Its object's mass [kg], and how far [m] and by how much [degrees] an object may move there.
+# DexGraspBench's object mass [kg], and its limits of displacement [m] and rotation [deg].
 MASS, _TRAVEL, _TURN = 0.1, 0.05, 15.0
-# Files of a checkout that a result depends on. The first two are what is run.
+# The program, its Allegro, and all files of a checkout that a result depends on.
 _MAIN, _ALLEGRO = "src/main.py", "assets/hand/allegro/right_hand.xml"
 _HASHED = ("src/**/*.py", "config/**/*.yaml", _ALLEGRO)
-# Seconds until it is called hung: its start, and one of its grasps.
+# Time limits of DexGraspBench [s]: for its start, and for each grasp.
 _START, _GRASP = 120.0, 60.0
 AS_IS, ARMATURE = "as it is", f"armature {Protocol().armature:g}"
 DIFFERENCES = f"""\
@@ -66,14 +66,14 @@ how far it moved."""
 
 @dataclass(frozen=True)
 class BenchCase(ObjectCase):
-    """The grasps of one object.
+    """Evaluation of the grasps of one object.
 
     Attributes:
         checkout: folder of DexGraspBench.
-        python: program that runs it.
-        armature: whether its Allegro is tried with our armature, too.
-        grasps: file of grasps to use, empty where they are planned.
-        content: hash of the checkout's code and of that file.
+        python: Python program that runs DexGraspBench.
+        armature: whether to also run its Allegro with our armature.
+        grasps: file of our grasps. Empty to plan them.
+        content: hash of the checkout's code and of the file of grasps.
     """
 
     checkout: str
@@ -87,26 +87,26 @@ class BenchCase(ObjectCase):
         return f"{thing_name(self.object)} {self.preset} {thing_name(self.hand)} seed {self.seed} {self.armature:d}"
 
     def asked(self) -> Record:
-        """Return what the case asks. The contents of files count, their places do not."""
+        """Return all inputs except the code. Files count by content, not by path."""
         return {name: value for name, value in super().asked().items() if name not in ("checkout", "python", "grasps")}
 
 
 def bench_cases(request: Request) -> tuple[BenchCase, ...]:
     """Return a case for each object and seed.
 
-    Raises GraspdError: no checkout, one that does not start, or unknown names in the request.
+    Raises GraspdError: there is no checkout, its program does not start, or the request has an unknown name.
     """
     if not request.checkout:
         raise ConfigError(f"{NAME}: give the folder of a checkout: graspd bench {NAME} FOLDER --python PATH")
     checkout, hand = Path(request.checkout).absolute(), request.hand or "allegro_right"
     for name in (_MAIN, _ALLEGRO):
         if not (checkout / name).is_file():
-            raise ConfigError(f"{request.checkout}: no checkout of DexGraspBench: {name} is missing")
+            raise ConfigError(f"{request.checkout}: not a checkout of DexGraspBench: {name} is missing")
     refuse_hand(load_hand(hand, candidates=1).name)
     python = shutil.which(request.python) if request.python else None
     if python is None:
-        told = f"{request.python!r} is no program" if request.python else "not given"
-        raise ConfigError(f"python: {told}; --python PATH is that of an environment with DexGraspBench's requirements")
+        told = f"{request.python!r} is not a program" if request.python else "not given"
+        raise ConfigError(f"python: {told}; give --python PATH of an environment with DexGraspBench's requirements")
     python = os.path.abspath(python)
     objects = request.objects or all_shapes()[: 1 if request.quick else None]
     if request.grasps:
@@ -114,7 +114,7 @@ def bench_cases(request: Request) -> tuple[BenchCase, ...]:
         objects = request.objects or (str(document["object"]["source"]),)
         refuse_hand(document["hand"]["name"])
         if len(objects) > 1:
-            raise ConfigError(f"grasps: {request.grasps} is of one object, not of {len(objects)}")
+            raise ConfigError(f"grasps: {request.grasps} is of one object; give one object, not {len(objects)}")
     _run([python, str(checkout / _MAIN), "--help"], Path(), _START)
     files = sorted(path for glob in _HASHED for path in checkout.glob(glob) if path.is_file())
     files += [Path(request.grasps)] if request.grasps else []
@@ -129,7 +129,7 @@ def bench_cases(request: Request) -> tuple[BenchCase, ...]:
 
 
 def run_bench(case: BenchCase) -> Record:
-    """Return all grasps that were tried here, verified or failed, with their results there."""
+    """Plan or read grasps, and run DexGraspBench on all of them. Return our verdicts and its results."""
     config = case.config
     hand = load_hand(case.hand, candidates=config.problem.fine_candidates)
     if case.grasps:
@@ -153,7 +153,7 @@ def run_bench(case: BenchCase) -> Record:
 
 
 def write_grasps(scene: Scene, hand: HandModel, grasps: Sequence[Grasp], out: Path) -> list[Path]:
-    """Write grasps and object in its format, about the object's centre of mass. Return the files, relative to `out`."""
+    """Write grasps and object for DexGraspBench, with origin at the centre of mass. Return paths relative to `out`."""
     center, rows = scene.object.center_of_mass, []
     for grasp in grasps:
         row: dict[str, Any] = {"hand_name": hand.name, "object_sha256": scene.object.sha256, "mass": scene.object.mass}
@@ -164,13 +164,13 @@ def write_grasps(scene: Scene, hand: HandModel, grasps: Sequence[Grasp], out: Pa
             row[f"{stage}_joint_positions"] = posture.joint_positions
         rows.append(row)
     if rows:
-        # It takes a part's file from its own folder unless the path is whole.
+        # DexGraspBench reads relative paths from its own folder, so the path of the objects is absolute.
         write_dexgraspbench(rows, moved_mesh(scene.object.mesh, -center), out, objects=str(out.absolute() / "objects"))
     return [Path(hand.name, scene.object.sha256, f"{number}.npy") for number in range(len(rows))]
 
 
 def write_armature(xml: Path, to: Path, armature: float) -> Path:
-    """Write a hand whose joints all have an armature [kg·m²]. Its meshes stay where they are. Return its path."""
+    """Write a copy of a hand's MJCF with `armature` [kg·m²] at all joints. It uses the same meshes. Return `to`."""
     tree = ElementTree.parse(xml)
     for compiler in tree.iter("compiler"):
         compiler.set("meshdir", str((xml.parent / compiler.get("meshdir", ".")).resolve()))
@@ -182,9 +182,9 @@ def write_armature(xml: Path, to: Path, armature: float) -> Path:
 
 
 def evaluate(case: BenchCase, written: Path, xml: Path, paths: Sequence[Path]) -> list[Record]:
-    """Run its evaluation. Return whether each grasp held, and how far [m] and by how much [degrees] it moved.
+    """Run DexGraspBench on grasp files. Return for each grasp `held`, `travel` [m] and `turn` [deg].
 
-    Raises ConfigError if it ended with an error, or gave no result for a grasp.
+    Raises ConfigError: DexGraspBench ended with an error, or gave no result for a grasp.
     """
     results = Path(tempfile.mkdtemp(dir=written.parent))
     options = {"task": "eval", "hand": "allegro", "setting": "fc", "exp_name": "graspd", "n_worker": "1"}
@@ -197,7 +197,7 @@ def evaluate(case: BenchCase, written: Path, xml: Path, paths: Sequence[Path]) -
     for path in paths:
         file = results / "evaluation" / path
         if not file.is_file():
-            raise ConfigError(f"DexGraspBench gave no result for a grasp: {told}")
+            raise ConfigError(f"DexGraspBench gave no result for grasp {path}: {told}")
         try:
             values = npy_dictionary(file, file.read_bytes())
             held, travel, turn = (
@@ -211,7 +211,7 @@ def evaluate(case: BenchCase, written: Path, xml: Path, paths: Sequence[Path]) -
 
 
 def _run(command: Sequence[str], folder: Path, patience: float) -> str:
-    """Run its code and return the last line that it wrote. Raises ConfigError: it ended with an error, or never."""
+    """Run a command for up to `patience` [s]. Return its last line of output. Raises ConfigError: it failed."""
     kept = {name: value for name, value in os.environ.items() if not name.startswith(("PYTHON", "VIRTUAL_ENV"))}
     try:
         done = subprocess.run(
@@ -236,8 +236,8 @@ def _run(command: Sequence[str], folder: Path, patience: float) -> str:
 
 
 def why_failed(there: Record) -> str:
-    """Return why a grasp did not hold there, in a few words."""
-    # So it says that a pregrasp was refused.
+    """Return why a grasp did not hold in DexGraspBench, in a few words."""
+    # DexGraspBench reports a refused pregrasp by such values.
     if there["travel"] >= 100 and there["turn"] >= 100:
         return "refused: the pregrasp overlaps the object, or the hand itself, by more than 1 cm"
     if not np.isfinite([there["travel"], there["turn"]]).all():
@@ -248,13 +248,13 @@ def why_failed(there: Record) -> str:
 
 
 def bench_came(record: Record) -> str:
-    """Return how many of the verified grasps hold there."""
+    """Return how many of our verified grasps hold in DexGraspBench."""
     pairs = [pair for pair in _pairs([record], AS_IS) if pair[0]]
     return f"{sum(there['held'] for _, there in pairs)} of {len(pairs)} verified hold there"
 
 
 def _pairs(records: Sequence[Record], variant: str) -> list[tuple[bool, Record]]:
-    """Return for every grasp whether it is verified here, and its result there."""
+    """Return for every grasp whether our trial verified it, and the result of DexGraspBench."""
     return [
         (own["verified"], there)
         for record in records
@@ -264,7 +264,7 @@ def _pairs(records: Sequence[Record], variant: str) -> list[tuple[bool, Record]]
 
 
 def bench_sections(records: Sequence[Record], chart: Path | None) -> Sections:
-    """Return one table, the reasons and the differences. Rows are objects by Allegro, and all objects together."""
+    """Return a table by object and variant of the Allegro, the reasons of failure, and the known differences."""
     headings = ["object", "its Allegro", "tried", "verified", "held by both", "by ours only", "by theirs only"]
     headings += ["by neither", "of the verified"]
     groups = [(thing_name(record["object"]), [record]) for record in records]

@@ -1,8 +1,7 @@
-"""Study of whether trials that stop early give the verdict of the full length, and how much time they save.
+"""Study `early`: whether trials that stop early give the same verdict as trials of full length, and the time saved.
 
-It uses the first grasps of the method's own ranking, none filtered by a trial. Each is tried as it is and out of place,
-at standard and lower friction, hard, lifted, with the short pulls of the ranking by robustness, and under gravity. Each
-trial runs twice, early and at full length.
+The study uses the first grasps of the method's own ranking. No trial filters them. Each goes through the trials of
+`trials_of`, once with early stopping and once at full length.
 """
 
 from __future__ import annotations
@@ -28,17 +27,17 @@ from graspd_core.verify.lift_trial import lift_trial
 from graspd_core.verify.world import PROTOCOLS, at_friction, build_world
 from graspd_dataset.run_records import markdown_table
 
-# Thin things: an authored shape, and factors on its three extents.
+# Thin objects: a built-in shape, and the factors on its extents along x, y and z.
 THIN = (("shape:plate", (1.0, 1.0, 0.3)), ("shape:box", (0.2, 0.2, 2.0)), ("shape:box", (0.1, 0.5, 2.0)))
 SHAPES = ("shape:mug", "shape:hammer", "shape:torus")
 ERROR_SEED = 4711
-# A grasp, whether the trial lasts its full length, and the hand's error, to what the trial says.
+# Runs a trial of a grasp. Arguments: the grasp, whether to run the full length, and the error of the hand's pose.
 Trial = Callable[[Grasp, bool, Any], Any]
 
 
 @dataclass(frozen=True)
 class EarlyEnds(ObjectCase):
-    """Grasps of an object, or of a thin thing made of it by factors on its extents."""
+    """Grasps of an object. `factors`, if not empty, scale its extents along x, y and z."""
 
     factors: tuple[float, ...] = ()
 
@@ -51,7 +50,7 @@ class EarlyEnds(ObjectCase):
 
 
 def early_cases(request: Request) -> tuple[EarlyEnds, ...]:
-    """Return every hand on a few shapes and thin things."""
+    """Return cases of every hand on a few shapes and thin objects."""
     things = [(thing, ()) for thing in find_objects(request.objects or SHAPES)]
     hands = (request.hand,) if request.hand else hand_names()
     cases = tuple(
@@ -64,7 +63,7 @@ def early_cases(request: Request) -> tuple[EarlyEnds, ...]:
 
 
 def run_early(case: EarlyEnds) -> Record:
-    """Run both lengths of every trial of every grasp."""
+    """Run every trial of every grasp, once early and once late (at full length). Return one row per trial."""
     hand, scene = case.load()
     grasps = raw_grasps(scene, hand, case.config, case.count, case.seed)
     errors = pose_errors((ERROR_SEED, case.seed), max(len(grasps), 1))
@@ -83,12 +82,12 @@ def run_early(case: EarlyEnds) -> Record:
 
 
 def trials_of(hand: HandModel, scene: Scene) -> Mapping[str, Trial]:
-    """Return the trials by group."""
+    """Return the trials by name. "noisy" displaces the hand and has the short pulls of the ranking by robustness."""
     parts, center = object_parts(scene.object), scene.object.center_of_mass
     standard, hard = PROTOCOLS["standard"], PROTOCOLS["hard"]
     slippery, brief = at_friction(standard, 0.3), replace(standard, hold_time=RobustConfig().hold_time)
     usual, low, harder = (build_world(hand, scene.object, parts, p) for p in (standard, slippery, hard))
-    # Too far below for the hand. The object rests on a plane of its own.
+    # The hand cannot reach this table, 1 m below the object. In the lift the object rests on a plane of its own.
     table = Plane(np.array([0.0, 0.0, 1.0]), float(scene.object.mesh.vertices[:, 2].min()) - 1.0)
     around = build_world(hand, scene.object, parts, standard, table)
 
@@ -112,7 +111,7 @@ def trials_of(hand: HandModel, scene: Scene) -> Mapping[str, Trial]:
 
 
 def early_sections(records: Sequence[Record], chart: Path | None) -> Sections:
-    """Return disagreements and CPU time by group as Markdown."""
+    """Return a table of disagreements and CPU time by trial, and a list of all disagreements."""
     groups: dict[str, list[Record]] = {}
     told = []
     for record in records:
@@ -139,7 +138,7 @@ def _run(trial: Trial, grasp: Grasp, full: bool, error: Any) -> Record:
 
 
 def _figures(rows: Sequence[Record]) -> list[str]:
-    """Return the cells of one group's row."""
+    """Return the cells of one trial's row. A trial of a figure (gravity) gets its greatest difference."""
     from scipy.stats import beta
 
     if "figure" in rows[0]["early"]:

@@ -1,8 +1,9 @@
-"""Study of a real depth camera's frames: segmentation against a reference cloud, reconstruction, verified grasps.
+"""Study `frames`: segmentation, reconstruction and grasps on frames of a real depth camera.
 
     graspd bench frames --objects DIR ...
 
-Each folder holds */depth_mm.png, camera.json (K, width, height) and object_cloud.xyz, the reference [m].
+Every subfolder of DIR with a depth_mm.png is a frame. It also holds camera.json (K, width, height) and
+object_cloud.xyz, the reference cloud of the object in the camera frame [m].
 """
 
 from __future__ import annotations
@@ -27,13 +28,13 @@ from graspd_core.planning.plan_grasps import plan_grasps
 from graspd_core.types import Verdict
 from graspd_dataset.run_records import markdown_table
 
-# Clouds are compared by the cubes of this side that they touch [m].
+# Edge length of the voxels by which clouds are compared [m].
 CUBE = 0.005
 
 
 @dataclass(frozen=True)
 class Frame(Case):
-    """A folder with one frame, and the grasps asked for."""
+    """A folder with one frame, and the request for grasps. `content` is a hash of the folder's files."""
 
     folder: str
     content: str
@@ -50,16 +51,17 @@ class Frame(Case):
 
 
 def frame_cases(request: Request) -> tuple[Frame, ...]:
-    """Return every frame below the folders, in order of name. Raises ConfigError: there is none."""
+    """Return a case for every frame below the folders, sorted by name. Raises ConfigError: there is no frame."""
     found = sorted(path.parent for folder in request.objects for path in Path(folder).glob("*/depth_mm.png"))
     if not found:
-        raise ConfigError("objects: no */depth_mm.png in the folders; valid: --objects DIR, as docs/clouds.md has it")
+        folders = ", ".join(request.objects) or "any folder"
+        raise ConfigError(f"objects: no */depth_mm.png in {folders}; give --objects DIR, as in docs/clouds.md")
     count, hand = request.count or 8, request.hand or "allegro_right"
     return tuple(Frame(str(folder), _content(folder), count, request.preset(), hand) for folder in found)
 
 
 def run_frame(case: Frame) -> Record:
-    """Plan on the object nearest the view axis. If it is not the reference's, use that at the reference's centre."""
+    """Plan on the object at the view axis, or at the reference's centre if the first has an IoU of at most 0.5."""
     cloud, reference = read_frame(Path(case.folder))
     hand = load_hand(case.hand)
     target, found = None, {}
@@ -90,19 +92,19 @@ def run_frame(case: Frame) -> Record:
 
 
 def read_frame(folder: Path) -> tuple[PointCloud, np.ndarray]:
-    """Return the cloud of a depth image in its camera's frame, and the reference cloud of its object [m]."""
+    """Return the cloud of a frame's depth image, and the reference cloud of its object. Camera frame [m]."""
     view = load_depth_view(folder / "depth_mm.png", folder / "camera.json")
     return view, np.loadtxt(folder / "object_cloud.xyz")
 
 
 def overlap(found: np.ndarray, reference: np.ndarray) -> float:
-    """Return the intersection over union of the 5 mm cubes that two clouds touch."""
+    """Return the intersection over union of the 5 mm voxels that two clouds [m] occupy."""
     a, b = ({tuple(c) for c in np.floor(points / CUBE).astype(int)} for points in (found, reference))
     return len(a & b) / max(len(a | b), 1)
 
 
 def frame_sections(records: Sequence[Record], chart: Path | None) -> Sections:
-    """Return a row for each frame."""
+    """Return a table with a row for each frame."""
     headings = ["frame", "object picked by", "points", "IoU with the reference", "closed", "verified grasps", "scene"]
     return {"frames": [markdown_table([*headings, "first verified grasp"], [_line(r) for r in records])]}
 

@@ -1,11 +1,10 @@
-"""Study of human grasps in the units of the Grasp'D paper: contact area, intersection volume, displacement.
+"""Study `mano`: human grasps in the units of the Grasp'D paper: contact area, intersection volume, displacement.
 
     graspd bench mano --hand MANO_RIGHT.pkl
 
-The model is the user's (https://mano.is.tue.mpg.de, never shipped). All grasps go through the hold trial. As in the
-paper, the two best ranked of every object are measured, once with rigid flesh and once with flesh that gives by a
-millimetre. Area and volume are those of the skinned mesh, by the definitions of docs/metrics.md. The trials use its
-convex hulls.
+The user provides the MANO model (https://mano.is.tue.mpg.de, never shipped). Grasps are planned with rigid flesh and
+with flesh that yields by 1 mm. All go through the hold trial. As in the paper, the two best ranked grasps per object
+are measured. Area and volume are those of the skinned mesh (docs/metrics.md). The trials use its convex hulls.
 """
 
 from __future__ import annotations
@@ -34,7 +33,7 @@ from graspd_core.verify.hold_trial import hold_trial
 from graspd_core.verify.world import PROTOCOLS, build_world
 from graspd_dataset.run_records import markdown_table, thing_name
 
-# Distances within which skin counts as touching [m]: the project's own, and two that others use.
+# Distances within which skin counts as touching [m]: ours, and two that other projects use.
 CONTACT_DISTANCES = (0.002, 0.005, 0.010)
 VOXEL = 0.001
 # About 1 mm between samples on an adult's hand.
@@ -43,11 +42,11 @@ _SAMPLES, _SEED = 40_000, 7
 
 @dataclass(frozen=True)
 class SkinMetrics:
-    """Figures of one placed skin.
+    """Metrics of a skinned hand mesh on an object.
 
     Attributes:
-        contact_area: skin within each of `CONTACT_DISTANCES` of the object's surface, on either side of it [m²].
-        intersection_volume: of the skin's inside and the object, in 1 mm voxels [m³].
+        contact_area: area of skin within each of `CONTACT_DISTANCES` of the object's surface, inside or outside [m²].
+        intersection_volume: volume that is inside both meshes, in voxels of 1 mm [m³].
         penetration: greatest depth of the skin in the object [m].
     """
 
@@ -57,7 +56,7 @@ class SkinMetrics:
 
 
 def measure_skin(query: DistanceQuery, skin: TriangleMesh) -> SkinMetrics:
-    """Measure a closed skin in the object's frame against an object (`make_distance_query` of its mesh)."""
+    """Measure a closed skin mesh on an object. `query` is the `make_distance_query` of the object. Object frame [m]."""
     points, _ = surface_samples(skin, _SAMPLES, _SEED)
     distance = signed_distance(query, points, reach=2 * CONTACT_DISTANCES[-1])
     corners = skin.vertices[skin.faces]
@@ -71,7 +70,7 @@ def measure_skin(query: DistanceQuery, skin: TriangleMesh) -> SkinMetrics:
 
 
 def _shared_volume(query: DistanceQuery, skin: TriangleMesh) -> float:
-    """Return the volume inside both [m³], from the middles of 1 mm voxels over the box that the two share."""
+    """Return the volume inside both object and skin [m³], by counting centres of 1 mm voxels."""
     low = np.maximum(query.tree.low, skin.vertices.min(0))
     high = np.minimum(query.tree.high, skin.vertices.max(0))
     if (high <= low).any():
@@ -90,11 +89,12 @@ def _middles(low: float, high: float) -> Float[np.ndarray, "n"]:
 
 SHAPES = ("shape:sphere", "shape:cylinder", "shape:box")
 BEST = 2
-# Turpin et al. 2022, table 1, MANO: mean over 57 ShapeNet objects of the two best grasps each.
+# Turpin et al. 2022, table 1, MANO: mean over 57 ShapeNet objects, two best grasps each. The values are contact area
+# [cm²], intersection volume [cm³], their ratio [1/cm] and displacement [cm].
 PAPER = {"Grasp'D": (43.0, 5.70, 7.55, 0.59), "ObMan / GraspIt!": (9.4, 1.28, 7.37, 1.95)}
-# How deep flesh gives while planning [m]: not at all, as in the paper, and less than a finger pad does.
+# How far flesh yields in planning [m]: not at all, as in the paper, and less than a finger pad does.
 SOFTNESS = (0.0, 0.001)
-# What is planned with, and how often, unless asked otherwise.
+# Default preset and seeds.
 _PRESET, _SEEDS = "contact_rich", (0, 1, 2)
 _HEADINGS = [
     "object, flesh gives",
@@ -110,7 +110,7 @@ _HEADINGS = [
 
 @dataclass(frozen=True)
 class HumanGrasps(ObjectCase):
-    """Grasps of an object with the model in a file."""
+    """Grasps of an object with a MANO model file. `content` is its hash, `softness` how far flesh yields [m]."""
 
     content: str = ""
     softness: float = 0.0
@@ -135,7 +135,7 @@ def mano_cases(request: Request) -> tuple[HumanGrasps, ...]:
 
 
 def run_mano(case: HumanGrasps) -> Record:
-    """Plan on one object, try every grasp, measure the best."""
+    """Plan on one object, try every grasp, and measure the best grasps."""
     config = case.config
     mano = load_mano(Path(case.hand), [], candidates=config.problem.fine_candidates)
     scene = load_scene(case.object, mass=PROTOCOL_MASS, resolution=config.resolution)
@@ -160,7 +160,7 @@ def run_mano(case: HumanGrasps) -> Record:
 
 
 def mano_sections(records: Sequence[Record], chart: Path | None) -> Sections:
-    """Return the objects, their mean, and the paper's rows, as Markdown."""
+    """Return a table with rows for the objects, their mean, and the paper's figures."""
     body = []
     for softness in dict.fromkeys(r["softness"] for r in records):
         alike = [r for r in records if r["softness"] == softness]
@@ -173,7 +173,7 @@ def mano_sections(records: Sequence[Record], chart: Path | None) -> Sections:
 
 
 def _row(name: str, softness: float, records: Sequence[Record]) -> list[str]:
-    """Return means over cases, empty where there are no grasps to measure."""
+    """Return a row of means over cases. The cells are empty if no grasp was measured."""
     name = f"{name}, {1e3 * softness:g} mm" if softness else f"{name}, rigid"
     held = f"{sum(r['held'] for r in records)}/{sum(r['count'] for r in records)}"
     if not any(r["contact_area_cm2"] for r in records):

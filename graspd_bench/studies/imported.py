@@ -1,9 +1,9 @@
-"""Study of imported grasps beside ours: the same objects, hand, trials and metrics, in one table.
+"""Study `imported`: imported grasps compared with ours, on the same objects, with the same hand, trials and metrics.
 
     graspd bench --import FOLDER --hand NAME
 
-Claims of a file about its grasps are ignored. A refused grasp has failed, as has one that our planner did not find.
-Shares are of all grasps of an object, or of the first `--count` of them.
+What a file says about its own success is ignored. Refused grasps count as failed, as do grasps that our planner does
+not find. Shares refer to all imported grasps of an object, or to the first `--count` of them.
 """
 
 from __future__ import annotations
@@ -31,9 +31,9 @@ from graspd_dataset.complete_grasps import by_object, complete_grasps
 from graspd_dataset.foreign_grasps import ImportedGrasp, foreign_files, read_foreign
 from graspd_dataset.run_records import markdown_table, thing_name
 
-# Whose grasps, in the order of the table.
+# Sources of grasps, in the order of the table.
 SOURCES = {"imported": "imported", "ranked": "graspd, as ranked", "planned": "graspd, verified"}
-# Trials of which a grasp passes or does not, and those of which there is a figure: heading, key, digits.
+# Headings of trials that a grasp passes or fails. Heading, key and digits of trials that give a figure.
 _PASSED = {"standard": "holds", "hard": "holds hard", "bullet": "holds in PyBullet"}
 _FIGURES = {
     "noisy": ("noisy", "share", 2),
@@ -44,15 +44,15 @@ _FIGURES = {
 
 @dataclass(frozen=True)
 class ImportedCase(ObjectCase):
-    """`count` imported grasps of one object.
+    """A case of `count` imported grasps of one object.
 
     Attributes:
         scale: factor on the object's coordinates.
-        files: files of the grasps.
-        mesh: used instead of the mesh that the files name, empty where none is given.
-        order: of the joints in npy files.
-        trials: their names.
-        content: hash of the files.
+        files: paths of the grasp files.
+        mesh: mesh file that replaces the one named in the files. Empty if not given.
+        order: joint names in the order of npy files.
+        trials: names of the trials.
+        content: hash of the grasp files.
     """
 
     scale: float
@@ -67,7 +67,7 @@ class ImportedCase(ObjectCase):
         return f"{_name(self.object)} scale {self.scale:g} {thing_name(self.hand)} seed {self.seed}"
 
     def asked(self) -> Record:
-        """Return what the case asks. The contents of files count, their places do not."""
+        """Return all inputs except the code. Files count by content, not by path."""
         return {name: value for name, value in super().asked().items() if name not in ("files", "mesh")}
 
     def shown(self) -> Record:
@@ -75,11 +75,11 @@ class ImportedCase(ObjectCase):
 
 
 def imported_cases(request: Request) -> tuple[ImportedCase, ...]:
-    """Return a case for each object and seed. Raises GraspdError: no folder or hand is given, or a malformed file."""
+    """Return a case for each object and seed. Raises GraspdError: no folder or hand was given, or a malformed file."""
     if not request.imported or not request.hand:
-        raise ConfigError("imported: give --import FOLDER, and --hand: whose grasps these are")
+        raise ConfigError("imported: give both --import FOLDER and --hand NAME")
     if len(request.objects) > 1:
-        raise ConfigError(f"objects: {', '.join(request.objects)}; one mesh stands for what the files name")
+        raise ConfigError(f"objects: {', '.join(request.objects)}; valid: one mesh, which replaces that of the files")
     if unknown := [name for name in request.trials if name not in TRIALS]:
         raise ConfigError(f"trials: {unknown[0]!r}; valid: {', '.join(TRIALS)}")
     hand, mesh = load_hand(request.hand, candidates=1), "".join(request.objects)
@@ -104,7 +104,7 @@ def imported_cases(request: Request) -> tuple[ImportedCase, ...]:
 
 
 def run_imported(case: ImportedCase) -> Record:
-    """Try and measure imported grasps, the first of our own ranking, and verified ones, all alike."""
+    """Run the same trials and metrics on imported grasps, our raw grasps, and our verified grasps."""
     config, hand = case.config, load_hand(case.hand, candidates=case.config.problem.fine_candidates)
     scene = load_scene(case.object, mass=PROTOCOL_MASS, scale=case.scale, resolution=config.resolution)
     completed = complete_grasps(scene, hand, _theirs(case, hand), config)
@@ -127,7 +127,7 @@ def _theirs(case: ImportedCase, hand: HandModel) -> tuple[ImportedGrasp, ...]:
 
 
 def tried(scene: Scene, hand: HandModel, grasps: Sequence[Grasp], trials: Sequence[str]) -> list[dict[str, Any]]:
-    """Return the figures of every grasp: metrics, and trials by name."""
+    """Return for every grasp its metrics, and the figures of each trial by name."""
     context, parts = make_metrics_context(scene.object, hand), object_parts(scene.object)
     results: list[dict[str, Any]] = [{"metrics": dict(measure(context, grasp.grasp))} for grasp in grasps]
     for name in trials if grasps else ():
@@ -138,7 +138,7 @@ def tried(scene: Scene, hand: HandModel, grasps: Sequence[Grasp], trials: Sequen
 
 
 def imported_sections(records: Sequence[Record], chart: Path | None) -> Sections:
-    """Return one table as Markdown, with a row for every object and source, and for all objects together."""
+    """Return a table with a row for every object and source, and for all objects together."""
     trials = [name for name in TRIALS if any(name in record["trials"] for record in records)]
     metrics = [row for row in METRICS.values() if row.measure is not None]
     headings = ["object", "grasps of", "tried", *(_PASSED[name] for name in trials if name in _PASSED)]
@@ -175,7 +175,7 @@ def _row(name: str, records: Sequence[Record], source: str, trials: Sequence[str
         return f"{np.median(there):.{digits}f}" if there else "–"
 
     if source == "imported" and any(map(_doubted, records)):
-        # What holds of poses that are read in another frame says nothing of the grasps.
+        # Figures of poses in a wrong frame say nothing about the grasps.
         return [name, "imported, frame in doubt", f"{len(grasps)} of {asked}", *["–"] * (width - 3)]
     cells = [name, SOURCES[source], f"{len(grasps)} of {asked}"]
     for trial in trials:

@@ -1,7 +1,6 @@
-"""Study that clears a pile: look, choose a thing, plan among the others, lift it on the truth, until none can be
-grasped.
+"""Study `piles`: clear a pile of objects. Look, choose an object, plan, and lift it, until nothing can be grasped.
 
-The robot knows only what the camera saw. The results are measured on the truth.
+The planner knows only the camera's view. The lifts are simulated with the true objects.
 """
 
 from __future__ import annotations
@@ -43,18 +42,18 @@ from graspd_core.verify.lift_trial import LiftSettings
 from graspd_core.verify.world import PROTOCOLS, FreeBody
 from graspd_dataset.run_records import markdown_table, thing_name
 
-# Things in a scene.
+# Numbers of objects in a scene, and their limit.
 SIZES, MOST_THINGS = (3, 5, 8, 12), 24
 MASS = 0.1
-# The fence that things fall into has this side for one thing, and the root of their number times it for many [m].
+# Side of the fence for one object [m]. For n objects it is multiplied by the square root of n.
 _FENCE = 0.12
-# Where the camera stands: far enough to see what rolls away [rad], [m].
+# Elevation [rad] and distance [m] of the camera. It is far enough to see objects that roll away.
 _ELEVATION, _DISTANCE = np.deg2rad(55.0), 0.7
 
 
 @dataclass(frozen=True)
 class PileCase(Case):
-    """`size` things drawn from `objects`, dropped, and removed as cameras see them from `views` places."""
+    """A pile of `size` objects drawn from `objects`, seen by `views` cameras."""
 
     objects: tuple[str, ...]
     size: int
@@ -76,7 +75,7 @@ class PileCase(Case):
 
 
 def pile_cases(request: Request) -> tuple[PileCase, ...]:
-    """Return a scene for each size and seed. Raises GraspdError: an unknown object or a size out of range."""
+    """Return a case for each size and seed. Raises GraspdError: unknown object, or a size out of range."""
     sizes = tuple(map(_size, request.cases)) or (SIZES[:1] if request.quick else SIZES)
     objects = find_objects(request.objects or [f"shape:{name}" for name in SHAPES])
     preset, hand = request.preset(), request.hand or "allegro_right"
@@ -85,17 +84,17 @@ def pile_cases(request: Request) -> tuple[PileCase, ...]:
 
 def _size(text: str) -> int:
     if not text.isdigit() or not 1 <= int(text) <= MOST_THINGS:
-        raise ConfigError(f"cases: {text!r}; valid: how many things there are, 1 to {MOST_THINGS}")
+        raise ConfigError(f"cases: {text!r}; valid: a number of objects from 1 to {MOST_THINGS}")
     return int(text)
 
 
 def pile_seconds(case: PileCase) -> float:
-    """Return the CPU seconds of a case, roughly. Among more neighbours every plan takes longer."""
+    """Return the estimated CPU time of a case [s]. With more neighbours, each plan takes longer."""
     return 4.0 * case.size + 0.3 * case.size**2
 
 
 def drawn_things(case: PileCase) -> list[str]:
-    """Return the things of a scene: all in a drawn order, then all again where there are too few."""
+    """Return the objects of a scene: all in random order, repeated if there are fewer than `case.size`."""
     rng = np.random.default_rng((case.seed, case.size))
     order: list[str] = []
     while len(order) < case.size:
@@ -104,7 +103,7 @@ def drawn_things(case: PileCase) -> list[str]:
 
 
 def dropped_pile(case: PileCase) -> tuple[FreeBody, ...]:
-    """Return things at rest, which fell one above the other into a fence that is then removed."""
+    """Return the pile: objects that were dropped into a fence and are at rest after its removal."""
     things = drawn_things(case)
     models = {thing: load_scene(thing, mass=MASS).object for thing in set(things)}
     wall = 0.5 * _FENCE * float(np.sqrt(case.size)) + 0.05
@@ -112,7 +111,7 @@ def dropped_pile(case: PileCase) -> tuple[FreeBody, ...]:
 
 
 def seen_pile(case: PileCase, bodies: Sequence[FreeBody], look: int) -> tuple[list[PointCloud], Any]:
-    """Return the views, and for each point, view after view, the thing it belongs to (beyond them: the table)."""
+    """Return the views, and the label of each point in the order of the views: an index in `bodies`, or the table."""
     meshes = [moved(body.model.mesh, body.pose) for body in bodies]
     table = tabletop("sphere")
     stage = TabletopScene(meshes[0], np.eye(4), tuple(meshes[1:]), table.table, table.support)
@@ -122,29 +121,29 @@ def seen_pile(case: PileCase, bodies: Sequence[FreeBody], look: int) -> tuple[li
     return views, np.concatenate([label[depth > 0] for depth, label in images])
 
 
-# A thing that is seen within this of a place where one failed is that thing [m]. So often is one tried.
+# A segment this close to the place of a failed attempt counts as the same object [m]. Limit of attempts per object.
 _SAME_PLACE, _TRIES = 0.03, 2
-# A segment of which so much is of a second thing is two things taken for one.
+# If more than this share of a segment belongs to a second object, two objects were segmented as one.
 _MERGED = 0.15
-# A thing that went so far while another was taken was moved by it [m].
+# An object that shifts more than this while another is lifted counts as moved [m].
 MOVED = 0.02
-# What the hand takes out rises with it: it may slip and turn in the hand as long as it comes up.
+# The lifted object may slip and turn in the hand, as long as it rises.
 _PROTOCOL = replace(PROTOCOLS["standard"], max_displacement=0.1, max_rotation=2 * np.pi)
 _LIFT = LiftSettings(hold_time=1.0)
-# Endings of an attempt.
+# Outcomes of an attempt.
 CLEARED, DROPPED, BLOCKED, NO_GRASP, NO_SCENE = "cleared", "dropped", "blocked", "no verified grasp", "no scene"
 
 
 @dataclass
 class _Run:
-    """The things left on the table, and what was tried.
+    """State of clearing a pile.
 
     Attributes:
-        present: numbers of the things that are left, in the order of `bodies`.
-        bodies: these things, as they lie.
-        failures: places where trials failed.
-        attempts: their records.
-        frames: of the film strip.
+        present: numbers of the remaining objects, in the order of `bodies`.
+        bodies: the remaining objects at their current poses.
+        failures: centres of the segments of failed attempts [m].
+        attempts: records of all attempts.
+        frames: poses of objects and hand for the film strip.
     """
 
     present: list[int]
@@ -158,7 +157,7 @@ class _Run:
 
 
 def run_pile(case: PileCase) -> Record:
-    """Return the record of one scene."""
+    """Clear one pile. Return its record."""
     hand = load_hand(case.hand, candidates=case.config.problem.fine_candidates)
     things, bodies = drawn_things(case), dropped_pile(case)
     run, look_s, looks = _Run(list(range(case.size)), bodies), [], 0
@@ -200,7 +199,7 @@ def _take_one(
     truth: Int[np.ndarray, "points"],
     seen: Sequence[Float[np.ndarray, "_ 3"]],
 ) -> bool:
-    """Try things until a grasp was executed, fewest failures first, then the highest. Return whether one was."""
+    """Execute the first verified grasp of a segment, fewest failures and highest first. Return whether there is one."""
     cloud = KDTree(np.vstack([view.points for view in views]))
     order = sorted(seen, key=lambda points: (run.failed_before(points.mean(0)), -float(points[:, 2].max())))
     for points in order:
@@ -236,9 +235,9 @@ def _planned(
     attempt: Record,
     seed: int,
 ) -> Grasp | None:
-    """Return the surest verified grasp of a segment. Where there is none, the attempt says why."""
+    """Return the first verified grasp of a segment. If there is none, note the reason in `attempt` and return None."""
     began = time.process_time()
-    # A point of the thing itself: the middle of a ring is empty.
+    # The target must be a point of the segment, because the centre of a ring is empty.
     middle = points[np.linalg.norm(points - points.mean(0), axis=1).argmin()]
     try:
         scene = scene_from_views(views, target=Target(point=middle))
@@ -264,7 +263,7 @@ def _why_none(result: GraspResult) -> str:
 
 
 def _execute(hand: HandModel, run: _Run, grasp: Grasp, attempt: Record) -> None:
-    """Lift on the truth. Things that came up are removed, the rest comes to rest."""
+    """Lift the true object. Remove all objects that rose, and let the others come to rest. Complete `attempt`."""
     index = run.present.index(attempt["thing"])
     before = [body.pose for body in run.bodies]
     lifted = lift_out(hand, run.bodies, index, grasp, _PROTOCOL, _LIFT)
@@ -308,7 +307,7 @@ _HEADINGS = [
     "two taken for one", "came along", "moved others", "verified grasps that held",
     "segmentation and reconstruction, a thing", "planning, a thing",
 ]  # fmt: skip
-# The scene of this many things is drawn, if there is one. Frames of this size, so many in a row.
+# Size of the pile that the film strip shows, if there is one. Size of a frame [pixels], and frames per row.
 _DRAWN, _WIDTH, _HEIGHT, _ROW = 8, 320, 240, 4
 _BORDER = 4
 _COLOURS = (
@@ -320,12 +319,12 @@ _HAND, _TABLE = (0.35, 0.38, 0.42), (0.93, 0.92, 0.89)
 
 
 def pile_came(record: Record) -> str:
-    """Return the results of a scene, in a few words."""
+    """Return the result of a pile, in a few words."""
     return f"{record['cleared']} of {record['size']} taken out in {len(record['attempts'])} attempts"
 
 
 def pile_sections(records: Sequence[Record], chart: Path | None) -> Sections:
-    """Return the table, the causes and the film strip."""
+    """Return the film strip, the table by pile size, the share held by segment quality, and the causes of failure."""
     sizes = {size: [r for r in records if r["size"] == size] for size in sorted({r["size"] for r in records})}
     body = [_row(str(size), own) for size, own in sizes.items()]
     if len(sizes) > 1:
@@ -364,7 +363,7 @@ def _by_segment(records: Sequence[Record]) -> str:
 
 
 def _causes(records: Sequence[Record]) -> list[str]:
-    """Return the causes of failed attempts, most frequent first, and how many segments were of two things."""
+    """Return a table of failed attempts by cause, most frequent first, with the number of merged segments."""
     failed = [a for r in records for a in r["attempts"] if a["ended"] != CLEARED]
     if not failed:
         return []
@@ -381,7 +380,7 @@ def _plain(reason: str) -> str:
 
 
 def film_picture(record: Record, chart: Path) -> Picture | None:
-    """Return the film strip of a scene as a file, or None where its meshes are missing."""
+    """Save the film strip of a pile as piles.png beside `chart`. Return None if a mesh or the hand is missing."""
     try:
         image = film_strip(record)
     except GraspdError:
@@ -393,9 +392,9 @@ def film_picture(record: Record, chart: Path) -> Picture | None:
 
 
 def film_strip(record: Record) -> UInt8[np.ndarray, "height width 3"]:
-    """Return a frame of the fallen pile, and one at the end of every lift, in rows.
+    """Return an image with one frame of the initial pile, and one at the end of every lift.
 
-    Raises GraspdError if an object or the hand cannot be loaded.
+    Raises GraspdError: an object or the hand cannot be loaded.
     """
     names = ("size", "preset", "hand", "seed", "views")
     case = PileCase(tuple(record["objects"]), **{name: record[name] for name in names})

@@ -1,6 +1,6 @@
-"""Study of ranking by robustness: as many verified grasps in the order of the score, and of the noisy trial.
+"""Study `robust`: verified grasps ranked by score and ranked by the noisy trial, and the cost of the ranking.
 
-Both orders are compared by noisy trials of other errors, with pulls of 2 s.
+Both rankings are evaluated by noisy trials with other errors and pulls of 2 s.
 """
 
 from __future__ import annotations
@@ -23,9 +23,9 @@ from graspd_core.verify.hold_trial import noisy_share, pose_errors
 from graspd_core.verify.world import PROTOCOLS, at_friction, build_world
 from graspd_dataset.run_records import markdown_table, thing_name
 
-# Shapes whose grasps do not all survive an error of 5 mm and 5°.
+# Shapes for which some grasps fail if the hand is displaced by 5 mm and 5°.
 SHAPES = ("shape:box", "shape:plate", "shape:torus", "shape:bottle", "shape:l_block", "shape:hammer")
-# Errors of the evaluating trials: as many for each grasp, from a seed that no plan draws from.
+# Number of evaluation trials per grasp, and the seed of their errors, which no plan uses.
 EVALUATIONS, EVALUATION_SEED = 16, 977
 FRICTION = 0.6
 _SCORE, _NOISE, _BEST = (method_row(name).colour for name in ("graspd2022", "closed_form", "random_closure"))
@@ -37,11 +37,11 @@ def robust_cases(request: Request) -> tuple[ObjectCase, ...]:
 
 
 def run_robust(case: ObjectCase) -> Record:
-    """Return the costs of both plans, the figure each grasp was ranked by, and the share that it really holds."""
+    """Plan with and without ranking. Return both CPU times, and each grasp's score, noisy share, and evaluation."""
     config = case.config
     ranked = replace(config, robust=replace(config.robust, rank=True))
     hand, scene = case.load(friction=FRICTION)
-    # The parts are built once and belong to neither run.
+    # The convex parts are computed first, so that neither plan pays for them.
     parts = object_parts(scene.object)
     began = time.process_time()
     plain = plan_grasps(scene, hand, count=case.count, seed=case.seed, preset=config)
@@ -56,7 +56,7 @@ def run_robust(case: ObjectCase) -> Record:
         "shape": thing_name(case.object),
         "plan_cpu_s": between - began,
         "ranked_plan_cpu_s": ended - between,
-        # In the order of the score, as a plan without ranking gives them.
+        # These lists are in the order of the score, in which the plan without ranking returns the grasps.
         "score": [g.score for g in verified],
         "ranked_by": [shares[g.score] for g in verified],
         "shares": [noisy_share(world, g, protocol, errors) for g in verified],
@@ -64,7 +64,7 @@ def run_robust(case: ObjectCase) -> Record:
 
 
 def robust_sections(records: Sequence[Record], chart: Path | None) -> Sections:
-    """Return costs and gains by shape, the rank correlations, and the chart."""
+    """Return the chart, a table of costs and gains by shape, and the rank correlations."""
     rows = [record for record in records if record["shares"]]
     if not rows:
         return {}
@@ -88,9 +88,9 @@ def robust_sections(records: Sequence[Record], chart: Path | None) -> Sections:
 def orders(
     rows: Sequence[Record],
 ) -> tuple[Float[np.ndarray, "places"], Float[np.ndarray, "places"], Float[np.ndarray, "places"]]:
-    """Return the mean share held at each place, first to last: by score, by the noisy trial, and in the best order.
+    """Return the mean share held at each rank in three orders: by score, by the noisy trial, and by the share itself.
 
-    There are as many places as the shortest plan has grasps. Grasps that are level keep the order of the score.
+    There are as many ranks as the shortest plan has grasps. Grasps with equal keys keep the order of the score.
     """
     places = min(len(row["shares"]) for row in rows)
     held = [np.array(row["shares"]) for row in rows]
@@ -101,7 +101,7 @@ def orders(
 
 
 def correlation(rows: Sequence[Record], key: str) -> float:
-    """Return Spearman's rank correlation of a figure with the share held within a plan, mean over plans that differ."""
+    """Return Spearman's correlation of a figure with the share held: mean over plans in which both vary, or NaN."""
     from scipy.stats import rankdata
 
     found = [
@@ -113,7 +113,7 @@ def correlation(rows: Sequence[Record], key: str) -> float:
 
 
 def draw_robust(rows: Sequence[Record], path: Path) -> Path:
-    """Draw the share held by place on the left, CPU seconds by shape on the right. Return the PNG's path."""
+    """Draw the share held by rank (left), and CPU seconds by shape (right). Return the PNG's path."""
     with figure(8.0, 3.0, ncols=2) as (made, (gain, cost)):
         by_score, by_noise, best = (100.0 * order for order in orders(rows))
         places = np.arange(1, len(best) + 1)

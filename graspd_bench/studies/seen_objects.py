@@ -1,7 +1,7 @@
-"""Study `rgbd`: grasps of a thing on a table as a camera sees it, tried on the truth.
+"""Study `rgbd`: grasps planned on camera views of an object on a table, and tried on the true object.
 
-Every case is rendered with the sensor noise of a D415 and goes through segmentation, reconstruction and `plan_grasps`
-as a user's clouds do. Every grasp that was verified on the reconstruction is tried again on the true mesh.
+The views are rendered with the sensor noise of a D415. Like a user's clouds, they go through segmentation,
+reconstruction and `plan_grasps`. Every grasp that is verified on the reconstruction is tried again on the true mesh.
 """
 
 from __future__ import annotations
@@ -37,16 +37,16 @@ from graspd_core.verify.world import PROTOCOLS, build_world
 from graspd_dataset.run_records import markdown_table, thing_name
 
 SHAPES = ("sphere", "box", "cylinder", "capsule", "torus", "mug", "bowl", "bottle", "l_block", "hammer")
-# Cameras. 0 plans on the true mesh.
+# Numbers of cameras. 0 plans on the true mesh.
 VIEWS = (0, 1, 3, 15)
-# Elevation of the camera at each start: a robot looks at its table from half above. From a wrist, from above [deg].
+# Elevations of the camera by seed [deg]: of a camera beside the robot, and of a wrist camera, which looks from above.
 ELEVATIONS, ABOVE = (40.0, 50.0, 30.0), (75.0, 88.0, 60.0)
 YAW = 0.3
-# Room between the object and each thing beside it [m].
+# Gap between the object and each neighbour [m].
 CLEAR = 0.04
-# Where a sphere of 5 mm about a true point meets the reconstruction, that point counts as found.
+# A true point counts as found within this distance of the reconstruction [m]. Number of sampled surface points.
 FOUND, SAMPLES = 0.005, 20_000
-# By number of views, and how they see the object: from half above, with other things beside, from above.
+# Names of the rows by number of views and sight: alone, with neighbours, or seen from above.
 PLAIN, CROWDED, FROM_ABOVE = "plain", "crowded", "from above"
 NAMES = {
     (1, PLAIN): "1 view", (1, CROWDED): "1 view, crowded", (1, FROM_ABOVE): "1 view, from above", (3, PLAIN): "3 views",
@@ -61,10 +61,10 @@ _HEADINGS = [
 
 @dataclass(frozen=True)
 class Seen(ObjectCase):
-    """Grasps of what `views` cameras see, or of the true mesh if `views` is 0.
+    """Grasps of an object seen by `views` cameras, or of the true mesh if `views` is 0.
 
-    The seed draws noise and grasps, and the place of the first camera. In a crowd, two other things beside it hide a
-    part.
+    The seed sets the noise, the planner, and the place of the first camera. If `sight` is `CROWDED`, two neighbours
+    hide a part of the object.
     """
 
     views: int = 1
@@ -72,7 +72,7 @@ class Seen(ObjectCase):
 
 
 def seen_cases(request: Request) -> tuple[Seen, ...]:
-    """Return every object from every number of views, by default from two places."""
+    """Return cases of every object with every number of views and sight. There are two seeds by default."""
     request = request if request.seeds else replace(request, seeds=(0,) if request.quick else (0, 1))
     cases = object_cases(request, [f"shape:{name}" for name in SHAPES], 4)
     seen = [(views, PLAIN) for views in VIEWS[: 2 if request.quick else None]] + [(1, CROWDED), (1, FROM_ABOVE)]
@@ -80,17 +80,17 @@ def seen_cases(request: Request) -> tuple[Seen, ...]:
 
 
 def seen_seconds(case: Seen) -> float:
-    """Return the CPU seconds of a case, roughly."""
+    """Return the estimated CPU time of a case [s]."""
     return 4.0 + 0.4 * case.count + 0.6 * case.views
 
 
 def run_seen(case: Seen) -> Record:
-    """Return the record of one case. A refusal is a result with its message."""
+    """Run a case. If no scene can be built, the record holds the message as `refused`."""
     hand = load_hand(case.hand, candidates=case.config.problem.fine_candidates)
     stage = _stage(case)
     clouds = views_of(stage, CAMERA, camera_poses(case), DEFAULT, 1000 * case.seed) if case.views else []
     _load_libraries()
-    # Or the full mesh would be met again at its next start.
+    # Without this, the next case of the full mesh would find it in the cache.
     disk_cache.forget()
     began = time.perf_counter()
     try:
@@ -108,7 +108,7 @@ def run_seen(case: Seen) -> Record:
 
 
 def _stage(case: Seen) -> TabletopScene:
-    """Return the object on its table, and its neighbours at a distance of `CLEAR`, one of them towards the camera."""
+    """Return the object on a table. A crowded scene has two neighbours `CLEAR` away, one on the camera's side."""
     thing = case.object.removeprefix("shape:") if case.object.startswith("shape:") else load_mesh(case.object)
     alone = tabletop(thing, yaw=YAW)
     if case.sight != CROWDED:
@@ -119,7 +119,7 @@ def _stage(case: Seen) -> TabletopScene:
 
 
 def camera_poses(case: Seen) -> tuple[np.ndarray, ...]:
-    """Return one camera, three around, or two rings of eight and seven."""
+    """Return `T_world_camera` of one or three cameras on a ring, or of fifteen on two rings."""
     azimuth = np.deg2rad(20.0 + 120.0 * case.seed)
     places = ABOVE if case.sight == FROM_ABOVE else ELEVATIONS
     elevation = np.deg2rad(places[case.seed % len(places)])
@@ -142,19 +142,19 @@ def _true_scene(stage: TabletopScene, source: str) -> Scene:
 
 
 def _grasps(case: Seen, scene: Scene, stage: TabletopScene, hand: HandModel) -> Record:
-    """Plan one grasp against the clock, then `count`. Try all that were verified on the truth."""
+    """Plan one grasp and time it, then plan `count` grasps. Try all verified grasps on the true object."""
     first = plan_grasps(scene, hand, count=1, seed=case.seed, preset=case.preset)
     many = plan_grasps(scene, hand, count=case.count, seed=case.seed, preset=case.preset)
     protocol, truth = PROTOCOLS["standard"], _true_scene(stage, case.object)
     parts = object_parts(truth.object)
     world = build_world(hand, truth.object, parts, protocol)
     table = build_world(hand, truth.object, parts, protocol, stage.support, truth.obstacles)
-    # How deep a grasp of what was seen lies in the true object is no fault of the grasp.
+    # The trial tolerates penetration, because a planner cannot know the true surface.
     protocol = out_of_place(protocol)
     one = [hold_trial(world, grasp, protocol) for grasp in _verified(first)]
     holds = [(grasp, hold_trial(world, grasp, protocol)) for grasp in _verified(many)]
     lifts = [lift_trial(table, hand, grasp, protocol) for grasp, hold in holds if hold.passed]
-    # Those that hold on the likeliest shape and are less sure, too: how far is the probability right?
+    # Unverified grasps with a probability are tried as well, to calibrate the probability.
     guessed = [grasp for grasp in many.tried if grasp.probability is not None]
     told = [(grasp.probability, hold_trial(world, grasp, protocol).passed) for grasp in guessed]
     timing = first.timing
@@ -176,14 +176,14 @@ def _verified(result: GraspResult) -> list[Grasp]:
 
 
 def reconstruction_error(scene: Scene, stage: TabletopScene) -> dict[str, Any]:
-    """Return distances between the reconstruction's surface and the true one, and whether it is closed.
+    """Return distances between the reconstructed and the true surface, and whether the reconstruction is closed.
 
-    `chamfer_mm` is the mean of the mean distances either way [mm]. `completeness` is the share of the true surface
-    within 5 mm of the reconstruction. `beyond_10mm` is the share of the reconstruction farther than 10 mm from the
-    truth.
+    `chamfer_mm` is the mean of the mean distances in both directions [mm]. `completeness` is the share of the true
+    surface within 5 mm of the reconstruction. `beyond_10mm` is the share of the reconstruction farther than 10 mm from
+    the true surface.
     """
     points, normals = surface_samples(stage.truth, SAMPLES, 0)
-    # Bodies that overlap have surfaces that nobody could see.
+    # Where bodies of the true mesh overlap, their inner surfaces are invisible and do not count.
     outer = points[~winding_inside(stage.truth, points + 1e-4 * normals)]
     found = surface_samples(scene.object.mesh, SAMPLES, 0)[0]
     missing = surface_distance(make_surface(scene.object.mesh), outer)
@@ -197,7 +197,7 @@ def reconstruction_error(scene: Scene, stage: TabletopScene) -> dict[str, Any]:
 
 
 def rgbd_sections(records: Sequence[Record], chart: Path | None) -> Sections:
-    """Return both tables."""
+    """Return a table by number of views and sight, a table by object, and the calibration of the probability."""
     rows = {row: own for row in NAMES if (own := [r for r in records if (r["views"], r["sight"]) == row])}
     full = _share(rows[0, PLAIN], "first_held") if (0, PLAIN) in rows else 0.0
     body = [[NAMES[views], *_row(own, full)] for views, own in rows.items()]
@@ -247,7 +247,7 @@ def _marks(own: Sequence[Record]) -> str:
 
 
 def calibration(told: Sequence[tuple[float, bool]], where: str = "") -> list[str]:
-    """Return how often grasps of each stated probability held on the truth, and the mean square of the error."""
+    """Return the Brier score and the share held at each stated probability. `told`: pairs (probability, held)."""
     if not told:
         return []
     levels = sorted({probability for probability, _ in told}, reverse=True)

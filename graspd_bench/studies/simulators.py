@@ -1,7 +1,7 @@
-"""Study of whether the second simulator agrees: hold and displacement trials of the same grasps in MuJoCo and PyBullet.
+"""Study `simulators`: hold and displacement trials of the same grasps in MuJoCo and in PyBullet. Do they agree?
 
-It uses the first grasps of the optimiser's own ranking, none filtered by a trial. Each is tried once more with the hand
-out of place by up to 5 mm and 5°, as in the noisy trial, so that failures are among them.
+The study uses the first grasps of the optimiser's own ranking. No trial filters them. Each is tried a second time with
+the hand displaced by up to 5 mm and 5°, as in the noisy trial. So some grasps fail.
 """
 
 from __future__ import annotations
@@ -22,12 +22,12 @@ from graspd_core.verify.hold_trial import displaced, hold_trial, pose_error
 from graspd_core.verify.world import PROTOCOLS, build_world
 from graspd_dataset.run_records import markdown_table, thing_name
 
-# Seconds of each pull, in both simulators. MuJoCo tries the full length as well.
+# Duration of each pull in both simulators [s]. MuJoCo also runs the full duration.
 PULL = 0.5
 
 
 def simulator_cases(request: Request) -> tuple[ObjectCase, ...]:
-    """Return a case for each shape and seed. Raises ConfigError: there is no PyBullet."""
+    """Return a case for each shape and seed. Raises ConfigError: PyBullet is not installed."""
     if not bullet_available():
         raise ConfigError("simulators: PyBullet is not installed; pip install -e '.[bench]', on Python 3.11")
     return object_cases(request, all_shapes(), 4, 1)
@@ -38,7 +38,7 @@ def run_simulators(case: ObjectCase) -> Record:
     hand, scene = case.load()
     first = raw_grasps(scene, hand, case.config, case.count, case.seed)
     parts, standard = object_parts(scene.object), PROTOCOLS["standard"]
-    # Bullet refuses no posture: the physics are compared.
+    # The PyBullet trial accepts all postures, so the MuJoCo trial must, too. Only the physics are compared.
     standard = replace(standard, max_grasp_penetration=np.inf, max_self_penetration=np.inf)
     short = replace(standard, hold_time=PULL)
     world = build_world(hand, scene.object, parts, standard)
@@ -60,7 +60,7 @@ def run_simulators(case: ObjectCase) -> Record:
 
 
 def simulator_sections(records: Sequence[Record], chart: Path | None) -> Sections:
-    """Return the verdicts side by side, every disagreement with both reasons, and the displacements, as Markdown."""
+    """Return a table of the verdicts, every disagreement with both reasons, and the mean displacements."""
     rows = [(r["object"], trial) for r in records for trial in r["trials"]]
     if not rows:
         return {}

@@ -1,7 +1,7 @@
-"""Study of whether steering works and what it costs, by the same request with a wish and without.
+"""Study `steered`: the same request with and without a steering constraint. Do grasps obey it, and what does it cost?
 
-Wishes are drawn at random from the case's seed, object and hand. Some cannot be met, as a cone from where the object is
-too wide for the hand. Whether grasps keep to a wish is computed here from postures and contacts.
+Constraints are drawn at random from the case's seed, object and hand. Some cannot be met, such as an approach cone
+from a side where the object is too wide for the hand. Postures and contacts show here whether grasps obey.
 """
 
 from __future__ import annotations
@@ -28,22 +28,22 @@ from graspd_dataset.run_records import markdown_table, thing_name
 SHAPES = ("box", "bottle", "mug", "hammer", "torus", "plate", "cylinder", "l_block", "bowl", "capsule")
 HANDS = ("allegro_right", "leap_right", "barrett_like", "parallel_gripper")
 WISHES = ("cone", "cone and roll", "region", "cone and region", "avoid")
-# Half-angles of the cones [rad], share of the object that a region holds, and its least breadth [m].
+# Ranges of the cones' half-angle [rad] and of a region's share of the object's length. Least breadth of a region [m].
 _ANGLES, _SHARES, _BREADTH = (0.35, 0.8), (0.4, 0.7), 0.05
 _ROLL_TOLERANCE = 0.35
-# How much of an end is avoided, and how far the box reaches beyond the object [m].
+# Share of the object's length in a box to avoid, and how far the box extends beyond the object [m].
 _END, _BEYOND = 0.25, 0.03
 
 
 @dataclass(frozen=True)
 class SteeredCase(ObjectCase):
-    """A plan with a wish, and one without."""
+    """A plan with a steering constraint of the kind `wish` (one of `WISHES`), and a plan without it."""
 
     wish: str = "cone"
 
 
 def steered_cases(request: Request) -> tuple[SteeredCase, ...]:
-    """Return a case for each object, hand, wish and seed."""
+    """Return a case for each object, hand, kind of constraint and seed."""
     things = find_objects(request.objects or tuple(f"shape:{s}" for s in SHAPES[: 1 if request.quick else None]))
     hands = (request.hand,) if request.hand else HANDS[: 1 if request.quick else None]
     count, preset = request.count or (2 if request.quick else 4), request.preset()
@@ -57,7 +57,7 @@ def steered_cases(request: Request) -> tuple[SteeredCase, ...]:
 
 
 def drawn_wish(case: SteeredCase, scene: Scene) -> Steering:
-    """Return the wish of a case, drawn at random."""
+    """Draw the steering constraint of a case. It depends only on seed, object, hand and kind."""
     rng = np.random.default_rng([case.seed, zlib.crc32(f"{case.object} {case.hand} {case.wish}".encode())])
     direction, angle = rng.normal(size=3), float(rng.uniform(*_ANGLES))
     vertices = scene.object.mesh.vertices
@@ -73,7 +73,7 @@ def drawn_wish(case: SteeredCase, scene: Scene) -> Steering:
 
 
 def _end_of(vertices: Float[np.ndarray, "n 3"], rng: np.random.Generator, share: float, beyond: float) -> Box:
-    """Return a box about a share of the object, from one of its six ends, no narrower than a hand can use."""
+    """Draw a box at an end of the object: `share` of its extent, for a region at least 5 cm, plus `beyond` [m]."""
     low, high = vertices.min(0), vertices.max(0)
     axis, side = int(rng.integers(3)), int(rng.integers(2))
     breadth = max(share * (high - low)[axis], _BREADTH if beyond < _BEYOND else 0.0)
@@ -86,7 +86,7 @@ def _end_of(vertices: Float[np.ndarray, "n 3"], rng: np.random.Generator, share:
 
 
 def run_steered(case: SteeredCase) -> Record:
-    """Return the costs of both plans, how many verified grasps keep to the wish, and the greatest miss."""
+    """Plan with and without the constraint. Return costs, numbers of verified grasps, and the greatest violations."""
     hand, scene = case.load()
     object_parts(scene.object)
     wish = drawn_wish(case, scene)
@@ -102,7 +102,7 @@ def run_steered(case: SteeredCase) -> Record:
         "tried": len(found.tried),
         "refused": dict(found.refused),
         "message": found.message,
-        # Greatest excess over each wish: negative where all keep to it.
+        # Greatest violation of each constraint. It is negative if all grasps obey.
         "beyond_cone_rad": max((beyond_cone(hand, grasp, wish) for grasp in good), default=None),
         "beyond_region_m": max((beyond_region(grasp, wish) for grasp in good), default=None),
         "in_boxes": sum(_in_boxes(hand, grasp, wish) for grasp in good),
@@ -118,7 +118,7 @@ def _timed(case: SteeredCase, scene: Scene, hand: HandModel, restrictions: Seque
 
 
 def beyond_cone(hand: HandModel, grasp: Grasp, wish: Steering) -> float:
-    """Return by how much a grasp's approach is outside the cone [rad]."""
+    """Return the angle by which a grasp's approach direction is outside the cone [rad]. Negative if inside."""
     if wish.approach_direction is None:
         return -np.pi
     w, x, y, z = grasp.grasp.quaternion_wxyz
@@ -127,7 +127,7 @@ def beyond_cone(hand: HandModel, grasp: Grasp, wish: Steering) -> float:
 
 
 def beyond_region(grasp: Grasp, wish: Steering) -> float:
-    """Return how far the farthest contact is outside the region [m]."""
+    """Return how far the farthest contact is outside the region [m]. Negative if all are inside."""
     if not isinstance(wish.region, Box):
         return -1.0
     beyond = (
@@ -141,7 +141,7 @@ def _in_boxes(hand: HandModel, grasp: Grasp, wish: Steering) -> bool:
 
 
 def steered_sections(records: Sequence[Record], chart: Path | None) -> Sections:
-    """Return success and cost by wish."""
+    """Return a table of success and cost by kind of constraint."""
     headings = ["wish", "requests", "with a verified grasp", "without the wish", "grasps of those asked for"]
     headings += [
         "without the wish",

@@ -1,6 +1,6 @@
-"""Study of verified grasps a second of a known object, on one thread and on two, by the clock on the wall.
+"""Study `throughput`: verified grasps per second of wall time for a known object, on one and on two threads.
 
-Cases that run at the same time share the cores, so figures count with `--processes 1` on a quiet machine.
+Cases that run at the same time share the cores, so the figures are valid only with `--processes 1` on an idle machine.
 """
 
 from __future__ import annotations
@@ -20,26 +20,26 @@ from graspd_core.types import Verdict
 from graspd_dataset.run_records import markdown_table, thing_name
 
 THREADS = (1, 2)
-# Of the plan that goes before, with another seed, so that the object is known: its grid, parts and worlds are there.
+# Grasps of a first plan with another seed. It fills the caches with the object's SDF grid, convex parts and worlds.
 _WARM_UP = 2
 
 
 @dataclass(frozen=True)
 class Throughput(ObjectCase):
-    """Verified grasps of an object on so many threads."""
+    """Verified grasps of an object, planned on `threads` threads."""
 
     threads: int = 1
 
 
 def throughput_cases(request: Request) -> tuple[Throughput, ...]:
-    """Return every shape from three seeds, on one thread and on two."""
+    """Return cases of every shape with three seeds, each on one and on two threads."""
     request = request if request.seeds or request.quick else replace(request, seeds=(0, 1, 2))
     cases = object_cases(request, [f"shape:{name}" for name in SHAPES], 64)
     return tuple(Throughput(**vars(case), threads=threads) for case in cases for threads in THREADS)
 
 
 def run_throughput(case: Throughput) -> Record:
-    """Return seconds, on the wall and of the CPU, of one plan without metrics."""
+    """Plan once without metrics. Return the numbers of grasps, and the wall and CPU time [s]."""
     hand, scene = case.load()
     before = torch.get_num_threads()
     torch.set_num_threads(case.threads)
@@ -55,7 +55,7 @@ def run_throughput(case: Throughput) -> Record:
 
 
 def throughput_sections(records: Sequence[Record], chart: Path | None) -> Sections:
-    """Return verified grasps a second and CPU time of each, by object and number of threads."""
+    """Return a table of verified grasps per second, and CPU time per grasp, by object and number of threads."""
     rows = [record for record in records if record["verified"]]
     if not rows:
         return {}
@@ -70,7 +70,7 @@ def throughput_sections(records: Sequence[Record], chart: Path | None) -> Sectio
 
 
 def _figures(rows: Sequence[Record]) -> list[float]:
-    """Return tries for each verified grasp, then by number of threads verified ones a second and CPU ms of each."""
+    """Return tried per verified grasp, then for each number of threads: verified per second, CPU ms per verified."""
     found = [sum(row["tried"] for row in rows) / sum(row["verified"] for row in rows)]
     for threads in THREADS:
         here = [row for row in rows if row["threads"] == threads]

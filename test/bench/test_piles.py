@@ -34,7 +34,7 @@ def scene(size: int, *objects: str) -> PileCase:
 def test_a_scene_is_a_number_of_things():
     assert [case.size for case in pile_cases(Request())] == [3, 5, 8, 12]
     assert [(c.size, c.seed) for c in pile_cases(Request(cases=("4",), seeds=(0, 7)))] == [(4, 0), (4, 7)]
-    with pytest.raises(ConfigError, match="cases: 'many'; valid: how many things there are, 1 to 24"):
+    with pytest.raises(ConfigError, match="cases: 'many'; valid: a number of objects from 1 to 24"):
         pile_cases(Request(cases=("many",)))
 
 

@@ -216,5 +216,5 @@ def test_objects_are_shapes_files_and_folders(tmp_path: Path):
     (tmp_path / "notes.txt").write_text("no mesh")
     found = find_objects(("shape:mug", str(tmp_path)))
     assert [Path(source).name for source in found] == ["shape:mug", "a.obj", "b.obj"]
-    with pytest.raises(MeshError, match="two objects are called 'a'"):
+    with pytest.raises(MeshError, match="share the name 'a'; rename one of them"):
         find_objects((str(tmp_path), str(tmp_path / "a.obj")))

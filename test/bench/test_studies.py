@@ -105,7 +105,7 @@ def test_a_human_hand_is_measured_rigid_and_with_flesh_that_gives(tmp_path: Path
 
 
 def test_an_option_that_no_study_looks_at_is_named(tmp_path: Path):
-    with pytest.raises(ConfigError, match="trials: maps does not look at it; valid: cases, quick"):
+    with pytest.raises(ConfigError, match="trials: not used by maps; valid: cases, quick"):
         make_plan(studies_of(["maps"]), Request(trials=("hard",)), tmp_path)
     both = make_plan(studies_of(["maps", "main", "maps"]), Request(trials=("hard",), quick=True), tmp_path)
     assert {job.study for job in both.jobs} == {"maps", "main"}
@@ -129,7 +129,7 @@ BAD: list[tuple[list[str], str]] = [
     (["--trials", "standard,gentle"], "unknown trial 'gentle'; valid: standard, hard, "),
     (["--processes", "0"], "processes: 0; at least 1"),
     (["--compare", "nowhere.json"], "nowhere.json: No such file"),
-    (["--cases", "empty"], "cases: main does not look at it; valid: "),
+    (["--cases", "empty"], "cases: not used by main; valid: "),
     (["stress", "--cases", "broken"], "unknown case 'broken'; valid: "),
     (["--suite", "stress", "--presets", "fast", "balanced"], "one at a time"),
     (["--frobnicate"], "unrecognized arguments: --frobnicate"),

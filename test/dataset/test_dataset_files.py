@@ -61,7 +61,7 @@ def _column(table, name: str, values: list):
 @pytest.mark.parametrize(
     ("spoil", "told"),
     [
-        (lambda t: _column(t, "verdict", ["failed"] * len(t)), "verdicts that the trials do not bear out"),
+        (lambda t: _column(t, "verdict", ["failed"] * len(t)), "verdicts contradict the trials"),
         (lambda t: _column(t, "grasp_quaternion_wxyz", [[1.0, 1.0, 0.0, 0.0]] * len(t)), "not of unit length"),
         (lambda t: _column(t, "squeeze_position", [[float("nan")] * 3] * len(t)), "not finite"),
         (lambda t: t.drop_columns(["score"]), "columns are not those of the schema: score"),
@@ -98,8 +98,8 @@ def test_spoilt_moved_doubled_and_missing_files_are_found(copied: DatasetStore, 
     first.write_bytes(content)
     shutil.copy(first, second)
     (fault, twice) = list(faults_of_dataset(copied))
-    assert f"it holds the block {first.stem}" in fault
-    assert "a grasp that is in" in twice
+    assert f"its metadata does not match its name: it is of block {first.stem}" in fault
+    assert "a grasp is also in" in twice
     second.unlink()
     shutil.rmtree(root / "objects")
     (fault,) = list(faults_of_dataset(copied))
@@ -131,10 +131,10 @@ def test_a_byte_that_changed_anywhere_is_found(copied: DatasetStore, graspd: Run
         copied.write(path, content)
     lost = copied.list("grasps")[0]
     (Path(copied.where) / lost).unlink()
-    assert f"{lost}: is missing, but a run has written it" in list(faults_of_dataset(copied))
+    assert f"{lost}: is missing, but a run wrote it" in list(faults_of_dataset(copied))
     (run,) = copied.list("runs")
     copied.write(run, copied.read(run)[:-9])
-    assert any("no record of a run" in fault for fault in faults_of_dataset(copied))
+    assert any("not a record of a run" in fault for fault in faults_of_dataset(copied))
 
 
 def test_a_merged_data_set_has_the_hashes_of_all(made: DatasetStore, copied: DatasetStore, tmp_path: Path):
@@ -175,7 +175,7 @@ def test_merged_data_sets_hold_every_block_once(made: DatasetStore, copied: Data
 
 def test_a_key_with_other_rows_is_a_conflict(made: DatasetStore, copied: DatasetStore, tmp_path: Path):
     _rewritten(copied, lambda t: _column(t, "score", [7.0] * len(t)))
-    with pytest.raises(FormatError, match=r"other rows than .* which has the same key"):
+    with pytest.raises(FormatError, match=r"rows differ from .* which has the same key; keep only one"):
         merge([made, copied], DatasetStore(str(tmp_path / "out")))
 
 
@@ -242,7 +242,7 @@ def test_a_block_without_a_candidate_is_a_block(copied: DatasetStore):
 @pytest.mark.parametrize(
     ("words", "told"),
     [
-        (["stats"], "dataset stats: 0 data sets; valid: one"),
+        (["stats"], "dataset stats: 0 data sets; valid: exactly one"),
         (["stats", "a", "b"], "dataset stats: 2 data sets"),
         (["validate", "nowhere"], "no data set"),
         (["shape:box"], "--out is missing"),

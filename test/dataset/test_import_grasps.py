@@ -181,7 +181,7 @@ def shifted(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def test_a_frame_in_doubt_is_named_and_no_share_is_printed_for_it(shifted: Path, tmp_path: Path, graspd, capsys):
     out = tmp_path / "out.json"
     assert graspd("import", shifted, "--object", "shape:box", "--hand", "allegro_right", "--out", out) == 0
-    told = "grasps are more than 5 mm deep in the object: their poses are hardly those of the base link 'base_link'"
+    told = "grasps are more than 5 mm deep in the object: the poses do not seem to be those of base link 'base_link'"
     assert told in capsys.readouterr().err
     assert told in json.loads(out.read_text())["outcome"]["warnings"][0]
     words = ("--hand", "allegro_right", "--presets", "fast", "--trials", "standard", "--out", tmp_path / "out")
@@ -315,7 +315,7 @@ def test_a_joint_beyond_its_limit_is_refused_and_counted(exported, tmp_path: Pat
 def test_an_order_that_is_not_known_or_does_not_fit_is_refused(exported, tmp_path: Path, graspd, capsys):
     folder, _ = exported
     for words, message in (
-        (("--hand", "leap_right"), "joint order: npy files name no joints, that of leap_right is not known"),
+        (("--hand", "leap_right"), "joint order: not known for leap_right, and npy files have no names; give one: "),
         (("--hand", "allegro_right", "--joint-order", "a,b"), "joint order: 'a' is not of allegro_right; valid: "),
         (("--hand", "allegro_right", "--joint-order", HAND.joint_names[0]), "of allegro_right is missing"),
     ):
@@ -332,7 +332,7 @@ def test_coupled_joints_may_be_named_and_must_follow():
     values = dict(zip(all_joint_names(hand), all_joint_positions(hand, joints).tolist(), strict=True))
     assert np.abs(joints_by_name(values, hand, "x") - joints).max() < 1e-12
     coupled = next(mimic.name for mimic in hand.mimics)
-    with pytest.raises(FormatError, match=f"joint '{coupled}' is .*; by the joint that it follows"):
+    with pytest.raises(FormatError, match=f"joint '{coupled}' is .*; valid: .*, as it is coupled"):
         joints_by_name({**values, coupled: values[coupled] + 0.1}, hand, "x")
 
 
@@ -367,11 +367,11 @@ def test_a_bench_tries_them_beside_ours(exported, tmp_path: Path, graspd, capsys
 @pytest.mark.parametrize(
     ("words", "message"),
     [
-        (("imported",), "imported: give --import FOLDER, and --hand"),
-        (("--import", "x"), "imported: give --import FOLDER, and --hand"),
+        (("imported",), "imported: give both --import FOLDER and --hand"),
+        (("--import", "x"), "imported: give both --import FOLDER and --hand"),
         (("--import", "nowhere", "--hand", "allegro_right"), "nowhere: no such file or folder"),
         (("--import", "x", "--hand", "allegro_right", "--trials", "luck"), "trials: 'luck'; valid: standard"),
-        (("steered", "--import", "x"), "imported: steered does not look at it"),
+        (("steered", "--import", "x"), "imported: not used by steered"),
     ],
 )
 def test_a_bench_without_what_it_needs_is_refused(tmp_path: Path, graspd, capsys, words: tuple[str, ...], message: str):
