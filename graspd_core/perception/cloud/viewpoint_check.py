@@ -283,16 +283,17 @@ def things_behind(points: Points, viewpoint: Vector) -> bool:
     (x, y, z), (a, b, c) = (points[:: 1 + len(points) // 2000, None].T.astype(np.float32), normals.T.astype(np.float32))
     height = np.abs(x.T * a + y.T * b + z.T * c - (corners[:, 0] * normals).sum(1).astype(np.float32))
     best = int(np.argmax(np.count_nonzero(height < PLANE_TOLERANCE, axis=0)))
-    above = float((viewpoint - corners[best, 0]) @ normals[best])
-    normal = normals[best] * (1.0 if above > 0 else -1.0)
-    height = (points - corners[best, 0]) @ normal
-    on = np.abs(height) < PLANE_TOLERANCE
+    on = np.abs((points - corners[best, 0]) @ normals[best]) < PLANE_TOLERANCE
     if on.mean() < PLANE_SHARE:
         return False
-    if not np.linalg.eigvalsh(np.cov(points[on].T, bias=True))[0] < PLANE_NOISE**2:
+    spread, axes = np.linalg.eigh(np.cov(points[on].T, bias=True))
+    if not spread[0] < PLANE_NOISE**2:
         return False
+    normal, middle = axes[:, 0], points[on].mean(0)
+    above = float((viewpoint - middle) @ normal)
     if abs(above) < LEAST_ELEVATION * np.median(np.linalg.norm(points[on] - viewpoint, axis=1)):
         return True
+    height = (points - middle) @ normal * np.sign(above)
     first = perpendicular(normal)
     flat = points @ np.column_stack([first, np.cross(normal, first)])
     seen = convex_hull(flat[on])
