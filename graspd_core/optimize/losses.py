@@ -70,7 +70,7 @@ def wrench_support(
 
 
 def soft_contact(distance: Distances, radius: Values, delta: float) -> Distances:
-    """Return the activation s = exp(−|φ − r| / δ). It is one on the padded surface, its gradient vanishes nowhere."""
+    """Return the activation s = exp(−|φ − r| / δ): one on the padded surface. Off it the gradient is never zero."""
     return (-(distance - radius[:, None]).abs() / delta).exp()
 
 

@@ -113,7 +113,7 @@ def make_obstacle_tensors(
 
 
 def _balls_about(count: int, points: np.ndarray, radii: np.ndarray, links: np.ndarray) -> Float[np.ndarray, "links 4"]:
-    """Return centre and radius of the bounding ball of each link's balls. The radius of a link without balls is −inf."""
+    """Return centre and radius of the bounding ball of each link's balls. The radius is −inf if it has none."""
     around = np.zeros((count, 4))
     around[:, 3] = -np.inf
     for link in np.unique(links):
