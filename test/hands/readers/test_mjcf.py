@@ -186,7 +186,7 @@ def test_included_files_are_read_as_if_they_stood_there(folder: Path) -> None:
     assert parts.link_names == whole.link_names
     assert [p.kind for p in parts.primitives] == [p.kind for p in whole.primitives]
     (folder / "parts" / "finger.xml").write_text("<robot/>")
-    with pytest.raises(HandError, match=r"<include file='finger.xml'>: its root element is <robot>"):
+    with pytest.raises(HandError, match=r"<include file='finger.xml'>: the root element is <robot>"):
         _read(folder, f'{head}<include file="parts/middle.xml"/>{rest}')
 
 
