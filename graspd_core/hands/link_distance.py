@@ -137,8 +137,7 @@ class CollisionTensors:
 
     Attributes:
         rotation, translation: `T_link_primitive` [m].
-        core: half extents of a box, or (radius, radius, half length) of a cylinder [m]. (0, 0, half length) for
-            capsules, zero for spheres.
+        core: [m]. Box: half extents. Cylinder: (radius, radius, half length). Capsule: (0, 0, half length). Sphere: 0.
         radius: radius of spheres and capsules, zero for others [m].
         is_round: one for cylinders, whose x and y are one radial coordinate. Zero for others.
         link: link of each primitive.

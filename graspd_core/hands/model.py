@@ -117,8 +117,7 @@ class HandModel:
         base_place: pose of the base link in the frame of its file: position [m] and quaternion wxyz.
         mimics: coupled joints, in the order of their links.
         mount: pose of the base link on an arm. None if it is unknown.
-        skins: links with a surface mesh in the link frame [m], which holds their contact candidates. If a link has no
-            skin, its candidates lie on its solids.
+        skins: links with a surface mesh [m] in the link frame. Their contact candidates lie on it, not on solids.
     """
 
     name: str

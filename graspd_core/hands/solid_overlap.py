@@ -16,8 +16,7 @@ from graspd_core.hands.link_distance import CollisionTensors
 from graspd_core.hands.model import HandModel
 from graspd_core.se3 import SE3
 
-# Two edges give a direction only if the sine of the angle between them exceeds this. Other directions have a least
-# length [m].
+# Least sine of the angle between two edges that give a direction, and least length of other directions [m].
 _PARALLEL, _SHORTEST = 1e-3, 1e-6
 # An edge direction is chosen only if its depth is less than that of every face by this [m]. It avoids rounding effects.
 _RATHER_FACES = 1e-6

@@ -30,8 +30,7 @@ from graspd_core.types import TriangleMesh
 _TILT, _PALM_STANDOFF = 0.35, (0.005, 0.05)
 # Starts with fingertips: range of the closing fraction (0 open, 1 closed), and of the distance to the object [m].
 _SHARE_CLOSED, _TIP_STANDOFF = (0.2, 0.8), (-0.01, 0.01)
-# Poses drawn for each start kept, surface points to measure the object's width, and scale of the preference for
-# narrow widths [m].
+# Poses drawn per start, points to measure the object's width, and scale of the preference for narrow widths [m].
 _POOL, _SPAN_POINTS, _SPAN_SCALE = 6, 400, 0.012
 # Among obstacles: poses drawn for each start kept, the depth in an obstacle that makes a pose e times less likely [m],
 # and the greatest lift off the support [m].
@@ -87,10 +86,9 @@ def draw_starts(
 
     As in Grasp'D, the palm faces a random surface point with a random roll. Points are on the hull, so that no palm
     starts inside a hollow. Narrow cross-sections are preferred. A share `fingertips` of the starts has half-closed
-    fingers, with the middle between the fingertips at the point instead of the palm. An open hand does not reach
-    objects that are small or low on a table. Poses are less likely if the hand penetrates an obstacle there or at the
-    retreat. With restrictions, up to `_MOST_POOLS` pools are drawn. Fewer than `count` starts, perhaps none, are
-    returned if too few are allowed.
+    fingers, with the fingertips at the point instead of the palm. An open hand does not reach objects that are small or
+    low on a table. Poses are unlikely if the hand penetrates an obstacle there or at its retreat. With restrictions, at
+    most `_MOST_POOLS` pools are drawn. If they allow too few starts, the result has fewer than `count`, perhaps none.
     """
     generator = torch.Generator().manual_seed(seed)
     obstacles = make_obstacle_tensors(scene, hand, "cpu", torch.float64)

@@ -6,8 +6,7 @@ function of the grasp wrench space is a sum over contacts (docs/method.md):
     v_ik = w_k,lin + w_k,ang × (x_i − c) / L
     h_k  = Σ_i s_i · max(0, −n_i·v_ik + μ ‖v_ik − (n_i·v_ik) n_i‖)
 
-Gradients are exact where a term is smooth, with one exception: the squared tangential speed is at least
-`_TANGENT_FLOOR`.
+Gradients are exact where a term is smooth, except that the squared tangential speed has the floor `_TANGENT_FLOOR`.
 """
 
 from __future__ import annotations
@@ -104,10 +103,9 @@ def penetration(distance: Distances, radius: Values) -> Values:
 def self_collision(
     centers: Float[Tensor, "batch spheres 3"], radii: Float[Tensor, "spheres"], weight: Float[Tensor, "spheres spheres"]
 ) -> Values:
-    """Return the squared overlap of spheres of non-adjacent links [mm²].
+    """Return the squared overlap of spheres of non-adjacent links [mm²], with depth (R² − d²) / 2R.
 
-    The depth is approximated by (R² − d²) / 2R, which is exact where spheres touch. R is the sum of the radii.
-    `weight` is 1 / 2R [1/m] once for each checked pair, zero elsewhere.
+    R is the sum of the radii. The depth is exact where spheres touch. `weight` is 1 / 2R [1/m], zero for other pairs.
     """
     inner = (radii * radii - (centers * centers).sum(-1))[..., None]
     ones, r = torch.ones_like(inner), radii.expand(len(centers), -1)[..., None]

@@ -1,9 +1,9 @@
 """Measure the hand's distance from the support plane and from the obstacles around the object.
 
 The solids of the hand are convex. So a solid is clear of the support if its extreme points are: corners of boxes and
-hulls, ends of spheres and capsules less their radius, rim points of cylinders. Against neighbouring objects the
-collision spheres (`hands.self_collision`) are tested too, for the faces between the corners. They extend a little out
-of flat faces. Gradients are exact, except for the interpolated distance to neighbours.
+hulls, ends of spheres and capsules less their radius, rim points of cylinders. Obstacles are also tested against the
+collision spheres (`hands.self_collision`), which extend a little out of flat faces. Gradients are exact, except for the
+interpolated distance to obstacles.
 """
 
 from __future__ import annotations
@@ -180,8 +180,7 @@ def obstacle_gaps(obstacles: ObstacleTensors, base: SE3, links: SE3, wide: float
 def least_gap(obstacles: ObstacleTensors, base: SE3, links: SE3, wide: float = WIDE) -> Values:
     """Return the least of `obstacle_gaps` of each hand [m].
 
-    Obstacles farther away than `wide` are ignored. Only links near an obstacle's grid are tested. In a bin with five
-    obstacles this is a tenth of all pairs.
+    Obstacles beyond `wide` are ignored. Only links near an obstacle's grid are tested: in a bin of five, a tenth.
     """
     least = base.translation.new_full(base.translation.shape[:1], wide)
     if obstacles.normal is not None:

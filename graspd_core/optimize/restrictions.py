@@ -186,8 +186,7 @@ def restrictions_in_words(restrictions: BoundRestrictions, refused: Mapping[str,
     """Return a sentence about the refused candidates, most frequent reason first. Empty if none was refused.
 
     Example: "12 candidates held, 9 refused: 7 outside the approach cone, 2 with a contact outside the region".
-    If no candidate was found at all, the sentence names the restrictions. `held` is the number of grasps that meet the
-    request, `tried` the number of admitted candidates.
+    If nothing was found at all, it names the restrictions. `held` counts good grasps, `tried` admitted candidates.
     """
     if refused:
         reasons = ", ".join(f"{n} {reason}" for reason, n in sorted(refused.items(), key=lambda item: -item[1]))

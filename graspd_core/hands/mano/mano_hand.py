@@ -6,10 +6,9 @@ differs from the hulls by a few millimetres. Contact candidates lie on the skin 
 
 The base frame has the model's axes and its origin in the wrist joint. The palm belongs to the wrist body.
 
-Each of MANO's fifteen ball joints becomes three hinges. The rotation of a body relative to its parent is `R = B
-Rx(flexion) Ry(abduction) Rz(twist) Bᵀ`. B is the anatomical frame at rest: z along the bone, x the flexion axis, y = z
-× x. The order follows the recommendation of the ISB (Wu et al. 2005, after Grood and Suntay 1983). The conversion is
-exact in both directions if abduction is below 90°.
+Each of MANO's fifteen ball joints becomes three hinges. A body turns relative to its parent by `R = B Rx(flexion)
+Ry(abduction) Rz(twist) Bᵀ`. B is the anatomical frame at rest: z along the bone, x the flexion axis, y = z × x. The
+order is that of the ISB (Wu et al. 2005, after Grood and Suntay 1983). It is exact both ways if abduction is below 90°.
 
 The anatomical frames come from the joints of the shape. A finger flexes towards the palm normal, which is the normal of
 the plane through wrist, index knuckle and little knuckle. The thumb flexes towards a point in front of the palm. In the

@@ -153,8 +153,7 @@ class _Parts:
 
     Attributes:
         meshes: mesh asset of each mesh geom, by geom id.
-        labels: name of each joint, by joint id.
-        shown: names of the bodies whose visual geoms are used, because none of their geoms collides.
+        labels, shown: joint names by joint id, and names of bodies without colliding geoms, which use visual geoms.
     """
 
     path: Path

@@ -35,7 +35,6 @@ _STUCK, _SHRUNK = 1.5, 0.95
 
 
 def _colliding(link: ET.Element) -> list[ET.Element]:
-    """Return the `<collision>` elements of a link. If it has none, return its `<visual>` elements."""
     return link.findall("collision") or link.findall("visual")
 
 

@@ -92,10 +92,9 @@ def rows_kept(settings: ClosedFormConfig, keep: int, rows: int, index: int) -> i
 
 
 def at_budget(settings: ClosedFormConfig, budget: float) -> ClosedFormConfig:
-    """Return the settings for a budget relative to 1.
+    """Return the settings for a budget. A budget below 1 scales the steps, with one search. Above 1 it scales starts.
 
-    Below 1, the number of steps is scaled and there is one search: steps dominate the time of a small batch, and easy
-    objects need fewer. Above 1, the number of starts is scaled, because hard objects need more starts.
+    The steps determine the time of a small batch, and easy objects need fewer. Hard objects need more starts.
     """
     share, times = min(budget, 1.0), max(budget, 1.0)
     steps = {

@@ -1,8 +1,7 @@
 """Load the build of the compiled kernel that this machine can run, or report why there is none.
 
-The environment variable `GRASPD_KERNEL` selects a build: `off` for torch alone, the name of a build, or the path of a
-library. By default the best build that runs here is loaded. The structures mirror src/layout.hpp, field by field.
-`load` compares their sizes.
+The environment variable `GRASPD_KERNEL` is `off` (torch alone), the name of a build, or the path of a library. The
+default is the best build that runs here. The structures mirror src/layout.hpp by field. `load` compares their sizes.
 """
 
 from __future__ import annotations
