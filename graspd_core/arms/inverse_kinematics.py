@@ -45,7 +45,7 @@ def tip_chain(arm: Arm, dtype: torch.dtype = torch.float32) -> SerialChain:
 def tip_and_jacobian(
     chain: SerialChain, q: Float[Tensor, "batch joints"]
 ) -> tuple[SE3, Float[Tensor, "batch 6 joints"]]:
-    """Return `T_base_tip` at joint values q [rad] or [m], and the Jacobian: velocity, then turning, base frame."""
+    """Return `T_base_tip` at joint values q [rad] or [m], and the Jacobian, base frame: linear, then angular rows."""
     jacobian, tip = chain.jacobian_tensor(q, ret_eef_pose=True)
     return SE3(tip[:, :3, :3], tip[:, :3, 3]), jacobian
 
@@ -235,7 +235,7 @@ def reach_bounds(table: StartTable, usable: Bool[Tensor, "entries"]) -> Float[Te
 
 
 def within_reach(table: StartTable, bounds: Float[Tensor, "2 points"], tip: SE3) -> Bool[Tensor, "batch"]:
-    """Return True for each `T_base_tip` within the bounds. Without a usable posture no pose is."""
+    """Return True for each `T_base_tip` within the bounds. All are False if no posture is usable."""
     away = _away(tip, table.shoulder)
     return ((away >= bounds[0]) & (away <= bounds[1])).all(-1)
 

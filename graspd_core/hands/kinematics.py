@@ -196,7 +196,7 @@ def drawn_back(
     approach: Float[Tensor, "3"],
     distance: float = RETREAT,
 ) -> Float[Tensor, "*batch 3"]:
-    """Return base positions moved by `distance` [m] straight back against the approach direction [m]."""
+    """Return base positions [m] moved by `distance` [m] straight back against the approach direction."""
     return position - distance * (rotation @ approach)
 
 

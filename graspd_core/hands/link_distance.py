@@ -49,7 +49,7 @@ def primitive_sdf(primitive: Primitive, points: _Places) -> _Distances:
 
 
 def depth_inside(hand: HandModel, link: int, points: Float[np.ndarray, "points 3"]) -> Float[np.ndarray, "points"]:
-    """Return the depth [m] of points inside the union of a link's primitives, 0 outside. Points are in link frame."""
+    """Return the depth [m] of link-frame points inside the union of a link's primitives. 0 outside."""
     depth = np.zeros(len(points))
     near = np.flatnonzero(within_bounds(hand.primitives_of[link], points))
     for primitive in hand.primitives_of[link]:
@@ -137,7 +137,8 @@ class CollisionTensors:
 
     Attributes:
         rotation, translation: `T_link_primitive` [m].
-        core: [m]. Box: half extents. Cylinder: (radius, radius, half length). Capsule: (0, 0, half length). Sphere: 0.
+        core: half extents of a box, or (radius, radius, half length) of a cylinder [m]. A capsule has the core
+            (0, 0, half length), a sphere (0, 0, 0).
         radius: radius of spheres and capsules, zero for others [m].
         is_round: one for cylinders, whose x and y are one radial coordinate. Zero for others.
         link: link of each primitive.

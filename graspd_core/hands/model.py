@@ -201,7 +201,7 @@ class HandModel:
 
     @cached_property
     def link_multiplier(self) -> Float[np.ndarray, "links"]:
-        """Travel of the joint above each link per radian or metre of `link_joint`. One if it is that joint."""
+        """Travel of the joint above each link per radian or metre of `link_joint`. One if that joint is actuated."""
         multiplier = np.ones(self.num_links)
         for mimic in self.mimics:
             multiplier[mimic.link] = mimic.multiplier

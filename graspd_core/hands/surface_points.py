@@ -185,7 +185,7 @@ class _Pool:
 
 @lru_cache(maxsize=8)
 def with_candidates(hand: HandModel, count: int) -> HandModel:
-    """Return the hand with `count` contact candidates. Raises HandError: `count` is less than one."""
+    """Return the hand with `count` contact candidates, or the same hand if it has them. Raises HandError: count < 1."""
     if count < 1:
         raise HandError(f"candidates={count}: at least 1 is needed")
     if count == len(hand.candidate_link):

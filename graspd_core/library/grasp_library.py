@@ -279,7 +279,7 @@ class GraspLibrary:
 
 
 def strict_enough(entries: Sequence[LibraryEntry], verify: str) -> list[LibraryEntry]:
-    """Return entries with trials at least as strict as `verify`, strictest first. Raises ConfigError: it is unknown."""
+    """Return entries at least as strict as `verify`, strictest first. Raises ConfigError: `verify` is unknown."""
     if verify not in STRICTNESS:
         raise ConfigError(f"verify: {verify!r}; valid: {', '.join(STRICTNESS)}")
     enough = [entry for entry in entries if STRICTNESS[entry.verify] >= STRICTNESS[verify]]

@@ -72,7 +72,7 @@ class ContactSet:
 
 @torch.no_grad()
 def find_contacts(problem: Problem, poses: Poses, reach: float) -> ContactSet:
-    """Find the contacts of every link: its nearest candidate, two far from that, and the nearest sharp point.
+    """Find the contacts of every link: its nearest candidate, two others far apart, and the nearest sharp point.
 
     Slots within `reach` [m] of the surface are active.
     """
@@ -358,7 +358,7 @@ def squeeze(
 def joint_torques(
     problem: Problem, poses: Poses, contact_set: ContactSet, forces: Float[Tensor, "batch slots 3"]
 ) -> Joints:
-    """Return τ = JᵀF, the gradient of Σ F·x(q) over the hand's contact points. [N·m], [N] for sliding joints."""
+    """Return τ = JᵀF, the gradient of Σ F·x(q) over the hand's contact points [N·m], [N] for prismatic joints."""
     base = poses.base
     x = base.apply_inverse(contact_set.position)
     joints = poses.joints.detach().requires_grad_(True)

@@ -207,7 +207,7 @@ def _allowed(draw: Callable[[int], StartPool], wanted: int, seed: int, restricti
 def raise_clear(obstacles: ObstacleTensors, base: SE3, links: SE3) -> tuple[Positions, Values]:
     """Lift hands off the support by at most `_HIGHEST_LIFT`. `links` are the link poses in the base frame.
 
-    Returns the lifted base origins, and the hands' depth in any obstacle there or at the retreat, the greater [m].
+    Returns the lifted base origins [m], and each hand's greatest depth in obstacles, there or at the retreat [m].
     """
     translation = base.translation
     if obstacles.normal is not None:
@@ -219,7 +219,7 @@ def raise_clear(obstacles: ObstacleTensors, base: SE3, links: SE3) -> tuple[Posi
 
 
 def depth_of_starts(scene: Scene, hand: HandModel, count: int, restrictions: BoundRestrictions) -> float:
-    """Return the least depth in the obstacles [m] of `count` starts, at the start or its retreat. 0 without any."""
+    """Return the depth in the obstacles [m] of the best of `count` starts, there or at the retreat. 0 without any."""
     obstacles = make_obstacle_tensors(scene, hand, "cpu", torch.float64)
     if obstacles is None:
         return 0.0

@@ -86,7 +86,7 @@ def wrench_resistance(support: Float[Tensor, "batch directions"], friction: floa
 
 
 def touch(gap: Float[Tensor, "batch groups"], reach: Float[Tensor, "groups"]) -> Values:
-    """Return the mean distance of link groups from the padded surface, saturating beyond each group's reach [m].
+    """Return the mean distance [cm] of link groups from the padded surface. It saturates beyond their `reach` [m].
 
     Groups with a long reach (fingertips) are attracted from afar. Other groups are attracted only if already near.
     """

@@ -180,7 +180,7 @@ def obstacle_gaps(obstacles: ObstacleTensors, base: SE3, links: SE3, wide: float
 def least_gap(obstacles: ObstacleTensors, base: SE3, links: SE3, wide: float = WIDE) -> Values:
     """Return the least of `obstacle_gaps` of each hand [m].
 
-    Obstacles beyond `wide` are ignored. Only links near an obstacle's grid are tested: in a bin of five, a tenth.
+    Obstacles beyond `wide` are ignored. Only links near an obstacle's grid are tested (in a bin, a tenth of them).
     """
     least = base.translation.new_full(base.translation.shape[:1], wide)
     if obstacles.normal is not None:

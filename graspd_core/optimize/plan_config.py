@@ -41,7 +41,7 @@ class Method:
         colour, marker: colour and marker in charts, as Matplotlib takes them.
         benchmark_count: grasps of one unfiltered batch in the benchmark.
         at_budget: returns the settings for a multiple of the usual budget. The default keeps the settings.
-        searches: returns the greatest number of searches per round. Each but the first runs only if it is needed.
+        searches: returns the greatest number of searches per round. They end if enough grasps are expected to hold.
     """
 
     module: str

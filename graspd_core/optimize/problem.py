@@ -349,7 +349,7 @@ def self_collision(problem: Problem, links: SE3) -> Values:
 
 
 def solid_collision(problem: Problem, links: SE3) -> Values:
-    """Return the squared overlap of the hand's solids with each other [mm² / 10]. It is exact for boxes."""
+    """Return a tenth of the squared overlap of the hand's solids with each other [mm²]. It is exact for boxes."""
     row, depth = solid_overlaps(problem.hand.solids, problem.hand.solid_pairs, links)
     return depth.new_zeros(len(links.translation)).index_add(0, row, (1e3 * depth) ** 2 / 10.0)
 

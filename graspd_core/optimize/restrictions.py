@@ -119,7 +119,7 @@ class BoundRestriction:
         return ()
 
     def starts(self, positions: Places, quaternions: Turns, joints: JointRows) -> Allowed:
-        """Return True for each initial pose that may lead to an admissible grasp. [m], unit quaternions wxyz."""
+        """Return True for each initial pose that may lead to an admissible grasp. Quaternions are wxyz and unit."""
         return np.ones(len(positions), dtype=bool)
 
     def admit(self, grasps: Sequence[Grasp]) -> Sequence[Grasp | Refusal]:
@@ -186,7 +186,7 @@ def restrictions_in_words(restrictions: BoundRestrictions, refused: Mapping[str,
     """Return a sentence about the refused candidates, most frequent reason first. Empty if none was refused.
 
     Example: "12 candidates held, 9 refused: 7 outside the approach cone, 2 with a contact outside the region".
-    If nothing was found at all, it names the restrictions. `held` counts good grasps, `tried` admitted candidates.
+    If no candidate was found, it names the restrictions. `held` counts good grasps, `tried` admitted candidates.
     """
     if refused:
         reasons = ", ".join(f"{n} {reason}" for reason, n in sorted(refused.items(), key=lambda item: -item[1]))

@@ -166,7 +166,7 @@ class ClosedForm:
 def minimise_compiled(
     solver: ClosedForm, problem: Problem, compiled: KernelProblem, starts: Poses, hooks: Hooks
 ) -> Solution:
-    """Run `solver` as `loop.minimise` does, but in the kernel. Raises MemoryError: too little for the threads."""
+    """Run `solver` like `loop.minimise`, but in the kernel. Raises MemoryError: too little memory for the threads."""
     config, x = solver.config, pack(moved_along(starts, problem.hand.pivot)).contiguous()
     nearest = torch.empty(len(x))
     compiled.call("graspd_least_distance", len(x), x, nearest)

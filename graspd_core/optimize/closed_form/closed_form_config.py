@@ -92,7 +92,7 @@ def rows_kept(settings: ClosedFormConfig, keep: int, rows: int, index: int) -> i
 
 
 def at_budget(settings: ClosedFormConfig, budget: float) -> ClosedFormConfig:
-    """Return the settings for a budget. A budget below 1 scales the steps, with one search. Above 1 it scales starts.
+    """Return the settings for a budget. Below 1 it scales the steps with one search. Above 1 it scales the starts.
 
     The steps determine the time of a small batch, and easy objects need fewer. Hard objects need more starts.
     """
