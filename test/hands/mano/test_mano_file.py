@@ -169,7 +169,7 @@ def test_a_missing_or_huge_file_is_refused(tmp_path: Path) -> None:
     path = tmp_path / "huge.pkl"
     with path.open("wb") as file:
         file.truncate(65 * 2**20)
-    with pytest.raises(HandError, match=r"huge.pkl: more than 64 MB"):
+    with pytest.raises(HandError, match=r"huge.pkl: larger than 64 MB"):
         load_hand(path)
 
 
@@ -181,7 +181,7 @@ def test_a_missing_or_huge_file_is_refused(tmp_path: Path) -> None:
         ("posedirs", np.zeros((5, 3, 135)), r"posedirs is 5 x 3 x 135, expected \d+ x 3 x 135"),
         ("weights", "half", "weights: holds str"),
         ("hands_mean", np.full(45, np.nan), "hands_mean has entries that are not finite"),
-        ("hands_mean", np.array([None] * 45), "hands_mean: holds an array of 'O8'"),
+        ("hands_mean", np.array([None] * 45), "hands_mean: holds an array of type 'O8'"),
         ("f", np.array([[0, 1, 10**6]]), "f: names vertices outside"),
         ("kintree_table", np.zeros((2, 16)), "kintree_table is not MANO's tree"),
     ],
