@@ -1,10 +1,10 @@
-"""Arms by name, from an arm description: the YAML file beside a URDF (docs/arms.md).
+"""Load arms by name, or from an arm description: a YAML file beside a URDF (docs/arms.md).
 
-An arm is a frozen chain of links from its base to the tip that carries the hand. graspd's URDF reader reads it. Forward
-kinematics and Jacobians are those of pytorch-kinematics, which is imported when an arm is used.
+An arm is a chain of links from its base to the tip link that carries the hand. graspd's URDF reader reads it. Forward
+kinematics and Jacobians come from pytorch-kinematics, which is imported when an arm is used.
 
-Solids become capsules: all points nearer to a segment than a radius. Distances between capsules and to a plane are
-exact. Any other solid gets an enclosing capsule, which is larger.
+Collision solids become capsules: all points within a radius of a segment. Spheres and capsules do not change. Any other
+solid is replaced by a larger enclosing capsule. Distances between capsules and to a plane are exact.
 """
 
 from __future__ import annotations
@@ -32,17 +32,17 @@ from graspd_core.se3 import SE3, rotation_from_quaternion
 if TYPE_CHECKING:
     from pytorch_kinematics.chain import Chain
 
-# A squared length below this is a point's [m²].
+# A segment with a smaller squared length is a point [m²].
 _POINT = 1e-12
 
 
 @dataclass(frozen=True)
 class Capsules:
-    """Some capsules, each fixed in a link.
+    """Capsules that are fixed to links.
 
     Attributes:
-        link: number of the link of each.
-        start, end: the ends of their segments, link frame [m].
+        link: index of each capsule's link.
+        start, end: end points of the segments, link frame [m].
         radius: [m].
     """
 
@@ -53,7 +53,7 @@ class Capsules:
 
 
 def capsules_about(primitives: Sequence[Primitive]) -> Capsules:
-    """Return an enclosing capsule of each solid, spheres and capsules as they are."""
+    """Return an enclosing capsule of each solid. Spheres and capsules are exact."""
     rows = [_about(primitive) for primitive in primitives]
     turned = [
         [primitive.rotation @ point + primitive.translation for point in row[:2]]
@@ -65,7 +65,7 @@ def capsules_about(primitives: Sequence[Primitive]) -> Capsules:
 
 
 def _about(primitive: Primitive) -> tuple[Float[np.ndarray, "3"], Float[np.ndarray, "3"], float]:
-    """Return ends and radius of a capsule about a solid, in the solid's frame."""
+    """Return the end points and the radius of a capsule around a solid, in the solid's frame [m]."""
     size, up = primitive.size, np.array([0.0, 0.0, 1.0])
     if primitive.kind == "sphere":
         return np.zeros(3), np.zeros(3), size[0]
@@ -78,14 +78,14 @@ def _about(primitive: Primitive) -> tuple[Float[np.ndarray, "3"], Float[np.ndarr
 
 
 def _about_points(corners: Float[np.ndarray, "n 3"]) -> tuple[Float[np.ndarray, "3"], Float[np.ndarray, "3"], float]:
-    """Return a capsule about points, along their direction of greatest spread, as thin, then as short as possible."""
+    """Return the end points and the radius of a capsule around points. Its axis is the direction of greatest spread."""
     center = 0.5 * (corners.min(0) + corners.max(0))
     local = corners - center
     axis = np.linalg.svd(local, full_matrices=False)[2][0]
     along = local @ axis
     away = np.linalg.norm(local - np.outer(along, axis), axis=1)
     radius = float(away.max())
-    # The caps reach past the ends. A point beside the axis needs them to reach less far than one on it.
+    # The capsule is as short as possible: its round caps enclose points beyond the end of the segment by `slack`.
     slack = np.sqrt(np.maximum(radius**2 - away**2, 0.0))
     low, high = float((along + slack).min()), float((along - slack).max())
     if low > high:
@@ -96,7 +96,7 @@ def _about_points(corners: Float[np.ndarray, "n 3"]) -> tuple[Float[np.ndarray, 
 def placed(
     capsules: Capsules, links: SE3
 ) -> tuple[Float[Tensor, "batch n 3"], Float[Tensor, "batch n 3"], Float[Tensor, "n"]]:
-    """Return ends [m] and radii of capsules at link poses, in the frame of the poses."""
+    """Return end points [m] and radii [m] of capsules at link poses, in the frame of the poses."""
     poses = links[:, torch.as_tensor(capsules.link)]
     ends = [torch.as_tensor(points).to(poses.translation) for points in (capsules.start, capsules.end)]
     start, end = ((poses.rotation @ points[..., None]).squeeze(-1) + poses.translation for points in ends)
@@ -109,17 +109,17 @@ def segment_distance(
     c: Float[Tensor, "*#batch 3"],
     d: Float[Tensor, "*#batch 3"],
 ) -> Float[Tensor, "*batch"]:
-    """Return the distance [m] of the segments from a to b and from c to d.
+    """Return the distance [m] between the segments from a to b and from c to d.
 
-    Each may be a point. C. Ericson, Real-Time Collision Detection, 5.1.9: the nearest points of the lines are clamped
-    to their segments.
+    A segment may be a point. Source: C. Ericson, Real-Time Collision Detection, 5.1.9. The nearest points of the lines
+    are clamped to the segments.
     """
     along, other, between = b - a, d - c, a - c
     aa, ee = (along * along).sum(-1), (other * other).sum(-1)
     f, cc, bb = (other * between).sum(-1), (along * between).sum(-1), (along * other).sum(-1)
     safe_a, safe_e = aa.clamp_min(_POINT), ee.clamp_min(_POINT)
     denominator = aa * ee - bb * bb
-    # Of parallel segments any point will do for a start.
+    # For parallel segments any start value of s is correct.
     apart = denominator > 1e-9 * aa * ee
     s = torch.where(apart, (bb * f - cc * ee) / torch.where(apart, denominator, 1.0), 0.0).clamp(0.0, 1.0)
     t = torch.where(ee > _POINT, ((bb * s + f) / safe_e), 0.0).clamp(0.0, 1.0)
@@ -129,16 +129,16 @@ def segment_distance(
 
 @dataclass(frozen=True, eq=False)
 class Arm:
-    """An arm as loaded, hashed by identity. Joints are those between base and tip, base first.
+    """A loaded arm, hashed by identity. Joints are those between base and tip, starting at the base.
 
     Attributes:
-        name: the arm's name.
-        chain: its links and joints, link 0 the base, whose frame is the arm's base frame.
-        tip: number of the link that carries the hand.
-        lower, upper: joint limits, the URDF's or narrower [rad] or [m].
-        seed: joint values clear of everything, which joints stay near if they can.
-        capsules: its links' solids, a little larger than they are.
-        mounts: where hands' base links sit on the tip, by the hand's name. Others sit as they say themselves.
+        name: name of the arm.
+        chain: links and joints of the arm. Link 0 is the base, whose frame is the arm's base frame.
+        tip: index of the link that carries the hand.
+        lower, upper: joint limits of the URDF or narrower ones [rad] or [m].
+        seed: collision-free joint values, near which the solutions stay if possible [rad] or [m].
+        capsules: capsules that enclose the collision solids of the links.
+        mounts: poses of hands on the tip, by hand name. Other hands use the mount of their own description.
     """
 
     name: str
@@ -152,23 +152,23 @@ class Arm:
 
     @property
     def joint_names(self) -> tuple[str, ...]:
-        """Names of the joints, base first."""
+        """Names of the joints, starting at the base."""
         return self.chain.joint_names
 
     @cached_property
     def moved_link(self) -> Int[np.ndarray, "joints"]:
-        """The link that each joint moves against its parent."""
+        """Index of the child link of each joint."""
         return np.flatnonzero(self.chain.link_joint >= 0)
 
 
 def tip_hand(arm: Arm, hand: HandModel) -> SE3:
-    """Return `T_tip_hand`, the hand's pose on the tip. Raises ConfigError: neither arm nor hand says it."""
+    """Return `T_tip_hand`, the hand's pose on the tip. Raises ConfigError: neither arm nor hand has a mount."""
     mount = arm.mounts.get(hand.name, hand.mount)
     if mount is None:
         known = ", ".join(arm.mounts) or "none"
         raise ConfigError(
-            f"arm {arm.name}: nobody says how hand {hand.name} is mounted; mounts of the arm: {known}; "
-            "or give the hand's description a mount (docs/arms.md)"
+            f"arm {arm.name}: no mount for hand {hand.name}; mounts of the arm: {known}; "
+            "add `mounts` to the arm's description, or `mount` to the hand's (docs/arms.md)"
         )
     rotation = rotation_from_quaternion(torch.tensor(mount.quaternion_wxyz, dtype=torch.float64))
     return SE3(rotation, torch.tensor(mount.position, dtype=torch.float64))
@@ -177,7 +177,7 @@ def tip_hand(arm: Arm, hand: HandModel) -> SE3:
 # Arms are hashed by identity.
 @lru_cache(maxsize=8)
 def kinematic_chain(arm: Arm) -> Chain:
-    """Build pytorch-kinematics' chain of all links of an arm, in float64. Its own URDF reader keeps float32."""
+    """Build the pytorch-kinematics chain of all links of an arm in float64. The library's URDF reader uses float32."""
     from pytorch_kinematics.chain import Chain
     from pytorch_kinematics.frame import Frame, Joint, Link
     from pytorch_kinematics.transforms import Transform3d
@@ -201,7 +201,7 @@ def kinematic_chain(arm: Arm) -> Chain:
 
 
 def arm_links(arm: Arm, q: Float[Tensor, "batch joints"]) -> SE3:
-    """Return `T_base_link` of every link at joint values q [rad] or [m]: a batch of arms by links."""
+    """Return `T_base_link` of every link at joint values q [rad] or [m]. The shape is batch by links."""
     chain = kinematic_chain(arm)
     poses = chain.forward_kinematics_tensor(q.double())[chain.get_frame_indices(*arm.chain.link_names)]
     poses = poses.transpose(0, 1).to(q)
@@ -213,7 +213,7 @@ ROBOT_DESCRIPTION = "robot_description"
 
 @dataclass(frozen=True)
 class _MountEntry:
-    """Where a hand's base link sits on the tip: position [m] and unit quaternion, w first."""
+    """The pose of a hand's base link on the tip: position [m] and unit quaternion, w first."""
 
     position: tuple[float, float, float] = (0.0, 0.0, 0.0)
     quaternion_wxyz: tuple[float, float, float, float] = (1.0, 0.0, 0.0, 0.0)
@@ -224,14 +224,14 @@ class ArmFile:
     """The keys of an arm description.
 
     Attributes:
-        urdf: path of the URDF, from the description's folder, or `robot_description`: the robot that a caller brings
-            along. It may hold more than the arm.
-        tip: the link that carries the hand.
-        base: the link that the arm begins at. Empty: the URDF's root.
-        name: of the arm. Empty: the file's.
-        seed: joint values by name, others in the middle of their limits [rad] or [m].
-        limits: narrower limits by joint name, lower and upper [rad] or [m].
-        mounts: `_MountEntry`s by the hand's name. Other hands sit as their own description says.
+        urdf: path of the URDF, relative to the description's folder. `robot_description` means the URDF that the caller
+            passes. The URDF may contain more than the arm.
+        tip: name of the link that carries the hand.
+        base: name of the first link of the arm. Empty for the root of the URDF.
+        name: name of the arm. Empty for the stem of the file name.
+        seed: joint values by joint name [rad] or [m]. The default is the middle of the limits.
+        limits: narrower limits by joint name: lower and upper [rad] or [m].
+        mounts: pose on the tip (`_MountEntry`) by hand name. Other hands use the mount of their own description.
     """
 
     urdf: str = ""
@@ -244,7 +244,7 @@ class ArmFile:
 
 
 def arm_names() -> tuple[str, ...]:
-    """Return the names of the arms that graspd ships with."""
+    """Return the names of the arms that are part of graspd."""
     return tuple(sorted(path.stem for path in (config_dir() / "arms").glob("*.yaml")))
 
 
@@ -252,11 +252,11 @@ def load_arm(name_or_path: str | Path, robot_description: str = "") -> Arm:
     """Load an arm by its name, or by the path of its description (.yaml).
 
     Args:
-        name_or_path: of the arm.
-        robot_description: a robot's URDF, for descriptions whose `urdf` is `robot_description`.
+        name_or_path: name of the arm, or path of its description.
+        robot_description: text of a robot's URDF, for descriptions whose `urdf` is `robot_description`.
 
     Raises:
-        ConfigError: no such arm or file, or the description is wrong. Names file, key and valid choices.
+        ConfigError: the arm or file does not exist, or the description is invalid. Names file, key and valid choices.
         HandError: the URDF cannot be used.
     """
     path, entries = read_arm_file(name_or_path)
@@ -264,18 +264,18 @@ def load_arm(name_or_path: str | Path, robot_description: str = "") -> Arm:
     if not from_robot_description(entries):
         return _make_arm(entries, urdf, read_xml(urdf), str(path))
     if not robot_description:
-        told = "is what the node hears at its start, where its parameter arm names this file; else name a file"
-        raise ConfigError(f"{path}.urdf: {ROBOT_DESCRIPTION} {told}")
+        told = "only the node has it, through its parameter arm; elsewhere give the path of a URDF"
+        raise ConfigError(f"{path}.urdf: {ROBOT_DESCRIPTION}: {told}")
     return _make_arm(entries, urdf, parse_xml(urdf, robot_description), str(path))
 
 
 def from_robot_description(entries: ArmFile) -> bool:
-    """Tell whether the arm is part of a robot whose URDF the caller brings."""
+    """Return True if the URDF is the robot description that the caller passes."""
     return entries.urdf == ROBOT_DESCRIPTION
 
 
 def read_arm_file(name_or_path: str | Path) -> tuple[Path, ArmFile]:
-    """Read an arm's description. Return its path and entries. Raises ConfigError: see `load_arm`."""
+    """Read an arm description and return its path and entries. Raises ConfigError: see `load_arm`."""
     text = str(name_or_path)
     if not text.endswith((".yaml", ".yml")):
         if text not in arm_names():
@@ -291,12 +291,12 @@ def read_arm_file(name_or_path: str | Path) -> tuple[Path, ArmFile]:
 
 
 def _make_arm(entries: ArmFile, urdf: Path, root: ET.Element, where: str) -> Arm:
-    """Make the arm of a description and its URDF. The elements of `root` are changed. Raises: see `load_arm`."""
+    """Build an arm from its description and URDF. `root` is modified. Raises the errors of `load_arm`."""
     _keep_chain(root, entries.base, entries.tip, where)
     chain = read_urdf(urdf, root)
     if chain.mimics:
         raise ConfigError(
-            f"{where}: joint {chain.mimics[0].name!r} follows another; an arm's joints move by themselves"
+            f"{where}: joint {chain.mimics[0].name!r} is coupled by <mimic>; valid: independent joints of the arm"
         )
     if all(chain.link_group[primitive.link] == 0 for primitive in chain.primitives):
         raise ConfigError(f"{urdf}: no link that moves has a <collision> or <visual> shape: give the arm capsules")
@@ -306,7 +306,7 @@ def _make_arm(entries: ArmFile, urdf: Path, root: ET.Element, where: str) -> Arm
         index = chain.joint_names.index(joint)
         if not _number(value) or not lower[index] <= value <= upper[index]:
             limits = f"[{lower[index]:g}, {upper[index]:g}]"
-            raise ConfigError(f"{where}.seed.{joint}: {shown(value)} is no number within the limits {limits}")
+            raise ConfigError(f"{where}.seed.{joint}: {shown(value)}; valid: a number within the limits {limits}")
         seed[index] = value
     name = entries.name or Path(where).stem
     mounts = {str(hand): _mount(given, entries.tip, f"{where}.mounts.{hand}") for hand, given in entries.mounts.items()}
@@ -315,7 +315,7 @@ def _make_arm(entries: ArmFile, urdf: Path, root: ET.Element, where: str) -> Arm
 
 
 def _keep_chain(root: ET.Element, base: str, tip: str, where: str) -> None:
-    """Drop all links and joints except those from base to tip and what is welded to them before the tip."""
+    """Keep only the chain from base to tip, and the links fixed to the chain before the tip."""
     links = [str(link.get("name")) for link in root.findall("link")]
     for key, link in (("tip", tip), ("base", base)):
         if link and link not in links:
@@ -349,7 +349,7 @@ def _end(joint: ET.Element, end: str) -> str:
 def _limits(
     chain: HandModel, narrower: Mapping[str, Any], where: str
 ) -> tuple[Float[np.ndarray, "joints"], Float[np.ndarray, "joints"]]:
-    """Return the URDF's limits, narrowed as the description says."""
+    """Return the URDF's joint limits, with the narrower limits of the description."""
     lower, upper = chain.lower.copy(), chain.upper.copy()
     for joint, given in _by_joint(chain, narrower, f"{where}.limits").items():
         index = chain.joint_names.index(joint)
@@ -358,7 +358,7 @@ def _limits(
         low, high = given
         if not chain.lower[index] <= low < high <= chain.upper[index]:
             limits = f"[{chain.lower[index]:g}, {chain.upper[index]:g}]"
-            raise ConfigError(f"{where}.limits.{joint}: [{low:g}, {high:g}] is no range within the URDF's {limits}")
+            raise ConfigError(f"{where}.limits.{joint}: [{low:g}, {high:g}]; valid: a range within the URDF's {limits}")
         lower[index], upper[index] = low, high
     return lower, upper
 
@@ -378,6 +378,6 @@ def _mount(given: Any, tip: str, where: str) -> Mount:
     entry = from_mapping(_MountEntry, given, where)
     length = float(np.linalg.norm(entry.quaternion_wxyz))
     if abs(length - 1.0) > 1e-2:
-        raise ConfigError(f"{where}.quaternion_wxyz: a unit quaternion has length 1, not {length:.3g}")
+        raise ConfigError(f"{where}.quaternion_wxyz: length {length:.3g}; valid: a unit quaternion")
     w, x, y, z = (value / length for value in entry.quaternion_wxyz)
     return Mount(tip, entry.position, (w, x, y, z))

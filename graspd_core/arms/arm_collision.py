@@ -1,8 +1,8 @@
-"""Collisions of an arm: its links as capsules against the support, the object, obstacles, each other and the hand.
+"""Check collisions of an arm's capsules with the support, the object, obstacles, the hand, and each other.
 
-The support is a plane. Objects are signed distances, sampled along each capsule's segment so densely that the padding
-stays below an eighth of the radius. The base is checked against the arm only. The first moving link is not checked
-against the support, above which it turns.
+The support is a plane. Object and obstacles are signed distance fields, sampled along the segment of each capsule. The
+samples are so dense that their padding is less than an eighth of the radius. The base is checked against the arm only.
+The first moving link is not checked against the support, because it only turns above the support.
 """
 
 from __future__ import annotations
@@ -28,8 +28,8 @@ class Hits:
     """Collision depths of an arm.
 
     Attributes:
-        depth: of each possible collision, negative where clear [m].
-        what: names of the collisions, "forearm in the table".
+        depth: depth of each possible collision [m]. Negative without collision.
+        what: description of each collision, such as "forearm in the table".
     """
 
     depth: Float[Tensor, "batch things"]
@@ -37,16 +37,16 @@ class Hits:
 
 
 def joined(*hits: Hits) -> Hits:
-    """Join the collisions of several."""
+    """Concatenate several sets of collisions."""
     return Hits(torch.cat([h.depth for h in hits], -1), tuple(what for h in hits for what in h.what))
 
 
 def hits_of_scene(arm: Arm, scene: Scene, base: SE3, links: SE3) -> Hits:
-    """Return the depths in the support, the object and the obstacles.
+    """Return the collision depths of the arm in the support, the object and the obstacles.
 
     Args:
-        base: `T_scene_base`, one.
-        links: of `arm_links`.
+        base: a single pose `T_scene_base`.
+        links: link poses from `arm_links`.
     """
     solids = [("the object", scene.sdf), *(("an obstacle", obstacle.sdf) for obstacle in scene.obstacles)]
     moved = np.flatnonzero(arm.chain.link_group[arm.capsules.link] != 0)
@@ -63,14 +63,14 @@ def hits_of_scene(arm: Arm, scene: Scene, base: SE3, links: SE3) -> Hits:
 def hits_of_support(
     arm: Arm, scene: Scene, base: SE3, ends: tuple[Float[Tensor, "batch n 3"], Float[Tensor, "batch n 3"]]
 ) -> Hits:
-    """Return the depths in the support, if there is one, of capsules with these segment ends, base frame [m]."""
+    """Return the depths of capsules in the support. Empty without support. `ends` are segment ends, base frame [m]."""
     start, end = ends
     if scene.support is None:
         return Hits(start.new_zeros(len(start), 0), ())
     group = arm.chain.link_group[arm.capsules.link]
     beyond = np.flatnonzero((group != 0) & (group != arm.chain.link_group[arm.moved_link[0]]))
     normal = torch.as_tensor(scene.support.normal).to(start)
-    # The plane in the base's frame.
+    # The support plane in the base frame is local · x = offset.
     local, offset = normal @ base.rotation, scene.support.offset - float(normal @ base.translation)
     height = (
         torch.minimum(start @ local, end @ local)[:, beyond] - offset - torch.as_tensor(arm.capsules.radius[beyond])
@@ -90,7 +90,7 @@ def _worst_of_each(
 
 
 def hits_of_self(arm: Arm, links: SE3) -> Hits:
-    """Return the depths of links in each other, except neighbours and pairs that touch in the seed posture."""
+    """Return the collision depths between links. Neighbours and pairs that touch in the seed posture do not count."""
     start, end, radius = placed(arm.capsules, links)
     first, second = _pairs(arm)
     distance = segment_distance(start[:, first], end[:, first], start[:, second], end[:, second])
@@ -101,10 +101,10 @@ def hits_of_self(arm: Arm, links: SE3) -> Hits:
 
 
 def hits_of_hand(arm: Arm, hand: HandModel, links: SE3, joints: Float[Tensor, "batch hand_joints"]) -> Hits:
-    """Return the depths of links in the hand at its joint values, except pairs that touch in the seed posture."""
+    """Return the collision depths of links in the hand. Pairs that touch in the seed posture do not count."""
     own_start, own_end, own_radius = placed(arm.capsules, links)
     start, end, radius = _hand_capsules(arm, hand, links, joints)
-    # Links that stay clear of a ball about the hand need no closer look.
+    # Links outside a bounding ball of the hand cannot collide with it.
     center = 0.5 * (start + end).mean(1, keepdim=True)
     ball = torch.maximum((start - center).norm(dim=-1), (end - center).norm(dim=-1)).add(radius).amax(1, keepdim=True)
     near = segment_distance(own_start, own_end, center, center) < own_radius + ball
@@ -132,7 +132,7 @@ def _capsules_of_hand(hand: HandModel) -> Capsules:
 
 @lru_cache(maxsize=8)
 def _pairs(arm: Arm) -> tuple[Int[np.ndarray, "pairs"], Int[np.ndarray, "pairs"]]:
-    """Return the capsules to check against each other: no neighbours, none that touch in the seed posture."""
+    """Return the pairs of capsules to check: no neighbours, and no pairs that touch in the seed posture."""
     group = arm.chain.link_group[arm.capsules.link]
     parent = arm.chain.link_parent[group]
     above = np.where(parent < 0, -1, arm.chain.link_group[parent])
@@ -160,14 +160,14 @@ def _seed_links(arm: Arm) -> SE3:
 
 @lru_cache(maxsize=8)
 def _samples(arm: Arm) -> tuple[Float[Tensor, "points columns"], Float[Tensor, "points"], Int[np.ndarray, "points"]]:
-    """Return points along the segments as a `placement`, their padded radii [m], and the capsule of each."""
+    """Return sample points of all segments as a `placement` matrix, their padded radii [m], and their capsules."""
     points, radii, owner = [], [], []
     for k in range(len(arm.capsules.link)):
         start, end, radius = arm.capsules.start[k], arm.capsules.end[k], arm.capsules.radius[k]
         count = 1 + int(np.ceil(np.linalg.norm(end - start) / radius))
         spacing = np.linalg.norm(end - start) / max(count - 1, 1)
         points.append(start + np.linspace(0.0, 1.0, count)[:, None] * (end - start))
-        # Of the surface point nearest to a segment, a sample is at most half a spacing farther along.
+        # The nearest sample is at most half a spacing away along the segment, so the padded ball covers the capsule.
         radii.append(np.full(count, np.hypot(radius, spacing / 2)))
         owner.append(np.full(count, k))
     owner = np.concatenate(owner)

@@ -1,8 +1,8 @@
-"""Paths of an arm through grasps: joint values at every waypoint of the hand, or a reason why there are none.
+"""Compute arm paths through grasps: joint values at every waypoint of the hand, or the reason why there is no path.
 
-The hand passes retreat, pregrasp, grasp and lift in closely spaced poses. For each grasp several postures are found,
-from starts all over the arm's postures, so that elbow and wrist vary. From each the whole path is solved at once. The
-path nearest to the seed posture is taken that keeps the limits, has no jump, and hits nothing.
+The hand passes retreat, pregrasp, grasp and lift in closely spaced poses. For each grasp, inverse kinematics finds
+several arm postures from spread starts, so that elbow and wrist vary. All waypoints are solved from each posture. The
+result is the path nearest to the seed posture that keeps the joint limits, has no jump, and is collision-free.
 """
 
 from __future__ import annotations
@@ -24,28 +24,28 @@ from graspd_core.perception.scene import Scene
 from graspd_core.se3 import SE3, rotation_from_quaternion
 from graspd_core.types import ArmPath, Grasp, Posture
 
-# How far up the hand goes after the grasp [m].
+# Height of the lift after the grasp [m].
 LIFT = 0.1
 # Steps from retreat to pregrasp, pregrasp to grasp, grasp to lift: about 2 cm each.
 STEPS = (5, 2, 5)
-# Rows of the way at the ends of these steps.
+# Indices of the waypoints retreat, pregrasp, grasp and lift.
 STAGE_ROWS = (0, STEPS[0], STEPS[0] + STEPS[1], sum(STEPS))
-# How much each waypoint, by row, has of each stage: nearest neighbours blend on a line.
+# Weights of the four stages (columns) at each waypoint (rows), for linear interpolation between neighbouring stages.
 _ALONG = np.concatenate([[0.0], *(k + np.arange(1, steps + 1) / steps for k, steps in enumerate(STEPS))])
 _SHARES = np.maximum(1.0 - np.abs(_ALONG[:, None] - np.arange(len(STAGE_ROWS))), 0.0)
 
 
 def hand_ways(grasps: Sequence[Grasp], approach: Float[np.ndarray, "3"], up: Float[np.ndarray, "3"]) -> SE3:
-    """Return `T_scene_hand` along the path of each grasp: a batch of grasps by waypoints.
+    """Return `T_scene_hand` along the path of each grasp. The shape is grasps by waypoints.
 
     Args:
-        grasps: some. Positions between pregrasp and grasp are on a line, turns between them the shortest.
+        grasps: from pregrasp to grasp, positions are on a straight line and the rotation is the shortest.
         approach: unit direction in which the hand moves towards an object, hand frame.
         up: unit direction of the lift, scene frame.
     """
     before, there = (_stacked([getattr(grasp, stage) for grasp in grasps]) for stage in ("pregrasp", "grasp"))
     begun = drawn_back(before[0], rotation_from_quaternion(before[1]), torch.as_tensor(approach))
-    # Both signs of a quaternion are one rotation: the nearer is turned to.
+    # Both signs of a quaternion give the same rotation. The nearer sign is used, for the shortest rotation.
     sign = torch.where((before[1] * there[1]).sum(-1, keepdim=True) < 0, -1.0, 1.0)
     raised = there[0] + LIFT * torch.as_tensor(up)
     corners = torch.stack([begun, before[0], there[0], raised], 1)
@@ -62,14 +62,14 @@ def _stacked(postures: Sequence[Posture]) -> tuple[Float[Tensor, "n 3"], Float[T
     return position, quaternion
 
 
-# No joint moves farther between two waypoints [rad].
+# Greatest valid motion of a joint between two waypoints [rad].
 LARGEST_JUMP = 0.2
-# Starts of each grasp, and postures of each that are followed along the path. Steps of inverse kinematics for both.
+# For each grasp: number of starts, and number of postures whose path is solved. Solver steps for both.
 _STARTS, _FOLLOWED = 8, 2
 _STEPS, _WAY_STEPS = 8, 5
-# Joint values nearer than this are one posture [rad].
+# Postures count as equal if all joint values differ by less than this [rad].
 _SAME = 0.1
-# Grasps at once.
+# Grasps per batch.
 _AT_ONCE = 64
 
 
@@ -78,10 +78,10 @@ class ArmTask:
     """An arm with a hand in a scene.
 
     Attributes:
-        arm, hand, scene: the parts.
-        base: `T_scene_base` of the arm's base frame, one.
-        usable: entries of the arm's start table that are clear of the support.
-        bounds: distances of their tips, see `reach_bounds`.
+        arm, hand, scene: arm, hand and scene of the task.
+        base: a single pose `T_scene_base` of the arm's base.
+        usable: True for entries of the arm's start table that do not collide with the support.
+        bounds: `reach_bounds` of the usable entries [m].
     """
 
     arm: Arm
@@ -93,12 +93,12 @@ class ArmTask:
 
     @property
     def up(self) -> Float[np.ndarray, "3"]:
-        """Direction of a lift in the scene: off the support, else along the z axis of the arm's base."""
+        """Direction of the lift, scene frame: the support normal, or the z axis of the arm's base without support."""
         return self.base.rotation[:, 2].numpy() if self.scene.support is None else self.scene.support.normal
 
 
 def make_task(arm: Arm, hand: HandModel, scene: Scene, base: SE3) -> ArmTask:
-    """Build the task, with the entries of the start table that are clear of the support."""
+    """Build the task. The entries of the start table are checked for collision with the support."""
     table = start_table(arm)
     hits = hits_of_support(arm, scene, base, (table.start, table.end))
     usable = (hits.depth <= 0).all(-1)
@@ -106,7 +106,7 @@ def make_task(arm: Arm, hand: HandModel, scene: Scene, base: SE3) -> ArmTask:
 
 
 def tip_poses(task: ArmTask, hand_poses: SE3) -> SE3:
-    """Return the `T_base_tip` that bring the hand to `T_scene_hand`."""
+    """Return the tip poses `T_base_tip` for the hand poses `T_scene_hand`."""
     mount = tip_hand(task.arm, task.hand)
     rotation = hand_poses.rotation @ mount.rotation.T
     at = hand_poses.translation - (rotation @ mount.translation[:, None]).squeeze(-1)
@@ -116,7 +116,7 @@ def tip_poses(task: ArmTask, hand_poses: SE3) -> SE3:
 
 @torch.no_grad()
 def arm_paths(task: ArmTask, grasps: Sequence[Grasp]) -> list[ArmPath | str]:
-    """Return a path of the arm through each grasp, or the reason why there is none: "beyond joint_4's limit"."""
+    """Return the arm path through each grasp, or the reason why there is none, such as "beyond joint_4's limit"."""
     found: list[ArmPath | str] = []
     for first in range(0, len(grasps), _AT_ONCE):
         found += _some_paths(task, grasps[first : first + _AT_ONCE])
@@ -137,7 +137,7 @@ def _some_paths(task: ArmTask, grasps: Sequence[Grasp]) -> list[ArmPath | str]:
 
 
 def _best_of_each(followed: _Followed, owner: Int[Tensor, "postures"], count: int) -> list[int]:
-    """Return the first posture of each grasp with a valid path, else the first of all, -1 for none."""
+    """Return for each grasp its first posture with a valid path, otherwise its first posture. -1 without posture."""
     best = [-1] * count
     for row in reversed(range(len(owner))):
         grasp, good = int(owner[row]), followed.good(row)
@@ -147,7 +147,7 @@ def _best_of_each(followed: _Followed, owner: Int[Tensor, "postures"], count: in
 
 
 def _why_lost(task: ArmTask, ways: SE3, followed: _Followed, best: Sequence[int]) -> dict[int, str]:
-    """Return the reasons of the grasps without a path, by number."""
+    """Return why grasps have no path, by the index of the grasp."""
     reasons: dict[int, str] = {}
     unreached: list[tuple[int, int, Tensor]] = []
     for grasp, row in enumerate(best):
@@ -168,9 +168,9 @@ def _why_lost(task: ArmTask, ways: SE3, followed: _Followed, best: Sequence[int]
 
 
 def _postures(task: ArmTask, target: SE3) -> tuple[Float[Tensor, "postures joints"], Int[Tensor, "postures"]]:
-    """Return different joint values that bring the tip to each target, nearest to the seed first, and their targets.
+    """Return distinct joint values that reach the targets, nearest to the seed first, and the target index of each.
 
-    Postures above the support come first. Other collisions are checked along the paths.
+    For each target, postures without collision with the support come first. Other collisions are checked later.
     """
     arm, table = task.arm, start_table(task.arm)
     starts = nearest_postures(table, target, _STARTS, task.usable)
@@ -184,7 +184,7 @@ def _postures(task: ArmTask, target: SE3) -> tuple[Float[Tensor, "postures joint
     away = (q - torch.as_tensor(arm.seed)).square().sum(-1)
     order = (owner * 1e6 + (hits.depth > 0).any(-1) * 1e5 + away).argsort()
     q, owner = q[order], owner[order]
-    # Of each grasp the first postures that differ from all before them.
+    # For each grasp, keep the first `_FOLLOWED` postures that differ from all before them.
     alike = (owner[:, None] == owner) & ((q[:, None] - q).abs().amax(-1) < _SAME)
     kept = torch.nonzero(~alike.tril(-1).any(1)).flatten()
     place = torch.arange(len(kept)) - torch.searchsorted(owner[kept].contiguous(), owner[kept].contiguous())
@@ -193,7 +193,7 @@ def _postures(task: ArmTask, target: SE3) -> tuple[Float[Tensor, "postures joint
 
 
 def _nearest_turn(arm: Arm, q: Float[Tensor, "batch joints"]) -> Float[Tensor, "batch joints"]:
-    """Return the same postures, with joints turned by full turns to be nearest to the seed within their limits."""
+    """Add full turns to revolute joints, so that they are as near as possible to the seed within their limits."""
     turns = ((torch.as_tensor(arm.seed) - q) / (2 * np.pi)).round() * (2 * np.pi)
     turned = torch.where(torch.as_tensor(arm.chain.slides), q, q + turns)
     inside = (turned >= torch.as_tensor(arm.lower)) & (turned <= torch.as_tensor(arm.upper))
@@ -202,12 +202,12 @@ def _nearest_turn(arm: Arm, q: Float[Tensor, "batch joints"]) -> Float[Tensor, "
 
 @dataclass(frozen=True)
 class _Followed:
-    """Paths from a posture at their grasp.
+    """Paths, each solved from an arm posture at its grasp.
 
     Attributes:
         path: joint values at every waypoint.
-        lost: the unreached waypoint nearest to the grasp, -1 if all are reached.
-        hit: the jump or collision of a path whose waypoints are all reached, empty for a valid path.
+        lost: for each path, the unreached waypoint nearest to the grasp. -1 if all are reached.
+        hit: for each path, a phrase about its jump or deepest collision. Empty if there is none.
     """
 
     path: Float[Tensor, "postures way joints"]
@@ -215,14 +215,14 @@ class _Followed:
     hit: list[str]
 
     def good(self, row: int) -> bool:
-        """Tell whether a path is valid."""
+        """Return True if a path is valid."""
         return self.lost[row] < 0 and not self.hit[row]
 
 
 def _followed(
     task: ArmTask, ways: SE3, q: Float[Tensor, "postures joints"], joints: Float[Tensor, "postures hand_joints"]
 ) -> _Followed:
-    """Follow each path from the posture at its grasp, with the hand's joints as they are at the pregrasp."""
+    """Solve each path from the arm posture at its grasp. `joints` are the hand's joint values at the pregrasp."""
     count, length = ways.translation.shape[:2]
     if not count:
         return _Followed(q.new_zeros(0, length, q.shape[1]), [], [])
@@ -243,7 +243,7 @@ def _followed(
 def _hits_on_way(
     task: ArmTask, path: Float[Tensor, "postures way joints"], joints: Float[Tensor, "postures hand_joints"]
 ) -> Hits:
-    """Return the deepest hits of each path: of the scene at every waypoint, of itself and the hand at its stages."""
+    """Return the deepest collisions of each path: with the scene at every waypoint, with arm and hand at the stages."""
     count = len(path)
     scene = hits_of_scene(task.arm, task.scene, task.base, arm_links(task.arm, path.flatten(0, 1)))
     stages = arm_links(task.arm, path[:, list(STAGE_ROWS)].flatten(0, 1))

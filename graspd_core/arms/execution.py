@@ -1,8 +1,8 @@
-"""A grasp for an executor: one timed trajectory of arm and hand with gates, so that it needs no geometry.
+"""Convert a grasp to a timed trajectory of arm and hand for an executor, which needs no geometry.
 
-All joints rest at every gate. An executor sends the rows up to a gate, checks that it is reached, and sends the next.
-Between two gates the joints follow the grasp's own path by a cubic from rest to rest. Its greatest speed is 1.5 times
-the mean one.
+The trajectory has gates, at which all joints are at rest. An executor sends the rows up to a gate, checks that the gate
+is reached, and sends the next rows. Between two gates the joints follow the grasp's path with a cubic time law from
+rest to rest. Its greatest speed is 1.5 times the mean speed.
 """
 
 from __future__ import annotations
@@ -21,27 +21,27 @@ from graspd_core.hands.kinematics import RETREAT
 from graspd_core.hands.model import HandModel
 from graspd_core.types import Grasp
 
-# Where all joints rest, in this order: the arm stands at the retreat before the first.
+# Gates in their order. Before the first, the arm is at rest at the retreat.
 GATES = ("pregrasp", "closed", "squeezed", "lifted")
-# Greatest over mean speed of a cubic that starts and ends at rest, and its greatest acceleration over travel by time².
+# For a cubic from rest to rest: greatest speed / mean speed, and greatest acceleration / (travel / time²).
 PEAK_SPEED, PEAK_ACCELERATION = 1.5, 6.0
-# Rows of a squeeze.
+# Number of rows of the squeeze.
 _SQUEEZE_ROWS = 4
-# Times at which a stage's speed is looked at.
+# Number of times at which the speed of a stage is evaluated.
 _SAMPLES = 200
 _GRAVITY = 9.81
 
 
 @dataclass(frozen=True)
 class ExecutionPace:
-    """How fast a grasp is executed.
+    """Speed limits for the execution of a grasp.
 
     Attributes:
-        finger_speed: greatest of the hand's turning joints [rad/s].
-        base_speed: greatest of the hand on its way to the object and up, and of its sliding joints [m/s].
-        closing_speed: greatest of the hand from the pregrasp to the grasp [m/s].
+        finger_speed: greatest speed of the hand's revolute joints [rad/s].
+        base_speed: greatest speed of the hand in approach and lift, and of its prismatic joints [m/s].
+        closing_speed: greatest speed of the hand from the pregrasp to the grasp [m/s].
         shortest: least time of a stage [s].
-        payload_share: of the greatest mass that the grasp holds, which weight and the lift's acceleration may ask for.
+        payload_share: weight and acceleration of the object may use this share of the grasp's payload.
         gentlest, strongest: bounds of the lift's acceleration [m/s²].
     """
 
@@ -56,22 +56,22 @@ class ExecutionPace:
     def __post_init__(self) -> None:
         for name, value in vars(self).items():
             if not (math.isfinite(value) and value > 0):
-                raise ConfigError(f"{name}: {value}; it must be positive and finite")
+                raise ConfigError(f"{name}: {value}; valid: a positive, finite number")
 
 
 @dataclass(frozen=True, eq=False)
 class Execution:
-    """One grasp, from the retreat to the end of the lift.
+    """The trajectory of one grasp, from the retreat to the end of the lift.
 
     Attributes:
-        arm_joints, hand_joints: names, in the order of the columns. Joints that follow others are left out.
-        times: of each row from the start [s]. The first is zero.
-        arm: joint values of each row [rad] or [m].
-        arm_speed: of the arm's joints there [rad/s] or [m/s].
-        hand: joint targets of each row [rad] or [m].
-        hand_speed: of the hand's joints there [rad/s] or [m/s].
-        efforts: of the hand's joints at each row, zero until they squeeze [N·m] or [N].
-        gates: the rows of `GATES`.
+        arm_joints, hand_joints: joint names in column order, without coupled joints.
+        times: time of each row from the start [s]. The first is zero.
+        arm: joint values of the arm at each row [rad] or [m].
+        arm_speed: joint speeds of the arm at each row [rad/s] or [m/s].
+        hand: joint targets of the hand at each row [rad] or [m].
+        hand_speed: joint speeds of the hand at each row [rad/s] or [m/s].
+        efforts: joint efforts of the hand at each row [N·m] or [N]. Zero before the squeeze.
+        gates: row index of each of `GATES`.
     """
 
     arm_joints: tuple[str, ...]
@@ -85,7 +85,7 @@ class Execution:
     gates: tuple[int, ...]
 
     def rows_to(self, gate: str) -> slice:
-        """Return the rows that lead from the gate before to this one, both included."""
+        """Return the rows from the previous gate to this gate, both included."""
         place = GATES.index(gate)
         return slice(self.gates[place - 1] if place else 0, self.gates[place] + 1)
 
@@ -98,17 +98,17 @@ def execution_of(
     mass: float | None = None,
     pace: ExecutionPace | None = None,
 ) -> Execution:
-    """Return the timed trajectory of a grasp that an arm reaches.
+    """Return the timed trajectory of a grasp with an arm path.
 
     Args:
-        grasp: with `Grasp.arm`.
-        hand: that it was planned for.
-        arm_speeds: greatest of the arm's joints [rad/s] or [m/s].
-        mass: of the object [kg]. None: unknown, so that the lift is gentle.
-        pace: how fast all else moves.
+        grasp: grasp with `Grasp.arm`.
+        hand: hand of the grasp.
+        arm_speeds: greatest speed of each arm joint [rad/s] or [m/s].
+        mass: mass of the object [kg]. If None, the lift has the acceleration `pace.gentlest`.
+        pace: other speed limits.
 
     Raises:
-        ConfigError: the grasp has no path of the arm.
+        ConfigError: the grasp has no arm path.
     """
     if grasp.arm is None:
         raise ConfigError("execution: the grasp has no path of an arm; plan it with the restriction Reach")
@@ -144,7 +144,7 @@ def execution_of(
 
 
 def lift_time(grasp: Grasp, mass: float | None, pace: ExecutionPace) -> float:
-    """Return how long the lift takes [s]: the faster, the more than its mass the grasp would hold."""
+    """Return the duration of the lift [s]. The more the payload exceeds the mass [kg], the faster is the lift."""
     payload = (grasp.metrics or {}).get("payload")
     spare = 0.0 if not payload or not mass else _GRAVITY * (pace.payload_share * payload / mass - 1.0)
     return math.sqrt(PEAK_ACCELERATION * LIFT / min(max(spare, pace.gentlest), pace.strongest))
@@ -153,7 +153,7 @@ def lift_time(grasp: Grasp, mass: float | None, pace: ExecutionPace) -> float:
 def squeeze_efforts(
     grasp: Grasp, hand: HandModel, stages: GraspStagesConfig | None = None
 ) -> Float[np.ndarray, "joints"]:
-    """Return the joint efforts when the object stops the squeeze at the grasp, within their limits [N·m] or [N]."""
+    """Return the joint efforts if the object stops the squeeze at the grasp posture, within limits [N·m] or [N]."""
     stages = stages or GraspStagesConfig()
     gain = np.where(hand.slides, stages.slide_stiffness, stages.stiffness)
     return np.clip(gain * (grasp.squeeze.joint_positions - grasp.grasp.joint_positions), -hand.effort, hand.effort)
@@ -166,12 +166,12 @@ def _both(arm: np.ndarray, hand: np.ndarray) -> np.ndarray:
 def _from_rest_to_rest(
     rows: np.ndarray, limits: np.ndarray, least: float, shortest: float
 ) -> tuple[Float[np.ndarray, "rows"], Float[np.ndarray, "rows joints"]]:
-    """Return times [s] of rows evenly spaced along their path, and speeds, zero at both ends."""
+    """Return times [s] and joint speeds of rows that are evenly spaced along their path. Speeds are 0 at both ends."""
     share = np.linspace(0.0, 1.0, len(rows))
-    # The share that a cubic covers, 3t² − 2t³, solved for t.
+    # The cubic covers the share 3t² − 2t³ at time t. This is solved for t.
     time = 0.5 - np.sin(np.arcsin(1.0 - 2.0 * share) / 3.0)
     speed = np.gradient(rows, share, axis=0) * (6.0 * time * (1.0 - time))[:, None]
-    # Between rows a controller's cubic may be faster than at them.
+    # A controller's cubic may be faster between the rows than at the rows.
     fastest = np.abs(CubicHermiteSpline(time, rows, speed)(np.linspace(0.0, 1.0, _SAMPLES), 1)).max(0)
     span = max(shortest, least, float((fastest / limits).max()))
     return span * time, speed / span

@@ -1,15 +1,15 @@
-"""Inverse kinematics of an arm for many poses at once: damped least squares within the joint limits.
+"""Solve the inverse kinematics of an arm for many poses at once, by damped least squares within the joint limits.
 
-Tip and Jacobian are those of pytorch-kinematics. The damping follows the error's own square (T. Sugihara,
-Solvability-unconcerned inverse kinematics by the Levenberg-Marquardt method, IEEE T-RO 2011). A joint that the step
-would push beyond its limit is held there, and the step is found without it. This loop is five times faster than the
-library's solver, since it starts near and drops poses as they are reached (docs/arms.md).
+Tip pose and Jacobian come from pytorch-kinematics. The damping is proportional to the squared error (T. Sugihara,
+Solvability-unconcerned inverse kinematics by the Levenberg-Marquardt method, IEEE T-RO 2011). If a step would move a
+joint beyond its limit, the step is computed without this joint. This solver is five times faster than the library's,
+because its starts are near and it drops poses that are reached (docs/arms.md).
 
-Starts are the postures of a table whose tips are nearest. A pose is out of reach if its tip, or a point fixed to the
-tip, is nearer to the shoulder or farther from it than in all postures of the table. Of hands drawn around objects at
-0.3 to 0.95 m this keeps 99.3 and 99.7 % of those that the shipped arms reach, and 18 and 4 % of the others.
+The starts are those postures of a table whose tip poses are nearest. A pose counts as out of reach if its tip, or a
+point fixed to the tip, is nearer to the shoulder or farther from it than in all postures of the table. For hands around
+objects at 0.3 to 0.95 m, this keeps 99.3 and 99.7 % of the hands that graspd's arms reach, and 18 and 4 % of others.
 
-A pose out of reach has a reason: the joint whose limit is in the way, or that no posture gets there at all.
+If no posture is found, `why_unreached` names the joint whose limit prevents it, or says that the pose is out of reach.
 """
 
 from __future__ import annotations
@@ -45,33 +45,33 @@ def tip_chain(arm: Arm, dtype: torch.dtype = torch.float32) -> SerialChain:
 def tip_and_jacobian(
     chain: SerialChain, q: Float[Tensor, "batch joints"]
 ) -> tuple[SE3, Float[Tensor, "batch 6 joints"]]:
-    """Return `T_base_tip` at joint values q [rad] or [m], and the Jacobian: velocity, then turning, base frame."""
+    """Return `T_base_tip` at joint values q [rad] or [m], and the Jacobian, base frame: linear, then angular rows."""
     jacobian, tip = chain.jacobian_tensor(q, ret_eef_pose=True)
     return SE3(tip[:, :3, :3], tip[:, :3, 3]), jacobian
 
 
-# A pose is reached when it is this near [m], [rad].
+# A pose counts as reached within these tolerances [m], [rad].
 POSITION_TOLERANCE, ROTATION_TOLERANCE = 1e-4, 1e-3
-# One radian counts as so many metres.
+# Length that counts as much as one radian [m].
 RADIAN = 0.3
 _WEIGHTS = [1.0, 1.0, 1.0, RADIAN, RADIAN, RADIAN]
-# Damping as a share of the error's square, and what is left of it where the error is none [m²].
+# Damping relative to the squared error, and least damping [m²].
 _DAMPING, _LEAST_DAMPING = 0.05, 1e-7
-# No joint turns farther in one step [rad].
+# Greatest change of a joint in one step [rad].
 _LONGEST_STEP = 0.6
-# Entries of a rotation matrix whose differences are the axis, and a sine that rounding could make.
+# Indices of the rotation matrix entries whose differences give the axis, and a sine that may be a rounding error.
 _ROWS, _COLUMNS, _TINY = [2, 0, 1], [1, 2, 0], 1e-7
 _HALF_TURN = (torch.pi, 0.0, 0.0)
 
 
 @dataclass(frozen=True)
 class Solutions:
-    """Joint values, and the error of the tip.
+    """Joint values and the remaining error of the tip.
 
     Attributes:
-        q: joint values within the limits, the nearest that were found [rad] or [m].
-        reached: whether they bring the tip there.
-        error: the length of position error and turning error, one radian as `RADIAN` metres [m].
+        q: joint values at the last step [rad] or [m].
+        reached: True if the tip is within the tolerances of its target.
+        error: norm of position error and rotation error [m], where one radian counts as `RADIAN`.
     """
 
     q: Float[Tensor, "batch joints"]
@@ -80,16 +80,16 @@ class Solutions:
 
 
 def pose_error(target: SE3, tip: SE3) -> Float[Tensor, "batch 6"]:
-    """Return what moves and turns the tip to the target, base frame [m], [rad]."""
+    """Return translation [m] and rotation vector [rad] from the tip to the target, base frame."""
     return torch.cat([target.translation - tip.translation, rotation_vector(target.rotation, tip.rotation)], -1)
 
 
 def rotation_vector(
     target: Float[Tensor, "batch 3 3"], current: Float[Tensor, "batch 3 3"]
 ) -> Float[Tensor, "batch 3"]:
-    """Return axis times angle of the turn between two orientations, base frame [rad]. Half a turn is about x."""
+    """Return the rotation vector from `current` to `target`, base frame [rad]. For half a turn the axis is x."""
     turn = target @ current.transpose(-1, -2)
-    # Twice the sine and twice the cosine of the angle.
+    # `sine` and `cosine` are twice the sine and twice the cosine of the angle.
     axis = turn[:, _ROWS, _COLUMNS] - turn[:, _COLUMNS, _ROWS]
     sine, cosine = axis.norm(dim=-1), turn.diagonal(dim1=-2, dim2=-1).sum(-1) - 1.0
     tiny = sine < _TINY
@@ -101,14 +101,14 @@ def rotation_vector(
 def solve(
     arm: Arm, target: SE3, start: Float[Tensor, "batch joints"], steps: int, *, limited: bool = True
 ) -> Solutions:
-    """Follow the error from each start to its target, `T_base_tip`.
+    """Iterate from each start towards its target `T_base_tip`.
 
-    Rows that have arrived wait for the others. Computed in float32, which is a hundred times finer than the tolerances
-    and takes two thirds of the time.
+    Rows that have reached their target are no longer computed. The solver uses float32, which is a hundred times finer
+    than the tolerances and takes two thirds of the time.
 
     Args:
-        steps: the most steps.
-        limited: whether joints are kept within their limits.
+        steps: greatest number of steps.
+        limited: keep joints within their limits.
     """
     limits = [torch.as_tensor(limit).float() for limit in (arm.lower, arm.upper)]
     target, now, chain = SE3(target.rotation.float(), target.translation.float()), start.float(), tip_chain(arm)
@@ -129,7 +129,7 @@ def solve(
         now = now + _step(jacobian, wrong, now, limits if limited else None)
         now = now.clamp(*limits) if limited else now
     q = q.to(start)
-    # Rounding may step over a limit.
+    # Rounding may exceed a limit.
     q = q.clamp(*map(torch.as_tensor, (arm.lower, arm.upper))) if limited else q
     return Solutions(q, reached, error.to(start))
 
@@ -140,7 +140,7 @@ def _step(
     q: Float[Tensor, "batch joints"],
     limits: Sequence[Tensor] | None,
 ) -> Float[Tensor, "batch joints"]:
-    """Return `Jᵀ (J Jᵀ + λ I)⁻¹ e` with rows of turning weighted, without joints that would leave their limits."""
+    """Return the step `Jᵀ (J Jᵀ + λ I)⁻¹ e`, with weighted rotation rows, without joints that would leave limits."""
     weight = wrong.new_tensor(_WEIGHTS)
     jacobian, wrong = jacobian * weight[:, None], wrong * weight
     if limits is not None:
@@ -154,24 +154,24 @@ def _step(
     return change / (change.abs().amax(-1, keepdim=True) / _LONGEST_STEP).clamp_min(1.0)
 
 
-# Entries, of which those are dropped that would hit themselves.
+# Number of entries before entries with self-collision are dropped.
 _ENTRIES = 4000
-# Points fixed to the tip whose distance from the shoulder is looked at, tip frame [m].
+# Points fixed to the tip whose distances from the shoulder are compared, tip frame [m].
 _POINTS = [[0, 0, 0], [0, 0, -0.1], [0, 0, -0.2], [0.1, 0, -0.1], [-0.1, 0, -0.1], [0, 0.1, -0.1], [0, -0.1, -0.1]]
-# Metres that count as much as a change of one in an entry of the rotation matrix: 0.28 m a radian.
+# Length that counts as much as a change of 1 in an entry of the rotation matrix [m]. This is 0.28 m per radian.
 _PER_ENTRY = 0.2
 
 
 @dataclass(frozen=True)
 class StartTable:
-    """Postures by the pose of the tip.
+    """A table of postures, to find the postures whose tip poses are near a given pose.
 
     Attributes:
         q: joint values [rad] or [m].
-        features: position and scaled rotation of the tip, base frame.
-        shoulder: the point of the first joint's axis that the second joint is nearest to, base frame [m].
+        features: position and scaled rotation of the tip, base frame [m].
+        shoulder: point of the first joint's axis that is nearest to the second joint, base frame [m].
         away: distances of points fixed to the tip from the shoulder [m].
-        start, end: the ends of the arm's capsules, base frame [m].
+        start, end: end points of the arm's capsules, base frame [m].
     """
 
     q: Float[Tensor, "entries joints"]
@@ -185,7 +185,7 @@ class StartTable:
 # Arms are hashed by identity.
 @lru_cache(maxsize=8)
 def start_table(arm: Arm) -> StartTable:
-    """Return the table of an arm, the same every time. It is made once."""
+    """Return the start table of an arm. It is deterministic and cached."""
     q = random_postures(arm, _ENTRIES, torch.Generator().manual_seed(0))
     hits = hits_of_self(arm, arm_links(arm, q))
     q = q[(hits.depth <= 0).all(-1)] if hits.what else q
@@ -206,7 +206,7 @@ def _away(tip: SE3, shoulder: Float[Tensor, "3"]) -> Float[Tensor, "batch points
 
 
 def random_postures(arm: Arm, count: int, generator: torch.Generator) -> Float[Tensor, "count joints"]:
-    """Draw joint values evenly within the limits, and within half a turn of the middle of wider limits."""
+    """Draw uniform joint values within the limits. A revolute joint stays within half a turn of its mid-range."""
     middle = 0.5 * (arm.lower + arm.upper)
     half = np.where(arm.chain.slides, 0.5 * (arm.upper - arm.lower), np.minimum(0.5 * (arm.upper - arm.lower), np.pi))
     drawn = 2.0 * torch.rand(count, len(middle), generator=generator, dtype=torch.float64) - 1.0
@@ -214,14 +214,14 @@ def random_postures(arm: Arm, count: int, generator: torch.Generator) -> Float[T
 
 
 def tip_features(tip: SE3) -> Float[Tensor, "batch 12"]:
-    """Return poses as vectors whose distance is that of position and rotation together [m]."""
+    """Return poses as vectors. The Euclidean distance of two vectors combines position and rotation [m]."""
     return torch.cat([tip.translation, _PER_ENTRY * tip.rotation.flatten(-2)], -1).float()
 
 
 def nearest_postures(
     table: StartTable, tip: SE3, count: int, usable: Bool[Tensor, "entries"] | None = None
 ) -> Float[Tensor, "batch count joints"]:
-    """Return joint values of the entries nearest to poses `T_base_tip`, nearest first, usable ones if there are any."""
+    """Return the `count` postures nearest to each `T_base_tip`, nearest first. If any are usable, only those."""
     q, features = table.q, table.features
     if usable is not None and usable.any():
         q, features = q[usable], features[usable]
@@ -229,27 +229,27 @@ def nearest_postures(
 
 
 def reach_bounds(table: StartTable, usable: Bool[Tensor, "entries"]) -> Float[Tensor, "2 points"]:
-    """Return the least and greatest distances of points fixed to the tip from the shoulder in usable postures [m]."""
+    """Return the least and the greatest distances of the tip's points from the shoulder in usable postures [m]."""
     away = table.away[usable] if usable.any() else table.away.new_full((1, len(_POINTS)), torch.nan)
     return torch.stack([away.amin(0), away.amax(0)])
 
 
 def within_reach(table: StartTable, bounds: Float[Tensor, "2 points"], tip: SE3) -> Bool[Tensor, "batch"]:
-    """Return which poses `T_base_tip` are within the bounds, none without a usable posture."""
+    """Return True for each `T_base_tip` within the bounds. All are False if no posture is usable."""
     away = _away(tip, table.shoulder)
     return ((away >= bounds[0]) & (away <= bounds[1])).all(-1)
 
 
-# Starts of each pose, and steps of each.
+# Number of starts of each pose, and number of solver steps.
 _STARTS, _STEPS = 3, 10
 _TOO_FAR, _NOWHERE = "farther than the arm reaches", "that no posture of the arm reaches"
 
 
 def why_unreached(arm: Arm, target: SE3, start: Float[Tensor, "batch joints"]) -> list[str]:
-    """Return why each of the poses `T_base_tip` is not reached, solved without limits from `start` and near postures.
+    """Return why each pose `T_base_tip` is not reached. The reason is empty if a posture within the limits reaches it.
 
-    The posture that breaks its limits least counts, and its joint that breaks its own limit most. The reason is empty
-    if a posture within the limits gets there.
+    The poses are solved without limits from `start` and from near postures. The posture that exceeds its limits least
+    is chosen. The reason names its joint that exceeds its limit most.
     """
     if not len(start):
         return []

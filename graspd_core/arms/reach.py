@@ -1,4 +1,4 @@
-"""The restriction that an arm can bring the hand to a grasp: which starts are drawn, which candidates are tried."""
+"""Restrict starts and candidates to those that an arm can reach with the hand."""
 
 from __future__ import annotations
 
@@ -30,24 +30,24 @@ from graspd_core.perception.scene import Scene
 from graspd_core.se3 import SE3, rotation_from_quaternion
 from graspd_core.types import Grasp, Posture
 
-# A base farther away than this is in another unit [m].
+# A base farther away than this is a mistake in the unit [m].
 _FARTHEST = 100.0
-# Fingers reach past the base link by no more than this [m].
+# Greatest distance of a fingertip from the base link of a hand [m].
 _HAND_LENGTH = 0.4
-# Hands around the object that are asked about where none could be begun from.
+# Number of hands around the object that explain why no start was found.
 _PROBES = 64
 
 
 @dataclass(frozen=True, eq=False)
 class Reach:
-    """An arm at a place: only grasps that it can reach and lift are tried (docs/arms.md).
+    """The restriction to grasps that an arm at a given base pose can reach and lift (docs/arms.md).
 
-    Each grasp gets the arm's joint values along its way, `Grasp.arm`.
+    Each grasp gets the arm's joint values along its path (`Grasp.arm`).
 
     Attributes:
         arm: from `load_arm`.
         position: origin of the arm's base in the object frame [m].
-        quaternion_wxyz: turn of the arm's base there, unit.
+        quaternion_wxyz: orientation of the arm's base in the object frame, a unit quaternion.
     """
 
     arm: Arm
@@ -55,7 +55,7 @@ class Reach:
     quaternion_wxyz: tuple[float, float, float, float] = (1.0, 0.0, 0.0, 0.0)
 
     def bind(self, scene: Scene, hand: HandModel) -> BoundReach:
-        """Bind the restriction, see `Restriction`. Raises ConfigError: a bad base pose, or the hand has no mount."""
+        """Bind the restriction, see `Restriction`. Raises ConfigError: invalid base pose, or hand without mount."""
         position, quaternion = (np.asarray(v, dtype=float) for v in (self.position, self.quaternion_wxyz))
         if position.shape != (3,) or not np.isfinite(position).all() or np.abs(position).max() > _FARTHEST:
             raise ConfigError(f"arm base: position {list(self.position)}; valid: three numbers up to {_FARTHEST:g} m")
@@ -80,7 +80,7 @@ class BoundReach(BoundRestriction):
 
     @property
     def impossible(self) -> str:
-        """Say that every posture is in the support, or that the base is too far away. Empty if one may come there."""
+        """The reason: every posture collides with the support, or the object is too far away. Empty otherwise."""
         task, support = self.task, self.task.scene.support
         if support is not None and not task.usable.any():
             table = start_table(task.arm)
@@ -97,12 +97,12 @@ class BoundReach(BoundRestriction):
         if away <= longest + _HAND_LENGTH:
             return ""
         return (
-            f"the object is {away:.2f} m from the base of {task.arm.name}, which brings {task.hand.name} "
-            f"{longest:.2f} m far"
+            f"the object is {away:.2f} m from the base of {task.arm.name}, whose reach with {task.hand.name} "
+            f"is {longest:.2f} m"
         )
 
     def why_none(self, others: BoundRestrictions) -> str:
-        """Count the reasons why the arm cannot bring hands drawn around the object there."""
+        """Return a sentence with the counts of the reasons why the arm cannot reach hands around the object."""
         task = self.task
         starts = draw_starts(task.scene, task.hand, _PROBES, 0, "cpu", torch.float64, restrictions=others)
         rows = zip(*(rows.numpy() for rows in (starts.translation, starts.quaternion, starts.joints)), strict=True)
@@ -113,7 +113,7 @@ class BoundReach(BoundRestriction):
         return f"of {len(ways)} hands around the object: {told}" if told else ""
 
     def starts(self, positions: Places, quaternions: Turns, joints: JointRows) -> Allowed:
-        """Return which initial poses are within the arm's reach, when retreated and lifted too."""
+        """Return True for each initial pose that is within the arm's reach, also at its retreat and its lift."""
         task, at = self.task, torch.as_tensor(positions)
         rotation = rotation_from_quaternion(torch.as_tensor(quaternions))
         retreat = drawn_back(at, rotation, torch.as_tensor(task.hand.approach))
@@ -125,7 +125,7 @@ class BoundReach(BoundRestriction):
         return np.isin(np.arange(len(at)), allowed.numpy())
 
     def admit(self, grasps: Sequence[Grasp]) -> Sequence[Grasp | Refusal]:
-        """Return each candidate with the arm's path, or the reason why there is none."""
+        """Return each candidate with its arm path, or the reason why there is no path."""
         paths = arm_paths(self.task, grasps)
         return [
             Refusal(path) if isinstance(path, str) else replace(grasp, arm=path)

@@ -1,1 +1,1 @@
-"""Hand models from URDF and their kinematics."""
+"""Models of robot hands: readers, kinematics, collision geometry and contact candidates."""

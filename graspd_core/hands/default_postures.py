@@ -1,9 +1,9 @@
-"""A palm, an approach and two postures, guessed for a hand whose description names none.
+"""Guess palm, approach and two postures of a hand whose description does not give them.
 
-Fingers are the chains that end in links which move no other link. The palm is the link that all of them hang from. In a
-human-like hand most fingers bend the same way. The palm faces where the fingertips move from straight to mid-range. In
-a gripper the fingers bend or slide against each other. The palm faces along them. A search finds the postures:
-fingertips around a small ball in front of the palm, and around a large one.
+A finger is a chain of links up to a last link without children. The palm is the link from which all fingers branch. In
+a human-like hand most fingers bend the same way: the palm normal is the direction in which the fingertips move from
+straight to mid-range. In a gripper the fingers move against each other: the palm normal is along the fingers. A search
+finds the postures: fingertips around a small ball in front of the palm (closed), and around a large one (open).
 """
 
 from __future__ import annotations
@@ -31,22 +31,22 @@ from graspd_core.hands.self_collision import link_overlaps
 from graspd_core.hands.surface_points import dense_samples
 
 _STARTS, _TIP_SPREAD, _STEPS, _RATE = 24, 0.4, 100, 0.08
-# How much the search minds one-sided fingertips, joints away from where they rest, a ball away from its place,
-# overlap [1/m].
+# Costs in the search: of one-sided fingertips, of joints away from their rest posture, of the ball away from its wanted
+# place, and of overlap [1/m].
 _BALANCE, _REST, _PLACE, _OVERLAP = 0.3, 0.08, 0.3, 60.0
 
 
 @dataclass(frozen=True, eq=False)
 class FingertipGoal:
-    """What the search for a posture aims at.
+    """The goal of the search for a posture: fingertips on a ball.
 
     Attributes:
-        ball: middle of the ball, base frame [m].
-        radius: of the ball [m].
-        rest: the posture that joints stay near [rad] or [m].
-        directions: unit, from the ball to each fingertip, None for any that surround it evenly.
-        weights: of each fingertip's miss where directions are given, with a sum of one, None for equal ones.
-        ball_fixed: whether the ball has to stay where it is.
+        ball: centre of the ball, base frame [m].
+        radius: radius of the ball [m].
+        rest: rest posture, near which the joints stay [rad] or [m].
+        directions: unit vectors from the ball to each fingertip. None if the fingertips only surround it evenly.
+        weights: weights of the fingertips' errors with given directions, with a sum of one. None for equal weights.
+        ball_fixed: True if the search must not move the ball.
     """
 
     ball: Float[np.ndarray, "3"]
@@ -63,16 +63,16 @@ def around_ball(
     goal: FingertipGoal,
     surface: tuple[Float[np.ndarray, "samples 3"], Int[np.ndarray, "samples"]],
 ) -> tuple[Float[np.ndarray, "joints"], Float[np.ndarray, "3"]]:
-    """Return the posture that puts the fingertips around a ball without overlap of links, and the ball's final place.
+    """Return a posture with the fingertips around a ball and little overlap of links, and the ball's final centre.
 
-    Wrist joints do not move. `surface` holds the points in link frames and their links, by which overlap is found.
+    Wrist joints do not move. `surface` holds surface points in link frames [m] and their links, to measure overlap.
     """
     kinematics = make_kinematics(hand, dtype=torch.float64)
     matrix = placement(hand.num_links, torch.as_tensor(fingers.points), torch.as_tensor(fingers.links))
     lower, half = torch.as_tensor(hand.lower), torch.as_tensor(0.5 * (hand.upper - hand.lower))
     origin = torch.as_tensor(goal.ball + side_by_side(fingers))
     home = torch.as_tensor(goal.rest - hand.lower) / half - 1.0
-    # A jaw that slides is as much at rest in one place as in another.
+    # A prismatic joint has no preferred rest position.
     turns = torch.as_tensor(~hand.slides).double()
     still = torch.zeros(hand.num_joints, dtype=torch.bool)
     still[fingers.wrist] = True
@@ -109,7 +109,7 @@ def around_ball(
 def _missed(
     fingers: Fingers, goal: FingertipGoal, away: Float[Tensor, "starts tips 3"]
 ) -> tuple[Float[Tensor, "starts"], Float[Tensor, "starts"]]:
-    """Return how far the fingertips at `away` [m] miss their places, and how one-sided they lie [finger lengths²]."""
+    """Return two costs of fingertips at `away` from the ball [m]: squared error [finger lengths²], one-sidedness."""
     if goal.directions is not None:
         missed = ((away - goal.radius * torch.as_tensor(goal.directions)) / fingers.length).square().sum(-1)
         mean = missed.mean(-1) if goal.weights is None else missed @ torch.as_tensor(goal.weights)
@@ -123,7 +123,7 @@ def _missed(
 
 
 def side_by_side(fingers: Fingers) -> Float[np.ndarray, "tips 3"]:
-    """Return each fingertip's ball relative to the middle one [m], so that neighbouring fingers close side by side."""
+    """Return an offset of the ball for each fingertip [m], so that neighbouring fingers close side by side."""
     aside = np.zeros_like(fingers.roots)
     if fingers.mates.sum() > 1:
         knuckles, row = fingers.roots[fingers.mates], knuckle_row(fingers)
@@ -137,16 +137,16 @@ def _joined_links(hand: HandModel) -> Bool[np.ndarray, "links links"]:
     return (groups[:, None] == groups) | (above[:, None] == groups) | (groups[:, None] == above)
 
 
-# Radii of the balls that fingertips close and open around, and the ball's distance from the palm, in finger lengths.
+# In finger lengths: radii of the balls of the closed and the open posture, and distance of the ball from the palm.
 _CLOSED, _OPEN, _AHEAD = 0.16, 0.55, 0.4
-# Breadth of the palm's surface that its middle is found on [m].
+# Radius of the spot of the palm's surface that gives the height of the palm centre [m].
 _SPOT = 0.02
-# From this cosine to the way in which the fingers point on, a joint's axis spreads them.
+# A joint spreads a finger if the cosine between its axis and the finger's direction is at least this.
 _SPREAD = 0.7
 
 
 def default_palm(hand: HandModel) -> HandModel:
-    """Return the hand with a guessed palm centre, palm normal and approach, and a warning that they are guessed."""
+    """Return the hand with guessed palm centre, palm normal and approach, and with a warning about the guess."""
     fingers = find_fingers(hand)
     normal = fingers.bend if fingers.mates.any() else _along(hand, fingers)
     warnings = [*hand.warnings, "palm guessed; name it in a hand description if it is wrong"]
@@ -159,7 +159,7 @@ def default_palm(hand: HandModel) -> HandModel:
 
 
 def default_postures(hand: HandModel, which: tuple[str, ...] = ("open", "closed")) -> HandModel:
-    """Return the hand with the postures that `which` names guessed for its palm, and a warning."""
+    """Return the hand with a guess for each posture in `which`, and with a warning. The palm must be known."""
     fingers = find_fingers(hand)
     ahead = hand.palm_center + _AHEAD * fingers.length * hand.palm_normal
     height = float(((fingers.tips - hand.palm_center) @ hand.palm_normal).mean())
@@ -187,7 +187,7 @@ def default_postures(hand: HandModel, which: tuple[str, ...] = ("open", "closed"
 
 
 def _along(hand: HandModel, fingers: Fingers) -> Float[np.ndarray, "3"]:
-    """Return the direction in which a gripper's fingers point at mid-range, normal to the plane of their roots."""
+    """Return the direction of a gripper's fingers at mid-range, made normal to the plane of their first joints."""
     middle = middle_joints(hand, fingers)
     half_way = placed_tips(hand, fingers, middle) - fingers.roots
     along = units(half_way.mean(0), 1e-6)
@@ -205,7 +205,7 @@ def _along(hand: HandModel, fingers: Fingers) -> Float[np.ndarray, "3"]:
 def _first_bends(
     hand: HandModel, fingers: Fingers, q: Float[np.ndarray, "joints"], along: Float[np.ndarray, "3"]
 ) -> Float[np.ndarray, "tips 3"]:
-    """Return the first joint of each finger that does not turn it about `along`, at a posture, base frame [m]."""
+    """Return for each finger the position of its first joint that does not turn it about `along`, base frame [m]."""
     rotations, translations = link_poses(hand, q)
     places = fingers.roots.copy()
     for finger, tip in enumerate(fingers.links):
@@ -219,7 +219,7 @@ def _first_bends(
 
 
 def _center(hand: HandModel, fingers: Fingers, normal: Float[np.ndarray, "3"]) -> Float[np.ndarray, "3"]:
-    """Return the point of the palm's surface in front of which the fingers meet [m]."""
+    """Return the point of the palm's surface in front of which the fingers meet, base frame [m]."""
     surface = palm_points(hand, fingers)
     middle = 0.5 * (surface.min(0) + surface.max(0))
     if fingers.mates.any():
@@ -233,19 +233,19 @@ def _center(hand: HandModel, fingers: Fingers, normal: Float[np.ndarray, "3"]) -
 
 
 def _balance(directions: Float[np.ndarray, "tips 3"]) -> Float[np.ndarray, "tips"]:
-    """Return weights with a sum of one that make the directions cancel as far as possible."""
+    """Return weights with a sum of one, for which the weighted sum of the directions is as short as possible."""
     from scipy.optimize import nnls
 
-    # A little ridge shares the weight between fingers on the same side.
+    # A small ridge term distributes the weight over fingers on the same side.
     system = np.vstack([directions.T, np.ones(len(directions)), 0.01 * np.eye(len(directions))])
     weights, _ = nnls(system, np.concatenate([np.zeros(3), [1.0], np.zeros(len(directions))]))
     return weights / weights.sum()
 
 
 def _own_sides(hand: HandModel, fingers: Fingers, normal: Float[np.ndarray, "3"]) -> Float[np.ndarray, "tips 3"]:
-    """Return the side on which each finger of a gripper stands, in the palm's plane, zero for a finger alone.
+    """Return for each finger of a gripper the unit direction of its side in the palm plane. Zero for a single finger.
 
-    The side comes from the roots. The tips may pass through each other.
+    The side comes from the finger roots, because the tips may cross each other.
     """
     middle = middle_joints(hand, fingers)
     plane = np.eye(3) - np.outer(normal, normal)
@@ -253,13 +253,13 @@ def _own_sides(hand: HandModel, fingers: Fingers, normal: Float[np.ndarray, "3"]
         (points - points.mean(0)) @ plane for points in (fingers.roots, placed_tips(hand, fingers, middle))
     )
     aside = np.where(np.linalg.norm(by_root, axis=1, keepdims=True) > 1e-3, by_root, by_tip)
-    # As far as its joints can take it: of two fingers beside each other, straight away from the third.
+    # The joints limit the direction: two fingers beside each other move straight away from the third.
     travel = plane @ (point_jacobian(hand, middle, fingers.points, fingers.links) * (middle - hand.lower))
     return units((travel @ (travel.transpose(0, 2, 1) @ aside[:, :, None])).squeeze(-1), 1e-12)
 
 
 def _apart(hand: HandModel, fingers: Fingers) -> Float[np.ndarray, "tips 3"]:
-    """Return the opening direction of each finger of a human-like hand in the palm's plane, the thumb's opposite."""
+    """Return the opening direction of each finger of a human-like hand in the palm plane. The thumb's is opposite."""
     plane = np.eye(3) - np.outer(hand.palm_normal, hand.palm_normal)
     straight = (fingers.tips - fingers.roots)[fingers.mates].mean(0) @ plane
     if fingers.mates.sum() > 1:

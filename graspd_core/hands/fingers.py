@@ -1,4 +1,4 @@
-"""The fingers of a hand: where they join the palm, where their tips are, and which of them bend the same way."""
+"""Find the fingers of a hand: their roots at the palm, their tips, and which of them bend the same way."""
 
 from __future__ import annotations
 
@@ -12,12 +12,12 @@ from graspd_core.hands.kinematics import LinkNumbers, LinkPoints, LinkPoses, in_
 from graspd_core.hands.model import HandModel
 from graspd_core.hands.surface_points import surface_points
 
-# Fingers of which this share of the sweep is left after cancelling bend the same way: three of four that bend against
-# the fourth leave a half, three around a circle or two against one leave a third or less.
+# Fingers bend the same way if the mean of their unit bending directions is longer than this. Three fingers against one
+# give 1/2. Three around a circle, or two against one, give at most 1/3.
 _ALIKE = 0.42
-# Directions within this cosine of each other are the same. A thumb's are not those of the fingers.
+# Two directions count as equal from this cosine on. A thumb's directions differ from those of the fingers.
 _SAME_WAY = 0.7
-# From this cosine to the normal of a plane on, a finger stands up from it.
+# A finger stands up from a plane if the cosine between the finger and the plane's normal exceeds this.
 _UPRIGHT = 0.5
 
 
@@ -26,14 +26,14 @@ class Fingers:
     """The fingers at straight joints.
 
     Attributes:
-        points: fingertips in the frame of their links [m].
-        links: the link of each.
-        roots: where each finger joins the palm, base frame [m].
-        tips: the fingertips in the base frame [m].
-        palm: the group of links that all fingers hang from.
-        wrist: joints that move the palm itself.
-        mates: the fingers of a human-like hand that bend the same way, without its thumb. None in a gripper.
-        bend: the unit direction in which `mates` bend, base frame, zero in a gripper.
+        points: fingertips in the frames of their links [m].
+        links: link of each fingertip.
+        roots: position of each finger's joint at the palm, base frame [m].
+        tips: fingertips in the base frame [m].
+        palm: rigid group of links from which all fingers branch.
+        wrist: joints that move the palm.
+        mates: True for fingers of a human-like hand that bend the same way, not for the thumb. All False in a gripper.
+        bend: unit direction in which `mates` bend, base frame. Zero in a gripper.
     """
 
     points: Float[np.ndarray, "tips 3"]
@@ -51,15 +51,15 @@ class Fingers:
         return float(np.linalg.norm(self.tips - self.roots, axis=1).mean()) or 0.05
 
 
-# Kept for the last few hands, which are hashed by identity.
+# The results for the last hands are cached. Hands are hashed by identity.
 @lru_cache(maxsize=8)
 def find_fingers(hand: HandModel) -> Fingers:
-    """Find the chains that end in links which move no other link. The tip is the far end of the last solids."""
+    """Find the fingers: the chains that end in a link without children. The tip is the far end of the last solids."""
     groups = hand.link_group
     heads = np.unique(groups)
     above = {int(g): int(groups[hand.link_parent[g]]) if hand.link_parent[g] >= 0 else -1 for g in heads}
     solid = {int(groups[p.link]) for p in hand.primitives}
-    # A leaf without solids is a frame or a sensor: what carries it is the fingertip.
+    # A last link without solids is a frame or a sensor. Then its parent is the fingertip.
     leaves = set()
     for group in set(above) - set(above.values()):
         while group > 0 and group not in solid:
@@ -92,7 +92,7 @@ def find_fingers(hand: HandModel) -> Fingers:
 def _far_end(
     reached: Float[np.ndarray, "points 3"], root: Float[np.ndarray, "3"], middle: Float[np.ndarray, "3"]
 ) -> Float[np.ndarray, "3"]:
-    """Return the middle of the points farthest from a finger's root, or from the palm if that lies amid the points."""
+    """Return the mean of the points farthest from a finger's root, or from the palm if the root is amid the points."""
     for origin in (root, middle):
         distance = np.linalg.norm(reached - origin, axis=1)
         end = reached[distance >= np.quantile(distance, 0.85)].mean(0)
@@ -111,11 +111,11 @@ def _chain(group: int, above: dict[int, int]) -> list[int]:
 def _mates(
     hand: HandModel, points: LinkPoints, links: LinkNumbers, straight: LinkPoints, wrist: list[int]
 ) -> tuple[Bool[np.ndarray, "points"], Float[np.ndarray, "3"]]:
-    """Return which fingers point and bend the same way, and their bending direction. None and zero for a gripper."""
+    """Return a mask of the fingers that point and bend the same way, and their bend. Both are zero for a gripper."""
     q = straight_joints(hand)
     travel = 0.5 * (hand.lower + hand.upper) - q
     travel[wrist] = 0.0
-    # Half a millimetre is the noise of limits that are meant to be symmetric.
+    # Joint limits that are meant to be symmetric give a sweep of up to half a millimetre.
     sweep = units(point_jacobian(hand, q, points, links) @ travel, 5e-4)
     alike = (sweep @ sweep.T > _SAME_WAY) & (straight @ straight.T > _SAME_WAY)
     mates = alike[alike.sum(1).argmax()]
@@ -126,13 +126,13 @@ def _mates(
 
 
 def _stand_up(roots: Float[np.ndarray, "3 3"], pair: Float[np.ndarray, "2 3"]) -> bool:
-    """Tell whether two fingers stand on the plane of all three roots. Those of a human-like hand lie in it."""
+    """Return True if two fingers stand up from the plane of all three roots. In a human-like hand they lie in it."""
     across = np.cross(roots[1] - roots[0], roots[2] - roots[0])
     return bool(abs(pair.mean(0) @ units(across, 1e-6)) > _UPRIGHT)
 
 
 def palm_points(hand: HandModel, fingers: Fingers) -> Float[np.ndarray, "points 3"]:
-    """Return surface points of the palm, base frame [m]. Without solids: the roots of the fingers."""
+    """Return surface points of the palm, base frame [m]. If the palm has no solids, return the finger roots."""
     poses = link_poses(hand, straight_joints(hand))
     found = _group_surface(hand, poses, fingers.palm, 400, np.random.default_rng(0))
     return found if len(found) else fingers.roots
@@ -153,13 +153,13 @@ def placed_tips(hand: HandModel, fingers: Fingers, q: Float[np.ndarray, "joints"
 
 
 def knuckle_row(fingers: Fingers) -> Float[np.ndarray, "3"]:
-    """Return the direction in which the knuckles of two mates or more lie side by side."""
+    """Return the unit direction along the row of knuckles. There must be at least two mates."""
     knuckles = fingers.roots[fingers.mates]
     return np.linalg.svd(knuckles - knuckles.mean(0))[2][0]
 
 
 def straight_joints(hand: HandModel) -> Float[np.ndarray, "joints"]:
-    """Return joint values at zero, or as near as the limits allow."""
+    """Return joint values of zero, clamped to the joint limits."""
     return np.clip(0.0, hand.lower, hand.upper)
 
 
@@ -171,6 +171,6 @@ def middle_joints(hand: HandModel, fingers: Fingers) -> Float[np.ndarray, "joint
 
 
 def units(vectors: Float[np.ndarray, "*n 3"], least: float) -> Float[np.ndarray, "*n 3"]:
-    """Return unit vectors, zero for those shorter than `least`."""
+    """Return unit vectors. A vector not longer than `least` gives zero."""
     length = np.linalg.norm(vectors, axis=-1, keepdims=True)
     return np.where(length > least, vectors / np.maximum(length, 1e-300), 0.0)

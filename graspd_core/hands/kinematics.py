@@ -1,8 +1,8 @@
-"""Forward kinematics, batched over postures and parallel over links of equal depth. A hand at a posture as a mesh.
+"""Compute forward kinematics of a batch of postures, and the mesh of a hand at a posture.
 
-All functions of tensors are differentiable in the joint values with exact gradients. Formula: Rodrigues' rotation `R =
-I + sin(q) K + (1 - cos(q)) K²`, multiplied into each joint's constant offset beforehand. So a link's local transform is
-a sum of three constant matrices.
+All functions of tensors are differentiable in the joint values with exact gradients. The rotation is Rodrigues' `R = I
++ sin(q) K + (1 - cos(q)) K²`. It is multiplied into each joint's constant offset in advance. So a link's local
+transform is a weighted sum of constant matrices. Links of equal depth are computed together.
 """
 
 from __future__ import annotations
@@ -25,22 +25,22 @@ LinkPoints = Float[np.ndarray, "points 3"]
 LinkNumbers = Int[np.ndarray, "points"]
 LinkPoses = tuple[Float[np.ndarray, "links 3 3"], Float[np.ndarray, "links 3"]]
 
-# From how far a hand comes to its pregrasp, straight along its approach [m].
+# Distance of the retreat from the pregrasp, straight back along the approach [m].
 RETREAT = 0.1
 
 
 @dataclass(frozen=True, eq=False)
 class Kinematics:
-    """A hand's constants as tensors on one device. Links are regrouped by depth, and `order` undoes it.
+    """A hand's constants as tensors on one device. Links are sorted by depth.
 
     Attributes:
         constant, sine, cosine: `T_parent_link = constant + sin(q) sine + cos(q) cosine`, upper three rows.
-        slide: what a prismatic joint adds to the translation per metre, None if no joint is prismatic.
-        joint: the actuated joint of each regrouped link (0 where fixed: its coefficients are zero).
-        multiplier, shift: a coupled link's joint is at multiplier · q + shift, None if no joint is coupled.
-        level_sizes: number of links at each depth, the base's level first.
-        level_parents: per depth from 2 on, each link's parent within the level above, None if one to one.
-        order: position of each link of the hand in the regrouped list.
+        slide: translation per metre of a prismatic joint. None if no joint is prismatic.
+        joint: actuated joint of each sorted link. 0 for a fixed link, whose coefficients are zero.
+        multiplier, shift: a coupled joint has the value multiplier · q + shift. None if no joint is coupled.
+        level_sizes: number of links at each depth, starting with the base.
+        level_parents: for each depth from 2 on, each link's parent in the level above. None if one to one.
+        order: position of each link of the hand in the sorted list.
     """
 
     constant: Float[Tensor, "links 3 4"]
@@ -58,11 +58,11 @@ class Kinematics:
 def make_kinematics(
     hand: HandModel, device: torch.device | str = "cpu", dtype: torch.dtype = torch.float32
 ) -> Kinematics:
-    """Return what `forward` needs. The last few results are kept."""
+    """Return the constants that `forward` needs. The last results are cached."""
     return _make_kinematics(hand, torch.device(device), dtype)
 
 
-# A hand is hashed by identity: copies made by `replace` are hands of their own. Few are kept, for a hand is large.
+# A hand is hashed by identity, so a copy made by `replace` is another hand. Hands are large, so the cache is small.
 @lru_cache(maxsize=8)
 def _make_kinematics(hand: HandModel, device: torch.device, dtype: torch.dtype) -> Kinematics:
     depth = link_depths(hand.link_parent)
@@ -95,7 +95,7 @@ def _make_kinematics(hand: HandModel, device: torch.device, dtype: torch.dtype) 
 
 
 def forward(kinematics: Kinematics, q: Float[Tensor, "batch joints"]) -> SE3:
-    """Return `T_base_link` of every link at joint values q [rad] or [m]: a batch of hands by links."""
+    """Return `T_base_link` of every link at joint values q [rad] or [m]. The shape is batch by links."""
     k = kinematics
     values = q[:, k.joint]
     if k.multiplier is not None and k.shift is not None:
@@ -103,7 +103,7 @@ def forward(kinematics: Kinematics, q: Float[Tensor, "batch joints"]) -> SE3:
     local = k.constant + values.sin()[..., None, None] * k.sine + values.cos()[..., None, None] * k.cosine
     if k.slide is not None:
         local = local + values[..., None, None] * k.slide
-    # The base and its children need no product: the base frame is the world of this function.
+    # The base and its children need no product, because all poses are relative to the base frame.
     levels = list(local.split(list(k.level_sizes), dim=1))
     for depth, parents in enumerate(k.level_parents, start=2):
         parent = levels[depth - 1] if parents is None else levels[depth - 1][:, parents]
@@ -116,10 +116,10 @@ def forward(kinematics: Kinematics, q: Float[Tensor, "batch joints"]) -> SE3:
 def placement(
     num_links: int, points: Float[Tensor, "points 3"], links: Int[Tensor, "points"], *, directions: bool = False
 ) -> Float[Tensor, "points columns"]:
-    """Return a constant matrix that places link-frame points (or directions) by one product.
+    """Return a constant matrix with which `place_points` transforms link-frame points (or directions).
 
     Row p holds the homogeneous coordinates of point p in the four columns of its link. `place_points` is then one
-    matrix product for the whole batch, twice as fast as gathering a rotation per point.
+    matrix product for the whole batch. This is twice as fast as gathering a rotation per point.
     """
     matrix = points.new_zeros(len(points), num_links, 4)
     rows = torch.arange(len(points), device=points.device)
@@ -132,7 +132,7 @@ def place_points(matrix: Float[Tensor, "points columns"], links: SE3) -> Float[T
     """Return the points of a `placement` in the base frame [m], at the link poses of `forward`."""
     batch = links.rotation.shape[0]
     poses = torch.cat([links.rotation, links.translation[..., None]], dim=-1)
-    # Written out: of no pose at all, the number of rows could not be told from the size.
+    # The sizes are explicit, because −1 cannot be resolved for an empty batch.
     columns = poses.permute(1, 3, 0, 2).reshape(4 * poses.shape[1], 3 * batch)
     return (matrix @ columns).unflatten(1, (batch, 3)).transpose(0, 1)
 
@@ -150,7 +150,7 @@ def points_in_base(
     points: Float[Tensor, "points 3"],
     links: Int[Tensor, "points"],
 ) -> Float[Tensor, "batch points 3"]:
-    """Return link-frame points at joint values q, base frame [m]. For a fixed set of points keep its `placement`."""
+    """Return link-frame points at joint values q in the base frame [m]. To repeat this, keep the `placement`."""
     poses = forward(kinematics, q)
     return place_points(placement(poses.translation.shape[1], points, links), poses)
 
@@ -158,15 +158,15 @@ def points_in_base(
 def point_jacobian(
     hand: HandModel, q: JointValues, points: LinkPoints, links: LinkNumbers
 ) -> Float[np.ndarray, "points 3 joints"]:
-    """Return the geometric Jacobian of link-frame points, base frame, at one posture: `dx = J dq`, `τ = Σ Jᵀ f`.
+    """Return the geometric Jacobian of link-frame points at one posture, base frame: `dx = J dq`, `τ = Σ Jᵀ f`.
 
-    A revolute joint with axis a through o moves a point x behind it by `a × (x − o)`, a prismatic one by `a`. Coupled
-    joints add to the column of the joint that they follow, times their multipliers.
+    A revolute joint with axis a through o moves a point x of a later link by `a × (x − o)`. A prismatic joint moves it
+    by `a`. A coupled joint adds its motion times its multiplier to the column of the actuated joint.
     """
     rotation, translation = link_poses(hand, q)
     x = in_base((rotation, translation), points, links)
     jacobian = np.zeros((len(points), 3, hand.num_joints))
-    # Which link, by row, every other one hangs on.
+    # behind[i, j] is True if link i lies on the chain from the base to link j.
     behind = np.eye(hand.num_links, dtype=bool)
     for link in range(1, hand.num_links):
         behind[:, link] |= behind[:, hand.link_parent[link]]
@@ -179,7 +179,7 @@ def point_jacobian(
 
 
 def link_poses(hand: HandModel, q: JointValues) -> LinkPoses:
-    """Return `T_base_link` of every link at one posture in float64 numpy [m]."""
+    """Return `T_base_link` of every link at one posture as numpy arrays: rotations and origins [m]."""
     links = forward(make_kinematics(hand, dtype=torch.float64), torch.as_tensor(q)[None].double())[0]
     return links.rotation.numpy(), links.translation.numpy()
 
@@ -196,18 +196,18 @@ def drawn_back(
     approach: Float[Tensor, "3"],
     distance: float = RETREAT,
 ) -> Float[Tensor, "*batch 3"]:
-    """Return the positions of base frames [m], moved straight back against the hand's approach direction."""
+    """Return base positions [m] moved by `distance` [m] straight back against the approach direction."""
     return position - distance * (rotation @ approach)
 
 
 def retreat_posture(hand: HandModel, pregrasp: Posture, distance: float = RETREAT) -> Posture:
-    """Return the pregrasp moved straight back against the hand's approach direction by `distance` [m]."""
+    """Return the pregrasp moved by `distance` [m] straight back against the hand's approach direction."""
     rotation = rotation_from_quaternion(torch.as_tensor(pregrasp.quaternion_wxyz, dtype=torch.float64)).numpy()
     return replace(pregrasp, position=pregrasp.position - distance * rotation @ hand.approach)
 
 
 def link_depths(parent: Int[np.ndarray, "links"]) -> Int[np.ndarray, "links"]:
-    """Return the number of joints between each link and the base."""
+    """Return the number of joints, fixed ones included, between each link and the base."""
     depth = np.zeros(len(parent), dtype=np.int64)
     for link, above in enumerate(parent):
         if above >= 0:
@@ -237,7 +237,7 @@ def _coefficients(hand: HandModel) -> tuple[np.ndarray, np.ndarray, np.ndarray, 
 def hand_mesh(hand: HandModel, q: JointValues) -> TriangleMesh:
     """Return all collision primitives at joint values q as one mesh of overlapping closed bodies, base frame [m].
 
-    Curved faces are inscribed, with vertices on the true surface.
+    Curved faces are approximated by triangles with vertices on the true surface.
     """
     rotations, translations = link_poses(hand, q)
     meshes = [(primitive.link, primitive_mesh(primitive)) for primitive in hand.primitives]
@@ -245,7 +245,7 @@ def hand_mesh(hand: HandModel, q: JointValues) -> TriangleMesh:
 
 
 def primitive_mesh(primitive: Primitive) -> TriangleMesh:
-    """Return one primitive, triangulated, in the frame of its link [m]."""
+    """Return the triangle mesh of one primitive in the frame of its link [m]."""
     import trimesh
 
     size = primitive.size

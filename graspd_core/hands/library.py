@@ -1,4 +1,4 @@
-"""Hands by name, from a hand description (`config/hands/*.yaml`) or from a bare URDF."""
+"""Load hands by name, from a hand description (`config/hands/*.yaml`), or from a URDF or MJCF without description."""
 
 from __future__ import annotations
 
@@ -23,23 +23,23 @@ from graspd_core.hands.self_collision import adjacent_links
 from graspd_core.hands.surface_points import with_candidates
 from graspd_core.paths import config_dir
 
-# A joint's greatest torque [N·m], a sliding joint's greatest force [N], where neither URDF nor description gives one.
+# Greatest torque of a revolute joint [N·m] and force of a prismatic joint [N], if neither URDF nor description says it.
 DEFAULT_EFFORT, DEFAULT_FORCE = 0.7, 40.0
 
 
 def hand_names() -> tuple[str, ...]:
-    """Return the names of the hands that graspd ships with."""
+    """Return the names of the hands that are part of graspd."""
     return tuple(sorted(path.stem for path in (config_dir() / "hands").glob("*.yaml")))
 
 
 def load_hand(name_or_path: str | Path, *, candidates: int = 600, prefix: str = "") -> HandModel:
-    """Load a hand by its name, or from a description (.yaml), a bare URDF or MJCF (.urdf, .xml) or a MANO file (.pkl).
+    """Load a hand by name, or from a description (.yaml), a URDF or MJCF file (.urdf, .xml) or a MANO file (.pkl).
 
-    A bare URDF gets a guessed palm and guessed postures, and a warning in `HandModel.warnings`. `prefix` is put before
-    the names of joints and links. Two hands on one robot need different names.
+    Without a description, palm and postures are guessed, with a warning in `HandModel.warnings`. `prefix` is put before
+    all joint and link names, because two hands on one robot need different names.
 
     Raises:
-        HandError: no such hand or file, or it cannot be used. The message names the file and the culprit.
+        HandError: the hand or file does not exist or cannot be used. The message names the file and the culprit.
     """
     if candidates < 1:
         raise HandError(f"candidates={candidates}: at least 1 is needed")
@@ -69,10 +69,10 @@ def _prefixed(hand: HandModel, prefix: str) -> HandModel:
 
 
 def read_hand_file(path: Path, root_link: str | None = None) -> HandModel:
-    """Read a URDF or an MJCF file, as the root element decides.
+    """Read a URDF or an MJCF file. The root element decides which of the two it is.
 
-    `root_link` of a URDF names the link where the hand begins. Raises HandError: the file is neither, cannot be used,
-    or has no shape that could touch an object.
+    `root_link` names the link of a URDF at which the hand begins. Raises HandError: the file is neither URDF nor MJCF,
+    cannot be used, or has no shape that could touch an object.
     """
     root = read_xml(path)
     readers = {"robot": read_urdf, "mujoco": read_mjcf}
@@ -106,16 +106,16 @@ def _with_effort(hand: HandModel) -> HandModel:
     return replace(hand, effort=np.where(np.isfinite(hand.effort), hand.effort, default))
 
 
-# No joint of a hand is stronger than this [N·m], and no slide [N].
+# Greatest plausible effort of a revolute joint [N·m] and of a prismatic joint [N].
 _STRONGEST, _STRONGEST_SLIDE = 100.0, 10_000.0
-# Axes of one linkage: cosine between them, how far apart along them, and across them [m].
+# Two axes belong to one linkage from this cosine between them, and up to these distances along and across them [m].
 _PARALLEL, _LEVEL, _SIDE_BY_SIDE = 0.999, 0.008, 0.04
-# Two palms are farther apart than this [m].
+# Two branching links are two palms if they are farther apart than this [m].
 _APART = 0.2
 
 
 def doubts(hand: HandModel) -> tuple[str, ...]:
-    """Return warnings of what a hand can hardly have: efforts of a machine, an open linkage, fingers on two palms."""
+    """Return warnings about implausible properties: too high efforts, an open linkage, fingers on two palms."""
     rotations, translations = link_poses(hand, np.clip(0.0, hand.lower, hand.upper))
     linkages = _open_linkages(hand, rotations, translations)
     return (*_strong_joints(hand), *linkages, *_palms(hand, translations))
@@ -134,7 +134,7 @@ def _strong_joints(hand: HandModel) -> tuple[str, ...]:
 def _open_linkages(
     hand: HandModel, rotations: Float[np.ndarray, "links 3 3"], translations: Float[np.ndarray, "links 3"]
 ) -> tuple[str, ...]:
-    """Warn of free joints side by side on one link, if one of them moves only its own link: an open linkage."""
+    """Warn of an open linkage: two free joints side by side on one link, one of which moves only its own link."""
     parents = {link: int(hand.link_group[hand.link_parent[link]]) for link in np.flatnonzero(hand.link_joint >= 0)}
     coupled = {mimic.link for mimic in hand.mimics}
     free = [link for link in parents if link not in coupled and hand.joint_kind[link] == "revolute"]
@@ -154,7 +154,7 @@ def _open_linkages(
 
 
 def _palms(hand: HandModel, translations: Float[np.ndarray, "links 3"]) -> tuple[str, ...]:
-    """Warn of two links far apart, neither above the other, which fingers hang from."""
+    """Warn of two palms: two links far apart with several children each, neither an ancestor of the other."""
     counts = Counter(int(hand.link_parent[link]) for link in np.flatnonzero(hand.link_joint >= 0))
     branches = sorted(link for link, count in counts.items() if count > 1)
 
@@ -172,7 +172,7 @@ def _palms(hand: HandModel, translations: Float[np.ndarray, "links 3"]) -> tuple
 
 @lru_cache
 def hand_hash(name: str) -> str:
-    """Return the hash of a hand's URDF and description. Raises HandError: no such hand, or it cannot be used."""
+    """Return the hash of a hand's URDF and description. Raises HandError: the hand does not exist or is unusable."""
     hand = load_hand(name, candidates=1)
     boxed = config_dir() / "hands" / f"{name}.yaml"
     files = [Path(hand.urdf), boxed if boxed.is_file() else Path(name)]

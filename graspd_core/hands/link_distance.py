@@ -1,12 +1,12 @@
-"""Signed distance of points to a link's collision primitives, negative inside.
+"""Compute signed distances of points to the collision primitives of links [m], negative inside.
 
-Distances to boxes, spheres, capsules and cylinders are exact [m], and so are their gradients where they exist. On a
-centre or an axis the gradient is zero (see `se3.safe_norm`). Two approximations: inside a union, the depth to the
-nearest single primitive is a lower bound. The distance to a hull is the greatest to its face planes:
-exact inside and a lower bound outside near edges and corners.
+Distances to boxes, spheres, capsules and cylinders are exact. Their gradients are exact where they exist. On a centre
+or an axis the gradient is zero (see `se3.safe_norm`). There are two approximations. Inside a union, the greatest depth
+in a single primitive is a lower bound. The distance to a hull is the greatest distance to its face planes. It is exact
+inside, and a lower bound outside near edges and corners.
 
-`CollisionTensors` hold all boxes and round solids of a hand at once, for the distance of object points to every link.
-Hulls are left to the contact candidates.
+`CollisionTensors` hold all boxes and round solids of a hand, to compute the distance of object points to every link.
+They do not contain hulls. Hulls are tested by their contact candidates.
 """
 
 from __future__ import annotations
@@ -24,15 +24,15 @@ from graspd_core.hands.model import HandModel, Primitive
 from graspd_core.mesh.topology import scaled_normals
 from graspd_core.se3 import SE3, safe_norm
 
-# Points and their distances. A size of a solid, one for all points or one for each [m].
+# Points, their distances [m], and a size of a solid [m], which is one value or one per point.
 _Places, _Distances = Float[Tensor, "*batch 3"], Float[Tensor, "*batch"]
 _Length = float | Float[Tensor, "*#batch"]
-# Primitives of which planes and bounds are remembered: those of the most crowded hand.
+# Number of primitives whose planes and bounds are cached. It is enough for the hand with the most primitives.
 _MOST = 2048
 
 
 def primitive_sdf(primitive: Primitive, points: _Places) -> _Distances:
-    """Return the signed distance [m] of points in the link's frame to one primitive."""
+    """Return the signed distance [m] of points to one primitive. Points are in the link frame."""
     rotation, translation = (torch.as_tensor(a).to(points) for a in (primitive.rotation, primitive.translation))
     local = (points - translation) @ rotation
     size = primitive.size
@@ -49,7 +49,7 @@ def primitive_sdf(primitive: Primitive, points: _Places) -> _Distances:
 
 
 def depth_inside(hand: HandModel, link: int, points: Float[np.ndarray, "points 3"]) -> Float[np.ndarray, "points"]:
-    """Return the depth [m] of points in a link's frame inside the union of its primitives, zero outside."""
+    """Return the depth [m] of link-frame points inside the union of a link's primitives. 0 outside."""
     depth = np.zeros(len(points))
     near = np.flatnonzero(within_bounds(hand.primitives_of[link], points))
     for primitive in hand.primitives_of[link]:
@@ -62,7 +62,7 @@ def depth_inside(hand: HandModel, link: int, points: Float[np.ndarray, "points 3
 def within_bounds(
     primitives: Sequence[Primitive], points: Float[np.ndarray, "points 3"], margin: float = 0.0
 ) -> Bool[np.ndarray, "points"]:
-    """Return which points lie within `margin` [m] of the bounding box of the primitives, in the link's frame."""
+    """Return True for each link-frame point within `margin` [m] of the bounding box of the primitives."""
     if not primitives:
         return np.zeros(len(points), dtype=bool)
     low, high = _bounds_of_all(tuple(primitives))
@@ -77,7 +77,7 @@ def _bounds_of_all(primitives: tuple[Primitive, ...]) -> tuple[Float[np.ndarray,
 
 @lru_cache(maxsize=_MOST)
 def bounds(primitive: Primitive) -> tuple[Float[np.ndarray, "3"], Float[np.ndarray, "3"]]:
-    """Return the least and greatest coordinates of a primitive in its link's frame [m]."""
+    """Return the least and the greatest coordinates of a primitive in the link frame [m]."""
     if primitive.kind == "hull":
         corners = primitive.vertices @ primitive.rotation.T + primitive.translation
         return corners.min(0), corners.max(0)
@@ -95,51 +95,52 @@ def hull_planes(primitive: Primitive) -> tuple[Float[np.ndarray, "planes 3"], Fl
     keep = area > 1e-14
     normals = cross[keep] / area[keep, None]
     planes = np.column_stack([normals, (normals * primitive.vertices[primitive.faces[keep, 0]]).sum(1)])
-    # Coplanar triangles of one facet make one plane (rounded to 1e-9, far below what a mesh file resolves).
+    # Coplanar triangles give one plane. They are compared after rounding to 1e-9, far below a mesh file's resolution.
     planes = planes[np.unique(np.round(planes, 9), axis=0, return_index=True)[1]]
     return planes[:, :3], planes[:, 3]
 
 
 def sphere_sdf(points: _Places, radius: _Length) -> _Distances:
-    """Return the distance [m] to a sphere about the origin."""
+    """Return the signed distance [m] to a sphere about the origin."""
     return safe_norm(points) - radius
 
 
 def capsule_sdf(points: _Places, radius: _Length, half_length: _Length) -> _Distances:
-    """Return the distance [m] to a capsule: all points within `radius` of the segment |z| ≤ `half_length`."""
+    """Return the signed distance [m] to a capsule: all points within `radius` of the segment |z| ≤ `half_length`."""
     z = points[..., 2]
     beyond = z.sign() * (z.abs() - half_length).clamp_min(0.0)
     return safe_norm(torch.cat([points[..., :2], beyond[..., None]], -1)) - radius
 
 
 def box_sdf(points: _Places, half_extents: Float[Tensor, "*#batch 3"]) -> _Distances:
-    """Return the distance [m] to an axis-aligned box about the origin."""
+    """Return the signed distance [m] to an axis-aligned box about the origin."""
     return corner_sdf(points.abs() - half_extents)
 
 
 def cylinder_sdf(points: _Places, radius: _Length, half_length: _Length) -> _Distances:
-    """Return the distance [m] to a flat-ended cylinder along z, |z| ≤ `half_length`."""
+    """Return the signed distance [m] to a flat-ended cylinder along z, |z| ≤ `half_length`."""
     return corner_sdf(torch.stack([safe_norm(points[..., :2]) - radius, points[..., 2].abs() - half_length], -1))
 
 
 def corner_sdf(past: Float[Tensor, "*batch n"]) -> _Distances:
-    """Return the distance [m] to a corner of `n` orthogonal faces, from the signed distances past each face."""
+    """Return the signed distance [m] to a corner of `n` orthogonal faces. `past` has the distance to each face [m]."""
     return safe_norm(past.clamp_min(0.0)) + past.amax(-1).clamp_max(0.0)
 
 
-# Distances at once, on a CPU and on an accelerator. Each takes some hundred bytes on the way.
+# Distances computed at once on a CPU and on an accelerator. Each needs some hundred bytes of memory.
 _AT_ONCE, _AT_ONCE_ELSEWHERE = 2**21, 2**25
 
 
 @dataclass(frozen=True, eq=False)
 class CollisionTensors:
-    """Primitives in one common form: a box of half extents `core`, swept by `radius`. Cylinders are round boxes.
+    """Primitives in one common form: a core, which is a box or a cylinder, grown by `radius` on all sides.
 
     Attributes:
         rotation, translation: `T_link_primitive` [m].
-        core: half extents of a box, or (radius, radius, half length) of a cylinder, zero-width for swept solids [m].
-        radius: sweep radius of spheres and capsules, zero for others [m].
-        is_round: one where x and y are one radial coordinate.
+        core: half extents of a box, or (radius, radius, half length) of a cylinder [m]. A capsule has the core
+            (0, 0, half length), a sphere (0, 0, 0).
+        radius: radius of spheres and capsules, zero for others [m].
+        is_round: one for cylinders, whose x and y are one radial coordinate. Zero for others.
         link: link of each primitive.
     """
 
@@ -152,7 +153,7 @@ class CollisionTensors:
 
 
 def make_collision_tensors(hand: HandModel, device: torch.device | str, dtype: torch.dtype) -> CollisionTensors:
-    """Return the hand's boxes and round solids as tensors. The last few results are kept."""
+    """Return the hand's boxes and round solids as tensors. The last results are cached."""
     return _make_collision_tensors(hand, torch.device(device), dtype)
 
 
@@ -187,7 +188,7 @@ def _make_collision_tensors(hand: HandModel, device: torch.device, dtype: torch.
 def solid_distance(
     solids: CollisionTensors, links: SE3, points: Float[Tensor, "batch points 3"]
 ) -> Float[Tensor, "batch points solids"]:
-    """Return the signed distance [m] of base-frame points to every solid, negative inside, at poses of `forward`."""
+    """Return the signed distance [m] of base-frame points to every solid. `links` are the poses of `forward`."""
 
     def whole(links: SE3, points: Tensor) -> Tensor:
         return _distance(_to_solids(solids, links, points), solids.core, solids.radius, solids.is_round)
@@ -227,7 +228,7 @@ def _to_solids(
 def pair_distance(
     solids: CollisionTensors, links: SE3, points: Float[Tensor, "batch pairs 3"], which: Int[Tensor, "batch pairs"]
 ) -> Float[Tensor, "batch pairs"]:
-    """Return the signed distance [m] of base-frame points, each to one solid."""
+    """Return the signed distance [m] of each base-frame point to its own solid `which`."""
     rows = torch.arange(len(points), device=points.device)[:, None]
     in_link = links[rows, solids.link[which]].apply_inverse(points[..., None, :])
     local = SE3(solids.rotation, solids.translation)[which].apply_inverse(in_link).squeeze(-2)
@@ -235,7 +236,7 @@ def pair_distance(
 
 
 def local_distance(solids: CollisionTensors, local: _Places, which: Int[Tensor, "*batch"]) -> _Distances:
-    """Return the signed distance [m] of points in the frame of a solid, each to one solid."""
+    """Return the signed distance [m] of each point to its own solid `which`. Points are in that solid's frame."""
     return _distance(local, solids.core[which], solids.radius[which], solids.is_round[which])
 
 

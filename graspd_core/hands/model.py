@@ -1,6 +1,6 @@
-"""A hand as a frozen tree of links with joints, masses, collision primitives and contact candidates.
+"""The hand model: a tree of links with joints, masses, collision primitives and contact candidates.
 
-Link frames are the URDF's. The base frame is the frame of `base_link`. Metres, radians, kilograms, newton metres.
+Link frames are those of the URDF. The base frame is the frame of `base_link`. Units are m, rad, kg, N, N·m.
 """
 
 from __future__ import annotations
@@ -17,23 +17,23 @@ from graspd_core.types import TriangleMesh
 PrimitiveKind = Literal["box", "sphere", "capsule", "cylinder", "hull"]
 JointKind = Literal["revolute", "prismatic", "fixed"]
 
-# Where the base link stands in a file that says nothing of it.
+# Pose of the base link if the file does not give one.
 AT_ORIGIN = ((0.0, 0.0, 0.0), (1.0, 0.0, 0.0, 0.0))
-# Travel of a sliding joint that counts as much as a turn of one radian [m]: what a finger of 50 mm makes of it.
+# Travel of a prismatic joint that counts as one radian [m]. A fingertip at 50 mm moves as far in one radian.
 METRES_PER_RADIAN = 0.05
 
 
 @dataclass(frozen=True, eq=False)
 class Primitive:
-    """One convex collision solid, fixed in its link.
+    """A convex collision solid, fixed to a link.
 
     Attributes:
-        link: index of the link it belongs to.
-        kind: what solid it is.
-        rotation: `R_link_primitive`, capsules and cylinders lie along the primitive's z axis.
-        translation: the primitive's origin in the link frame [m].
-        size: [m] three half extents (box), radius (sphere), radius and half length (capsule, cylinder), none (hull).
-        vertices: corners of a hull in the primitive's frame, empty for other kinds [m].
+        link: index of the link.
+        kind: kind of the solid.
+        rotation: `R_link_primitive`. Capsules and cylinders lie along the primitive's z axis.
+        translation: origin of the primitive in the link frame [m].
+        size: three half extents (box), radius (sphere), radius and half length (capsule, cylinder), () (hull) [m].
+        vertices: corners of a hull in the primitive's frame [m]. Empty for other kinds.
         faces: triangles of a hull, counter-clockwise seen from outside.
     """
 
@@ -48,14 +48,14 @@ class Primitive:
 
 @dataclass(frozen=True)
 class Mimic:
-    """A joint coupled to an actuated one: its value is `multiplier · q[joint] + offset`.
+    """A joint coupled to an actuated joint. Its value is `multiplier · q[joint] + offset`.
 
     Attributes:
-        name: of the coupled joint.
-        link: the link that it moves.
-        joint: the actuated joint that it follows, chains of coupled joints resolved.
-        multiplier: its travel for one radian or metre of that joint.
-        offset: its value where that joint is at zero [rad] or [m].
+        name: name of the coupled joint.
+        link: link that the coupled joint moves.
+        joint: index of the actuated joint, also if there are other coupled joints in between.
+        multiplier: travel of the coupled joint per radian or metre of the actuated joint.
+        offset: value of the coupled joint when the actuated joint is at zero [rad] or [m].
     """
 
     name: str
@@ -67,12 +67,12 @@ class Mimic:
 
 @dataclass(frozen=True)
 class Mount:
-    """Where a hand's base link sits on the arm that carries it: `T_parent_base`.
+    """The pose of a hand's base link on an arm: `T_parent_base`.
 
     Attributes:
-        parent: the arm's link, its flange or tool frame.
-        position: of the base link in that frame [m].
-        quaternion_wxyz: of the base link in that frame, unit.
+        parent: link of the arm: its flange or tool frame.
+        position: position of the base link in the parent's frame [m].
+        quaternion_wxyz: orientation of the base link in the parent's frame, a unit quaternion.
     """
 
     parent: str
@@ -82,42 +82,42 @@ class Mount:
 
 @dataclass(frozen=True, eq=False)
 class HandModel:
-    """A hand as loaded. Links and joints are in depth-first order. Link 0 is `base_link`.
+    """A loaded hand. Links and joints are in depth-first order. Link 0 is `base_link`.
 
-    Joints are the actuated ones throughout: coupled joints follow from them (`mimics`), and only what leaves graspd
-    lists them too (`all_joint_names`).
+    Joint arrays contain the actuated joints. Coupled joints follow from them (`mimics`). Only the outputs of graspd,
+    files and messages, list coupled joints too (`all_joint_names`).
 
     Attributes:
-        name: the hand's name.
-        urdf: path of the description, as loaded.
-        link_names: every link, those behind fixed joints included.
-        joint_names: actuated joints, depth-first.
+        name: name of the hand.
+        urdf: path of the loaded URDF or other hand file.
+        link_names: all links, also those behind fixed joints.
+        joint_names: actuated joints.
         lower, upper: joint limits [rad] or [m].
         effort: greatest joint torque [N·m] or force [N].
-        velocity: greatest joint speed, infinite where unset [rad/s] or [m/s].
-        open_posture, closed_posture: joint values of an open hand and of a fist around something.
-        palm_center: the point of the palm's surface that grasps centre on, base frame [m].
+        velocity: greatest joint speed [rad/s] or [m/s]. Infinite if the file gives none.
+        open_posture, closed_posture: joint values of the open hand and of the hand closed around an object.
+        palm_center: centre of the palm's surface, base frame [m].
         palm_normal: unit direction out of the palm, base frame.
         approach: unit direction in which the hand moves towards an object, base frame.
-        link_parent: each link's parent, -1 for the base.
-        link_joint: the actuated joint that moves the link against its parent, directly or coupled, -1 for none.
+        link_parent: parent of each link, -1 for the base.
+        link_joint: actuated joint that moves the link relative to its parent, directly or by coupling. -1 for none.
         link_offset_rotation, link_offset_translation: `T_parent_link` at joint value zero [m].
-        joint_axis: unit axis of the link's own joint in the link frame, zero where fixed.
+        joint_axis: unit axis of the joint between link and parent, link frame. Zero for a fixed joint.
         joint_kind: kind of the joint between link and parent.
-        link_group: links welded to each other by fixed joints share a number.
-        link_mass: [kg], zero if the description gives none.
+        link_group: number of the rigid group of each link. Fixed joints connect the links of a group.
+        link_mass: [kg], zero if the file gives none.
         link_com: centre of mass, link frame [m].
-        link_inertia: about the centre of mass, in link axes [kg·m²].
+        link_inertia: inertia about the centre of mass, in link axes [kg·m²].
         primitives: collision solids.
-        adjacent: pairs of links that are never checked against each other, symmetric, true on the diagonal.
-        candidate_points: contact candidates, frame of their link [m].
-        candidate_normals: outward unit normals there.
-        candidate_link: the link of each candidate.
-        warnings: what had to be guessed while loading.
-        base_place: where the base link stands in the frame of its file, position [m] and quaternion wxyz.
-        mimics: the coupled joints, in the order of their links.
-        mount: where the base link sits on an arm, None where nobody said.
-        skins: links, and the surfaces that their contact candidates lie on where it is not that of their solids [m].
+        adjacent: True for pairs of links that are never checked for collision. Symmetric, True on the diagonal.
+        candidate_points: contact candidates, in the frames of their links [m].
+        candidate_normals: outward unit normals at the candidates.
+        candidate_link: link of each candidate.
+        warnings: guesses and doubts from loading.
+        base_place: pose of the base link in the frame of its file: position [m] and quaternion wxyz.
+        mimics: coupled joints, in the order of their links.
+        mount: pose of the base link on an arm. None if it is unknown.
+        skins: links with a surface mesh [m] in the link frame. Their contact candidates lie on it, not on solids.
     """
 
     name: str
@@ -156,7 +156,7 @@ class HandModel:
 
     @property
     def base_link(self) -> str:
-        """Name of the root link, whose frame is the base frame."""
+        """Name of the root link. Its frame is the base frame."""
         return self.link_names[0]
 
     @property
@@ -171,29 +171,29 @@ class HandModel:
 
     @property
     def num_links(self) -> int:
-        """Number of links, fixed ones included."""
+        """Number of links, also of those behind fixed joints."""
         return len(self.link_names)
 
     @cached_property
     def link_index(self) -> dict[str, int]:
-        """Link name to link number."""
+        """The index of each link by name."""
         return {name: i for i, name in enumerate(self.link_names)}
 
     @cached_property
     def primitives_of(self) -> tuple[tuple[Primitive, ...], ...]:
-        """The primitives of each link, by link number."""
+        """The primitives of each link, by link index."""
         return tuple(tuple(p for p in self.primitives if p.link == i) for i in range(self.num_links))
 
     @cached_property
     def fingertip_groups(self) -> Int[np.ndarray, "tips"]:
-        """Groups of rigidly joined links at the ends of the fingers: those that move no further group."""
+        """The rigid groups at the ends of the fingers, which have no child group."""
         groups, parents = self.link_group, self.link_parent
         inner = {int(groups[p]) for link, p in enumerate(parents) if p >= 0 and groups[link] != groups[p]}
         return np.array(sorted(set(groups.tolist()) - inner), dtype=int)
 
     @cached_property
     def link_joint_names(self) -> tuple[str, ...]:
-        """Name of the joint that moves each link against its parent, coupled ones too, empty for none."""
+        """Name of the actuated or coupled joint between each link and its parent. Empty for a fixed joint."""
         names = [self.joint_names[joint] if joint >= 0 else "" for joint in self.link_joint.tolist()]
         for mimic in self.mimics:
             names[mimic.link] = mimic.name
@@ -201,7 +201,7 @@ class HandModel:
 
     @cached_property
     def link_multiplier(self) -> Float[np.ndarray, "links"]:
-        """Travel of each link's own joint for one radian or metre of `link_joint`: one where it is that joint."""
+        """Travel of the joint above each link per radian or metre of `link_joint`. One if that joint is actuated."""
         multiplier = np.ones(self.num_links)
         for mimic in self.mimics:
             multiplier[mimic.link] = mimic.multiplier
@@ -209,7 +209,7 @@ class HandModel:
 
     @cached_property
     def link_shift(self) -> Float[np.ndarray, "links"]:
-        """Value of each link's own joint where `link_joint` is at zero [rad] or [m]."""
+        """Value of the joint above each link when `link_joint` is at zero [rad] or [m]."""
         shift = np.zeros(self.num_links)
         for mimic in self.mimics:
             shift[mimic.link] = mimic.offset
@@ -217,7 +217,7 @@ class HandModel:
 
     @cached_property
     def slides(self) -> Bool[np.ndarray, "joints"]:
-        """Which actuated joints are prismatic."""
+        """True for each actuated joint that is prismatic."""
         slides = np.zeros(self.num_joints, dtype=bool)
         coupled = {mimic.link for mimic in self.mimics}
         for link, joint in enumerate(self.link_joint):
@@ -227,16 +227,16 @@ class HandModel:
 
     @cached_property
     def joint_scale(self) -> Float[np.ndarray, "joints"]:
-        """The travel of each joint that counts as much as one radian [rad] or [m]."""
+        """The travel of each joint that counts as one radian: 1 rad if revolute, a length [m] if prismatic."""
         return np.where(self.slides, METRES_PER_RADIAN, 1.0)
 
 
 def all_joint_names(hand: HandModel) -> tuple[str, ...]:
-    """Return the names of all movable joints, coupled ones too, depth-first, as files and messages hold them."""
+    """Return the names of all actuated and coupled joints, depth-first, as in files and messages."""
     return tuple(name for name in hand.link_joint_names if name)
 
 
 def all_joint_positions(hand: HandModel, q: Float[np.ndarray, "joints"]) -> Float[np.ndarray, "movable"]:
-    """Return the values of `all_joint_names` at actuated values q [rad] or [m]."""
+    """Return the values of `all_joint_names` for the actuated joint values q [rad] or [m]."""
     moved = hand.link_joint >= 0
     return hand.link_multiplier[moved] * q[hand.link_joint[moved]] + hand.link_shift[moved]

@@ -1,8 +1,8 @@
-"""Spheres that fill the links, for a cheap differentiable self-collision term. Overlap of links at a posture.
+"""Fill links with spheres for a cheap differentiable self-collision term, and measure the overlap of links.
 
-The spheres approximate: they bulge out of the flat faces of long boxes by up to a fifth of the half thickness. Metrics
-use signed distances instead. The term looks at every pair of spheres, so their number is bounded. Thin solids get
-spheres that bulge. Crowded hands keep the spheres that stick out farthest.
+The spheres extend beyond the flat faces of long boxes, by up to a fifth of the half thickness, and beyond thin solids.
+Metrics use signed distances instead. The term tests every pair of spheres, so the number of spheres is limited. If a
+hand has too many, those that extend farthest are kept.
 """
 
 from __future__ import annotations
@@ -18,11 +18,12 @@ from graspd_core.hands.link_distance import depth_inside
 from graspd_core.hands.model import HandModel, Primitive
 from graspd_core.hands.surface_points import dense_samples, kept, parent_groups
 
-# The most spheres of a rigid group of links, and of a hand. One of more groups than that has one for each.
+# Greatest number of spheres of a rigid group, and of a hand. A hand with more groups has one sphere per group.
 MOST_OF_GROUP, MOST_OF_HAND = 64, 160
-# The finest radius that solids are filled with [m]. They may themselves be smaller.
+# Least radius of the spheres in a box, unless the box is smaller, and least step along capsules and cylinders [m].
 _FINEST = 0.003
-# What the spheres of a crowded hand leave bare where there are enough, and a disc around its one sphere [m].
+# A dropped sphere may extend beyond the kept ones by `_BARE` [m]. A cylinder is filled like a box if its radius exceeds
+# its half length by more than `_RIM` [m].
 _BARE, _RIM = 0.001, 0.01
 
 
@@ -49,11 +50,11 @@ def collision_spheres(
 def _spread(
     centers: Float[np.ndarray, "n 3"], radii: Float[np.ndarray, "n"], groups: Int[np.ndarray, "n"]
 ) -> Int[np.ndarray, "kept"]:
-    """Choose the largest sphere of each group, then always the one that sticks farthest out of those chosen.
+    """Choose the largest sphere of each group, then repeatedly the sphere that extends farthest beyond the chosen ones.
 
     This is farthest-point sampling (Gonzalez 1985).
     """
-    # Farther out than any sphere can stick: nothing of its group has been chosen.
+    # More than 1e3 m marks a sphere whose group has no chosen sphere yet.
     bare = 1e3 + radii
     chosen: list[int] = []
     while bare.max() > _BARE and (len(chosen) < MOST_OF_HAND or bare.max() > 1e3):
@@ -105,9 +106,9 @@ def _row(reach: float, step: float) -> Float[np.ndarray, "n"]:
     return np.linspace(-reach, reach, int(np.ceil(2 * reach / (1.2 * step))) + 1)
 
 
-# Overlap that counts as touching rather than colliding [m].
+# Overlap up to this counts as touching, not as collision [m].
 _TOUCH = 1e-4
-# Overlap of links two joints apart that square corners make where the true links are round [m].
+# Links two joints apart may overlap up to this [m], because boxes have corners where the true links are round.
 _GRAZE = 2e-3
 _SAMPLES, _POSTURES = 1200, 24
 
@@ -118,9 +119,9 @@ def link_overlaps(
     points: Float[np.ndarray, "samples 3"],
     links: Int[np.ndarray, "samples"],
 ) -> Float[np.ndarray, "postures links links"]:
-    """Return the greatest depth [m] of each link's surface samples (link frames) inside each other link, symmetric.
+    """Return the overlap depth of each pair of links [m]: the greatest depth of surface samples of one in the other.
 
-    Adjacent pairs are included: mask them with `hand.adjacent`.
+    `points` are surface samples in link frames [m]. Adjacent pairs are included. Mask them with `hand.adjacent`.
     """
     poses = forward(make_kinematics(hand, dtype=torch.float64), torch.as_tensor(q).double())
     owner = torch.as_tensor(links)
@@ -143,10 +144,10 @@ def deepest_overlap(hand: HandModel, q: Float[np.ndarray, "postures joints"]) ->
 
 
 def adjacent_links(hand: HandModel) -> Bool[np.ndarray, "links links"]:
-    """Return the pairs of links that are never checked against each other, remembered on disk by the hand's content.
+    """Return the pairs of links that are never checked for collision. The result is cached on disk by hand content.
 
-    These are links welded or one joint apart, and links two joints apart that at most graze, as boxes stand for rounded
-    knuckles. Pairs that overlap in the open posture or in every sampled posture are adjacent too.
+    These are links of one rigid group, links one joint apart, and links two joints apart with little overlap. Pairs
+    that overlap in the open posture or in every sampled posture are adjacent too.
     """
     build = lambda: {"adjacent": _adjacent_links(hand)}  # noqa: E731
     return kept(hand, "adjacent", hand.num_links, {"adjacent": (hand.num_links,)}, build)["adjacent"]

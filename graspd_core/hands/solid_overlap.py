@@ -1,8 +1,8 @@
-"""How deep the solids of links that are not adjacent overlap, by separating axes.
+"""Compute the overlap depth of solids of links that are not adjacent, by the separating axis test.
 
-Two boxes are apart along a face normal of one or across an edge of each. The least overlap along these fifteen
-directions is exact. Round solids take three more directions. Where an edge meets a rim the depth is somewhat too large.
-Hulls are left out. Gradients are exact where one direction is the least.
+A separating axis of two boxes is a face normal, or the cross product of two edges. For boxes the least overlap along
+these fifteen directions is the exact depth. Round solids need three more directions. If an edge meets a rim, the depth
+is slightly too large. Hulls are excluded. Gradients are exact if a single direction has the least overlap.
 """
 
 from __future__ import annotations
@@ -16,14 +16,14 @@ from graspd_core.hands.link_distance import CollisionTensors
 from graspd_core.hands.model import HandModel
 from graspd_core.se3 import SE3
 
-# Sine of the least angle between two edges that tell a direction, and the least length of other directions [m].
+# Least sine of the angle between two edges that give a direction, and least length of other directions [m].
 _PARALLEL, _SHORTEST = 1e-3, 1e-6
-# Edges tell the direction only where they are better than faces by this [m]: rounding chooses between equals.
+# An edge direction is chosen only if its depth is less than that of every face by this [m]. It avoids rounding effects.
 _RATHER_FACES = 1e-6
 
 
 def solid_pairs(hand: HandModel) -> Int[np.ndarray, "pairs 2"]:
-    """Return the pairs of solids, without hulls, whose links are not adjacent."""
+    """Return the pairs of solids whose links are not adjacent. Hulls are not counted as solids here."""
     link = np.array([p.link for p in hand.primitives if p.kind != "hull"], dtype=np.int64)
     return np.argwhere(np.triu(~hand.adjacent[np.ix_(link, link)], 1))
 
@@ -31,7 +31,7 @@ def solid_pairs(hand: HandModel) -> Int[np.ndarray, "pairs 2"]:
 def solid_overlaps(
     solids: CollisionTensors, pairs: Int[Tensor, "pairs 2"], links: SE3
 ) -> tuple[Int[Tensor, "overlaps"], Float[Tensor, "overlaps"]]:
-    """Return the rows of the pairs that overlap in a batch of link poses, and their depth [m], differentiable."""
+    """Return the batch row and the depth [m] of every overlapping pair. The depth is differentiable."""
     placed = links[:, solids.link].compose(SE3(solids.rotation, solids.translation))
     apart = placed.translation[:, pairs[:, 0]] - placed.translation[:, pairs[:, 1]]
     reach = (solids.core.norm(dim=-1) + solids.radius)[pairs].sum(-1)
@@ -56,7 +56,7 @@ def solid_overlaps(
 def _width(
     solids: CollisionTensors, which: Int[Tensor, "n"], local: Float[Tensor, "n directions 3"]
 ) -> Float[Tensor, "n directions"]:
-    """Return half the extent of each solid along directions in its own frame [m]."""
+    """Return half the extent of each solid [m] along directions given in the solid's frame."""
     core, round_one = solids.core[which][:, None], solids.is_round[which][:, None] > 0
     x, y, z = local.abs().unbind(-1)
     radial = (x * x + y * y).clamp_min(1e-24).sqrt()

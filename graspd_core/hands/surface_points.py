@@ -1,7 +1,7 @@
-"""The hand's outer surface as points: contact candidates for the optimiser, dense samples for the metrics.
+"""Sample the hand's outer surface: contact candidates for the optimiser, dense samples for the metrics.
 
-Points inside another solid of the same rigid group are left out, and points that stay inside the next link at every
-joint value. Random points are uniform by area. Feature points add edges, corners and rims.
+Points inside another solid of the same rigid group are left out. Points that are inside the next link at every joint
+value are left out too. Random points are uniform by area. Feature points lie on edges, corners and rims.
 """
 
 from __future__ import annotations
@@ -25,12 +25,12 @@ from graspd_core.mesh.topology import scaled_normals
 from graspd_core.runtime import disk_cache as cache
 
 Points = Float[np.ndarray, "points 3"]
-# Points in link frames [m], the link of each, and the area that each stands for [m²].
+# Points in link frames [m], the link of each point, and the area that each point represents [m²].
 Samples = tuple[Points, LinkNumbers, Float[np.ndarray, "points"]]
 
 
 def primitive_area(primitive: Primitive) -> float:
-    """Return the surface area [m²]."""
+    """Return the surface area of a primitive [m²]."""
     size = primitive.size
     if primitive.kind == "box":
         return 8.0 * (size[0] * size[1] + size[1] * size[2] + size[2] * size[0])
@@ -44,7 +44,7 @@ def primitive_area(primitive: Primitive) -> float:
 
 
 def surface_points(primitive: Primitive, count: int, rng: np.random.Generator) -> tuple[Points, Points]:
-    """Draw `count` random surface points [m] and their outward normals."""
+    """Draw `count` random surface points [m] with outward normals, in the link frame."""
     if primitive.kind == "box":
         points, normals = _box(np.asarray(primitive.size), count, rng)
     elif primitive.kind == "hull":
@@ -55,7 +55,7 @@ def surface_points(primitive: Primitive, count: int, rng: np.random.Generator) -
 
 
 def feature_points(primitive: Primitive, spacing: float) -> tuple[Points, Points, Bool[np.ndarray, "points"]]:
-    """Return points on edges and rims at most `spacing` [m] apart, their mean normals, and which are corners."""
+    """Return points on edges and rims at most `spacing` [m] apart, mean normals, and True for each corner."""
     if primitive.kind == "box":
         points, normals, corner = _box_edges(np.asarray(primitive.size), spacing)
     elif primitive.kind == "cylinder":
@@ -71,8 +71,8 @@ def feature_points(primitive: Primitive, spacing: float) -> tuple[Points, Points
 
 
 def outermost(points: Float[np.ndarray, "_ 3"], count: int) -> Float[np.ndarray, "_ 3"]:
-    """Return the points that lie farthest out along `count` evenly spread directions."""
-    # By parts: a fine mesh has a hundred thousand points.
+    """Return the points that are extreme along `count` evenly spread directions."""
+    # Computing by parts limits the memory, because a fine mesh has a hundred thousand points.
     parts = np.array_split(even_directions(count), -(-count // 64), axis=1)
     return points[np.unique(np.concatenate([(points @ part).argmax(0) for part in parts]))]
 
@@ -95,7 +95,7 @@ def _box(half: Float[np.ndarray, "3"], count: int, rng: np.random.Generator) -> 
 
 
 def _round(primitive: Primitive, count: int, rng: np.random.Generator) -> tuple[Points, Points]:
-    """Sample spheres, capsules and cylinders: a barrel, and caps that are half balls or discs."""
+    """Sample a sphere, capsule or cylinder: the lateral surface, and caps that are half spheres or discs."""
     radius = primitive.size[0]
     half = primitive.size[1] if len(primitive.size) > 1 else 0.0
     flat = primitive.kind == "cylinder"
@@ -103,7 +103,7 @@ def _round(primitive: Primitive, count: int, rng: np.random.Generator) -> tuple[
     on_barrel = rng.uniform(size=count) < half / (half + caps) if half else np.zeros(count, dtype=bool)
     turn = rng.uniform(-np.pi, np.pi, count)
     around = np.column_stack([np.cos(turn), np.sin(turn), np.zeros(count)])
-    height = np.where(on_barrel, 0.0, rng.uniform(-1.0, 1.0, count))  # Archimedes: a sphere's height is uniform
+    height = np.where(on_barrel, 0.0, rng.uniform(-1.0, 1.0, count))  # Heights on a sphere are uniform (Archimedes).
     side = np.sign(height)
     if flat:
         reach = np.where(on_barrel, 1.0, np.sqrt(rng.uniform(size=count)))
@@ -149,27 +149,28 @@ def _rims(radius: float, half: float, spacing: float) -> tuple[Points, Points]:
     return points, _unit(np.concatenate([around + up, around - up]))
 
 
-# What no sample depends on.
+# Fields of the hand model that do not influence the samples.
 _BESIDES = {"name", "urdf", "warnings", "mount", "base_place", "adjacent"}
 _BESIDES |= {"candidate_points", "candidate_normals", "candidate_link"}
 _CONTENT = {item.name for item in fields(HandModel)} - _BESIDES
-# Steps along the normal that tell a face that lies on another solid from one that is flush with it [m].
+# Points within a tenth of this of another solid's surface count as on that surface [m].
 _STEP = 1e-6
-# How far out of a face a point must come free of the other solids of its group: in a crease nothing can be touched [m].
+# A point counts as covered if it is still near another solid of its group after this step along its normal [m]. In a
+# crease the hand cannot touch anything.
 _CREASE = 1e-4
-# Random points drawn for each that lies on the outer surface, at most.
+# Greatest number of random points drawn per wanted point.
 _MOST_DRAWN = 200
-# Points on edges and corners that candidates are chosen from, at most.
+# Greatest number of points on edges and corners from which candidates are chosen.
 _MOST_FEATURES = 20_000
-# Of the candidates, the most that may be corners chosen beforehand.
+# Greatest share of candidates that are corners.
 _CORNER_SHARE = 0.3
-# Spacing of candidates is inversely proportional to these. A surface that faces the grasp has 1.
+# The spacing of candidates is inversely proportional to these weights. A surface that faces the grasp has weight 1.
 _TIP_WEIGHT, _EDGE_WEIGHT, _BACK_WEIGHT = 2.0, 1.25, 0.5
 
 
 @dataclass(frozen=True, eq=False)
 class _Pool:
-    """Surface points in link frames, with the primitive each came from and the area it stands for [m²]."""
+    """Surface points in link frames [m]. `source` is the primitive of each, `areas` the area it represents [m²]."""
 
     points: Float[np.ndarray, "points 3"]
     normals: Float[np.ndarray, "points 3"]
@@ -179,13 +180,12 @@ class _Pool:
     corner: Bool[np.ndarray, "points"]
 
     def take(self, keep: np.ndarray) -> _Pool:
-        """Return the points that a mask or an index array chooses."""
         return _Pool(*(array[keep] for array in vars(self).values()))
 
 
 @lru_cache(maxsize=8)
 def with_candidates(hand: HandModel, count: int) -> HandModel:
-    """Return the hand with `count` contact candidates, itself if it has as many. Raises HandError: fewer than one."""
+    """Return the hand with `count` contact candidates, or the same hand if it has them. Raises HandError: count < 1."""
     if count < 1:
         raise HandError(f"candidates={count}: at least 1 is needed")
     if count == len(hand.candidate_link):
@@ -202,9 +202,9 @@ def with_candidates(hand: HandModel, count: int) -> HandModel:
 def candidates(hand: HandModel, count: int, seed: int) -> tuple[Points, Points, LinkNumbers]:
     """Return evenly spread contact candidates: points [m] and outward normals in link frames, and their links.
 
-    Corners of boxes that face the grasp come first. Then farthest-point sampling (Gonzalez 1985) runs within each rigid
-    group, denser on fingertips and sparser on backs (`_weights`). The first n of many cover the hand evenly too.
-    Candidates lie on a link's skin if it has one.
+    Corners that face the grasp are chosen first. Then farthest-point sampling (Gonzalez 1985) runs within each rigid
+    group. It is denser on fingertips and sparser on backs (`_weights`). The first n candidates cover the hand evenly
+    too. If a link has a skin, its candidates lie on the skin.
     """
     rng = np.random.default_rng(seed)
     features = _exposed(hand, _feature_pool(hand))
@@ -218,7 +218,7 @@ def candidates(hand: HandModel, count: int, seed: int) -> tuple[Points, Points, 
     if len(corners) > limit:
         corners = corners[_farthest(placed[corners], groups[corners], weights[corners], np.zeros(0, int), limit)]
     picked = _farthest(placed, groups, weights, corners, count)
-    # Sampled once more among themselves, so that the first few of them are not the corners alone.
+    # The second sampling sorts the candidates, so that the first few are not only corners.
     picked = picked[_farthest(placed[picked], groups[picked], weights[picked], np.zeros(0, int), count)]
     pool = pool.take(picked)
     points, normals = pool.points.copy(), pool.normals.copy()
@@ -231,8 +231,8 @@ def candidates(hand: HandModel, count: int, seed: int) -> tuple[Points, Points, 
 def dense_samples(hand: HandModel, *, count: int = 4000, seed: int = 1) -> Samples:
     """Return at least `count` random points of the outer surface: points in link frames [m], links, areas [m²].
 
-    They are independent of the candidates. The areas sum to the area of the outer surface. Raises HandError: hardly any
-    of its surface is outer surface.
+    The points are independent of the candidates. The areas sum to the area of the outer surface. Raises HandError:
+    almost all of the hand's surface lies inside other solids.
     """
     rng = np.random.default_rng(seed)
     drawn, pool = count, _exposed(hand, _random_pool(hand, count, rng))
@@ -245,7 +245,7 @@ def dense_samples(hand: HandModel, *, count: int = 4000, seed: int = 1) -> Sampl
 
 
 def kept_dense_samples(hand: HandModel, *, count: int, seed: int) -> Samples:
-    """Return `dense_samples`, remembered on disk by the hand's content."""
+    """Return `dense_samples`, cached on disk by the content of the hand."""
 
     def build() -> dict[str, np.ndarray]:
         points, links, areas = dense_samples(hand, count=count, seed=seed)
@@ -258,12 +258,12 @@ def kept_dense_samples(hand: HandModel, *, count: int, seed: int) -> Samples:
 def kept(
     hand: HandModel, what: str, rows: int, shapes: Mapping[str, tuple[int, ...]], build: Callable[[], cache.Arrays]
 ) -> cache.Arrays:
-    """Return what `build` samples of a hand of this content, remembered on disk.
+    """Return the arrays that `build` computes, cached on disk by the content of the hand.
 
     Args:
-        what: name of the samples and all settings that they depend on.
-        rows: the least number of rows.
-        shapes: the arrays' names, and the shape of a row of each.
+        what: name of the arrays, with all settings that they depend on.
+        rows: least number of rows of each array.
+        shapes: name of each array, and the shape of its rows.
     """
 
     def valid(arrays: cache.Arrays) -> bool:
@@ -287,7 +287,7 @@ def _pool(
 
 def _random_pool(hand: HandModel, count: int, rng: np.random.Generator) -> _Pool:
     areas = np.array([primitive_area(p) for p in hand.primitives])
-    # A few for the smallest solid too, but not thousands because there are thousands of solids.
+    # Small solids get a few points too, but only one each if there are thousands of solids.
     least = np.clip(count // len(areas), 1, 8)
     counts = np.maximum(least, np.ceil(count * areas / areas.sum())).astype(int)
     parts = [surface_points(p, int(n), rng) for p, n in zip(hand.primitives, counts, strict=True)]
@@ -298,17 +298,17 @@ def _feature_pool(hand: HandModel) -> _Pool:
     parts = [feature_points(p, spacing=0.004) for p in hand.primitives]
     corner = np.concatenate([part[2] for part in parts])
     pool = _pool(hand, parts, np.zeros(len(corner)), corner)
-    # Of thousands of solids no more than can be looked at: every so many-th, so that all have their share.
+    # If there are too many points, evenly spaced ones are taken, so that every solid keeps its share.
     total = len(pool.points)
     return pool if total <= _MOST_FEATURES else pool.take(np.linspace(0, total - 1, _MOST_FEATURES).astype(int))
 
 
 def _exposed(hand: HandModel, pool: _Pool) -> _Pool:
-    """Return the points of the pool that lie on the outer surface."""
+    """Return the points of the pool that are on the outer surface of the hand."""
     pool = pool.take(~_covered_in_group(hand, pool))
     groups, above = hand.link_group[pool.links], parent_groups(hand)
     always = np.ones(len(pool.points), dtype=bool)
-    # One joint lies between neighbouring groups, so that its range is covered by moving all joints together.
+    # Neighbouring groups have one joint between them. So moving all joints together covers the range of each.
     for share in np.linspace(0.0, 1.0, 5):
         poses = link_poses(hand, hand.lower + share * (hand.upper - hand.lower))
         placed = in_base(poses, pool.points, pool.links)
@@ -324,7 +324,7 @@ def _exposed(hand: HandModel, pool: _Pool) -> _Pool:
 
 
 def _covered_in_group(hand: HandModel, pool: _Pool) -> Bool[np.ndarray, "points"]:
-    """Return which points lie inside another solid of their group, on a face glued to one, or flush with another."""
+    """Return True for points inside another solid of their group, facing its surface, or on the same surface."""
     poses = link_poses(hand, hand.open_posture)
     placed = in_base(poses, pool.points, pool.links)
     raised = in_base(poses, pool.points + _CREASE * pool.normals, pool.links)
@@ -348,7 +348,7 @@ def _by_group(hand: HandModel) -> dict[int, list[tuple[int, Primitive]]]:
 
 
 def _distance(poses: LinkPoses, primitive: Primitive, points: Points) -> Float[np.ndarray, "points"]:
-    """Return the signed distance [m] of base-frame points to one primitive at one posture, infinite off its bounds."""
+    """Return the signed distance [m] of base-frame points to a primitive. Infinite outside its bounding box."""
     rotations, translations = poses
     local = (points - translations[primitive.link]) @ rotations[primitive.link]
     distance = np.full(len(local), np.inf)
@@ -359,14 +359,14 @@ def _distance(poses: LinkPoses, primitive: Primitive, points: Points) -> Float[n
 
 
 def parent_groups(hand: HandModel) -> Int[np.ndarray, "links"]:
-    """Return for each group the nearest group with solids that it hangs from, -1 for none.
+    """Return for each group its nearest ancestor group with solids, -1 for none.
 
-    Groups without solids are passed over: a joint of several axes consists of hinges with massless links between them.
+    Groups without solids are skipped, because a joint with several axes is a chain of hinges with massless links.
     """
     parent = hand.link_parent
     above = np.where(parent >= 0, hand.link_group[np.maximum(parent, 0)], -1)
     solid = np.isin(np.arange(hand.num_links), hand.link_group[[p.link for p in hand.primitives]])
-    # Links come in depth-first order, so that what a bare parent hangs from is known before its children.
+    # In depth-first order, the ancestor of a parent is known before its children are visited.
     for link, group in enumerate(above.tolist()):
         if group >= 0 and not solid[group]:
             above[link] = above[group]
@@ -374,10 +374,10 @@ def parent_groups(hand: HandModel) -> Int[np.ndarray, "links"]:
 
 
 def _weights(hand: HandModel, pool: _Pool) -> tuple[Float[np.ndarray, "points"], Bool[np.ndarray, "points"]]:
-    """Return the density of candidates around each point, and whether the point faces the grasp.
+    """Return the density of candidates around each point, and True for each point that faces the grasp.
 
-    A link faces where closing the hand moves it, the palm faces along its normal. A fingertip is the outer half of a
-    rigid group that ends a finger.
+    A point on a finger faces the grasp if closing the hand moves it outwards along its normal. The palm faces along the
+    palm normal. A fingertip is the outer half of the last rigid group of a finger.
     """
     poses = rotations, origins = link_poses(hand, hand.open_posture)
     groups = hand.link_group[pool.links]
@@ -403,7 +403,7 @@ def _weights(hand: HandModel, pool: _Pool) -> tuple[Float[np.ndarray, "points"],
 def _farthest(
     points: Points, groups: LinkNumbers, weights: Float[np.ndarray, "points"], chosen: np.ndarray, count: int
 ) -> Int[np.ndarray, "picked"]:
-    """Run farthest-point sampling on weighted distances. Points of different groups are infinitely far apart."""
+    """Run farthest-point sampling with weighted distances. The distance between different groups is infinite."""
     members = {group: np.flatnonzero(groups == group) for group in np.unique(groups)}
 
     def mates(index: int) -> np.ndarray:

@@ -1,1 +1,1 @@
-"""Verified grasps of known objects: kept in a file, and used again."""
+"""A library of verified grasps of known objects, kept in a file."""

@@ -1,7 +1,7 @@
-"""A file of verified grasps: SQLite, a transaction a record.
+"""Store verified grasps in an SQLite file, with one transaction per record.
 
-An entry is known by the content of mesh and hand, and by the physics of its trials. The journal is a write-ahead log:
-readers go on while one writes, and a killed writer loses its own record only. Each call opens the file and closes it.
+The content of mesh and hand and the physics of the trials identify an entry. A write-ahead log lets readers work while
+another process writes. A killed writer loses only its own record. Each call opens and closes the file.
 """
 
 from __future__ import annotations
@@ -29,27 +29,27 @@ from graspd_core.perception.scene import ObjectModel
 from graspd_core.runtime.disk_cache import digest
 from graspd_core.types import Grasp, GraspResult, Outcome, Timing, Verdict
 
-# How much a verification asks: what held under more is good where less is asked.
+# Strictness of each kind of verification. Grasps that passed a stricter one are valid for a less strict one.
 STRICTNESS = {"none": 0, "standard": 1, "full": 1, "hard": 2, "hard_full": 2}
-# Not part of a hand's content: what it is called, where it is mounted, and points that are drawn anew for each plan.
+# Fields that are not part of a hand's content: names, mount, and contact candidates, which each plan draws anew.
 _NO_CONTENT = {"name", "urdf", "link_names", "joint_names", "warnings", "mount", "mimics", "base_place"}
 _NO_CONTENT |= {"candidate_points", "candidate_normals", "candidate_link"}
 
 
 @dataclass(frozen=True)
 class LibraryEntry:
-    """An object at one size, a hand, and physics.
+    """The object, hand and physics of stored grasps.
 
     Attributes:
-        name: of the object: that of its file, with the scale if that is not 1.
-        source: absolute path of its file, or shape:NAME, empty for a mesh without a file.
-        file_sha256: hash of the file's content, empty likewise.
+        name: name of the object. The default is the file's name, with the scale if it is not 1.
+        source: absolute path of the mesh file, or shape:NAME. Empty for a mesh without a file.
+        file_sha256: hash of the file's content. Empty for a mesh without a file.
         mesh_sha256: hash of the cleaned mesh in metres.
         scale: metres per unit of the file.
-        mass: [kg].
+        mass: mass of the object [kg].
         friction: Coulomb coefficient.
-        verify: the trials that its grasps passed.
-        hand: the hand's name.
+        verify: name of the trials that the grasps passed, one of `STRICTNESS`.
+        hand: name of the hand.
         hand_content: hash of the hand's kinematics and solids.
     """
 
@@ -66,13 +66,13 @@ class LibraryEntry:
 
     @property
     def key(self) -> str:
-        """Hash of the content, which does not depend on the names of object and hand."""
+        """Hash of the content. It does not depend on the names of object and hand."""
         content = (self.mesh_sha256, self.hand_content, self.mass, self.friction, self.verify)
         return digest(content)[:32]
 
 
 def entry_of(target: ObjectModel, hand: HandModel, verify: str, name: str = "") -> LibraryEntry:
-    """Return the entry of an object as it was loaded."""
+    """Return the library entry of a loaded object. The default of `name` is the name of its file."""
     shape = target.source.startswith(SHAPE_PREFIX)
     source = absolute(target.source) if shape or Path(target.source).is_file() else ""
     called = target.source.removeprefix(SHAPE_PREFIX) if shape else Path(target.source).stem
@@ -91,12 +91,12 @@ def entry_of(target: ObjectModel, hand: HandModel, verify: str, name: str = "") 
 
 
 def absolute(source: str) -> str:
-    """Return the source with an absolute path."""
+    """Return a source with an absolute path. shape:NAME does not change."""
     return source if source.startswith(SHAPE_PREFIX) else str(Path(source).resolve())
 
 
 def source_hash(source: str) -> str:
-    """Return the hash of the content of a mesh file or a shape. Raises MeshError: it cannot be read."""
+    """Return the hash of the content of a mesh file or a shape. Raises MeshError: the file cannot be read."""
     if source.startswith(SHAPE_PREFIX):
         return content_hash(make_shape(source.removeprefix(SHAPE_PREFIX)))
     try:
@@ -114,18 +114,18 @@ def _file_hash(path: str, changed: int, size: int) -> str:
 
 @lru_cache(maxsize=8)
 def hand_hash(hand: HandModel) -> str:
-    """Return the hash of all that a grasp and its trials depend on. A prefix of names does not count."""
+    """Return the hash of all hand data that grasps and trials depend on. Names do not count."""
     mimics = tuple((m.link, m.joint, m.multiplier, m.offset) for m in hand.mimics)
     content = (getattr(hand, item.name) for item in fields(hand) if item.name not in _NO_CONTENT)
     return digest((*content, mimics))
 
 
 VERSION = 1
-# Marks the file as ours ("grsp"), in SQLite's header.
+# Application id in SQLite's header ("grsp"). It identifies the file as a library of graspd.
 _APPLICATION = 0x67727370
-# Grasps of a record: what a request may ask for.
+# Greatest number of grasps of a record. A request may not ask for more.
 MOST_GRASPS = 1024
-# A writer waits so long for another one [s].
+# Greatest time that a writer waits for another writer [s].
 _PATIENCE = 30.0
 _COLUMNS = tuple(item.name for item in fields(LibraryEntry))
 _SCHEMA = f"""
@@ -139,16 +139,16 @@ CREATE INDEX by_source ON records (source);
 
 @dataclass(frozen=True)
 class GraspLibrary:
-    """A library in a file. `checked` verifies the file.
+    """A library of grasps in a file. Call `checked` to verify the file.
 
     Attributes:
-        path: of the file. SQLite keeps two more beside it, of the same name with -wal and -shm, while it is in use.
+        path: path of the file. While it is open, SQLite keeps two files beside it, with the suffixes -wal and -shm.
     """
 
     path: Path
 
     def create(self) -> None:
-        """Make an empty library if there is no file yet, or an empty one. Raises FormatError."""
+        """Create an empty library if the file does not exist or is empty. Raises FormatError: it cannot be written."""
         if self.path.exists() and self.path.stat().st_size:
             return
         self.path.parent.mkdir(parents=True, exist_ok=True)
@@ -158,7 +158,7 @@ class GraspLibrary:
             base.executescript(f"BEGIN IMMEDIATE; {head} {_SCHEMA} COMMIT;")
 
     def checked(self) -> GraspLibrary:
-        """Check the file and return this library. Raises FormatError: it is missing, of another version, or torn."""
+        """Check the file and return this library. Raises FormatError: it is missing, damaged, or of another version."""
         with self._reading() as base:
             (told,) = base.execute("PRAGMA quick_check(1)").fetchone()
         if told != "ok":
@@ -166,7 +166,7 @@ class GraspLibrary:
         return self
 
     def entries(self, **wanted: str | float) -> list[tuple[LibraryEntry, int]]:
-        """Return the entries whose columns have the wanted values, and the number of grasps of each, by name."""
+        """Return entries with the wanted column values and their numbers of grasps. Entries are sorted by name."""
         where = " AND ".join(f"{column} = ?" for column in wanted) or "1"
         question = f"SELECT {', '.join(_COLUMNS)}, grasps FROM records WHERE {where} ORDER BY name, hand"
         with self._reading() as base:
@@ -174,21 +174,21 @@ class GraspLibrary:
         return [(LibraryEntry(*row[:-1]), row[-1]) for row in rows]
 
     def names(self) -> list[str]:
-        """Return the names of its objects, each once."""
+        """Return the distinct names of the objects in the library."""
         with self._reading() as base:
             return [name for (name,) in base.execute("SELECT DISTINCT name FROM records ORDER BY name")]
 
     def of_mesh(self, wanted: LibraryEntry, *, any_mass: bool = False) -> list[LibraryEntry]:
-        """Return entries of the same content whose trials were at least as strict as wanted, strictest first."""
+        """Return entries with the content of `wanted` and at least as strict trials, strictest first."""
         names = ("mesh_sha256", "hand_content", "friction", *(() if any_mass else ("mass",)))
         same = {name: getattr(wanted, name) for name in names}
         return strict_enough([entry for entry, _ in self.entries(**same)], wanted.verify)
 
     def grasps(self, entry: LibraryEntry, hand: HandModel) -> tuple[Grasp, ...]:
-        """Return the verified grasps of an entry, in the object frame, none for an unknown entry.
+        """Return the verified grasps of an entry in the object frame. Empty for an unknown entry.
 
         Raises:
-            FormatError: the library or the record is torn.
+            FormatError: the library or the record is damaged.
         """
         with self._reading() as base:
             row = base.execute("SELECT document FROM records WHERE key = ?", (entry.key,)).fetchone()
@@ -197,14 +197,14 @@ class GraspLibrary:
     def add(
         self, entry: LibraryEntry, target: ObjectModel, hand: HandModel, config: PlanConfig, grasps: Sequence[Grasp]
     ) -> int:
-        """Append verified grasps to an entry. Return the number that it has then.
+        """Append verified grasps to an entry. Return the new number of grasps of the entry.
 
         Args:
-            entry: of `target` and `hand`.
-            target: what is grasped.
-            hand: whose grasps they are.
-            config: settings that they were found with.
-            grasps: those that are not verified are left out.
+            entry: entry of `target` and `hand`.
+            target: grasped object.
+            hand: grasping hand.
+            config: settings with which the grasps were found.
+            grasps: grasps in the object frame. Grasps that are not verified are ignored.
 
         Raises:
             FormatError: the library cannot be read or written.
@@ -216,7 +216,7 @@ class GraspLibrary:
             result = GraspResult(Outcome.SUCCEEDED, kept, Timing(), 0, config.method)
             document = result_document(result, target, hand, config) | {"link_names": hand.link_names}
             packed = zlib.compress(json.dumps(document, allow_nan=False).encode())
-            # What the file was before it changed is nobody's any more.
+            # Entries of an earlier content of the same file are no longer valid.
             other = (entry.source, entry.file_sha256)
             base.execute("DELETE FROM records WHERE source != '' AND source = ? AND file_sha256 != ?", other)
             marks = ", ".join("?" * (len(_COLUMNS) + 3))
@@ -230,7 +230,7 @@ class GraspLibrary:
             document = json.loads(zlib.decompress(packed))
             grasps = grasps_of(document)
             names = dict(zip(document["link_names"], hand.link_names, strict=True))
-            # The hand may be loaded with a prefix, or without the one that it had.
+            # The hand may now have another prefix of its names than when the record was written.
             contacts = [tuple(replace(c, link=names[c.link]) for c in grasp.contacts) for grasp in grasps]
         except (zlib.error, ValueError, KeyError, TypeError, FormatError) as error:
             raise self._torn(f"record {entry.name} for {entry.hand}: {error}") from None
@@ -238,7 +238,7 @@ class GraspLibrary:
 
     @contextmanager
     def _reading(self, write: bool = False) -> Iterator[sqlite3.Connection]:
-        """Open the file and check its version. A write runs in a transaction."""
+        """Open the file and check its version. With `write` the body runs in a transaction."""
         if not self.path.is_file():
             raise FormatError(f"{self.path}: no such file; `graspd library build --out {self.path}` makes a library")
         with self._told(), _opened(self.path, "rw" if os.access(self.path, os.W_OK) else "ro") as base:
@@ -260,10 +260,10 @@ class GraspLibrary:
 
     @contextmanager
     def _told(self) -> Iterator[None]:
-        """Turn SQLite's errors into FormatError."""
+        """Convert SQLite's errors to FormatError."""
         try:
             yield
-        # Another process holds it for long, the disk is full, or nothing may be written there.
+        # Another process locks the file for long, the disk is full, or the file is read-only.
         except sqlite3.OperationalError as error:
             raise FormatError(f"{self.path}: the library cannot be used: {error}") from None
         except sqlite3.DatabaseError as error:
@@ -273,13 +273,13 @@ class GraspLibrary:
 
     def _torn(self, told: object) -> GraspdError:
         return FormatError(
-            f"{self.path}: torn or no library ({' '.join(str(told).split())[:200]}); take a whole copy, or "
+            f"{self.path}: damaged or not a library ({' '.join(str(told).split())[:200]}); use an intact copy, or "
             "build another with `graspd library build --out FILE`"
         )
 
 
 def strict_enough(entries: Sequence[LibraryEntry], verify: str) -> list[LibraryEntry]:
-    """Return the entries tried at least as strictly as `verify`, strictest first. Raises ConfigError: it is unknown."""
+    """Return entries at least as strict as `verify`, strictest first. Raises ConfigError: `verify` is unknown."""
     if verify not in STRICTNESS:
         raise ConfigError(f"verify: {verify!r}; valid: {', '.join(STRICTNESS)}")
     enough = [entry for entry in entries if STRICTNESS[entry.verify] >= STRICTNESS[verify]]
@@ -288,7 +288,7 @@ def strict_enough(entries: Sequence[LibraryEntry], verify: str) -> list[LibraryE
 
 @contextmanager
 def _opened(path: Path, mode: str) -> Iterator[sqlite3.Connection]:
-    # In a place that cannot be written there is no log beside the file, nor anybody who writes.
+    # In a read-only folder there is no log beside the file, and no other process writes.
     still = "&immutable=1" if mode == "ro" and not os.access(path.parent, os.W_OK) else ""
     base = sqlite3.connect(
         f"file:{quote(str(path.absolute()))}?mode={mode}{still}", uri=True, timeout=_PATIENCE, isolation_level=None

@@ -1,8 +1,8 @@
-"""Grasps of a known object in the present scene. Missing ones are planned and added to the library.
+"""Find stored grasps of a known object for the present scene. Missing grasps are planned and added to the library.
 
-A name or a mesh file says which object is meant. An error says what the library has instead. Stored grasps are as good
-as when they were tried if nothing stands near. Otherwise a hand that would collide is refused, one that comes near is
-tried again, and all others stay.
+A name or a mesh file identifies the object. If the library does not have it, the error lists what it has. A stored
+grasp is checked against support and obstacles. If the hand would collide, the grasp is refused. If the hand comes near,
+the trials are repeated. Otherwise the stored trials remain valid.
 """
 
 from __future__ import annotations
@@ -48,7 +48,7 @@ _MOST_NAMED = 8
 
 @dataclass(frozen=True)
 class Physics:
-    """What grasps must hold under: mass [kg] and friction of the object, and the trials. A mass of None accepts any."""
+    """Conditions of the trials: mass [kg] and friction of the object, and name of the trials. Mass None is any mass."""
 
     mass: float | None
     friction: float
@@ -65,13 +65,13 @@ class Physics:
 
 
 def entry_by_name(library: GraspLibrary, hand: HandModel | None, name: str, physics: Physics) -> LibraryEntry:
-    """Return the entry of an object of that name, for a hand, None for any hand.
+    """Return the entry of the object with this name, for this hand (None for any hand).
 
-    Of several masses and frictions it takes the wanted one, a single one always.
+    The entry must have the wanted mass and friction, unless all entries of the object have the same.
 
     Raises:
-        ConfigError: the name is unknown, or not with this hand or physics, or several objects have it.
-        MeshError: the object's file has changed since.
+        ConfigError: the name is unknown, has no entry for this hand or physics, or is not unique.
+        MeshError: the object's file has changed since the entry was made.
     """
     called = [entry for entry, _ in library.entries(name=name)]
     if not called:
@@ -83,7 +83,7 @@ def entry_by_name(library: GraspLibrary, hand: HandModel | None, name: str, phys
     same = _with_hand(library, hand, called, name)
     if len({entry.mesh_sha256 for entry in same}) > 1:
         sources = ", ".join(sorted({entry.source for entry in same}))
-        raise ConfigError(f"{name}: the library {library.path} has several: {sources}; name the mesh file")
+        raise ConfigError(f"{name}: the library {library.path} has several such objects: {sources}; name a mesh file")
     there = physics.of(same)
     if not there and len({(entry.mass, entry.friction) for entry in same}) == 1:
         there = same
@@ -102,11 +102,11 @@ def entry_by_file(
     *,
     required: bool = True,
 ) -> LibraryEntry | None:
-    """Return the entry of a mesh file, or shape:NAME, at a scale. None if it is missing and not required.
+    """Return the entry of a mesh file, or of shape:NAME, at a scale. None if there is none and it is not required.
 
     Raises:
-        ConfigError: the content is unknown, or not at this scale, with this hand or this physics.
-        MeshError: it cannot be read, or has changed since the library was made.
+        ConfigError: the library has no entry of this content, scale, hand and physics.
+        MeshError: the file cannot be read, or has changed since the entry was made.
     """
     path = absolute(str(source))
     content = [entry for entry, _ in library.entries(file_sha256=source_hash(path))]
@@ -122,7 +122,7 @@ def entry_by_file(
     sized = [entry for entry in content if entry.scale == scale]
     if not sized:
         scales = ", ".join(sorted({f"{entry.scale:g}" for entry in content}))
-        raise ConfigError(f"{path}: not at scale {scale:g} in the library {library.path}; it has it at {scales}")
+        raise ConfigError(f"{path}: not at scale {scale:g} in the library {library.path}; valid scales: {scales}")
     same = _with_hand(library, hand, sized, path)
     return _held_entry(library, physics.of(same), same, path, physics)
 
@@ -157,9 +157,9 @@ def _changed(library: GraspLibrary, entry: LibraryEntry) -> MeshError:
     )
 
 
-# Where hand or object is nearer to something than this [m], a grasp is tried again.
+# A grasp is tried again if hand or object is nearer than this to an obstacle [m].
 NEAR = 0.03
-# Deeper in something than this is no grasp [m]: the search itself allows as much.
+# A hand deeper than this in an obstacle is refused [m]. The search allows the same depth.
 _DEEP = 0.005
 
 Wanted = Callable[[Sequence[Grasp]], Sequence[Grasp]]
@@ -176,21 +176,21 @@ def known_grasps(
     wanted: Wanted = list,
     stop: StopHook | None = None,
 ) -> GraspResult:
-    """Return at most `count` verified grasps that the library has of the scene's object, none for an unknown one.
+    """Return at most `count` verified grasps of the scene's object from the library. None for an unknown object.
 
     Args:
         library: from `GraspLibrary(path).checked()`.
-        scene: known by its mesh, friction and mass, if that was given. Support and obstacles count.
-        hand: known by its content.
-        count: grasps wanted.
-        restrictions: as of `plan_grasps`.
-        verify: trials that they must have passed. Stricter ones are good too.
-        wanted: chooses the stored grasps that may be given.
-        stop: polled, true ends the trials.
+        scene: scene with the object, which is identified by mesh, friction, and mass if it was given.
+        hand: hand, which is identified by its content.
+        count: greatest number of grasps.
+        restrictions: as for `plan_grasps`.
+        verify: trials that the grasps must have passed. Stricter trials count too.
+        wanted: function that selects the stored grasps that may be returned.
+        stop: asked during the trials. True ends them.
 
     Raises:
-        FormatError: the library is torn, of another version or not there.
-        ConfigError: a number or a restriction is not valid.
+        FormatError: the library is damaged, missing, or of another version.
+        ConfigError: a number or a restriction is invalid.
     """
     began = time.perf_counter()
     check_request(count=count, seed=0, verify=verify, deadline=None, device="cpu")
@@ -213,7 +213,7 @@ def known_grasps(
 
 
 def library_result(library: GraspLibrary, grasps: Sequence[Grasp], count: int, seconds: float) -> GraspResult:
-    """Return grasps of a library as a result of `count` wanted, which took `seconds`."""
+    """Return grasps of a library as the result of a request for `count` grasps that took `seconds`."""
     timing = Timing(first_verified=seconds if grasps else None, total=seconds)
     told = f"{len(grasps)} grasps of the library {library.path.name}"
     return result_of(grasps, count, method="library", timing=timing, message=told)
@@ -233,11 +233,11 @@ def known_or_planned(
     name: str = "",
     **request: Any,
 ) -> GraspResult:
-    """Return grasps of the library, and plan the rest of `count`.
+    """Return grasps from the library, and plan more if there are fewer than `count`.
 
-    The verified ones are added to the library. `wanted` chooses which grasps count, stored and planned ones. `name` is
-    the object's name in the library. All else is as of `plan_grasps`. A library that cannot be written is a warning in
-    the result.
+    Planned grasps that are verified are added to the library. `wanted` selects the grasps that count, stored and
+    planned. `name` is the object's name in the library. The other arguments are as for `plan_grasps`. If the library
+    cannot be written, the result has a warning.
     """
     began, deadline, stop = time.perf_counter(), request.pop("deadline", None), request.get("stop")
     left = lambda: None if deadline is None else deadline - (time.perf_counter() - began)  # noqa: E731
@@ -249,7 +249,7 @@ def known_or_planned(
         return known
     config = load_preset(preset) if isinstance(preset, str) else preset
     rest = None if deadline is None else max(left() or 0.0, 1e-3)
-    # Another seed than that of the stored grasps, which would be found again.
+    # The seed that found the stored grasps would find them again, so another seed is used.
     asked |= {"count": count - found, "seed": seed + found, "preset": config, "deadline": rest}
     planned = plan_grasps(scene, hand, **asked, **request)
     warnings = planned.warnings
@@ -262,7 +262,7 @@ def known_or_planned(
     if outcome in (Outcome.SUCCEEDED, Outcome.NO_CANDIDATES) and found + len(new):
         outcome = Outcome.SUCCEEDED if found + len(new) >= count else Outcome.TOO_FEW
     told = f"{found} grasps of the library {library.path.name}, {len(new)} planned"
-    # A reason, not what the outcome of the plan alone says.
+    # The message is used only if it is more than the name of the outcome.
     why = planned.message if planned.message != planned.outcome.value else ""
     return replace(
         planned,
@@ -284,9 +284,9 @@ def add_planned(
     verify: str,
     name: str = "",
 ) -> int:
-    """Add the verified grasps of a run to the library, with the trial of the object alone.
+    """Add the verified grasps of a run to the library, with only their hold trials.
 
-    Returns their number. Raises FormatError: the library cannot be written.
+    Returns the new number of grasps of the entry. Raises FormatError: the library cannot be written.
     """
     if verify == "none":
         return 0
@@ -302,14 +302,14 @@ def add_planned(
 def _held(
     scene: Scene, hand: HandModel, grasps: Sequence[Grasp], verify: str, stop: StopHook
 ) -> Iterable[tuple[Grasp, str]]:
-    """Yield each grasp, tried again if something stands near, and why it is refused, empty if it is not."""
+    """Yield each grasp and the reason for refusing it (empty if accepted). Grasps near obstacles are tried again."""
     scene, far = near_scene(scene)
     near = [moved_grasp(grasp, -far) for grasp in grasps]
     gaps = clearance(scene, hand, near)
     vertices = torch.as_tensor(scene.object.mesh.vertices)
     if any(float(sample_sdf(o.sdf, vertices.to(o.sdf.field))[0].min()) < NEAR for o in scene.obstacles):
         gaps = np.minimum(gaps, NEAR / 2)
-    # Those that need no trial come first.
+    # Grasps that need no trial come first.
     for index in np.argsort(gaps < NEAR, kind="stable"):
         grasp, gap = grasps[index], gaps[index]
         if gap < -_DEEP:
@@ -325,7 +325,7 @@ def _held(
 
 
 def clearance(scene: Scene, hand: HandModel, grasps: Sequence[Grasp]) -> Float[np.ndarray, "grasps"]:
-    """Return the least distance [m] of each hand to support and obstacles, retreat to squeeze, infinite without."""
+    """Return each hand's least distance [m] to support and obstacles from retreat to squeeze. Infinite without any."""
     obstacles = make_obstacle_tensors(scene, hand, "cpu", torch.float64)
     if obstacles is None or not grasps:
         return np.full(len(grasps), np.inf)

@@ -1,1 +1,1 @@
-"""From a scene and a hand to ranked candidates."""
+"""Optimise hand poses for a scene and a hand, and rank the grasp candidates."""

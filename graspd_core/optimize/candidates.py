@@ -1,4 +1,4 @@
-"""Find candidates: draw starts, minimise by a method, make the three postures, rank. No trial is run here."""
+"""Find grasp candidates: draw starts, optimise them, compute the three postures and rank. No trial runs here."""
 
 from __future__ import annotations
 
@@ -30,22 +30,22 @@ from graspd_core.optimize.restrictions import UNRESTRICTED, BoundRestrictions
 from graspd_core.perception.scene import Scene
 from graspd_core.types import Contact, Grasp, Posture
 
-# A candidate that reaches deeper than this into the support or a neighbour is dropped [m].
+# A candidate that penetrates the support or a neighbouring object deeper than this is dropped [m].
 _DEEPEST = 0.0015
-# Poses made into grasps at once. Each takes a megabyte on the way.
+# Poses per batch in `assemble` on the CPU. Each pose needs about a megabyte of memory.
 _AT_ONCE = 128
-# Cost of a candidate that would sweep through the object on its way from the retreat: it is tried after all others.
+# Subtracted from the score if the approach from the retreat sweeps the object. Such candidates are tried last.
 _KNOCK_COST = 100.0
-# A score that no candidate has.
+# Every usable candidate scores above this. A dropped candidate has a score of −inf.
 _WORST = -1e3
-# Share of the grasps asked for that the ranking expects to hold, below which a method searches again, and how far apart
-# the seeds of two searches are: not those of two rounds.
+# The search is repeated if the ranking expects less than this share of the requested grasps to hold.
+# The seed step differs from that between two rounds, so that no seed is used twice.
 _LEAST_EXPECTED, _SEED_STEP = 0.9, 15_485_863
 
 
 @dataclass(frozen=True)
 class PlannerInput:
-    """What a method is asked for: `count` grasps of the scene's object. `seed` is that of everything that is drawn."""
+    """A request to a method: find `count` grasps of the scene's object. `seed` fixes every random draw."""
 
     scene: Scene
     hand: HandModel
@@ -59,14 +59,14 @@ class PlannerInput:
 
     @cached_property
     def problem(self) -> Problem:
-        """Scene and hand as tensors. Every method's poses are made into grasps and ranked in this problem."""
+        """Scene and hand as tensors. The postures and the ranking of every method are computed with this problem."""
         scene = self.restrictions.searched(self.scene)
         return build_problem(
             scene, self.hand, self.config.problem, seed=self.seed, device=self.device, dtype=self.dtype
         )
 
     def allowed(self, starts: Poses) -> Poses:
-        """Return the initial poses that the restrictions allow, for a method that draws its own."""
+        """Return the initial poses that the restrictions allow. A method that draws its own poses calls this."""
         if not self.restrictions.each:
             return starts
         turns = starts.quaternion / starts.quaternion.norm(dim=-1, keepdim=True)
@@ -76,11 +76,11 @@ class PlannerInput:
 
 @dataclass(frozen=True)
 class PlannerOutput:
-    """What a method ended with.
+    """The result of a method.
 
     Attributes:
-        poses: hand poses that the method found, at most a few times as many as asked for, in any order.
-        interrupted: why it ended early: "", "cancelled" or "deadline".
+        poses: hand poses in any order, at most a few times the requested count.
+        interrupted: why the method ended early: "cancelled" or "deadline". Empty if it did not.
     """
 
     poses: Poses
@@ -89,17 +89,17 @@ class PlannerOutput:
 
 @dataclass(frozen=True)
 class Candidates:
-    """Untried grasps, best first, and how the optimiser ended: "", "cancelled" or "deadline"."""
+    """Grasps before their trials, best first. `interrupted` is "cancelled", "deadline", or empty for a full run."""
 
     grasps: tuple[Grasp, ...]
     interrupted: str
 
 
 def find_candidates(task: PlannerInput) -> Candidates:
-    """Return ranked candidates by the method of the task's settings. There are fewer if starts were hopeless.
+    """Run the configured method and return its ranked candidates, perhaps fewer than `count`.
 
-    The search is repeated from as many other starts if the ranking expects too few grasps to hold: small, large and
-    long objects gain by that. Restrictions shape only the starts. Their caller refuses candidates.
+    If the ranking expects too few grasps to hold, the search is repeated from new starts. This helps on small, large
+    and long objects. Restrictions act here only on the starts. The caller checks the candidates against them.
     """
     config, count = task.config, task.count
     found = _searched(task)
@@ -112,7 +112,7 @@ def find_candidates(task: PlannerInput) -> Candidates:
 
 
 def expected_to_hold(grasps: Sequence[Grasp]) -> float:
-    """Return how many of the grasps the ranking expects to pass the hold trial."""
+    """Return the expected number of grasps that pass the hold trial, from their scores (log-odds)."""
     return sum((0.5 + 0.5 * math.tanh(0.5 * grasp.score) for grasp in grasps), 0.0)
 
 
@@ -132,12 +132,12 @@ def assemble(
 ) -> tuple[Grasp, ...]:
     """Return grasps with three postures and a score, best first.
 
-    Poses without a balanced squeeze are dropped, and poses that reach through an obstacle on their way or at its end.
-    Poses whose fingers press deep into the object are kept: some methods press deep and their grasps hold.
+    Poses whose approach path or end penetrates an obstacle are dropped. Poses whose fingers penetrate the object deeply
+    are kept, because some methods produce such poses and their grasps hold.
     """
     grasps: list[Grasp] = []
     device, total = poses.translation.device, len(poses.translation)
-    # An accelerator takes as long for one as for all of them.
+    # On an accelerator one pose takes as long as all of them, so all form one batch.
     at_once = _AT_ONCE if device.type == "cpu" else max(total, 1)
     for first in range(0, total, at_once):
         rows = torch.arange(first, min(first + at_once, total), device=device)
@@ -159,7 +159,7 @@ def finished(problem: Problem, hand: HandModel, some: Staged) -> list[Grasp]:
 def staged(
     problem: Problem, hand: HandModel, poses: Poses, config: PlanConfig, stop: Callable[[], bool] = lambda: False
 ) -> Staged:
-    """Compute contacts, squeeze and pregrasp of every pose. The caller bounds the batch by its memory."""
+    """Compute contacts, squeeze and pregrasp of every pose. The caller limits the batch to what fits in memory."""
     poses = settle(problem, poses, stop)
     contact_set = find_contacts(problem, poses, config.grasp_stages.touch_reach)
     effort = torch.as_tensor(hand.effort).to(problem.hand.lower)
@@ -178,11 +178,11 @@ def _grasps(hand: HandModel, some: Staged, scores: Tensor) -> list[Grasp]:
     active, distance = found.active.cpu().numpy(), found.distance.abs().cpu().numpy()
     link, position, normal = found.link.tolist(), _numbers(found.position), _numbers(found.normal)
     places = [_numbers(x) for x in (opened.translation, poses.translation)]
-    # Rounding to float32 and back may step over a limit by an ulp.
+    # Rounding to float32 and back may exceed a joint limit by one ulp.
     joints = [np.clip(_numbers(x), hand.lower, hand.upper) for x in (opened.joints, poses.joints, some.pressed.joints)]
     grasps = []
     for row, odds in enumerate(scores.tolist()):
-        # One contact a link: of its active slots, the one nearest to the surface.
+        # Each link has one contact: its active slot nearest to the surface.
         slots = np.flatnonzero(active[row])
         nearest = {link[slot]: slot for slot in slots[np.argsort(-distance[row, slots], kind="stable")]}
         contacts = tuple(

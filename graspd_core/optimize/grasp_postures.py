@@ -1,7 +1,7 @@
-"""Find the contacts of a hand at rest, and the other two of its postures: pregrasp and squeeze.
+"""Find the contacts of a grasp posture, and compute the pregrasp and the squeeze posture.
 
-From the pregrasp the hand closes without touching anything on its way. The squeeze has the joint targets that make
-balanced contact forces. Where the problem can be compiled, the kernel does the same steps as torch, a row at a time.
+From the pregrasp the hand closes without touching anything on its path. The squeeze has the joint targets that produce
+balanced contact forces. If the problem fits the compiled kernel, the kernel does the same steps as torch, row by row.
 """
 
 from __future__ import annotations
@@ -32,35 +32,35 @@ from graspd_core.optimize.problem import (
 )
 from graspd_core.se3 import SE3, rotation_from_quaternion
 
-# Contacts of one link beyond its nearest.
+# Contacts of one link in addition to its nearest candidate.
 _SPREAD = 2
-# Shares of the way from pregrasp to grasp that are kept clear.
+# Fractions of the path from pregrasp to grasp at which the hand is kept clear of the object.
 _WAY = (0.0, 0.4, 0.8)
-# What a square of travel costs: of joints per radian², of the base per metre².
+# Cost of squared travel: of joints [1/rad²], of the base [1/m²].
 _JOINT_COST, _BASE_COST = 0.1, 2e3
-# Weight of the pregrasp's overlap with itself [1/mm²].
+# Weight of the hand's self-collision at the pregrasp [1/mm²].
 _SELF_WEIGHT = 10.0
-# How a grasp gives way where it sinks in. Candidates nearer than `clearance` [m] are drawn to stay as near, by `keep`.
+# Settings of `settle`. Contact candidates nearer than `clearance` [m] are kept at their distance, with weight `keep`.
 _SETTLING = structs.Pregrasp(
     0.001, 0.003, 0.0003, joint_cost=1.0, base_cost=1e4, self_collision=1.0, keep=0.03, steps=30
 )
 _CONE_EDGES = 8
-# Weights of an even spread of the load and of normal forces that sum to one, against balance.
+# Weights relative to force balance: of an even load on the contacts, and of normal forces that sum to one.
 _RIDGE, _SUM = 0.5, 10.0
-# Newton's method ends at this squared slope. It takes ten steps at most, but for what is not a number.
+# Newton's method ends at this squared slope. It takes at most ten steps, unless a value is NaN.
 _CONVERGED, _NEWTON_STEPS = 1e-22, 60
 
 
 @dataclass(frozen=True)
 class ContactSet:
-    """Where a batch of hands touches: some slots for every link, of which only the active slots count.
+    """Contacts of a batch of hands: a few slots for every link. Only active slots are contacts.
 
     Attributes:
         link: link of each slot.
         position: point on the object, object frame [m].
-        normal: outward unit normal of the object there.
-        distance: signed distance of hand and object there [m].
-        active: whether it counts as a contact.
+        normal: outward unit normal of the object at `position`.
+        distance: signed distance between hand and object at `position` [m].
+        active: whether the slot is a contact.
     """
 
     link: Int[Tensor, "slots"]
@@ -72,7 +72,7 @@ class ContactSet:
 
 @torch.no_grad()
 def find_contacts(problem: Problem, poses: Poses, reach: float) -> ContactSet:
-    """Find the contacts of every link: its nearest candidate, two that spread the contact, its nearest sharp point.
+    """Find the contacts of every link: its nearest candidate, two others far apart, and the nearest sharp point.
 
     Slots within `reach` [m] of the surface are active.
     """
@@ -92,7 +92,7 @@ def find_contacts(problem: Problem, poses: Poses, reach: float) -> ContactSet:
     slots = torch.stack(chosen, -1).flatten(1)
     gap, n = distance[rows, slots], normal[rows, slots]
     own_link = points.links[slots] == links.repeat_interleave(_SPREAD + 1)
-    # A patch that is hardly larger than a point is one contact, not three.
+    # If all contacts of a link are within 4 mm, only the nearest counts.
     apart = [torch.ones_like(chosen[0], dtype=torch.bool)]
     apart += [(placed.points[rows, c] - placed.points[rows, chosen[0]]).norm(dim=-1) > 0.004 for c in chosen[1:]]
     found = ContactSet(
@@ -106,7 +106,7 @@ def find_contacts(problem: Problem, poses: Poses, reach: float) -> ContactSet:
 
 
 def _with_features(problem: Problem, poses: Poses, found: ContactSet, reach: float) -> ContactSet:
-    """Add one slot per solid: the object's sharp point nearest to it, with the solid's own normal turned round."""
+    """Add one slot per solid of the hand: the object's nearest sharp point, with the solid's inward normal."""
     pick, nearest, outward = nearest_features(problem, poses)
     return ContactSet(
         torch.cat([found.link, problem.hand.solids.link]),
@@ -120,7 +120,7 @@ def _with_features(problem: Problem, poses: Poses, found: ContactSet, reach: flo
 def nearest_features(
     problem: Problem, poses: Poses
 ) -> tuple[Int[Tensor, "batch solids"], Float[Tensor, "batch solids"], Float[Tensor, "batch solids 3"]]:
-    """Return the sharp point nearest to every solid of the hand, its signed distance [m], and its gradient."""
+    """Return for every solid of the hand the nearest sharp point, and its signed distance [m] with gradient."""
     solids = problem.hand.solids
     if (compiled := problem.compiled) is not None:
         x = pack(poses).contiguous()
@@ -141,7 +141,7 @@ def nearest_features(
 
 @torch.no_grad()
 def self_overlap(problem: Problem, joints: Joints) -> Values:
-    """Return the greatest depth of a solid of the hand in one of a link that is not adjacent [m]."""
+    """Return the greatest penetration depth between two solids of links that are not adjacent [m]."""
     if (compiled := problem.compiled) is not None:
         deepest = joints.new_empty(len(joints))
         compiled.call("graspd_self_overlap", len(joints), joints.contiguous(), deepest)
@@ -154,14 +154,14 @@ def self_overlap(problem: Problem, joints: Joints) -> Values:
 def find_pregrasp(
     problem: Problem, poses: Poses, config: GraspStagesConfig, stop: Callable[[], bool] = lambda: False
 ) -> tuple[Poses, Values]:
-    """Find a nearby posture, base shifted and never turned, from which the hand closes without sweeping the object.
+    """Find a nearby pregrasp, from which the hand closes without sweeping the object. The base shifts, never turns.
 
-    The posture and the straight way in joint space to the grasp are kept clear: at a share a of the way every candidate
-    is to be (1 − a) times the clearance away from the object, so that all contacts arrive together. The whole way also
-    keeps clear of obstacles, and the posture clear of itself.
+    The path to the grasp is straight in joint space. At a fraction a of the path, every contact candidate shall be
+    (1 − a) times the clearance away from the object. So all contacts arrive together. The whole path also avoids
+    obstacles, and the pregrasp avoids self-collision.
 
     Returns:
-        The postures, and the least distance on the way over what it should be there, one where all is clear.
+        The pregrasps, and the fraction of the wanted clearance that each path keeps (1 if it keeps all).
     """
     if (compiled := problem.compiled) is None:
         return _find_pregrasp(problem, poses, config, stop)
@@ -182,7 +182,7 @@ def _find_pregrasp(
     with torch.no_grad():
         reached = hand_distance(problem, poses.base, poses.joints)
     remaining = torch.tensor([1.0 - a for a in _WAY], dtype=start.dtype, device=start.device)[:, None, None]
-    # Where the grasp itself sinks in, the way out starts from that depth.
+    # If the grasp itself penetrates the object, the path starts from that depth.
     wanted = (reached.clamp(max=0.0) * (1 - remaining) + remaining * config.clearance).flatten(0, 1)
 
     def way_to(x: Rows) -> Float[Tensor, "way_batch variables"]:
@@ -213,10 +213,10 @@ def _find_pregrasp(
 
 
 def settle(problem: Problem, poses: Poses, stop: Callable[[], bool] = lambda: False) -> Poses:
-    """Return poses near by, base shifted and never turned, that sink in less: a finger that does gives way.
+    """Return nearby poses that penetrate the object less. The base may shift but does not turn.
 
-    The object's whole surface is held against the hand's solids, and the hand's candidates against the object. Those
-    that touch stay near.
+    The loss penalises object surface points inside the hand's solids, and contact candidates inside the object.
+    Candidates that touch the object are kept near it.
     """
     if (compiled := problem.of_surface.compiled) is not None:
         x = pack(poses).contiguous()
@@ -249,7 +249,7 @@ def _settle(problem: Problem, poses: Poses, stop: Callable[[], bool]) -> Rows:
 
 
 def _sunk_surface(on_surface: Problem, placed: HandPlacement, poses: Poses, x: Rows) -> Values:
-    """Return the squared depths of the object's surface in the hand, of each solid the deepest point [mm²]."""
+    """Return the sum over the hand's solids of the squared depth of the deepest object point in each [mm²]."""
     solids, features = on_surface.hand.solids, on_surface.object.features
     if not len(features) or not len(solids.link):
         return x.new_zeros(len(x))
@@ -269,7 +269,7 @@ def _pregrasp_settings(config: GraspStagesConfig) -> structs.Pregrasp:
 def _rates_and_costs(
     problem: Problem, settings: structs.Pregrasp
 ) -> tuple[Float[Tensor, "variables"], Float[Tensor, "variables"]]:
-    """Return the step sizes of base translation and joints, and what a square of travel costs."""
+    """Return for base translation and joints the step sizes, and the costs per squared travel."""
     rates = problem.hand.lower.new_full((3 + len(problem.hand.lower),), settings.joint_rate)
     rates[3:] *= problem.hand.joint_scale
     rates[:3] = settings.base_rate
@@ -287,7 +287,7 @@ def _descended(
     steps: int,
     stop: Callable[[], bool],
 ) -> Rows:
-    """Return base translations and joints after so many steps of Adam down a loss, at rates that fade."""
+    """Return base translations and joints after `steps` Adam steps that minimise `loss`. The step sizes decay."""
     x, mean, square = start.clone(), torch.zeros_like(start), torch.zeros_like(start)
     for count in range(1, steps + 1):
         if stop():
@@ -304,9 +304,9 @@ def _descended(
 
 @torch.no_grad()
 def approach_depth(problem: Problem, obstacles: ObstacleTensors, pregrasp: Poses) -> Values:
-    """Return how deep the hand is in the object on its straight way from the retreat to the pregrasp [m].
+    """Return the greatest penetration of the object on the straight path from the retreat to the pregrasp [m].
 
-    The way is clear where this is zero. The pregrasp itself is not looked at.
+    The depth is 0 if the path is collision-free. The path is sampled at `RETREAT_SHARES`, without the pregrasp.
     """
     rotation = rotation_from_quaternion(pregrasp.quaternion)
     begun = [drawn_back(pregrasp.translation, rotation, obstacles.approach, RETREAT * s) for s in RETREAT_SHARES]
@@ -322,12 +322,12 @@ def hand_distance(problem: Problem, base: SE3, joints: Joints) -> Distances:
 
 @dataclass(frozen=True)
 class Squeeze:
-    """Balanced contact forces and the joint targets that make them.
+    """Balanced contact forces and the joint targets that produce them.
 
     Attributes:
         joints: position targets [rad] or [m].
-        forces: on the object, one per link [N].
-        imbalance: norm of the net wrench over the sum of forces, one without a balance.
+        forces: contact force on the object at each slot [N].
+        imbalance: norm of the net wrench divided by the sum of the normal forces. 1 with fewer than two contacts.
     """
 
     joints: Float[Tensor, "batch joints"]
@@ -338,7 +338,7 @@ class Squeeze:
 def squeeze(
     problem: Problem, poses: Poses, contact_set: ContactSet, effort: Float[Tensor, "joints"], config: GraspStagesConfig
 ) -> Squeeze:
-    """Turn forces in the friction cones with zero net wrench (non-negative least squares) into offsets JᵀF / kp."""
+    """Compute balanced contact forces F by non-negative least squares, and joint targets offset by JᵀF / kp."""
     unit_forces, imbalance = balanced_forces(
         (contact_set.position - problem.object.center).double().cpu().numpy(),
         contact_set.normal.double().cpu().numpy(),
@@ -358,7 +358,7 @@ def squeeze(
 def joint_torques(
     problem: Problem, poses: Poses, contact_set: ContactSet, forces: Float[Tensor, "batch slots 3"]
 ) -> Joints:
-    """Return τ = JᵀF [N·m], of sliding joints [N]: the gradient of Σ F·x(q) over the hand's points at the contacts."""
+    """Return τ = JᵀF, the gradient of Σ F·x(q) over the hand's contact points [N·m], [N] for prismatic joints."""
     base = poses.base
     x = base.apply_inverse(contact_set.position)
     joints = poses.joints.detach().requires_grad_(True)
@@ -377,20 +377,20 @@ def balanced_forces(
     length: float,
     friction: float,
 ) -> tuple[Float[np.ndarray, "batch slots 3"], Float[np.ndarray, "batch"]]:
-    """Return contact forces on the object with normal components that sum to one and the least net wrench.
+    """Return the contact forces on the object with the least net wrench. Their normal components sum to one.
 
     Args:
         arms: contact points about the centre of mass [m].
         normals: outward unit normals.
-        active: which links touch.
-        length: scale of torques [m].
+        active: which slots are contacts.
+        length: torques are divided by this [m].
         friction: Coulomb coefficient of the cones.
 
     Returns:
         Forces, and the norm of their net wrench (torque over `length`).
     """
     active = active & (active.sum(-1, keepdims=True) > 1)
-    # The active slots of every row first, as many columns as the row with most of them has.
+    # Put the active slots of every row first. Keep as many columns as the row with the most active slots has.
     order = np.argsort(~active, axis=-1, kind="stable")[:, : int(active.sum(-1).max(initial=0))]
     rows = np.arange(len(arms))[:, None]
     touching = active[rows, order]
@@ -409,7 +409,7 @@ def balanced_forces(
 def _cone_edges(
     normals: Float[np.ndarray, "batch slots 3"], friction: float
 ) -> Float[np.ndarray, "batch slots edges 3"]:
-    """Return forces with a normal component of one along the edges of every contact's friction cone."""
+    """Return forces along the edges of every contact's friction cone, each with a normal component of one."""
     angles = np.arange(_CONE_EDGES) * 2 * np.pi / _CONE_EDGES
     first = np.cross(normals, np.eye(3)[np.abs(normals).argmin(-1)])
     first /= np.linalg.norm(first, axis=-1, keepdims=True).clip(1e-12)
@@ -423,9 +423,9 @@ def _balancing_weights(
 ) -> Float[np.ndarray, "batch edges"]:
     """Minimise ‖W x‖² + 10² (Σ x − 1)² + ridge² ‖x‖² over x ≥ 0, exactly.
 
-    With the six wrenches and the sum as rows of G and t = (0, …, 0, 10) the dual has seven unknowns, the residual
-    r = t − G x: it is the least of ‖r‖²/2 + ‖max(Gᵀr, 0)‖² / 2 ridge² − t·r, and x = max(Gᵀr, 0) / ridge². Newton's
-    method with halved steps ends after a few, since the second derivative changes only where an edge comes or goes.
+    Let G have the six wrench components and the sum as rows, and t = (0, …, 0, 10). The unknown of the dual is the
+    residual r = t − G x, which has seven components. It minimises ‖r‖²/2 + ‖max(Gᵀr, 0)‖² / 2 ridge² − t·r. Then
+    x = max(Gᵀr, 0) / ridge². Newton's method with halved steps needs few steps: the function is piecewise quadratic.
     """
     batch, count, _ = wrenches.shape
     g = np.concatenate([wrenches, np.full((batch, count, 1), _SUM)], -1) * allowed[..., None]

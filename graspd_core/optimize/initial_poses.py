@@ -1,6 +1,6 @@
-"""Draw seeded starts: the palm, fingers open, or the half-closed fingertips at a random point of the object's hull.
+"""Draw seeded initial poses: the open palm, or half-closed fingertips, at a random point of the object's convex hull.
 
-Starts that are aimed come from a wanted direction, rolled as wanted, to a wanted part of the object.
+An `Aim` restricts the approach direction, the roll, and the part of the object that the palm faces.
 """
 
 from __future__ import annotations
@@ -26,37 +26,37 @@ from graspd_core.perception.scene import Scene
 from graspd_core.se3 import SE3, aligning_rotation, normalize, quaternion_from_rotation, rotation_from_axis_angle
 from graspd_core.types import TriangleMesh
 
-# Tilt of the palm against the hull's normal [rad], and the palm's distance from the object [m].
+# Greatest tilt of the palm from the hull's normal [rad], and range of the palm's distance from the object [m].
 _TILT, _PALM_STANDOFF = 0.35, (0.005, 0.05)
-# How far from open to closed the fingers are whose tips are put to the object, and how far from it [m].
+# Starts with fingertips: range of the closing fraction (0 open, 1 closed), and of the distance to the object [m].
 _SHARE_CLOSED, _TIP_STANDOFF = (0.2, 0.8), (-0.01, 0.01)
-# Places drawn for each start kept, surface points that tell the object's width, and how much width matters [m].
+# Poses drawn per start, points to measure the object's width, and scale of the preference for narrow widths [m].
 _POOL, _SPAN_POINTS, _SPAN_SCALE = 6, 400, 0.012
-# Among obstacles more places are drawn. How deep a hand reaches into one [m] that makes its place e times rarer, and
-# how far a hand is lifted off the support to stay above it [m].
+# Among obstacles: poses drawn for each start kept, the depth in an obstacle that makes a pose e times less likely [m],
+# and the greatest lift off the support [m].
 _POOL_AMONG_OBSTACLES, _DEPTH_SCALE, _HIGHEST_LIFT = 18, 0.005, 0.03
-# Pools drawn at most where restrictions forbid starts, and how far apart the seeds of two pools are.
+# With restrictions: the greatest number of pools, and the seed step between two pools.
 _MOST_POOLS, _POOL_SEED_STEP = 20, 7_919
-# The slab of the object that a hand closes around [m].
+# Half breadth and depth of the slab of the object that a hand closes around [m].
 _SLAB_HALF_BREADTH, _SLAB_DEPTH = 0.05, 0.09
-# Spread of the joints, and how near to its axis a palm stays off the surface [m].
+# Joint noise as a share of the range, and radius around the palm's axis in which the palm avoids the surface [m].
 _JOINT_NOISE, _PALM_RADIUS = 0.1, 0.04
-# Starts use this share of the cone and of the tolerance of the roll, because the search turns them a little.
+# Starts use this share of the approach cone and of the roll tolerance, because the optimiser turns the hand a little.
 _INNER = 0.8
 
 
 @dataclass(frozen=True)
 class StartPool:
-    """Hands that starts are chosen from, object frame.
+    """Hand poses in the object frame, from which the starts are chosen.
 
     Attributes:
-        grip: the point of the hand that is put to the object, base frame: middle of the palm or of the fingertips [m].
+        grip: point of the hand that faces the object, base frame [m]: middle of the palm or of the fingertips.
         standoff: distance of the grip from the object [m].
-        middle: the grip's position [m].
+        middle: position of the grip [m].
         rotation: orientation of the base.
         translation: origin of the base [m].
         joints: [rad].
-        depth: how far the wanted place lies behind what the palm meets first [m], 0 if no place is wanted.
+        depth: distance from the first surface in front of the palm to the wanted place [m]. 0 without a wanted place.
     """
 
     grip: Float[Tensor, "batch 3"]
@@ -82,14 +82,13 @@ def draw_starts(
     fingertips: float = 0.0,
     restrictions: BoundRestrictions = UNRESTRICTED,
 ) -> Poses:
-    """Draw `count` seeded starts with the palm on the object's convex hull, at places that the hand can span.
+    """Draw `count` seeded starts with the palm near the object's convex hull, where the hand can span the object.
 
-    This follows the published initialisation of Grasp'D (a random surface point, palm towards it, random roll). Points
-    are on the hull, so that no palm starts inside a hollow. Place and roll favour narrow cross-sections. A share
-    `fingertips` of the starts has half-closed fingers, and the middle between the fingertips in place of the palm: an
-    open hand does not reach what is small or low on a table. Hands that would reach into obstacles, or could not have
-    come there, are drawn last. With restrictions, starts are drawn until enough are allowed, or `_MOST_POOLS` times as
-    many were drawn: then there are fewer than `count`, perhaps none.
+    As in Grasp'D, the palm faces a random surface point with a random roll. Points are on the hull, so that no palm
+    starts inside a hollow. Narrow cross-sections are preferred. A share `fingertips` of the starts has half-closed
+    fingers, with the fingertips at the point instead of the palm. An open hand does not reach objects that are small or
+    low on a table. Poses are unlikely if the hand penetrates an obstacle there or at its retreat. With restrictions, at
+    most `_MOST_POOLS` pools are drawn. If they allow too few starts, the result has fewer than `count`, perhaps none.
     """
     generator = torch.Generator().manual_seed(seed)
     obstacles = make_obstacle_tensors(scene, hand, "cpu", torch.float64)
@@ -109,7 +108,7 @@ def draw_starts(
         drawn = replace(drawn, middle=drawn.middle + raised - drawn.translation, translation=raised)
 
     half_width = half_widths(surface, drawn.middle, drawn.rotation, hand)
-    # Gumbel noise makes the best `count` a draw without replacement with weights exp(−half width / scale).
+    # With Gumbel noise, the best `count` are a random draw without replacement, with weights exp(−half width / scale).
     gumbel = -torch.log(-torch.log(_uniform(1e-12, 1.0, len(drawn.joints), generator)))
     preference = gumbel - (half_width + drawn.depth) / _SPAN_SCALE - blocked / _DEPTH_SCALE
     chosen = preference.topk(min(count, len(preference))).indices
@@ -123,7 +122,7 @@ def draw_starts(
 def _draw_pool(
     hull: TriangleMesh, hand: HandModel, count: int, seed: int, generator: torch.Generator, fingertips: float
 ) -> StartPool:
-    """Draw hands that face random points of the hull, rolled at random: open, or there with their fingertips."""
+    """Draw hands with random roll that face random points of the hull, open or with half-closed fingers."""
     points, normals = surface_samples(hull, count, seed)
     outward = torch.as_tensor(normals)
     tilt_axis = torch.linalg.cross(outward, torch.randn(count, 3, generator=generator, dtype=torch.float64))
@@ -155,9 +154,9 @@ def _uniform(low: float, high: float, count: int, generator: torch.Generator) ->
 def _aimed(
     pool: StartPool, aim: Aim, surface: Float[Tensor, "points 3"], hand: HandModel, generator: torch.Generator
 ) -> StartPool:
-    """Turn and move the hands of a pool as `aim` wants. Joints stay.
+    """Turn and move the hands of a pool so that they meet `aim`. The joints do not change.
 
-    A palm, or the middle between fingertips, faces a wanted place and stands off the `surface` points about its line.
+    The grip faces a wanted place, at its standoff from the `surface` points near the palm's axis.
     """
     count, rotation = len(pool.joints), pool.rotation
     if aim.direction is not None:
@@ -192,7 +191,7 @@ def _standing_off(places: Positions, facing: Positions, surface: Float[Tensor, "
 
 
 def _allowed(draw: Callable[[int], StartPool], wanted: int, seed: int, restrictions: BoundRestrictions) -> StartPool:
-    """Draw hands, seed after seed, until the restrictions allow `wanted` of them."""
+    """Draw pools with new seeds until the restrictions allow `wanted` hands, at most `_MOST_POOLS` pools."""
     kept: list[StartPool] = []
     for again in range(_MOST_POOLS):
         drawn = draw(seed + again * _POOL_SEED_STEP)
@@ -206,9 +205,9 @@ def _allowed(draw: Callable[[int], StartPool], wanted: int, seed: int, restricti
 
 
 def raise_clear(obstacles: ObstacleTensors, base: SE3, links: SE3) -> tuple[Positions, Values]:
-    """Move origins of hands off the support, within bounds, and return how deep the hands reach into anything [m].
+    """Lift hands off the support by at most `_HIGHEST_LIFT`. `links` are the link poses in the base frame.
 
-    The depth is that at the new place and drawn back from there. `links` are the link poses in the base frame.
+    Returns the lifted base origins [m], and each hand's greatest depth in obstacles, there or at the retreat [m].
     """
     translation = base.translation
     if obstacles.normal is not None:
@@ -220,7 +219,7 @@ def raise_clear(obstacles: ObstacleTensors, base: SE3, links: SE3) -> tuple[Posi
 
 
 def depth_of_starts(scene: Scene, hand: HandModel, count: int, restrictions: BoundRestrictions) -> float:
-    """Return how deep the best of `count` starts is in the obstacles, there or at its retreat [m], 0 without any."""
+    """Return the depth in the obstacles [m] of the best of `count` starts, there or at the retreat. 0 without any."""
     obstacles = make_obstacle_tensors(scene, hand, "cpu", torch.float64)
     if obstacles is None:
         return 0.0
@@ -232,9 +231,9 @@ def depth_of_starts(scene: Scene, hand: HandModel, count: int, restrictions: Bou
 def half_widths(
     surface: Float[Tensor, "points 3"], middle: Positions, rotation: Float[Tensor, "batch 3 3"], hand: HandModel
 ) -> Values:
-    """Return how far the object reaches from a hand's middle along the direction in which the fingers close [m].
+    """Return the object's greatest distance from the grip, measured along the closing direction of the fingers [m].
 
-    Only the slab between the fingers counts: as wide as a hand, and as deep as the fingers reach.
+    Only the slab between the fingers counts, as wide as a hand and as deep as the fingers reach. Infinite if empty.
     """
     normal = torch.as_tensor(hand.palm_normal)
     closing = torch.as_tensor(closing_axis(hand))
@@ -242,12 +241,12 @@ def half_widths(
     along, depth, across = (axis @ surface.T - (axis * middle).sum(-1, keepdim=True) for axis in axes)
     within = (across.abs() < _SLAB_HALF_BREADTH) & (depth < _SLAB_DEPTH)
     width = torch.where(within, along.abs(), 0.0).amax(-1)
-    # A palm that faces past the object has nothing to close around.
+    # If the palm faces past the object, the hand has nothing to close around.
     return torch.where(within.any(-1), width, torch.inf)
 
 
 def closing_axis(hand: HandModel) -> Float[np.ndarray, "3"]:
-    """Return the unit direction in the palm plane along which the fingertips travel most in closing, base frame."""
+    """Return the direction of greatest fingertip travel when closing: a unit vector in the palm plane, base frame."""
     tips = [int(np.flatnonzero(hand.link_group == group)[-1]) for group in hand.fingertip_groups]
     travel = (link_poses(hand, hand.closed_posture)[1] - link_poses(hand, hand.open_posture)[1])[tips]
     in_plane = travel - np.outer(travel @ hand.palm_normal, hand.palm_normal)
@@ -255,7 +254,7 @@ def closing_axis(hand: HandModel) -> Float[np.ndarray, "3"]:
 
 
 def between_fingertips(hand: HandModel, joints: Joints) -> Positions:
-    """Return the middle between the fingertips that close from one side and from the other, base frame [m]."""
+    """Return the middle between the fingertips of the two closing sides, base frame [m]."""
     fingers = find_fingers(hand)
     travel = placed_tips(hand, fingers, hand.closed_posture) - placed_tips(hand, fingers, hand.open_posture)
     along = torch.as_tensor(travel @ closing_axis(hand))
@@ -266,7 +265,7 @@ def between_fingertips(hand: HandModel, joints: Joints) -> Positions:
 
 
 def convex_hull(mesh: TriangleMesh) -> TriangleMesh:
-    """Return the convex hull of a mesh, or the mesh if it is flat and has none."""
+    """Return the convex hull of a mesh. A flat mesh has no hull and is returned unchanged."""
     try:
         return hull_surface(mesh.vertices)
     except QhullError:

@@ -1,6 +1,6 @@
-"""Lay a problem out for the compiled kernel: arrays of float32 and int32 in the order in which the kernel reads them.
+"""Convert a problem to the memory layout of the compiled kernel: arrays of float32 and int32.
 
-The parts of a hand and of an object are laid out once and kept, because most requests come for the same ones.
+The arrays of the last hands and objects are cached, because most requests use the same hand and object.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ from graspd_core.optimize.problem import (
     Problem,
 )
 
-# Vectors of the widest target, and floats that it may read past the last that counts.
+# Floats in a vector of the widest build. The kernel may read up to this many floats past the last value.
 _LANES = 16
 Argument = Tensor | Structure | int | float
 _KINDS = {"fixed": 0, "revolute": 1, "prismatic": 2}
@@ -38,20 +38,20 @@ _KINDS = {"fixed": 0, "revolute": 1, "prismatic": 2}
 
 @dataclass
 class Arrays:
-    """Arrays that structures point into. They live as long as this object."""
+    """Owner of the arrays that kernel structures point into. The arrays live as long as this object."""
 
     kept: list[object] = field(default_factory=list)
 
     def floats(self, values: np.ndarray | Tensor) -> int:
-        """Return the address of the values as float32, aligned for vectors, with a vector of zeros behind."""
+        """Copy the values to aligned float32 memory, followed by a vector of zeros, and return the address."""
         return self._keep(values, np.float32)
 
     def ints(self, values: np.ndarray | Tensor) -> int:
-        """Return the address of the values as int32."""
+        """Copy the values to aligned int32 memory and return the address."""
         return self._keep(values, np.int32)
 
     def rows(self, columns: np.ndarray, width: int) -> int:
-        """Return the address of an (n, k) array as k rows of `width` floats."""
+        """Copy an (n, k) array to k rows of `width` floats, padded by zeros, and return the address."""
         padded = np.zeros((columns.shape[1], width), dtype=np.float32)
         padded[:, : len(columns)] = columns.T
         return self.floats(padded)
@@ -67,7 +67,7 @@ class Arrays:
 
 @dataclass(frozen=True, eq=False)
 class KernelProblem:
-    """A problem in the kernel's memory: `struct` points into `arrays`. Read it from `Problem.compiled`."""
+    """A problem in the kernel's memory layout. `struct` points into `arrays`. Get it from `Problem.compiled`."""
 
     struct: structs.Problem
     arrays: tuple[Arrays, ...]
@@ -78,15 +78,15 @@ class KernelProblem:
         Args:
             function: name of the function.
             arguments: tensors are passed as addresses of their values and must be contiguous.
-            watch: called from this thread every few milliseconds with the steps done. True ends the call.
+            watch: called in this thread every few milliseconds with the number of steps done. True ends the call.
 
         Raises:
-            MemoryError: too little memory for the threads.
+            MemoryError: the threads need more memory than there is.
         """
         failures: list[BaseException] = []
 
         def poll(done: int) -> int:
-            # An exception, as at Ctrl-C, cannot pass through C++: it ends the call, and is raised afterwards.
+            # An exception, such as Ctrl-C, cannot pass through C++. It ends the call and is raised afterwards.
             try:
                 return bool(watch and watch(done))
             except BaseException as failure:
@@ -109,7 +109,7 @@ def _given(argument: Argument) -> object:
 
 
 def kernel_problem(problem: Problem) -> KernelProblem:
-    """Lay a problem out that the kernel can evaluate."""
+    """Convert a problem that the kernel can evaluate."""
     hand, hand_arrays = _hand(problem.hand)
     target, object_arrays = _object(problem.object)
     own = Arrays()
@@ -129,13 +129,13 @@ def kernel_problem(problem: Problem) -> KernelProblem:
 
 @lru_cache(maxsize=8)
 def _hand(hand: HandTensors) -> tuple[dict[str, Structure], Arrays]:
-    """Lay out the fields of `builds.Problem` that describe the hand."""
+    """Return the fields of `builds.Problem` that describe the hand, and their arrays."""
     arrays = Arrays()
     spheres, links = placed_points(hand.spheres.matrix)
     order = np.argsort(links.numpy(), kind="stable")
     width = _padded(len(order))
     weight = np.zeros((len(order), width))
-    # The upper triangle has each pair once. In another order of spheres a pair may come to lie below.
+    # Each pair is stored once, above the diagonal. Sorting the spheres by link may move a pair below it.
     both = hand.spheres.weight + hand.spheres.weight.T
     weight[:, : len(order)] = np.triu(both.numpy()[np.ix_(order, order)], 1)
     centers = _points(spheres.numpy()[order], links.numpy()[order], arrays)
@@ -176,7 +176,7 @@ def _links(hand: HandTensors, arrays: Arrays) -> structs.Hand:
 
 
 def _candidates(points: PointSet, arrays: Arrays) -> structs.Points:
-    """Sort candidates by group and link. Every group of links moves as one, so that its links lie together."""
+    """Return the contact candidates sorted by rigid group, then by link."""
     at, links = (values.numpy() for values in placed_points(points.matrix))
     group = np.zeros(len(at), dtype=int)
     for index, members in enumerate(points.groups.numpy()):

@@ -1,4 +1,4 @@
-"""Run any solver: starts in, best iterates out. Stop and deadline are obeyed within a step."""
+"""Run a solver from starts to the best iterates. A stop or a deadline ends the run within one step."""
 
 from __future__ import annotations
 
@@ -17,8 +17,8 @@ from graspd_core.se3 import SE3, rotation_from_quaternion
 if TYPE_CHECKING:
     from graspd_core.optimize.problem import Problem
 
-# Arrays of a batch: a value of every start, a row of its variables, its base position [m], its joints [rad] or [m],
-# points of its hand [m] and their distances [m].
+# Arrays with one row per start: a value, the solver's variables, base position [m], joints [rad] or [m], hand points
+# [m], and distances of the points [m].
 Values = Float[Tensor, "batch"]
 Rows = Float[Tensor, "batch variables"]
 Positions = Float[Tensor, "batch 3"]
@@ -51,7 +51,7 @@ class Poses:
 
 
 def pack(poses: Poses) -> Rows:
-    """Return rows of translation, quaternion and joints, as solvers step them."""
+    """Return rows of translation, quaternion and joints: the variables of the solvers."""
     return torch.cat([poses.translation, poses.quaternion, poses.joints], -1)
 
 
@@ -61,19 +61,19 @@ def unpack(x: Rows) -> Poses:
 
 
 def moved_along(poses: Poses, point: Float[Tensor, "*batch 3"]) -> Poses:
-    """Move the translation of poses along a vector of the base frame [m]."""
+    """Return the poses with each base moved by the vector `point`, given in the base frame [m]."""
     turned = (rotation_from_quaternion(poses.quaternion) @ point[..., None]).squeeze(-1)
     return Poses(poses.translation + turned, poses.quaternion, poses.joints)
 
 
 S = TypeVar("S")
-# How fast Adam's running means forget, of the gradient and of its square.
+# Adam's decay rates of the running means of the gradient and of its square.
 _BETA1, _BETA2, _EPSILON = 0.9, 0.98, 1e-8
 
 
 @runtime_checkable
 class Solver(Protocol[S]):
-    """A frozen value that holds its hyper-parameters. `minimise` runs it for `steps` steps."""
+    """An optimiser as a frozen value with its hyper-parameters. `minimise` runs it for `steps` steps."""
 
     @property
     def steps(self) -> int: ...
@@ -83,7 +83,7 @@ class Solver(Protocol[S]):
         ...
 
     def step(self, problem: Problem, state: S, index: int) -> S:
-        """Return the state after one step, perhaps without hopeless starts."""
+        """Return the state after one step. The solver may drop hopeless starts."""
         ...
 
     def best(self, state: S) -> tuple[Poses, Values]:
@@ -93,14 +93,14 @@ class Solver(Protocol[S]):
 
 @dataclass(frozen=True)
 class Hooks:
-    """How the caller follows and ends a run.
+    """Callbacks of the caller to follow a run and to end it.
 
     Attributes:
         report: called with (step, steps, best loss) at most every `interval` seconds.
-        stop: true ends the run within one step.
-        deadline: `time.perf_counter()` value at which the run ends within one step.
+        stop: asked before every step. True ends the run.
+        deadline: `time.perf_counter()` value after which the run ends within one step.
         interval: least time between reports [s].
-        watch: called with the best poses so far at every report, None for no call.
+        watch: called at every report with the best poses so far. None for no call.
     """
 
     report: Callable[[int, int, float], None] = field(default=lambda step, steps, loss: None)
@@ -112,13 +112,13 @@ class Hooks:
 
 @dataclass(frozen=True)
 class Solution:
-    """Where a run ended.
+    """The result of a run.
 
     Attributes:
         poses: best iterate of every start that was kept.
-        loss: its loss, infinite where no iterate was finite.
-        steps: steps done.
-        interrupted: why the run ended early: "", "cancelled" or "deadline".
+        loss: loss of that iterate. Infinite if the start had no finite iterate.
+        steps: number of steps done.
+        interrupted: why the run ended early: "cancelled" or "deadline". Empty for a full run.
     """
 
     poses: Poses
@@ -129,7 +129,7 @@ class Solution:
 
 @dataclass
 class Follow:
-    """Lets the caller's hooks follow a run of so many steps and end it. `reported` is a `time.perf_counter()` value."""
+    """Progress of a run of `steps` steps, reported to the hooks. `reported` is a `time.perf_counter()` value."""
 
     hooks: Hooks
     steps: int
@@ -138,7 +138,7 @@ class Follow:
     reported: float = -float("inf")
 
     def over(self) -> bool:
-        """Ask whether the run is to end, and note why."""
+        """Return True if the hooks end the run, and store the reason in `interrupted`."""
         if self.hooks.stop():
             self.interrupted = "cancelled"
         elif time.perf_counter() >= self.hooks.deadline:
@@ -146,7 +146,7 @@ class Follow:
         return bool(self.interrupted)
 
     def report(self, done: int, best: Callable[[], tuple[Poses, Values]]) -> None:
-        """Report that so many steps are done, if the last report was long ago or all steps are done."""
+        """Report that `done` steps are done, if `interval` has passed since the last report or all are done."""
         now = time.perf_counter()
         if now - self.reported < self.hooks.interval and done != self.steps:
             return
@@ -157,12 +157,11 @@ class Follow:
         self.reported = now
 
     def solution(self, poses: Poses, loss: Values) -> Solution:
-        """Return where the run ended."""
         return Solution(poses, torch.nan_to_num(loss, nan=torch.inf, posinf=torch.inf), self.done, self.interrupted)
 
 
 def minimise(solver: Solver[S], problem: Problem, starts: Poses, hooks: Hooks) -> Solution:
-    """Run `solver` from `starts`. A start that diverges never improves. Numerical trouble never raises."""
+    """Run `solver` from `starts`. A start that diverges keeps its best iterate. Numerical errors never raise."""
     state, follow = solver.init(problem, starts), Follow(hooks, solver.steps)
     while follow.done < solver.steps and not follow.over():
         state = solver.step(problem, state, follow.done)
@@ -172,10 +171,10 @@ def minimise(solver: Solver[S], problem: Problem, starts: Poses, hooks: Hooks) -
 
 
 def adam_moments(mean: Rows, square: Rows, gradient: Rows, count: int) -> tuple[Rows, Rows, Rows, Rows]:
-    """Return Adam's moments after step number `count`, from one (Kingma & Ba 2015, §2).
+    """Return Adam's moments after step `count`, counted from one (Kingma & Ba 2015, §2).
 
     Returns:
-        The running means of the gradient and of its square, and the two whose quotient is the direction of the step.
+        The running means of the gradient and of its square, and numerator and denominator of the step direction.
     """
     mean = _BETA1 * mean + (1 - _BETA1) * gradient
     square = _BETA2 * square + (1 - _BETA2) * gradient * gradient

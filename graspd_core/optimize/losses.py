@@ -1,12 +1,12 @@
 """Compute the loss terms of the closed-form relaxation: pure functions of arrays, one value per start, of order one.
 
-For a unit disturbance w the friction-cone-bounded contact forces that resist it best have a closed form at every
-contact, so the support function of the grasp wrench space is a sum over contacts (docs/method.md):
+For a unit disturbance w, the best resisting force in the friction cone of a contact has a closed form. So the support
+function of the grasp wrench space is a sum over contacts (docs/method.md):
 
     v_ik = w_k,lin + w_k,ang × (x_i − c) / L
     h_k  = Σ_i s_i · max(0, −n_i·v_ik + μ ‖v_ik − (n_i·v_ik) n_i‖)
 
-Gradients are exact where a term is smooth, except that the tangential speed's root is floored at `_TANGENT_FLOOR`.
+Gradients are exact where a term is smooth, except that the squared tangential speed has the floor `_TANGENT_FLOOR`.
 """
 
 from __future__ import annotations
@@ -17,16 +17,16 @@ from torch import Tensor
 
 from graspd_core.optimize.loop import Distances, Joints, Points, Values
 
-# Floor of the squared tangential speed, relative to the unit disturbance: keeps the square root differentiable.
+# Floor of the squared tangential speed, relative to the unit disturbance. It keeps the square root differentiable.
 _TANGENT_FLOOR = 1e-6
-# Lengths that make a term one [m].
+# Lengths at which a term is one [m].
 _CENTIMETRE, _MILLIMETRE = 0.01, 0.001
 # Added to h so that a start without any contact has a finite task loss.
 _SUPPORT_FLOOR = 1e-3
 
 
 def disturbance_directions(count: int, seed: int, dtype: torch.dtype = torch.float64) -> Float[Tensor, "count 6"]:
-    """Spread unit wrenches over the sphere in R⁶: the 12 signed axes first, then farthest-of-many random ones."""
+    """Return unit wrenches spread over the sphere in R⁶: the 12 signed axes, then random ones far from all before."""
     axes = torch.cat([torch.eye(6, dtype=dtype), -torch.eye(6, dtype=dtype)])
     chosen = axes[:count]
     pool = torch.randn(64 * max(count, 1), 6, generator=torch.Generator().manual_seed(seed), dtype=dtype)
@@ -69,33 +69,33 @@ def wrench_support(
 
 
 def soft_contact(distance: Distances, radius: Values, delta: float) -> Distances:
-    """Return the activation s = exp(−|φ − r| / δ): one on the padded surface, never with a zero gradient off it."""
+    """Return the activation s = exp(−|φ − r| / δ): one on the padded surface. Off it the gradient is never zero."""
     return (-(distance - radius[:, None]).abs() / delta).exp()
 
 
 def hard_contact(distance: Distances, radius: Values, delta: float) -> Distances:
-    """Return one within δ of the padded surface, else zero, without any gradient: the ablation of `soft_contact`."""
+    """Return 1 within δ of the padded surface, else 0. There is no gradient. This is the ablation of `soft_contact`."""
     return ((distance - radius[:, None]).abs() <= delta).to(distance)
 
 
 def wrench_resistance(support: Float[Tensor, "batch directions"], friction: float, sharpness: float = 4.0) -> Values:
-    """Return the soft maximum over disturbances of −log(h_k / μ + h₀): how badly the worst one is resisted."""
+    """Return the soft maximum over disturbances of −log(h_k / μ + h₀). High if one disturbance is hardly resisted."""
     resisted = -(support / friction + _SUPPORT_FLOOR).log()
     count = support.shape[-1]
     return (torch.logsumexp(sharpness * resisted, -1) - torch.log(torch.tensor(float(count)))) / sharpness
 
 
 def touch(gap: Float[Tensor, "batch groups"], reach: Float[Tensor, "groups"]) -> Values:
-    """Return the distance of the groups of links from the padded surface, saturating beyond each group's reach [m].
+    """Return the mean distance [cm] of link groups from the padded surface. It saturates beyond their `reach` [m].
 
-    Groups with a long reach (fingertips) are drawn from afar, the others only finish a contact that is already near.
+    Groups with a long reach (fingertips) are attracted from afar. Other groups are attracted only if already near.
     """
     size = gap.abs()
     return (size * reach / (size + reach)).mean(-1) / _CENTIMETRE
 
 
 def penetration(distance: Distances, radius: Values) -> Values:
-    """Return the depth below the padded surface: sum of squares in mm², growing linearly for deep points."""
+    """Return a penalty on points below the padded surface: the sum of squared depths [mm²], linear for deep points."""
     depth = (radius[:, None] - distance).clamp_min(0.0) / _MILLIMETRE
     return (depth * depth / (1.0 + 0.1 * depth)).sum(-1) / 10.0
 
@@ -103,9 +103,9 @@ def penetration(distance: Distances, radius: Values) -> Values:
 def self_collision(
     centers: Float[Tensor, "batch spheres 3"], radii: Float[Tensor, "spheres"], weight: Float[Tensor, "spheres spheres"]
 ) -> Values:
-    """Return the overlap of spheres of non-adjacent links [mm²], depth as (R² − d²) / 2R, exact where they touch.
+    """Return the squared overlap of spheres of non-adjacent links [mm²], with depth (R² − d²) / 2R.
 
-    `weight` is 1 / 2R [1/m] once for each checked pair, with R the sum of its radii, and zero elsewhere.
+    R is the sum of the radii. The depth is exact where spheres touch. `weight` is 1 / 2R [1/m], zero for other pairs.
     """
     inner = (radii * radii - (centers * centers).sum(-1))[..., None]
     ones, r = torch.ones_like(inner), radii.expand(len(centers), -1)[..., None]

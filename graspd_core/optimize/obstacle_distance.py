@@ -1,9 +1,9 @@
-"""Measure the hand's distance from what the object stands on and from the obstacles around it.
+"""Measure the hand's distance from the support plane and from the obstacles around the object.
 
-A solid is convex, so it is clear of a half-space exactly when its extreme points are: boxes and hulls by their corners,
-spheres and capsules by their ends less their radius, cylinders by points of their rims. Against neighbours the
-collision spheres (`hands.self_collision`), which bulge a little out of flat faces, stand in for what lies between
-the corners. Gradients are exact but for that of the neighbours' interpolated distance.
+The solids of the hand are convex. So a solid is clear of the support if its extreme points are: corners of boxes and
+hulls, ends of spheres and capsules less their radius, rim points of cylinders. Obstacles are also tested against the
+collision spheres (`hands.self_collision`), which extend a little out of flat faces. Gradients are exact, except for the
+interpolated distance to obstacles.
 """
 
 from __future__ import annotations
@@ -34,30 +34,30 @@ from graspd_core.optimize.loop import Poses, Values
 from graspd_core.perception.scene import Scene
 from graspd_core.se3 import SE3, rotation_from_quaternion
 
-# Shares of the straight way from the retreat to the pregrasp at which the hand is looked at, and of that to the grasp.
+# Fractions at which the hand is tested: of the straight path from retreat to pregrasp, and of that to the grasp.
 RETREAT_SHARES = (0.15, 0.3, 0.5, 0.75, 1.0)
 _WAY_SHARES = (0.0, 0.25, 0.5, 0.75, 1.0)
-# What the optimiser makes of gaps ends below this [m].
+# Gaps of at least this make no difference to the optimiser [m].
 WIDE = 0.005
-# Points that stand for a cylinder's rim, and for a hull with more corners than this.
+# Points that represent the rim of a cylinder, and the greatest number of points that represent a hull.
 _RIM, _HULL = 12, 32
 
 
 @dataclass(frozen=True)
 class ObstacleTensors:
-    """Support and neighbours, and the points of the hand that are held against them.
+    """Support and obstacles, and the points of the hand that are tested against them.
 
     Attributes:
         corner_matrix: places the extreme points of the hand's solids, see `hands.kinematics.placement`.
-        corner_radii: of the balls about them [m].
-        sphere_matrix: places the proxy spheres likewise.
-        sphere_radii: of the proxy spheres [m].
-        normal: of the support, into the free side, None without a support.
+        corner_radii: radii of the balls about the extreme points [m].
+        sphere_matrix: places the centres of the collision spheres in the same way.
+        sphere_radii: radii of the collision spheres [m].
+        normal: unit normal of the support, into the free side. None without a support.
         offset: n·x of the support's points [m].
-        sdfs: signed distances of the things that this hand can reach.
-        approach: unit direction in which the hand comes to its pregrasp, base frame.
-        points, radii, links: all of these balls, link frames [m], and the link of each.
-        around: of each link a ball about all of its own: its middle, link frame, and its radius [m].
+        sdfs: signed distance fields of the obstacles within the hand's reach.
+        approach: unit direction in which the hand moves to its pregrasp, base frame.
+        points, radii, links: centres (link frames), radii [m] and links of both kinds of balls.
+        around: bounding ball of all balls of each link: its centre in the link frame, and its radius [m].
     """
 
     corner_matrix: Float[Tensor, "corners columns"]
@@ -78,7 +78,7 @@ class ObstacleTensors:
 def make_obstacle_tensors(
     scene: Scene, hand: HandModel, device: torch.device | str, dtype: torch.dtype
 ) -> ObstacleTensors | None:
-    """Lay the obstacles out as this hand meets them, None if it meets none. Kept for the last few scenes and hands."""
+    """Return the support and the obstacles that this hand can reach, None if there are none. Results are cached."""
     vertices = torch.as_tensor(scene.object.mesh.vertices)
     gaps = [float(sample_sdf(thing.sdf, vertices.to(thing.sdf.field))[0].min()) for thing in scene.obstacles]
     reached = [thing for thing, gap in zip(scene.obstacles, gaps, strict=True) if gap < hand_reach(hand) + RETREAT]
@@ -113,7 +113,7 @@ def make_obstacle_tensors(
 
 
 def _balls_about(count: int, points: np.ndarray, radii: np.ndarray, links: np.ndarray) -> Float[np.ndarray, "links 4"]:
-    """Return middle and radius of a ball about the balls of each link. Of a link without any the radius is negative."""
+    """Return centre and radius of the bounding ball of each link's balls. The radius is −inf if it has none."""
     around = np.zeros((count, 4))
     around[:, 3] = -np.inf
     for link in np.unique(links):
@@ -131,14 +131,14 @@ def hand_reach(hand: HandModel) -> float:
 
 
 def extreme_points(hand: HandModel) -> tuple[Float[np.ndarray, "corners 3"], Float[np.ndarray, "corners"], np.ndarray]:
-    """Return points in link frames [m] and radii [m] of balls whose convex hull is each solid, and their links."""
+    """Return balls whose convex hull is the hand's solids: centres in link frames [m], radii [m] and links."""
     solids = extreme_points_of_solids(hand)
     points, radii, links = zip(*((p, np.full(len(p), r), np.full(len(p), link)) for p, r, link in solids), strict=True)
     return np.concatenate(points), np.concatenate(radii), np.concatenate(links)
 
 
 def extreme_points_of_solids(hand: HandModel) -> list[tuple[Float[np.ndarray, "n 3"], float, int]]:
-    """Return for each solid of the hand the points of `extreme_points` and their radius [m], and its link."""
+    """Return for each solid of the hand its extreme points in the link frame [m], their radius [m], and the link."""
     found = ((*_extremes(primitive), primitive) for primitive in hand.primitives)
     return [(at @ solid.rotation.T + solid.translation, radius, solid.link) for at, radius, solid in found]
 
@@ -160,9 +160,9 @@ def _extremes(primitive: Primitive) -> tuple[Float[np.ndarray, "n 3"], float]:
 
 
 def obstacle_gaps(obstacles: ObstacleTensors, base: SE3, links: SE3, wide: float = WIDE) -> Float[Tensor, "batch gaps"]:
-    """Return signed distances [m] of the hand's points to every obstacle. Link poses are in the base frame.
+    """Return signed distances [m] of the hand's balls to support and obstacles. `links` are poses in the base frame.
 
-    Distances are negative inside. One of at least `wide` may be given as `wide`.
+    Distances are negative inside. A distance of at least `wide` may be returned as `wide`.
     """
     corners = base.apply(place_points(obstacles.corner_matrix, links))
     gaps = []
@@ -180,8 +180,7 @@ def obstacle_gaps(obstacles: ObstacleTensors, base: SE3, links: SE3, wide: float
 def least_gap(obstacles: ObstacleTensors, base: SE3, links: SE3, wide: float = WIDE) -> Values:
     """Return the least of `obstacle_gaps` of each hand [m].
 
-    An obstacle farther away than `wide` does not count. Only links near an obstacle's grid are looked at: in a bin, of
-    a hand and five obstacles, a tenth of all.
+    Obstacles beyond `wide` are ignored. Only links near an obstacle's grid are tested (in a bin, a tenth of them).
     """
     least = base.translation.new_full(base.translation.shape[:1], wide)
     if obstacles.normal is not None:
@@ -205,7 +204,7 @@ def least_gap(obstacles: ObstacleTensors, base: SE3, links: SE3, wide: float = W
 def _gaps_to(
     sdf: GridSDF, points: Float[Tensor, "*batch 3"], radii: Float[Tensor, "points"], wide: float
 ) -> Float[Tensor, "*batch"]:
-    """Return gaps of balls to one obstacle. Only the balls near its grid are sampled, which are few of all."""
+    """Return the gaps of balls to one obstacle [m]. Only balls near its grid are sampled. The others get `wide`."""
     off_grid = (points.detach() - (sdf.origin + sdf.half)).abs() - sdf.half
     near = (off_grid < (radii + wide)[:, None]).all(-1)
     gaps = points.new_full(near.shape, wide)
@@ -218,9 +217,10 @@ def _gaps_to(
 def gap_on_the_way(
     obstacles: ObstacleTensors, kinematics: Kinematics, pregrasp: Poses, grasp: Poses, wide: float = WIDE
 ) -> Values:
-    """Return the least signed distance [m] of the hand to any obstacle, from the retreat over pregrasp to grasp.
+    """Return the least signed distance [m] of the hand to any obstacle on the path retreat, pregrasp, grasp.
 
-    It is negative inside. One of at least `wide` may be given as `wide`. The base has one orientation in both poses.
+    Distances are negative inside. A distance of at least `wide` may be returned as `wide`. The base must have the same
+    orientation in both poses.
     """
     rotation = rotation_from_quaternion(grasp.quaternion)
     begun = [drawn_back(pregrasp.translation, rotation, obstacles.approach, RETREAT * s) for s in RETREAT_SHARES]

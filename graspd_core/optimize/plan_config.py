@@ -1,8 +1,8 @@
-"""Hold the settings of a run of `plan_grasps`: the methods, their own settings, and the presets.
+"""Settings of a run of `plan_grasps`: the methods, the settings of each method, and the presets.
 
-A method of graspd_core is a row of `METHODS`. A method of another package registers itself: an entry point of the group
-`graspd.methods` names its row, which is loaded when the method is first asked for. A plugin is a Python file that adds
-rows to `METHODS`, `METRICS` or `TRIALS`. The environment names plugins, so that child processes run them too.
+A method of graspd_core is a row of `METHODS`. Another package registers a method by an entry point of the group
+`graspd.methods` that names its row. The row is loaded when the method is first used. A plugin is a Python file that
+adds rows to `METHODS`, `METRICS` or `TRIALS`. An environment variable lists the plugins, so child processes load them.
 """
 
 from __future__ import annotations
@@ -32,16 +32,16 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class Method:
-    """One way to find grasps.
+    """A method that finds grasps.
 
     Attributes:
-        module: has `plan(PlannerInput) -> PlannerOutput`.
-        config: dataclass of its settings. A preset's section of the method's name fills it.
-        label: its name in charts.
-        colour, marker: of its points in charts, as Matplotlib takes them.
+        module: dotted name of the module with `plan(PlannerInput) -> PlannerOutput`.
+        config: dataclass of the method's settings. The preset section with the method's name fills it.
+        label: name in charts.
+        colour, marker: colour and marker in charts, as Matplotlib takes them.
         benchmark_count: grasps of one unfiltered batch in the benchmark.
-        at_budget: its settings at a share of the usual budget. The default keeps the settings.
-        searches: of a round at most, by its settings, repeated only if too few grasps are expected to hold.
+        at_budget: returns the settings for a multiple of the usual budget. The default keeps the settings.
+        searches: returns the greatest number of searches per round. They end if enough grasps are expected to hold.
     """
 
     module: str
@@ -54,9 +54,9 @@ class Method:
     searches: Callable[[Any], int] = lambda settings: 1
 
     def plan(self, task: PlannerInput) -> PlannerOutput:
-        """Find poses. Numerical trouble is a missing pose, never an exception.
+        """Find poses. A numerical failure drops the pose and never raises.
 
-        The module is imported here and not with this file, because it needs torch.
+        The module needs torch, so it is imported here and not at the top of this file.
         """
         return importlib.import_module(self.module).plan(task)
 
@@ -87,19 +87,19 @@ def _registered() -> dict[str, EntryPoint]:
 
 @cache
 def _run_plugins() -> None:
-    """Run the plugins that a parent process was given. They import this module, so that it cannot run them itself."""
+    """Load the plugins of the parent process. Plugins import this module, so they cannot be loaded at its import."""
     for path in filter(None, os.environ.get(_PLUGINS, "").split(os.pathsep)):
         load_plugin(path)
 
 
 def method_names() -> tuple[str, ...]:
-    """Return the names of all methods: those of graspd_core and those that other packages register."""
+    """Return the names of all methods, of graspd_core and of other packages."""
     _run_plugins()
     return tuple(dict.fromkeys((*METHODS, *_registered())))
 
 
 def method_row(name: Any, where: str = "config") -> Method:
-    """Return the row of a method. Raises ConfigError: there is no such method."""
+    """Return the row of a method. Raises ConfigError: the method is unknown. `where` is the prefix of the message."""
     _run_plugins()
     if not isinstance(name, str) or (name not in METHODS and name not in _registered()):
         raise ConfigError(f"{where}.method: unknown method {shown(name)}; {choices(name, method_names())}")
@@ -113,17 +113,17 @@ class PlanConfig:
     """Settings of a run, apart from the scene, the hand and the seed.
 
     Attributes:
-        resolution: the signed distance grid has at most its cube in nodes. A cube has as many along each side.
-        method: how poses are searched for, one of `method_names`.
-        settings: of that method, of the type that its row names. None takes the defaults.
-        problem: how scene and hand are laid out.
-        grasp_stages: pregrasp and squeeze.
-        rounds: of optimiser and trial.
-        robust: the order of the verified grasps.
-        certainty: how sure a grasp of a partly guessed object must be.
+        resolution: the signed distance grid has at most `resolution`³ nodes: `resolution` along each side of a cube.
+        method: name of the method, one of `method_names`.
+        settings: settings of the method, an instance of `Method.config`. None takes the defaults.
+        problem: how scene and hand become tensors.
+        grasp_stages: settings of pregrasp and squeeze.
+        rounds: settings of the rounds of optimisation and trial.
+        robust: how the verified grasps are ordered.
+        certainty: required certainty of a grasp if part of the object's surface is a guess.
 
     Raises:
-        ConfigError: the method is unknown, or the settings are another method's.
+        ConfigError: the method is unknown, or the settings belong to another method.
     """
 
     resolution: int = 48
@@ -140,19 +140,19 @@ class PlanConfig:
         if self.settings is None:
             object.__setattr__(self, "settings", config())
         elif not isinstance(self.settings, config):
-            raise ConfigError(f"settings: {type(self.settings).__name__} is not {config.__name__} of {self.method}")
+            raise ConfigError(f"settings of {self.method}: {type(self.settings).__name__}; valid: {config.__name__}")
 
     def at_budget(self, budget: float) -> PlanConfig:
-        """Return the same method with more or less effort. A budget of 1 keeps its settings."""
+        """Return the settings with the method's effort scaled by `budget`. A budget of 1 changes nothing."""
         return dataclasses.replace(self, settings=method_row(self.method).at_budget(self.settings, budget))
 
     def with_method(self, method: str) -> PlanConfig:
-        """Return the settings with another method at its defaults, unchanged if it is the same method."""
+        """Return the settings with another method at its defaults. The same method keeps its settings."""
         return self if method == self.method else dataclasses.replace(self, method=method, settings=None)
 
 
 def to_mapping(config: PlanConfig) -> dict[str, Any]:
-    """Return the settings as a preset file has them: the method's own are in the section of its name."""
+    """Return the settings as nested mappings, as in a preset file. The method's name is the key of its settings."""
     values = dataclasses.asdict(config)
     return {config.method if key == "settings" else key: value for key, value in values.items()}
 
@@ -160,25 +160,25 @@ def to_mapping(config: PlanConfig) -> dict[str, Any]:
 def plan_config(values: Any, where: str = "config") -> PlanConfig:
     """Build the settings of a run from a preset's nested mappings.
 
-    Raises ConfigError: an unknown key or a value of the wrong type, by its dotted name, with the valid choices.
+    Raises ConfigError: unknown key or wrong type. The message has the dotted name and the valid choices.
     """
     named = values.get("method", _DEFAULT_METHOD) if isinstance(values, Mapping) else _DEFAULT_METHOD
     row = method_row(named, where)
     hints = {f.name: f.default_factory for f in dataclasses.fields(PlanConfig) if f.name not in ("settings", "method")}
     hints |= {"resolution": int, "method": str, named: row.config}
     unknown = set(values) - set(hints) if isinstance(values, Mapping) else ()
-    # Only an unknown key is worth the search for other packages' methods.
+    # `method_names` searches other packages, which is slow. So it is called only for an unknown key.
     if others := sorted(name for name in unknown if name in method_names()):
-        raise ConfigError(f"{where}.{others[0]}: settings of another method; this one has method: {named}")
+        raise ConfigError(f"{where}.{others[0]}: not used by method: {named}; valid: {named}, or method: {others[0]}")
     found = coerced(hints, values, where)
     return PlanConfig(**{("settings" if key == named else key): value for key, value in found.items()})
 
 
 def override(config: PlanConfig, changes: Mapping[str, Any]) -> PlanConfig:
-    """Return the settings with some of a preset's values changed, each by its dotted name.
+    """Return the settings with the values in `changes`, which maps dotted names of a preset file to new values.
 
     Raises:
-        ConfigError: there is no such value, or it is of another type.
+        ConfigError: a name is unknown, or a value has the wrong type.
     """
     if "method" in changes:
         config = config.with_method(changes["method"])
@@ -201,7 +201,7 @@ def load_preset(name: str) -> PlanConfig:
     """Load a preset by name, or a preset file by path.
 
     Raises:
-        ConfigError: no such preset (the valid ones are listed), malformed YAML, or a bad key or value.
+        ConfigError: the preset does not exist, the YAML is malformed, or a key or value is invalid.
     """
     by_path = Path(name).suffix in (".yaml", ".yml") or "/" in name
     path = Path(name) if by_path else config_dir() / "presets" / f"{name}.yaml"
@@ -213,10 +213,10 @@ def load_preset(name: str) -> PlanConfig:
 
 
 def load_plugin(path: str) -> str:
-    """Run a Python file that registers methods, metrics or trials, here and in child processes. Returns its path.
+    """Run a Python file that registers methods, metrics or trials. Child processes run it too. Returns its path.
 
     Raises:
-        ConfigError: there is no such file, its module's name is taken, or it raises.
+        ConfigError: the file does not exist, its module name is taken, or the file raises.
     """
     file = Path(path).resolve()
     if file.suffix != ".py" or not file.is_file():

@@ -1,4 +1,4 @@
-"""Lay hand, object and obstacles out as tensors on one device and dtype, and evaluate the loss terms of a problem."""
+"""Convert hand, object and obstacles to tensors on one device, and evaluate the loss terms of the problem."""
 
 from __future__ import annotations
 
@@ -40,17 +40,17 @@ from graspd_core.se3 import SE3
 if TYPE_CHECKING:
     from graspd_core.optimize.kernel_problem import KernelProblem
 
-# How far a group of links is drawn to the surface [m]: the ends of fingers from afar, the rest to finish a contact,
-# and patches of a hand that is to touch with its whole surface.
+# Distance at which a group of candidates is attracted to the surface [m]: fingertips from afar, other links only if
+# nearly touching, and the patches that are used where `patch_size` is set.
 _REACH_OF_TIPS, _REACH_OF_OTHERS, _REACH_OF_PATCHES = 0.1, 0.004, 0.03
 REACH_WHEN_SHARP = 0.01
-# A base frame this near to the middle of the palm lies in the palm [m].
+# A base frame nearer than this to the middle of the palm lies in the palm [m].
 _PALM_RADIUS = 0.05
-# Candidates that the task looks at, and pairs of sharp point and solid that polishing looks at.
+# Number of contact candidates in the wrench resistance term, and of pairs of sharp point and solid in penetration.
 TASK_POINTS, FEATURE_PAIRS = 96, 96
-# Points of the surface and of its edges by which the depth of a grasp is told.
+# Points of the surface and of its edges that measure how deep a grasp penetrates.
 _SURFACE, _CREASES = 3000, 1000
-# Free space that the hand keeps to obstacles [m]. Fingertips that hold an object low on a table all but touch it.
+# Distance that the hand keeps from obstacles [m]. It is small, because fingertips at a low object almost touch a table.
 OBSTACLE_MARGIN = 0.001
 
 
@@ -59,9 +59,9 @@ class PointSet:
     """Contact candidates of a hand.
 
     Attributes:
-        matrix: places them by their links' poses, see `hands.kinematics.placement`.
-        links: link of each.
-        groups: candidates of each rigid group of links, or of each patch of one, padded by repetition.
+        matrix: places the candidates by their links' poses, see `hands.kinematics.placement`.
+        links: link of each candidate.
+        groups: indices of the candidates of each rigid group of links or each patch, padded by repetition.
     """
 
     matrix: Float[Tensor, "points columns"]
@@ -74,9 +74,9 @@ class SphereTensors:
     """Spheres that fill the hand's links, for self-collision.
 
     Attributes:
-        matrix: places their centres by their links' poses, see `hands.kinematics.placement`.
+        matrix: places the centres by their links' poses, see `hands.kinematics.placement`.
         radii: [m].
-        weight: 1 / 2R of the checked pairs with R the sum of their radii, zero elsewhere [1/m].
+        weight: 1 / 2R for checked pairs [1/m], where R is the sum of both radii. Zero for other pairs.
     """
 
     matrix: Float[Tensor, "spheres columns"]
@@ -86,21 +86,21 @@ class SphereTensors:
 
 @dataclass(frozen=True, eq=False)
 class HandTensors:
-    """A hand.
+    """A hand as tensors.
 
     Attributes:
-        model: the hand that is laid out.
+        model: the hand model.
         kinematics: forward kinematics.
-        coarse: the first, evenly spread contact candidates, for most steps.
-        fine: all contact candidates, for the last steps.
+        coarse: the first contact candidates, evenly spread. Used in most steps.
+        fine: all contact candidates. Used in the last steps.
         reach: attraction range of each group of candidates [m].
         solids: collision primitives.
-        group_of_solid: the first group of each solid's links, one past the last group if they have no coarse candidate.
+        group_of_solid: first candidate group of the solid's rigid group. One past the last group if it has none.
         solid_pairs: pairs of solids whose links are not adjacent.
-        spheres: for self-collision.
+        spheres: spheres for self-collision.
         lower, upper: joint limits [rad] or [m].
-        pivot: the point that a solver turns the hand about, base frame [m].
-        joint_scale: travel of each joint that counts as much as one radian, one if it turns [rad] or [m].
+        pivot: point about which a solver turns the hand, base frame [m].
+        joint_scale: joint travel that counts as one radian: 1 rad if revolute, a length [m] if prismatic.
     """
 
     model: HandModel
@@ -119,22 +119,22 @@ class HandTensors:
 
     @property
     def has_hulls(self) -> bool:
-        """Whether the hand has hulls, of which only spheres and candidates tell that they overlap."""
+        """True if the hand has convex hulls. Overlap of hulls is detected only by spheres and contact candidates."""
         return len(self.solids.link) < len(self.model.primitives)
 
 
 @dataclass(frozen=True, eq=False)
 class ObjectTensors:
-    """An object.
+    """An object as tensors, in the object frame.
 
     Attributes:
         sdf: signed distance field.
-        features: sharp points of the surface, which could sink in between the hand's candidates [m].
-        surface: many points on the surface and its edges, by which the depth of a grasp is told [m].
-        coarse_features: how many of the first sharp points the coarse steps look at: some on thin walls, else none.
+        features: sharp points of the surface [m]. They could penetrate the hand between its contact candidates.
+        surface: many points on the surface and its edges [m], to measure how deep a grasp penetrates.
+        coarse_features: number of leading `features` used in the coarse steps, 0 if the object has no thin walls.
         center: centre of mass [m].
-        length: characteristic length of torques [m].
-        confidence: in the surface near each node of `sdf`, raised to a floor. None if all of it is known.
+        length: torques are divided by this characteristic length [m].
+        confidence: confidence in the surface near each node of `sdf`, at least a floor. None if all of it is known.
     """
 
     sdf: GridSDF
@@ -150,9 +150,9 @@ class ObjectTensors:
 def make_hand_tensors(
     hand: HandModel, candidates: int, patch_size: int, device: str, dtype: torch.dtype
 ) -> HandTensors:
-    """Lay a hand out. The coarse set is the first `candidates` of the hand's contact candidates.
+    """Convert a hand to tensors. The coarse set is the first `candidates` of the hand's contact candidates.
 
-    Candidates are grouped by rigid groups of links, or into patches of `patch_size`. The last few hands are kept.
+    Candidates are grouped by rigid groups of links, or by patches of about `patch_size`. The last hands are cached.
     """
 
     def tensor(values: np.ndarray) -> Tensor:
@@ -204,7 +204,7 @@ def _sphere_tensors(hand: HandModel, device: str, dtype: torch.dtype) -> SphereT
 
 @lru_cache(maxsize=4)
 def make_object_tensors(scene: Scene, settings: ProblemConfig, device: str, dtype: torch.dtype) -> ObjectTensors:
-    """Lay the scene's object out. The last few scenes are kept. They are hashed by identity."""
+    """Convert the scene's object to tensors. The last scenes are cached, by the identity of the scene."""
     sharp, thin_share = object_sharp_points(scene.object, 2 * settings.features)
     thin = thin_share > THIN_WALLED
     floor, confidence = settings.confidence_floor, None
@@ -217,7 +217,7 @@ def make_object_tensors(scene: Scene, settings: ProblemConfig, device: str, dtyp
     if settings.softness:
         sharp, thin, surface = sharp[:0], False, sharp[:0]
         sdf = replace(sdf, field=torch.cat([sdf.field[:1] + settings.softness, sdf.field[1:]]))
-    # They were chosen one by one, each the farthest from all before: the first half is spread as well.
+    # Each sharp point was chosen farthest from all before, so the first half is spread over the object too.
     coarse = max(settings.features, len(sharp) // 2) if thin else 0
     features = [part[neighbours_together(part)] for part in (sharp[:coarse], sharp[coarse:])]
     return ObjectTensors(
@@ -234,7 +234,7 @@ def make_object_tensors(scene: Scene, settings: ProblemConfig, device: str, dtyp
 
 
 def _patches(hand: HandModel, candidates: int, size: int) -> Int[np.ndarray, "points"]:
-    """Return the patch of each contact candidate: the nearest of its links' patches.
+    """Return the patch of each contact candidate: the nearest patch of its rigid group. −1 without coarse candidates.
 
     A rigid group of links has one patch for every `size` coarse candidates, with centres far from each other.
     """
@@ -244,7 +244,7 @@ def _patches(hand: HandModel, candidates: int, size: int) -> Int[np.ndarray, "po
     for group in np.unique(of_link[:candidates]):
         members = np.flatnonzero(of_link == group)
         coarse = members[members < candidates]
-        # Rounded, so that which of two equal ones is nearer does not depend on where the base frame is.
+        # Rounding makes the choice between two equal distances independent of the base frame.
         gaps = np.linalg.norm(points[members][:, None] - points[coarse], axis=-1).round(6)
         centres = [0]
         while len(centres) < round(len(coarse) / size):
@@ -263,13 +263,13 @@ def _members(group_of: Int[np.ndarray, "n"], present: Int[np.ndarray, "groups"])
 
 @dataclass(frozen=True)
 class Problem:
-    """One hand, one object, one set of disturbances, on one device and dtype.
+    """A hand, an object and a set of disturbances, on one device and dtype.
 
     Attributes:
-        hand, object: laid out as tensors.
+        hand, object: tensors of hand and object.
         directions: unit disturbance wrenches.
-        friction: coefficient planned with, never above the object's own.
-        obstacles: what else is in the way, None if nothing is.
+        friction: friction coefficient for planning, never above the object's own.
+        obstacles: support and obstacles within the hand's reach, None if there are none.
     """
 
     hand: HandTensors
@@ -280,26 +280,26 @@ class Problem:
 
     @cached_property
     def of_surface(self) -> Problem:
-        """The problem with points all over the surface as its sharp points."""
+        """The same problem with points of the whole surface in place of the sharp points."""
         return replace(self, object=replace(self.object, features=self.object.surface, coarse_features=0))
 
     @property
     def compiled(self) -> KernelProblem | None:
-        """The problem as the kernel reads it. None where torch evaluates it: no kernel, another device, or float64."""
+        """The problem for the compiled kernel. None if there is no kernel, or the data is not float32 on the CPU."""
         field = self.object.sdf.field
         fits = field.device.type == "cpu" and field.dtype == torch.float32 and field.numel() < 2**31
         return self._in_kernel if fits and min(field.shape[1:]) > 1 and kernel().library is not None else None
 
     @cached_property
     def _in_kernel(self) -> KernelProblem:
-        # That module reads the tensors of this one.
+        # kernel_problem imports this module, so it is imported late.
         from graspd_core.optimize.kernel_problem import kernel_problem
 
         return kernel_problem(self)
 
 
 class Terms(NamedTuple):
-    """Loss terms of a batch of starts, unweighted, named as in `LossWeights`. Free scenes have no `obstacle`."""
+    """Unweighted loss terms of a batch of starts, named as in `LossWeights`. `obstacle` is None without obstacles."""
 
     wrench_resistance: Values
     distance: Values
@@ -318,7 +318,7 @@ def build_problem(
     device: str = "cpu",
     dtype: torch.dtype = torch.float32,
 ) -> Problem:
-    """Lay scene and hand out as tensors. `seed` spreads the disturbances beyond the signed axes."""
+    """Convert scene and hand to tensors. `seed` fixes the disturbances other than the signed axes."""
     return Problem(
         hand=make_hand_tensors(hand, settings.candidates, settings.patch_size, device, dtype),
         object=make_object_tensors(scene, settings, device, dtype),
@@ -337,25 +337,25 @@ class HandPlacement(NamedTuple):
 
 
 def hand_forward(problem: Problem, points: PointSet, poses: Poses) -> HandPlacement:
-    """Compute where links and contact candidates are, for a batch of poses."""
+    """Compute the positions of links and contact candidates for a batch of poses."""
     base, links = poses.base, forward(problem.hand.kinematics, poses.joints)
     return HandPlacement(base, links, base.apply(place_points(points.matrix, links)))
 
 
 def self_collision(problem: Problem, links: SE3) -> Values:
-    """Return the loss of the hand's overlap with itself, at link poses in the base frame."""
+    """Return the self-collision loss of the hand. `links` are link poses in the base frame."""
     spheres = problem.hand.spheres
     return losses.self_collision(place_points(spheres.matrix, links), spheres.radii, spheres.weight)
 
 
 def solid_collision(problem: Problem, links: SE3) -> Values:
-    """Return the overlap of the hand's solids with each other at link poses [mm²], exact where they are boxes."""
+    """Return a tenth of the squared overlap of the hand's solids with each other [mm²]. It is exact for boxes."""
     row, depth = solid_overlaps(problem.hand.solids, problem.hand.solid_pairs, links)
     return depth.new_zeros(len(links.translation)).index_add(0, row, (1e3 * depth) ** 2 / 10.0)
 
 
 def obstacle_depth(obstacles: ObstacleTensors, base: SE3, links: SE3) -> Values:
-    """Return the loss of the hand's depth in support and obstacles, at link poses in the base frame."""
+    """Return the penetration loss of the hand in support and obstacles. `links` are poses in the base frame."""
     gaps = obstacle_gaps(obstacles, base, links)
     return losses.penetration(gaps, torch.full_like(gaps[:, 0], OBSTACLE_MARGIN))
 
@@ -363,7 +363,7 @@ def obstacle_depth(obstacles: ObstacleTensors, base: SE3, links: SE3) -> Values:
 def feature_distance(
     problem: Problem, features: Float[Tensor, "features 3"], placed: HandPlacement
 ) -> tuple[Float[Tensor, "batch pairs"], Int[Tensor, "batch pairs"]]:
-    """Return the signed distance of the nearest pairs of a sharp point and a solid of the hand [m], and the solids."""
+    """Find the nearest pairs of a sharp point and a solid of the hand. Return distances [m] and solids of the pairs."""
     in_base = placed.base.apply_inverse(features)
     with torch.no_grad():
         every = solid_bound(problem.hand.solids, placed.links, in_base)
@@ -383,7 +383,7 @@ def _wrench_resistance(
     radius: Values,
     activate: Callable[..., Tensor],
 ) -> Values:
-    """Return the loss of the worst disturbances, from the points nearest to the padded surface: no others push."""
+    """Return the wrench resistance loss from the `TASK_POINTS` points nearest to the padded surface."""
     near = (distance.detach() - radius[:, None]).abs().topk(min(TASK_POINTS, distance.shape[-1]), largest=False).indices
     rows = torch.arange(len(near), device=near.device)[:, None]
     target, position = problem.object, points[rows, near]
@@ -408,9 +408,9 @@ def evaluate(
     """Compute all loss terms of a batch of poses at padding `radius` [m] and contact width `delta` [m].
 
     Args:
-        fine: look at all candidates.
-        sharp: look at all sharp points, and attract only what is very near to the surface.
-        activate: how much a candidate counts as a contact, by its distance, `radius` and `delta`.
+        fine: use all contact candidates.
+        sharp: use all sharp points, and attract only groups that are very near the surface.
+        activate: contact weight of a candidate as a function of its distance, `radius` and `delta`.
     """
     points = problem.hand.fine if fine else problem.hand.coarse
     placed = hand_forward(problem, points, poses)
@@ -421,7 +421,7 @@ def evaluate(
     if len(features):
         edge, solids = feature_distance(problem, features, placed)
         sunk = sunk + losses.penetration(edge, torch.zeros_like(radius))
-        # One place more, for solids without a group.
+        # The extra last column is for solids without a group.
         start = gap.new_full((len(gap), gap.shape[-1] + 1), torch.inf)
         nearest = start.scatter_reduce(1, problem.hand.group_of_solid[solids], edge, "amin")
         gap = torch.minimum(gap, nearest[:, :-1])

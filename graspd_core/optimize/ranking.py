@@ -1,7 +1,7 @@
-"""Score candidates by how likely the hold trial is to pass, from what is known before the trial.
+"""Score candidates by their predicted chance to pass the hold trial, before the trial runs.
 
-The score is a network of two small layers, fitted to trials by `benchmarks/ranking.py`, which writes `ranking.npz`.
-docs/method.md says on what data and how well.
+The score comes from a network with two small hidden layers. `benchmarks/ranking.py` fits it to trials and writes
+`ranking.npz`. docs/method.md describes the data and the accuracy.
 """
 
 from __future__ import annotations
@@ -21,11 +21,11 @@ from graspd_core.optimize.loop import Poses, Values
 from graspd_core.optimize.problem import Problem
 from graspd_core.se3 import rotation_from_quaternion
 
-# Figures are clamped at so many deviations from their mean.
+# Figures are clamped at this many standard deviations from their mean.
 FARTHEST = 4.0
-# Cost of a hand that presses on nothing: no candidate that the network was fitted to did so.
+# Cost of a hand without any contact force. The network was fitted to no such candidate.
 _IDLE_COST = 20.0
-# Cost of a hand so deep in itself that the trial refuses it: it is tried after all others [m].
+# Cost of a self-collision deeper than `_DEEP` [m], which the trial refuses. Such a candidate is tried last.
 _SELF_COST, _DEEP = 100.0, 0.0018
 
 
@@ -33,12 +33,12 @@ class Staged(NamedTuple):
     """A batch of candidates before their trial.
 
     Attributes:
-        poses: of the grasp.
-        opened: of the pregrasp.
-        clearance: share of the wanted clearance that the way from there keeps.
-        contact_set: where the grasp touches.
-        pressed: its squeeze.
-        overlap: depth of the hand in itself at its pregrasp or grasp, whichever is deeper [m].
+        poses: hand poses of the grasp.
+        opened: hand poses of the pregrasp.
+        clearance: fraction of the wanted clearance that the path from pregrasp to grasp keeps.
+        contact_set: contacts of the grasp.
+        pressed: squeeze of the grasp.
+        overlap: greatest self-collision depth at pregrasp and grasp [m].
     """
 
     poses: Poses
@@ -50,10 +50,10 @@ class Staged(NamedTuple):
 
 
 def score(problem: Problem, staged: Staged) -> Values:
-    """Return the log-odds of passing the hold trial, less what the trial forgives and a real hand does not.
+    """Return the log-odds of passing the hold trial, minus costs for faults that the trial tolerates.
 
-    Costs are a finger deeper than 2 mm in the object, a hand deeper than 1 mm in itself, and pressing on nothing.
-    What the trial would refuse comes last.
+    Costs are for penetration of the object beyond 2 mm, self-collision beyond 1 mm, and no contact force. Candidates
+    that the trial would refuse come last.
     """
     odds = log_odds(_fitted(), ranking_figures(problem, staged)).to(staged.clearance)
     idle = (staged.pressed.forces == 0.0).all(-1).all(-1)
@@ -62,7 +62,7 @@ def score(problem: Problem, staged: Staged) -> Values:
 
 
 def log_odds(network: Mapping[str, Tensor], figures: Float[Tensor, "batch figures"]) -> Values:
-    """Return the log-odds of passing the hold trial, by a network as `benchmarks/ranking.py` fits it."""
+    """Return the log-odds of passing the hold trial, from a network that `benchmarks/ranking.py` fitted."""
     x = ((figures - network["mean"]) / network["deviation"]).clamp(-FARTHEST, FARTHEST)
     for layer in range(2):
         x = torch.nn.functional.silu(x @ network[f"weight{layer}"] + network[f"bias{layer}"])
@@ -71,7 +71,7 @@ def log_odds(network: Mapping[str, Tensor], figures: Float[Tensor, "batch figure
 
 @torch.no_grad()
 def ranking_figures(problem: Problem, staged: Staged) -> Float[Tensor, "batch figures"]:
-    """Return what the score looks at, on the CPU. Lengths are over the object's length, joints over their travel."""
+    """Return the inputs of the network, on the CPU. Lengths are relative to the object, joints to their travel."""
     poses, opened, pressed = staged.poses, staged.opened, staged.pressed
     hand, length = problem.hand, problem.object.length
     normal_forces = pressed.forces.norm(dim=-1)
@@ -96,7 +96,7 @@ def ranking_figures(problem: Problem, staged: Staged) -> Float[Tensor, "batch fi
         (staged.overlap / 0.001).clamp_max(5.0),
         _links_touching(staged.contact_set),
         count,
-        shares.sum(-1) ** 2 / (shares**2).sum(-1).clamp_min(1e-9),  # Contacts that share the load, 0 without force.
+        shares.sum(-1) ** 2 / (shares**2).sum(-1).clamp_min(1e-9),  # Effective number of loaded contacts, 0 if none.
         (shares[..., None] * arms).sum(1).norm(dim=-1),
         normals.sum(1).norm(dim=-1) / count,
         *_spread(normals, count).unbind(0),

@@ -1,7 +1,7 @@
-"""Say what a caller asks of grasps beside that they hold: the hand's direction, what it touches, what an arm reaches.
+"""Restrict the grasps of a run: the approach direction, the contact region, or the poses that an arm can reach.
 
-A restriction acts at two places. Initial poses that cannot lead to an admissible grasp are drawn again. Candidates that
-are not admissible are refused before any trial. A run without restrictions does neither.
+A restriction acts twice. Initial poses that cannot lead to an admissible grasp are drawn again. Candidates that are not
+admissible are refused before any trial. A run without restrictions skips both checks.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ from graspd_core.optimize.loop import Positions, Values
 from graspd_core.perception.scene import Obstacle, Scene, moved_grasp, moved_obstacle
 from graspd_core.types import Grasp
 
-# Initial poses as rows: origins of the base [m], unit quaternions wxyz, joint values, and which of them are allowed.
+# Initial poses as rows: base origins [m], unit quaternions wxyz, joint values, and True for each allowed pose.
 Places = Float[np.ndarray, "batch 3"]
 Turns = Float[np.ndarray, "batch 4"]
 JointRows = Float[np.ndarray, "batch joints"]
@@ -30,13 +30,13 @@ Allowed = Bool[np.ndarray, "batch"]
 
 @dataclass(frozen=True)
 class Roll:
-    """A wanted turn of the hand about its direction of approach.
+    """A wanted rotation of the hand about its approach direction.
 
     Attributes:
-        side: unit vector square to the hand's approach, base frame.
-        zero: unit vector that `side` points along at a roll of 0, once made square to the approach, object frame.
-        angle: wanted, right-handed about the approach [rad].
-        tolerance: either way [rad].
+        side: unit vector perpendicular to the hand's approach, base frame.
+        zero: direction of `side` at a roll of 0, object frame. It is projected perpendicular to the approach.
+        angle: wanted roll, right-handed about the approach [rad].
+        tolerance: allowed deviation to either side [rad].
     """
 
     side: Float[np.ndarray, "3"]
@@ -45,7 +45,7 @@ class Roll:
     tolerance: float
 
     def missing(self, approach: Positions, rotation: Float[Tensor, "batch 3 3"]) -> Values:
-        """Return the turn about the approach, in −π to π, that would bring each hand to the wanted roll [rad]."""
+        """Return the rotation about the approach that each hand needs to have the wanted roll [rad], in −π to π."""
         zero, side = torch.as_tensor(self.zero).to(approach), rotation @ torch.as_tensor(self.side).to(approach)
         square = zero - (approach @ zero)[:, None] * approach
         roll = torch.atan2((torch.linalg.cross(square, side) * approach).sum(-1), (square * side).sum(-1))
@@ -54,13 +54,13 @@ class Roll:
 
 @dataclass(frozen=True)
 class Aim:
-    """Where starts are wanted.
+    """Constraints on the poses of starts.
 
     Attributes:
-        direction: unit direction of approach, object frame. None: any.
-        angle: greatest angle between it and a hand's approach [rad].
-        roll: about the approach. None: any.
-        places: points of the surface that the palm is to face [m]. None: any.
+        direction: unit approach direction, object frame. None allows any direction.
+        angle: greatest angle between `direction` and a hand's approach [rad].
+        roll: wanted roll about the approach. None allows any roll.
+        places: surface points that the palm may face [m]. None allows any point.
     """
 
     direction: Float[np.ndarray, "3"] | None = None
@@ -71,59 +71,59 @@ class Aim:
 
 @dataclass(frozen=True)
 class Refusal:
-    """Why a candidate is not admitted, as a phrase that follows a number: "outside the approach cone"."""
+    """The reason for refusing a candidate, as a phrase to follow a number: "outside the approach cone"."""
 
     reason: str
 
 
 @runtime_checkable
 class Restriction(Protocol):
-    """What is asked of the grasps of one run, as the caller writes it."""
+    """A restriction as the caller states it. Before a run, `bind` applies it to a scene and a hand."""
 
     def bind(self, scene: Scene, hand: HandModel) -> BoundRestriction:
         """Return the restriction for this scene and this hand.
 
-        Raises ConfigError: it is malformed, or does not fit the scene or the hand.
+        Raises ConfigError: the restriction is malformed, or does not fit the scene or the hand.
         """
         ...
 
 
 class BoundRestriction:
-    """A restriction for one scene and one hand. Every check accepts by default. Subclasses override those they need.
+    """A restriction for one scene and one hand. Every check accepts by default. Subclasses override some checks.
 
-    All poses are `T_object_base`, in the object frame of the scene that `plan_grasps` was given.
+    All poses are `T_object_base`, in the object frame of the scene passed to `plan_grasps`.
     """
 
     @property
     def impossible(self) -> str:
-        """Why no grasp can be admitted, as a sentence. Then nothing is searched. Empty if one may be admitted."""
+        """The reason why no grasp can be admitted, as a sentence that ends the run. Empty if a grasp is possible."""
         return ""
 
     @property
     def asked(self) -> str:
-        """Name of what is asked for, for the message of a run that found nothing."""
+        """Name of the restriction in the message of a run that found no candidate."""
         return type(self).__name__
 
     def why_none(self, others: BoundRestrictions) -> str:
-        """Say why no candidate was found under this and the run's `others`. Empty if `asked` says enough."""
+        """Return why no candidate satisfies this restriction and the run's `others`. Empty if `asked` says enough."""
         return ""
 
     @property
     def aim(self) -> Aim | None:
-        """Where initial poses are drawn, None for anywhere. Of several aims the first counts."""
+        """Constraints on the initial poses, None for no constraint. With several restrictions the first aim is used."""
         return None
 
     @property
     def obstacles(self) -> tuple[Obstacle, ...]:
-        """What the search keeps the hand off, beside the scene's own obstacles. No trial knows of it."""
+        """Additional obstacles that the hand avoids in the search. The trials do not contain them."""
         return ()
 
     def starts(self, positions: Places, quaternions: Turns, joints: JointRows) -> Allowed:
-        """Return which initial poses may lead to an admissible grasp. Positions [m], unit quaternions wxyz."""
+        """Return True for each initial pose that may lead to an admissible grasp. Quaternions are wxyz and unit."""
         return np.ones(len(positions), dtype=bool)
 
     def admit(self, grasps: Sequence[Grasp]) -> Sequence[Grasp | Refusal]:
-        """Return each candidate, perhaps with more in it than before, or why it is refused, in their order."""
+        """Return for each candidate, in order, the grasp (perhaps with data added) or the reason for refusing it."""
         return grasps
 
 
@@ -132,35 +132,35 @@ class BoundRestrictions:
     """All restrictions of a run.
 
     Attributes:
-        each: applied one after the other. The first that refuses a candidate says why.
-        origin: of the poses that are given and returned here, in the frame of `each` [m].
+        each: applied in order. The first that refuses a candidate gives the reason.
+        origin: poses passed to or returned by this class are relative to this point, in the frame of `each` [m].
     """
 
     each: tuple[BoundRestriction, ...] = ()
     origin: Float[np.ndarray, "3"] = field(default_factory=lambda: np.zeros(3))
 
     def moved(self, origin: Float[np.ndarray, "3"]) -> BoundRestrictions:
-        """Return the same restrictions for poses about another origin [m]."""
+        """Return the same restrictions for poses relative to another origin [m]."""
         return replace(self, origin=origin)
 
     @property
     def impossible(self) -> str:
-        """Why the first restriction that admits nothing does so. Empty if each may admit something."""
+        """The reason of the first restriction that can admit no grasp. Empty if each may admit one."""
         return next((one.impossible for one in self.each if one.impossible), "")
 
     @property
     def aim(self) -> Aim | None:
-        """Where initial poses are drawn, None for anywhere."""
+        """Constraints on the initial poses, None for no constraint."""
         aim = next((one.aim for one in self.each if one.aim is not None), None)
         return aim if aim is None or aim.places is None else replace(aim, places=aim.places - self.origin)
 
     def searched(self, scene: Scene) -> Scene:
-        """Return the scene as the search sees it, about `origin`: with what restrictions keep the hand off."""
+        """Return the scene, which is relative to `origin`, with the additional obstacles of the restrictions."""
         obstacles = tuple(moved_obstacle(o, -self.origin) for one in self.each for o in one.obstacles)
         return replace(scene, obstacles=(*scene.obstacles, *obstacles)) if obstacles else scene
 
     def starts(self, positions: Places, quaternions: Turns, joints: JointRows) -> Allowed:
-        """Return which initial poses all restrictions allow. What one forbids is not shown to the next."""
+        """Return True for each initial pose that all restrictions allow. Each checks only what the others allowed."""
         allowed = np.ones(len(positions), dtype=bool)
         for one in self.each:
             rows = np.flatnonzero(allowed)
@@ -168,7 +168,7 @@ class BoundRestrictions:
         return allowed
 
     def admit(self, grasps: Sequence[Grasp]) -> tuple[tuple[Grasp, ...], Counter[str]]:
-        """Return the candidates that all restrictions admit, in their order, and how many were refused why."""
+        """Return the admitted candidates in order, and the number of refused candidates for each reason."""
         if not self.each:
             return tuple(grasps), Counter()
         admitted, refused = [moved_grasp(grasp, self.origin) for grasp in grasps], Counter[str]()
@@ -183,10 +183,10 @@ UNRESTRICTED = BoundRestrictions()
 
 
 def restrictions_in_words(restrictions: BoundRestrictions, refused: Mapping[str, int], held: int, tried: int) -> str:
-    """Say what the restrictions of a run refused, most frequent reason first. Empty if they refused nothing.
+    """Return a sentence about the refused candidates, most frequent reason first. Empty if none was refused.
 
     Example: "12 candidates held, 9 refused: 7 outside the approach cone, 2 with a contact outside the region".
-    `held` counts the grasps that are as good as was asked for, `tried` the candidates that were admitted.
+    If no candidate was found, it names the restrictions. `held` counts good grasps, `tried` admitted candidates.
     """
     if refused:
         reasons = ", ".join(f"{n} {reason}" for reason, n in sorted(refused.items(), key=lambda item: -item[1]))

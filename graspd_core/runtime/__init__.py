@@ -1,1 +1,1 @@
-"""The process: arrays kept on disk, a worker process, the heap."""
+"""Support for processes: arrays cached on disk, a worker process, a safe reader of pickles."""

@@ -1,8 +1,8 @@
-"""Arrays remembered by key: in this process always, and on disk between processes.
+"""Cache arrays by key, in the memory of this process and on disk for other processes.
 
-Files lie in `$XDG_CACHE_HOME/graspd` (else `~/.cache/graspd`). `GRASPD_CACHE=off` keeps everything in memory. A file
-that cannot be read back whole is built again. A disk that cannot be written is not used. The files not used for longest
-are removed, because clouds are never the same twice. Every file appears whole or not at all.
+Files are in `$XDG_CACHE_HOME/graspd`, by default `~/.cache/graspd`. `GRASPD_CACHE=off` disables the files. A damaged
+file is built again. A disk that cannot be written is not used. The least recently used files are removed, because
+clouds are never the same twice. Files are written atomically.
 """
 
 from __future__ import annotations
@@ -23,10 +23,10 @@ import numpy as np
 
 Arrays = dict[str, np.ndarray]
 
-# Part of every file's name: raise it when what is computed from the same mesh or hand changes.
+# Part of every file name. Increase it if the arrays computed from the same mesh or hand change.
 VERSION = 8
 CAPACITY = 24
-# Size of all files together [bytes], and how many are written between two looks at it.
+# Greatest size of all files together [bytes], and number of written files between two checks of it.
 MOST_BYTES, LOOK_EVERY = 512 * 2**20, 16
 
 _memory: OrderedDict[str, Arrays] = OrderedDict()
@@ -35,7 +35,7 @@ _written = itertools.count(1)
 
 
 def remember(key: str, build: Callable[[], Arrays], valid: Callable[[Arrays], bool]) -> Arrays:
-    """Return the arrays stored under `key`, built and stored if none are `valid`. Read-only by convention."""
+    """Return the arrays of `key`. If none are stored or `valid`, build and store them. Do not modify the arrays."""
     with _lock:
         if key in _memory:
             _memory.move_to_end(key)
@@ -54,13 +54,13 @@ def remember(key: str, build: Callable[[], Arrays], valid: Callable[[Arrays], bo
 
 
 def contents() -> dict[str, Arrays]:
-    """Return what this process remembers in memory, by key."""
+    """Return the arrays that this process has in memory, by key."""
     with _lock:
         return dict(_memory)
 
 
 def supply(arrays: dict[str, Arrays]) -> None:
-    """Remember in memory what another process built."""
+    """Add arrays that another process built to the memory of this process."""
     with _lock:
         _memory.update(arrays)
         while len(_memory) > CAPACITY:
@@ -68,13 +68,13 @@ def supply(arrays: dict[str, Arrays]) -> None:
 
 
 def forget() -> None:
-    """Empty the memory of this process. Files stay."""
+    """Clear the memory of this process. Files are kept."""
     with _lock:
         _memory.clear()
 
 
 def digest(values: Iterable[Any]) -> str:
-    """Return the SHA-256 of arrays, tuples, dataclasses and other values by their `repr`, hexadecimal."""
+    """Return the hexadecimal SHA-256 of arrays, tuples, dataclasses and other values (by `repr`)."""
     found = hashlib.sha256()
 
     def add(value: Any) -> None:
@@ -94,7 +94,7 @@ def digest(values: Iterable[Any]) -> str:
 
 
 def cache_path(key: str) -> Path | None:
-    """Return the path of the file of `key`, None if the disk is not to be used."""
+    """Return the file path of `key`, None if `GRASPD_CACHE` disables the disk."""
     if os.environ.get("GRASPD_CACHE", "").lower() in ("off", "0", "no"):
         return None
     home = os.environ.get("XDG_CACHE_HOME") or str(Path.home() / ".cache")
@@ -103,7 +103,7 @@ def cache_path(key: str) -> Path | None:
 
 def _read(path: Path) -> Arrays | None:
     try:
-        # Opening by hand closes the file whatever happens. Members of npz carry a CRC, so a damaged one is noticed.
+        # `open` closes the file also after an error. Members of npz have a CRC, so damage is detected.
         with path.open("rb") as file, np.load(file, allow_pickle=False) as stored:
             arrays = {name: stored[name] for name in stored.files}
         os.utime(path)
@@ -119,7 +119,7 @@ def _write(path: Path, arrays: Arrays) -> None:
         with tempfile.NamedTemporaryFile(dir=path.parent, suffix=".part", delete=False) as file:
             temporary = Path(file.name)
             np.savez(file, allow_pickle=False, **arrays)
-        # Renaming is atomic: another process sees the whole file or none.
+        # Renaming is atomic, so another process sees the complete file or none.
         temporary.replace(path)
         if next(_written) % LOOK_EVERY == 0:
             _prune(path.parent)
@@ -129,7 +129,7 @@ def _write(path: Path, arrays: Arrays) -> None:
 
 
 def _prune(directory: Path) -> None:
-    """Remove the files that were not used for longest until the rest is small enough."""
+    """Remove the least recently used files until the rest has at most `MOST_BYTES`."""
     files = sorted((path.stat().st_mtime, path.stat().st_size, path) for path in directory.glob("*.npz"))
     total = sum(size for _, size, _ in files)
     for _, size, path in files:
@@ -140,7 +140,7 @@ def _prune(directory: Path) -> None:
 
 
 def save_bytes(path: Path, content: bytes) -> None:
-    """Write a file that appears whole or not at all. Makes missing directories."""
+    """Write a file atomically. Missing directories are created."""
     path.parent.mkdir(parents=True, exist_ok=True)
     handle, temporary = tempfile.mkstemp(dir=path.parent, prefix=path.name)
     try:

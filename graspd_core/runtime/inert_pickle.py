@@ -1,11 +1,11 @@
-"""A pickle reader that runs nothing that a file asks for.
+"""Read pickles without running any code that a file names.
 
-A pickle is a program: it names classes and functions, and calls them. Here every name that a format uses gives an inert
-object of this module, from which the numbers are read afterwards (`array_of`). The file calls no library, and every
-other name is refused. Time and memory are bounded: the file's size, the arguments of a call, and keys, which are text
-or small numbers. The memo is a dictionary. No opcode may reserve memory beforehand.
+A pickle is a program that names classes and functions and calls them. This reader replaces every admitted name by an
+inert object of this module. `array_of` reads the numbers of such an object. Any other name is refused, and no library
+is called. Time and memory are limited by the file size, by the number of arguments of a call, and by the keys, which
+must be text or small numbers. The memo is a dictionary. Opcodes that reserve memory in advance are refused.
 
-Format: protocol 0 to 4, written by Python 2 (text is bytes in disguise, hence latin-1) or by Python 3.
+Formats: protocol 0 to 4, written by Python 3 or by Python 2, whose text is bytes and is decoded as latin-1.
 """
 
 from __future__ import annotations
@@ -22,9 +22,9 @@ import numpy as np
 
 # MANO's licensed file has 3.8 MB.
 MAX_BYTES = 64 * 2**20
-# The most arguments of any call that the format needs is four. Each call copies its arguments.
+# Greatest number of arguments of a call. The format needs four. Each call copies its arguments.
 _MOST_ARGUMENTS = 8
-# Opcodes that reach outside the file or reserve memory before they read.
+# Opcodes that refer to data outside the file, or that reserve memory before reading.
 _REFUSED_OPCODES = (
     pickle.PERSID, pickle.BINPERSID, pickle.EXT1, pickle.EXT2, pickle.EXT4,
     pickle.BYTEARRAY8, pickle.NEXT_BUFFER, pickle.READONLY_BUFFER,
@@ -33,12 +33,12 @@ _REFUSED_OPCODES = (
 
 @dataclass(eq=False)
 class Inert:
-    """An object of the file that is only kept.
+    """An object of the file that is stored but never run.
 
     Attributes:
-        kind: what it stands for.
-        arguments: what it was made with.
-        state: what it was told to become, None for nothing.
+        kind: kind of object that it represents, such as "array".
+        arguments: arguments of its construction.
+        state: argument of its `__setstate__`, None without a call.
     """
 
     kind: str
@@ -51,12 +51,12 @@ class Inert:
 
 @dataclass(frozen=True)
 class Maker:
-    """A stand-in for a class or function that a file names. It makes an `Inert`, and can do nothing else."""
+    """A replacement for a class or function that a file names. A call returns an `Inert` and does nothing else."""
 
     kind: str
 
     def __call__(self, *arguments: Any) -> Inert:
-        # `copy_reg._reconstructor`, by which protocol 0 makes an object of the class that it is given.
+        # In protocol 0, `copy_reg._reconstructor` constructs an object of the class in its first argument.
         if self.kind == "rebuilt":
             if not arguments or not isinstance(arguments[0], Maker):
                 raise pickle.UnpicklingError("an object of no known class")
@@ -68,12 +68,12 @@ class Maker:
 
 
 def makers(*rows: tuple[str, tuple[str, ...], tuple[str, ...]]) -> dict[tuple[str, str], Maker]:
-    """Return what a file may name, by module and name, from rows of a kind, its modules and its names."""
+    """Return makers by (module, name). Each row has a kind, its modules and its names."""
     return {(module, name): Maker(kind) for kind, modules, names in rows for module in modules for name in names}
 
 
-# What arrays of numpy name. An array's state is version, shape, type, whether it is in Fortran's order, and the raw
-# bytes. As "encoded" text Python 3 writes bytes into old protocols. Old and new numpy have different names for one.
+# Names in pickles of numpy arrays. An array's state is version, shape, type, Fortran order, and the raw bytes. In old
+# protocols Python 3 writes bytes as "encoded" text. The same function has different modules in old and new numpy.
 NUMPY_NAMES = makers(
     ("array", ("numpy.core.multiarray", "numpy._core.multiarray"), ("_reconstruct",)),
     ("array", ("numpy",), ("ndarray",)),
@@ -88,20 +88,20 @@ def _is_plain(key: object) -> bool:
 
 
 def _with_plain_keys(name: str, keys: slice) -> Callable[[Any], None]:
-    """Return the base class's act behind a check of the keys, which lie in its stack at `keys`."""
+    """Return the base class's method `name`, preceded by a check of the keys at `keys` in the stack."""
 
     def act(reader: Any) -> None:
         if not all(map(_is_plain, reader.stack[keys])):
-            raise pickle.UnpicklingError("a dictionary whose keys are neither text nor small numbers")
+            raise pickle.UnpicklingError("a dictionary with an invalid key; valid: text, integers from 0 to 2**32 - 1")
         getattr(pickle._Unpickler, name)(reader)
 
     return act
 
 
 class _Reader(pickle._Unpickler):
-    """A reader that gives an inert object for an admitted name and refuses every other one."""
+    """An unpickler that returns an inert object for an admitted name and refuses every other name."""
 
-    # What the base class has, though its stubs do not say so.
+    # Attributes of the base class that its type stubs lack.
     stack: list[Any]
     memo: dict[int, Any]
     readline: Any
@@ -109,13 +109,13 @@ class _Reader(pickle._Unpickler):
     def _call(self) -> None:
         arguments = self.stack.pop()
         if not isinstance(arguments, tuple) or len(arguments) > _MOST_ARGUMENTS:
-            raise pickle.UnpicklingError(f"a call with other than at most {_MOST_ARGUMENTS} arguments")
+            raise pickle.UnpicklingError(f"a call with invalid arguments; valid: a tuple of at most {_MOST_ARGUMENTS}")
         self.stack[-1] = self.stack[-1](*arguments)
 
     def _put(self) -> None:
         place = int(self.readline()[:-1])
         if not _is_plain(place):
-            raise pickle.UnpicklingError("a place in the memo that no file needs")
+            raise pickle.UnpicklingError(f"memo index {place}; valid: 0 to 2**32 - 1")
         self.memo[place] = self.stack[-1]
 
     dispatch: ClassVar[dict[int, Any]] = {
@@ -128,7 +128,7 @@ class _Reader(pickle._Unpickler):
         pickle.SETITEMS[0]: _with_plain_keys("load_setitems", slice(0, None, 2)),
         pickle.DICT[0]: _with_plain_keys("load_dict", slice(0, None, 2)),
         pickle.PUT[0]: _put,
-        # Sets carry no numbers: kept as lists, nothing in them is hashed.
+        # Sets contain no numbers. They become lists, so that their items are not hashed.
         pickle.EMPTY_SET[0]: dispatch[pickle.EMPTY_LIST[0]],
         pickle.ADDITEMS[0]: dispatch[pickle.APPENDS[0]],
         pickle.FROZENSET[0]: dispatch[pickle.LIST[0]],
@@ -139,7 +139,7 @@ class _Reader(pickle._Unpickler):
         self._admitted = admitted
 
     def find_class(self, module: str, name: str) -> Any:
-        """Return the maker for a name."""
+        """Return the maker of a name. Raises _RefusedError: the name is not admitted."""
         try:
             return self._admitted[module, name]
         except KeyError:
@@ -152,41 +152,41 @@ class _RefusedError(Exception):
 
 
 def read_bounded(path: Path, what: str) -> bytes:
-    """Read a file. Raises ValueError: it cannot be read, or is larger than any `what`, "MANO file" say."""
+    """Read a file. Raises ValueError: it cannot be read or is too large. `what` names the format: "MANO file"."""
     try:
         with path.open("rb") as file:
             content = file.read(MAX_BYTES + 1)
     except OSError as error:
         raise ValueError(f"cannot be read: {error.strerror or error}") from error
     if len(content) > MAX_BYTES:
-        raise ValueError(f"more than {MAX_BYTES // 2**20} MB, which no {what} has")
+        raise ValueError(f"larger than {MAX_BYTES // 2**20} MB, the limit of a {what}")
     return content
 
 
 def load_inert(content: bytes, admitted: Mapping[tuple[str, str], Maker], what: str) -> Any:
-    """Return what a pickle holds: Python's numbers, text, lists and dictionaries, and `Inert` objects.
+    """Return the content of a pickle: Python's numbers, text, lists and dictionaries, and `Inert` objects.
 
-    Raises ValueError: not a pickle, or it names anything but `admitted`. Says why, and names the culprit.
+    Raises ValueError: `content` is no pickle, or contains a name outside `admitted`. The message has the name.
     """
     try:
         return _Reader(content, admitted).load()
     except _RefusedError as refused:
-        told = f"asks for {refused}, which a {what} does not need: refused, and nothing of it was run"
+        told = f"asks for {refused}, which a {what} does not need; the file is refused, and nothing was run"
         raise ValueError(told) from None
-    # A file that is no pickle fails in whatever way its bytes happen to. The file is the culprit.
+    # A file that is no pickle can raise any exception.
     except Exception as error:
         told = f"{type(error).__name__}: {error}".splitlines()[0]
         raise ValueError(f"not the pickle of a {what}: {told[:200]}") from error
 
 
-# Types of numbers that an array may hold: booleans, integers, floats.
+# Valid types of array entries: booleans, integers, floats.
 _NUMERIC = {"b1", *(kind + size for kind in "iu" for size in "1248"), "f2", "f4", "f8"}
-# More axes than any array has.
+# Greatest number of axes of an array.
 _MOST_AXES = 8
 
 
 def array_of(value: Inert) -> np.ndarray:
-    """Return the array of numbers of an inert object, native byte order. Raises ValueError: it holds none."""
+    """Return the numeric array of an inert object, in native byte order. Raises ValueError: it is not numeric."""
     state = value.state
     if not isinstance(state, tuple) or len(state) != 5:
         raise ValueError("holds an array without content")
@@ -196,9 +196,9 @@ def array_of(value: Inert) -> np.ndarray:
         raw = raw.arguments[0] if raw.arguments else None
     raw = raw.encode("latin1") if isinstance(raw, str) else raw
     if not isinstance(raw, bytes) or not is_shape(shape):
-        raise ValueError("holds an array whose content is no block of numbers")
+        raise ValueError("holds an array whose shape or content is not numeric")
     flat = np.frombuffer(raw, dtype=kind)
-    # Of Python's integers, which cannot overflow.
+    # `math.prod` uses Python's integers, which cannot overflow.
     if math.prod(shape) != len(flat):
         raise ValueError(f"holds {len(flat)} numbers for an array of shape {shape}")
     return flat.astype(kind.newbyteorder("=")).reshape(shape, order="F" if fortran else "C")
@@ -207,10 +207,10 @@ def array_of(value: Inert) -> np.ndarray:
 def _dtype(value: Any) -> np.dtype:
     code = value.arguments[0] if isinstance(value, Inert) and value.kind == "dtype" and value.arguments else None
     if not isinstance(code, str) or code not in _NUMERIC:
-        raise ValueError(f"holds an array of {_shown(code)}, which is no type of numbers")
+        raise ValueError(f"holds an array of type {_shown(code)}; valid: booleans, integers, floats")
     order = value.state[1] if isinstance(value.state, tuple) and len(value.state) > 1 else "="
     if order not in ("<", ">", "|", "="):
-        raise ValueError(f"holds an array in byte order {_shown(order)}")
+        raise ValueError(f"holds an array in byte order {_shown(order)}; valid: <, >, |, =")
     return np.dtype(("<" if order in ("|", "=") else order) + code)
 
 
@@ -219,7 +219,7 @@ def _shown(value: object) -> str:
 
 
 def is_shape(value: object) -> bool:
-    """Tell whether a value is a shape that an array can have."""
+    """Return True if a value is a valid shape of an array."""
     return (
         isinstance(value, tuple) and len(value) <= _MOST_AXES and all(type(n) is int and 0 <= n < 2**40 for n in value)
     )

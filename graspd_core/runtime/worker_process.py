@@ -1,9 +1,9 @@
-"""Work in a process of its own: many libraries hold Python's lock through long calls, and some crash.
+"""Run functions in a child process, because many libraries hold Python's lock during long calls and some crash.
 
-A process that serves calls `start_worker_process` once. `run_isolated` then works in a child, in all other processes it
-works in place. The child is a bare interpreter, not one of multiprocessing's, which would import the user's main module
-again. This module is cheap to import, so that the child can be started before all else. For processes that serve for
-days, it also gives freed memory back to the system.
+A server process calls `start_worker_process` once. After that `run_isolated` runs functions in the child. In other
+processes it runs them in place. The child is a bare interpreter. A child of multiprocessing would import the user's
+main module again. This module imports fast, so that the child can start before anything else. It also returns freed
+memory to the system, for processes that run for days.
 """
 
 from __future__ import annotations
@@ -25,12 +25,12 @@ from multiprocessing.connection import Connection, Pipe
 from pathlib import Path
 from typing import Any, TypeVar
 
-# glibc's mallopt: how many arenas there may be.
+# mallopt of glibc: its parameter for the greatest number of arenas, and that number.
 _M_ARENA_MAX, _ARENAS = -8, 2
 
 
 def trim_heap() -> None:
-    """Return freed memory to the system. Only glibc keeps it and needs this."""
+    """Return freed memory to the system. Only glibc needs this call."""
     try:
         trim = ctypes.CDLL(None).malloc_trim
     except (OSError, AttributeError, TypeError):  # no glibc
@@ -39,7 +39,7 @@ def trim_heap() -> None:
 
 
 def limit_malloc_arenas() -> None:
-    """Let all threads allocate from two arenas (glibc only), since each of its own would keep freed memory."""
+    """Let all threads allocate from two arenas (glibc only), because an arena per thread would keep freed memory."""
     try:
         mallopt = ctypes.CDLL(None).mallopt
     except (OSError, AttributeError, TypeError):
@@ -49,21 +49,21 @@ def limit_malloc_arenas() -> None:
 
 T = TypeVar("T")
 
-# The child finds modules where this process does.
+# The child searches modules in the same paths as this process.
 _CHILD = "import sys; sys.path[:] = {path!r}; from {module} import serve; serve({pipe}, {modules!r}, {parent})"
 
-# How often a bounded call looks at the child's memory [s].
+# Interval at which a bounded call checks the child's memory [s].
 _POLL = 0.1
 # prctl(2): the signal that a process gets when the thread that started it ends.
 _PR_SET_PDEATHSIG = 1
 
 
 class WorkerProcess:
-    """A child process that calls functions. It starts at once and ends with this process, however that ends.
+    """A child process that calls functions. It starts immediately and ends with this process.
 
-    Calls come one at a time. Before the first the child imports `modules`. A child that has died is replaced. Functions
-    must be importable by their names. Arguments, results and errors are pickled. With `killed_with_thread` the child
-    ends with the thread that started it, even in the middle of a call (Linux), otherwise after its call.
+    The child first imports `modules`. Calls run one at a time. A child that has died is replaced. Functions must be
+    importable by name. Arguments, results and errors are pickled. If this process ends, the child finishes its call and
+    ends. With `killed_with_thread` (Linux) the end of the starting thread kills the child even during a call.
     """
 
     def __init__(self, *modules: str, killed_with_thread: bool = False) -> None:
@@ -73,8 +73,8 @@ class WorkerProcess:
         self._start()
 
     def __call__(self, work: Callable[..., T], *arguments: Any, **named: Any) -> T:
-        """Return or raise what the work does. Raises MemoryError: two children died over it."""
-        # pickle's own way with tensors, by value: that of multiprocessing shares memory that outlives nobody's death.
+        """Run `work` in the child. Return its result or raise its error. Raises MemoryError: the child died twice."""
+        # pickle copies tensors. multiprocessing would share their memory, which is lost when a process dies.
         call = pickle.dumps((work, arguments, named), pickle.HIGHEST_PROTOCOL)
         with self._lock:
             for _ in range(2):
@@ -87,24 +87,24 @@ class WorkerProcess:
                 except (EOFError, OSError):
                     self._process.wait()
                 except BaseException:
-                    # Ctrl-C while waiting: the answer, left in the pipe, would be taken for the next call's.
+                    # After Ctrl-C while waiting, the answer in the pipe would be taken for that of the next call.
                     self._process.kill()
                     self._process.wait()
                     raise
             else:
-                # Not called here instead: what killed them would kill this process.
-                raise MemoryError(f"{work.__name__}: the process that it is done in died twice")
+                # The function is not run in place, because it could kill this process too.
+                raise MemoryError(f"{work.__name__}: the worker process died twice")
         failed, answer = pickle.loads(told)
         if failed:
             raise answer
         return answer
 
     def bounded(self, seconds: float, most_mb: float, work: Callable[..., T], *arguments: Any) -> T:
-        """Call once, and end the call with its child if it takes too long or too much memory.
+        """Run `work` in the child, but kill the child if the call takes too long or too much memory.
 
         Raises:
-            TimeoutError: no end after `seconds`.
-            MemoryError: the child's resident memory passed `most_mb` (checked on systems with /proc).
+            TimeoutError: the call did not end within `seconds`.
+            MemoryError: the child's resident memory exceeded `most_mb` [MB] (checked on systems with /proc).
             ChildProcessError: the child died.
         """
         call = pickle.dumps((work, arguments, {}), pickle.HIGHEST_PROTOCOL)
@@ -118,7 +118,7 @@ class WorkerProcess:
                     if time.monotonic() > end:
                         raise TimeoutError(f"no end after {seconds:g} s")
                     if (held := resident_mb(self._process.pid)) > most_mb:
-                        raise MemoryError(f"its process held {held:.0f} MB, more than {most_mb:g}")
+                        raise MemoryError(f"its process used {held:.0f} MB, more than {most_mb:g} MB")
                 told = self._pipe.recv_bytes()
             except (EOFError, ConnectionError):
                 raise ChildProcessError(f"its process died with exit code {self._process.wait()}") from None
@@ -138,13 +138,13 @@ class WorkerProcess:
         self._process.wait()
 
     def _start(self) -> None:
-        # Only the child's end of the pipe goes to the child, so that it reads an end of file when this process dies.
+        # The child gets only its own end of the pipe, so that it reads an end of file when this process dies.
         self._pipe, theirs = Pipe()
         path = [entry for entry in sys.path if isinstance(entry, str)]
         names = {"module": __name__, "modules": self._modules, "parent": self._parent}
         program = _CHILD.format(path=path, pipe=theirs.fileno(), **names)
-        # Ctrl-C reaches every process of the terminal. This one ends when its parent does. It is born with the signal
-        # blocked, since it needs a second for its imports before it could ignore it.
+        # Ctrl-C reaches every process of the terminal, but the child must end with its parent only. It starts with the
+        # signal blocked, because its imports take a second before it could ignore the signal.
         before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
         try:
             self._process = subprocess.Popen(
@@ -159,9 +159,9 @@ _child: WorkerProcess | None = None
 
 
 def start_worker_process(*modules: str) -> None:
-    """Do what goes through `run_isolated` in a child process from now on, so that other threads go on.
+    """Start the child of `run_isolated`, so that its calls do not block other threads.
 
-    The child begins by importing `modules`. If there is a child already, nothing is done.
+    The child first imports `modules`. If there already is a child, the function does nothing.
     """
     global _child
     if _child is None:
@@ -170,12 +170,12 @@ def start_worker_process(*modules: str) -> None:
 
 
 def run_isolated(work: Callable[..., T], *arguments: Any, **named: Any) -> T:
-    """Return or raise what the work does, in the child if there is one, else here."""
+    """Run `work` in the child if there is one, otherwise in this process. Return its result or raise its error."""
     return work(*arguments, **named) if _child is None else _child(work, *arguments, **named)
 
 
 def resident_mb(process: int) -> float:
-    """Return the resident memory of a process [MB], 0 if it has ended or there is no /proc."""
+    """Return the resident memory of a process [MB]. It is 0 if the process has ended or there is no /proc."""
     try:
         pages = int(Path(f"/proc/{process}/statm").read_text().split()[1])
     except (OSError, IndexError):
@@ -184,18 +184,18 @@ def resident_mb(process: int) -> float:
 
 
 def serve(number: int, modules: Iterable[str] = (), parent: int = 0) -> None:
-    """Import modules, then answer calls from the pipe of this file descriptor until its other end is closed.
+    """Import `modules`, then answer calls from the pipe with file descriptor `number` until the pipe is closed.
 
-    The end of a named `parent` ends this process at once.
+    If `parent` is a process id, this process is killed when the parent ends.
     """
     if parent:
         _end_with(parent)
     pipe = Connection(number)
-    # Read by the libraries when they are imported, with the first work: the parent keeps the other cores busy.
+    # Libraries read this when they are imported. One thread is enough, because the parent uses the other cores.
     os.environ.setdefault("OMP_NUM_THREADS", "1")
     limit_malloc_arenas()
     for name in modules:
-        # One that cannot be imported fails the work that needs it.
+        # If an import fails, the calls that need the module will raise the error.
         with contextlib.suppress(Exception):
             importlib.import_module(name)
     while True:
@@ -221,25 +221,25 @@ def _end_with(parent: int) -> None:
 
 
 def _answer(call: bytes) -> bytes:
-    """Return whether the work failed, and its result or error, pickled."""
+    """Run a pickled call. Return the pickle of (True, error) if it failed, otherwise of (False, result)."""
     try:
         work, arguments, named = pickle.loads(call)
         return pickle.dumps((False, work(*arguments, **named)), pickle.HIGHEST_PROTOCOL)
     except Exception as error:
-        # A traceback stays behind, a note goes along.
+        # A traceback cannot be pickled, so it is added as a note.
         error.add_note("".join(traceback.format_exception(error)))
         try:
             answer = pickle.dumps((True, error))
             pickle.loads(answer)
-        except Exception:  # an error that cannot travel
+        except Exception:  # The error cannot be pickled.
             answer = pickle.dumps((True, RuntimeError(f"{type(error).__name__}: {error}")))
         return answer
 
 
-# What the child's work imports: all of a scene from clouds and of other shapes, and the library behind them.
+# Modules for the calls of the child: scenes from clouds, robustness checks, and Open3D.
 _MODULES = ("graspd_core.perception.scene_from_views", "graspd_core.verify.robustness", "open3d")
 
 
 def start_planning_worker() -> None:
-    """Start the child process, if there is none yet. It imports the libraries of planning meanwhile."""
+    """Start the child process if there is none yet. It imports the libraries of planning in the background."""
     start_worker_process(*_MODULES)

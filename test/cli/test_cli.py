@@ -512,9 +512,9 @@ def test_an_object_that_would_go_by_the_name_of_another_is_refused(tmp_path: Pat
         (["build", "shape:sphere"], "--out"),
         (["build", "shape:nothing", "--out", "new.grasps"], "shape"),
         (["build", "shape:sphere", "--out", "new.grasps", "--verify", "none"], "verify: none"),
-        (["build", "shape:sphere", "--out", "other.grasps"], "other.grasps: torn or no library"),
+        (["build", "shape:sphere", "--out", "other.grasps"], "other.grasps: damaged or not a library"),
         (["list", "none.grasps"], "none.grasps: no such file"),
-        (["list", "other.grasps"], "other.grasps: torn or no library"),
+        (["list", "other.grasps"], "other.grasps: damaged or not a library"),
     ],
 )
 def test_what_cannot_be_done_is_told_in_one_line(tmp_path: Path, monkeypatch, capsys, words: list[str], told: str):

@@ -207,9 +207,9 @@ def test_a_library_that_nobody_may_write_is_read(library: GraspLibrary, hand, tm
     [
         (lambda path: path.unlink(), "no such file; `graspd library build --out"),
         (lambda path: path.write_bytes(b""), "no library of grasps"),
-        (lambda path: path.write_text("grasps: none\n" * 500), "torn or no library"),
-        (lambda path: os.truncate(path, path.stat().st_size // 2), "torn or no library"),
-        (lambda path: _scribble(path), "torn or no library"),
+        (lambda path: path.write_text("grasps: none\n" * 500), "damaged or not a library"),
+        (lambda path: os.truncate(path, path.stat().st_size // 2), "damaged or not a library"),
+        (lambda path: _scribble(path), "damaged or not a library"),
         (lambda path: _sql(path, "PRAGMA user_version = 7"), "a library of version 7, this graspd reads version 1"),
         (lambda path: _sql(path, "PRAGMA application_id = 7"), "no library of grasps"),
     ],
@@ -226,7 +226,7 @@ def test_what_is_no_whole_library_of_this_version_is_told_in_one_line(library: G
 def test_a_record_that_was_spoilt_is_named(library: GraspLibrary, hand: HandModel):
     entry, _ = stored(library, hand)
     _sql(library.path, "UPDATE records SET document = substr(document, 1, 100)")
-    with pytest.raises(FormatError, match=r"known\.grasps: torn .*record sphere for allegro"):
+    with pytest.raises(FormatError, match=r"known\.grasps: damaged .*record sphere for allegro"):
         library.grasps(entry, hand)
 
 
@@ -400,5 +400,5 @@ def test_two_objects_of_one_name_are_told(library, hand, ball, planned, tmp_path
     other.parent.mkdir()
     save_mesh(other, make_shape("box"))
     add_planned(library, load_scene(other, mass=0.1), hand, load_preset("fast"), planned, "standard")
-    with pytest.raises(ConfigError, match=r"ball: the library .* has several: .*ball\.obj, .*ball\.obj; name the mesh"):
+    with pytest.raises(ConfigError, match=r"ball: the library .* has several such objects: .*; name a mesh"):
         entry_by_name(library, hand, "ball", PHYSICS)

@@ -84,7 +84,7 @@ def test_a_method_that_is_not_there_or_not_chosen_is_named(values: dict, culprit
 
 
 def test_settings_of_another_method_are_refused():
-    with pytest.raises(ConfigError, match="ClosedFormConfig is not AnnealingConfig of annealing"):
+    with pytest.raises(ConfigError, match="settings of annealing: ClosedFormConfig; valid: AnnealingConfig"):
         PlanConfig(method="annealing", settings=PlanConfig().settings)
 
 

@@ -103,7 +103,7 @@ def test_an_object_far_away_is_told_at_once(hand: HandModel, table: Scene):
     result = planned(table, hand, reach_of(table, 5.0))
     assert result.outcome is Outcome.NO_CANDIDATES
     assert not result.tried
-    assert "m from the base of panda_like, which brings barrett_like" in result.message
+    assert "m from the base of panda_like, whose reach with barrett_like" in result.message
 
 
 @pytest.mark.parametrize(("name", "below", "link"), [("ur5e_like", 0.12, "upper_arm"), ("panda_like", 0.3, "link_2")])

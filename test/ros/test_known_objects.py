@@ -158,7 +158,7 @@ def test_a_direction_and_a_surface_are_kept(folder: Path, hand: HandModel):
             {"source": GraspRequest.KNOWN, "mesh_uri": "ball.obj", "mesh_scale": 0.5},
             {},
             ConfigError,
-            "ball.obj: not at scale 0.5 in the library known.grasps; it has it at 1",
+            "ball.obj: not at scale 0.5 in the library known.grasps; valid scales: 1",
         ),
         (
             {"source": GraspRequest.LATEST_CLOUD, "surface": Plane(coef=[0.0, 0.0, 1.0, 0.0])},
@@ -184,7 +184,7 @@ def test_a_mesh_that_changed_and_a_library_that_was_torn_are_told(built: Path, f
     finally:
         save_mesh(built / "ball.obj", mesh)
     Path("known.grasps").write_bytes(b"no library" * 1000)
-    with pytest.raises(GraspdError, match=r"known\.grasps: torn or no library") as refused:
+    with pytest.raises(GraspdError, match=r"known\.grasps: damaged or not a library") as refused:
         node.answer(**known())
     assert code_of(refused.value) is ErrorCode.BAD_LIBRARY
 

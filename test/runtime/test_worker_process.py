@@ -111,7 +111,7 @@ def test_when_the_child_is_killed_nothing_is_lost(child: WorkerProcess):
 
 
 def test_work_that_kills_its_process_does_not_kill_this_one(child: WorkerProcess):
-    with pytest.raises(MemoryError, match="_exit: the process that it is done in died twice"):
+    with pytest.raises(MemoryError, match="_exit: the worker process died twice"):
         child(os._exit, 1)
     assert child(math.sqrt, 4.0) == 2.0
 

@@ -1,1 +1,1 @@
-"""The MANO hand model."""
+"""The MANO model of the human hand."""

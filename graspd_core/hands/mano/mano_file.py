@@ -1,7 +1,7 @@
-"""A MANO model as its file gives it: template, blend shapes, weights, tree (Romero, Tzionas and Black 2017).
+"""Read a MANO file: template, blend shapes, weights and tree (Romero, Tzionas and Black 2017).
 
-The file is licensed and never shipped: every user brings their own from https://mano.is.tue.mpg.de. It may name arrays,
-sparse matrices and expressions. Every other name is refused, and none is called (`runtime/inert_pickle`).
+The file is licensed and not part of graspd. Users download it from https://mano.is.tue.mpg.de. The pickle may contain
+arrays, sparse matrices and expressions. Any other name is refused. No name is ever called (`runtime/inert_pickle`).
 """
 
 from __future__ import annotations
@@ -17,9 +17,9 @@ from jaxtyping import Float, Int
 from graspd_core.errors import HandError
 from graspd_core.runtime.inert_pickle import NUMPY_NAMES, Inert, array_of, is_shape, load_inert, makers, read_bounded
 
-# A sparse matrix's state holds data, indices, indptr and the shape. A leaf of chumpy's has the value `x`. A selection
-# is `a` flattened, taken at `idxs`, in `preferred_shape`. Python 2 and 3, old and new scipy have different names for
-# the same.
+# The state of a sparse matrix has data, indices, indptr and the shape. A leaf of chumpy has the value `x`. A selection
+# takes the entries `idxs` of the flattened `a`, in `preferred_shape`. The same class has different names in Python 2
+# and 3, and in old and new scipy.
 ADMITTED = NUMPY_NAMES | makers(
     ("sparse columns", ("scipy.sparse.csc", "scipy.sparse._csc"), ("csc_matrix",)),
     ("sparse rows", ("scipy.sparse.csr", "scipy.sparse._csr"), ("csr_matrix",)),
@@ -28,14 +28,14 @@ ADMITTED = NUMPY_NAMES | makers(
     ("rebuilt", ("copy_reg", "copyreg"), ("_reconstructor",)),
     ("object", ("__builtin__", "builtins"), ("object", "set", "frozenset")),
 )
-# The most numbers that a sparse matrix may stand for, and the deepest nesting of expressions. MANO needs 12448 and 2.
+# Greatest number of entries of a sparse matrix, and deepest nesting of expressions. MANO needs 12448 and 2.
 _MAX_DENSE, _MAX_DEPTH = 2**22, 8
 
 
 def read_pickle(path: Path) -> Any:
-    """Return what a MANO file holds: Python's numbers, text, lists and dictionaries, and `Inert` objects.
+    """Return the content of a MANO file: Python's numbers, text, lists and dictionaries, and `Inert` objects.
 
-    Raises HandError: no such file, too large, not a pickle, or it names anything but `ADMITTED`.
+    Raises HandError: the file does not exist, is too large, is no pickle, or contains a name outside `ADMITTED`.
     """
     try:
         return load_inert(read_bounded(path, "MANO file"), ADMITTED, "MANO file")
@@ -44,9 +44,9 @@ def read_pickle(path: Path) -> Any:
 
 
 def numbers(value: Any, depth: int = 0) -> np.ndarray:
-    """Return the dense array of numbers that a value of the file stands for.
+    """Return the dense array of numbers that a value of the file represents.
 
-    `depth` counts the expressions around it. Raises ValueError: the value holds no numbers. Says why.
+    `depth` is the number of expressions around the value. Raises ValueError: the value is not numeric.
     """
     if depth > _MAX_DEPTH:
         raise ValueError(f"holds an expression nested more than {_MAX_DEPTH} deep")
@@ -71,14 +71,14 @@ def _is_number(value: object) -> bool:
 def _dense(value: Inert, depth: int) -> np.ndarray:
     data, indices, starts = (numbers(_entry(value, key), depth).ravel() for key in ("data", "indices", "indptr"))
     if indices.dtype.kind not in "iu" or starts.dtype.kind not in "iu":
-        raise ValueError("holds a sparse matrix whose indices are no integers")
-    # Signed: of unsigned ones the difference is never negative, and may be huge.
+        raise ValueError("holds a sparse matrix whose indices are not integers")
+    # Unsigned indices are made signed, because their differences would wrap around.
     indices, starts = indices.astype(np.int64), starts.astype(np.int64)
     shape = value.state.get("_shape", value.state.get("shape"))
     if not is_shape(shape) or len(shape) != 2 or 0 in shape:
-        raise ValueError("holds a sparse matrix of shape other than two numbers")
+        raise ValueError("holds a sparse matrix whose shape is not two positive numbers")
     if shape[0] * shape[1] > _MAX_DENSE:
-        raise ValueError(f"holds a sparse matrix of shape {shape!r}, larger than any of MANO's")
+        raise ValueError(f"holds a sparse matrix of shape {shape!r}; valid: at most {_MAX_DENSE} entries")
     major, minor = shape if value.kind == "sparse rows" else shape[::-1]
     consistent = len(starts) == major + 1 and starts[0] == 0 and starts[-1] == len(data) == len(indices)
     if (
@@ -86,7 +86,7 @@ def _dense(value: Inert, depth: int) -> np.ndarray:
         or (np.diff(starts) < 0).any()
         or (len(indices) and not 0 <= indices.min() <= indices.max() < minor)
     ):
-        raise ValueError("holds a sparse matrix that does not fit together")
+        raise ValueError("holds a sparse matrix with inconsistent indices")
     dense = np.zeros((major, minor))
     np.add.at(dense, (np.repeat(np.arange(major), np.diff(starts)), indices), data)
     return dense if value.kind == "sparse rows" else dense.T
@@ -107,29 +107,29 @@ def _entry(value: Inert, key: str) -> Any:
     return value.state[key]
 
 
-# The sixteen bodies, each named after the bone that it moves. 1 is the knuckle, 3 the last joint. Not the order of a
-# hand: the little finger comes before the ring finger.
+# The sixteen bodies, each named after its bone. 1 is the knuckle, 3 the last joint. In MANO's order the little finger
+# comes before the ring finger.
 FINGERS = ("index", "middle", "pinky", "ring", "thumb")
 BODIES = ("wrist", *(f"{finger}{number}" for finger in FINGERS for number in (1, 2, 3)))
 PARENTS = (-1, *(0 if number == 1 else 3 * finger + number - 1 for finger in range(5) for number in (1, 2, 3)))
-# Values of the pose blend shapes' input: entries of fifteen rotation matrices.
+# Number of inputs of the pose blend shapes: the entries of fifteen rotation matrices.
 POSE_FEATURES = 9 * 15
 
 
 @dataclass(frozen=True, eq=False)
 class ManoData:
-    """One MANO model in float64.
+    """A MANO model in float64.
 
     Attributes:
-        path: the file.
+        path: path of the file.
         template: vertices of the mean shape at rest [m].
         shape_directions: displacement of each vertex per unit of each shape coefficient [m].
-        pose_directions: displacement of each vertex per unit of each entry of R − I, body by body, row by row [m].
+        pose_directions: displacement of each vertex per unit of each entry of R − I [m]. Entries are row-major by body.
         joint_regressor: joints as combinations of vertices.
-        weights: skinning weights, rows sum to one.
-        faces: triangles, counter-clockwise seen from outside, open at the wrist.
+        weights: skinning weights. Each row sums to one.
+        faces: triangles, counter-clockwise seen from outside. The mesh is open at the wrist.
         components: principal components of the pose, one per row [rad].
-        mean: the mean pose, axis-angle of bodies 1 to 15 [rad].
+        mean: mean pose, as axis-angle vectors of bodies 1 to 15 [rad].
     """
 
     path: Path
@@ -144,9 +144,9 @@ class ManoData:
 
 
 def read_mano(path: Path) -> ManoData:
-    """Read and check a MANO file (.pkl), as downloaded.
+    """Read and check a MANO file (.pkl) as downloaded.
 
-    Raises HandError: it cannot be read, asks for code to be run, or has a missing or wrong entry. Names file and entry.
+    Raises HandError: the file cannot be read, would run code, or has a missing or wrong entry. Names file and entry.
     """
     content = read_pickle(path)
     if not isinstance(content, Mapping):
@@ -165,7 +165,7 @@ def read_mano(path: Path) -> ManoData:
         mean=_read(path, content, "hands_mean", (45,)),
     )
     tree = _read(path, content, "kintree_table", (2, len(BODIES))).astype(np.int64)
-    # The root's parent is -1, which an unsigned table shows as its largest number.
+    # The root's parent is -1. In an unsigned table this is the largest number, so the entry is not compared.
     if not np.array_equal(tree[1], range(len(BODIES))) or tuple(tree[0, 1:]) != PARENTS[1:]:
         raise HandError(f"{path}: kintree_table is not MANO's tree of a wrist and five fingers of three joints")
     for key, rows in (("weights", data.weights), ("J_regressor", data.joint_regressor)):
@@ -180,12 +180,12 @@ def read_mano(path: Path) -> ManoData:
 
 
 def _read(path: Path, content: Mapping[str, Any], key: str, shape: tuple[int | None, ...]) -> np.ndarray:
-    """Return an entry as float64. A None in `shape` stands for any positive number."""
+    """Return an entry as float64. A None in `shape` allows any positive number."""
     if key not in content:
         known = ", ".join(sorted(str(name)[:40] for name in content)[:20])
         raise HandError(f"{path}: {key} is missing; the file has {known}")
     try:
-        # A NaN of any kind is looked for below: numpy would warn of those that signal.
+        # NaN values are detected below. Here numpy would warn of signalling NaNs.
         with np.errstate(invalid="ignore"):
             array = numbers(content[key]).astype(np.float64)
     except ValueError as error:

@@ -1,18 +1,18 @@
-"""A MANO model as a `HandModel`: sixteen rigid bodies, forty-five hinges, a convex hull for every body.
+"""Convert a MANO model to a `HandModel`: sixteen rigid bodies, forty-five hinges, a convex hull for every body.
 
-Methods, metrics and trials see an ordinary hand. `ManoHand.skinned_mesh` gives MANO's own surface at the same joint
-values. The hulls stand for the skin at rest and ignore the blend shapes of the pose. At a strongly bent joint the skin
-bulges by a few millimetres against them. Contact candidates lie on the skin at rest.
+Methods, metrics and trials see an ordinary hand. `ManoHand.skinned_mesh` returns MANO's own surface at the same joint
+values. The hulls approximate the skin at rest, without the blend shapes of the pose. At a strongly bent joint the skin
+differs from the hulls by a few millimetres. Contact candidates lie on the skin at rest.
 
-Base frame: the model's axes, origin in the wrist joint. The wrist body carries the palm.
+The base frame has the model's axes and its origin in the wrist joint. The palm belongs to the wrist body.
 
-MANO's fifteen ball joints become hinges. A body turns against its parent by `R = B Rx(flexion) Ry(abduction) Rz(twist)
-Bᵀ`. B is its anatomical frame at rest: z along the bone, x the flexion axis, y = z × x. The order follows the ISB's
-recommendation (Wu et al. 2005, after Grood and Suntay 1983). It is exact both ways while abduction stays under 90°.
+Each of MANO's fifteen ball joints becomes three hinges. A body turns relative to its parent by `R = B Rx(flexion)
+Ry(abduction) Rz(twist) Bᵀ`. B is the anatomical frame at rest: z along the bone, x the flexion axis, y = z × x. The
+order follows the ISB (Wu et al. 2005, after Grood and Suntay 1983). It is exact both ways while abduction is below 90°.
 
-The anatomical frames come from the joints of the shape. A finger flexes towards the palm's normal, that of the plane
-through wrist, index and little knuckle. The thumb flexes towards a point in front of the palm. The mean pose, whose
-fingers are bent, shows on which side of the plane the palm is.
+The anatomical frames come from the joints of the shape. A finger flexes towards the palm normal, which is the normal of
+the plane through wrist, index knuckle and little knuckle. The thumb flexes towards a point in front of the palm. In the
+mean pose the fingers are bent, which shows the palm's side of the plane.
 """
 
 from __future__ import annotations
@@ -47,13 +47,13 @@ from graspd_core.se3 import rotation_from_quaternion
 from graspd_core.types import Posture, TriangleMesh
 
 HINGES = ("flexion", "abduction", "twist")
-# How far in front of the palm the thumb's tip goes when the thumb is bent [m].
+# Distance from the palm of the point towards which the thumb flexes [m].
 _OPPOSITION = 0.05
 # Limits of flexion, abduction and twist [deg], from the flat hand. Fingers: Lin, Wu and Huang 2000 (flexion 0 to 90 at
 # the knuckle, 0 to 110, 0 to 90, abduction ±15), knuckles also 20 backwards (Norkin and White: 45 passively). Thumb:
 # flexion of knuckle and tip 50 and 80 (American Academy of Orthopaedic Surgeons 1965). Saddle joint 53 of flexion, 42
-# of abduction and 17 of twist in all (Cooney et al. 1981), about MANO's rest, which is in their middle. What is no
-# degree of freedom in the literature keeps a little play, as living joints do.
+# of abduction and 17 of twist in all (Cooney et al. 1981), with MANO's rest pose in the middle. Axes that are no degree
+# of freedom in the literature get a small range, because human joints have some play.
 _LIMITS_DEG = {
     "finger1": ((-20.0, 90.0), (-15.0, 15.0), (-5.0, 5.0)),
     "finger2": ((-5.0, 110.0), (-3.0, 3.0), (-3.0, 3.0)),
@@ -62,17 +62,17 @@ _LIMITS_DEG = {
     "thumb2": ((-10.0, 50.0), (-8.0, 8.0), (-5.0, 5.0)),
     "thumb3": ((-15.0, 80.0), (-3.0, 3.0), (-3.0, 3.0)),
 }
-# Flexion [deg] of the open and of the closed hand, joint by joint along a finger and along the thumb.
+# Flexion of the open and of the closed hand [deg], for the three joints of a finger and of the thumb.
 _OPEN_DEG = {"finger": (10.0, 20.0, 10.0), "thumb": (10.0, 0.0, 0.0)}
 _CLOSED_DEG = {"finger": (45.0, 40.0, 20.0), "thumb": (15.0, 10.0, 10.0)}
-# What a fingertip can press with [N]: half of an adult's tip pinch (Mathiowetz et al. 1985: 50 N women, 80 N men).
+# Greatest force of a fingertip [N]: half of an adult's tip pinch (Mathiowetz et al. 1985: 50 N women, 80 N men).
 _TIP_FORCE = 30.0
-# Lever of twist [m], half the breadth of a finger, and the least lever of anything.
+# Lever of twist, which is half the breadth of a finger, and least lever of every axis [m].
 _TWIST_LEVER, _LEAST_LEVER = 0.01, 0.02
 
 
 def kind_of(body: int) -> str:
-    """Return the row of `_LIMITS_DEG` of a body other than the wrist."""
+    """Return the key of a body in `_LIMITS_DEG`. The body must not be the wrist."""
     name = BODIES[body]
     return name if name.startswith("thumb") else f"finger{name[-1]}"
 
@@ -93,14 +93,14 @@ def postures() -> tuple[Float[np.ndarray, "45"], Float[np.ndarray, "45"]]:
 
 
 def efforts(joints: Float[np.ndarray, "16 3"], tips: Float[np.ndarray, "5 3"]) -> Float[np.ndarray, "45"]:
-    """Return the greatest torques [N·m], with which a stretched finger of this shape presses `_TIP_FORCE`."""
+    """Return the greatest joint torques [N·m]: those with which a straight finger presses with `_TIP_FORCE`."""
     reach = np.linalg.norm(np.repeat(tips, 3, axis=0) - joints[1:], axis=1)
     lever = np.maximum(np.column_stack([reach, reach, np.full(15, _TWIST_LEVER)]), _LEAST_LEVER)
     return (_TIP_FORCE * lever).ravel()
 
 
 def palm_normal(data: ManoData, joints: Float[np.ndarray, "16 3"]) -> Float[np.ndarray, "3"]:
-    """Return the unit direction out of the palm at rest, model frame. The mean pose shows the palm's side."""
+    """Return the unit direction out of the palm at rest, model frame. The side is that of the bent mean pose."""
     wrist, index, little = joints[0], joints[1], joints[7]
     normal = np.cross(index - wrist, little - wrist)
     normal /= np.linalg.norm(normal)
@@ -111,14 +111,14 @@ def palm_normal(data: ManoData, joints: Float[np.ndarray, "16 3"]) -> Float[np.n
     flat = torch.eye(3).to(zero).expand(1, 16, 3, 3)
     bent, straight = (skin_vertices(skin, zero, r, zero.new_zeros(1, 3))[1][0].numpy() for r in (turned, flat))
     ends = [3, 6, 9, 12]
-    # A mean pose that is flat says nothing: the file's usual content is a right hand.
+    # A flat mean pose does not show the side. Then a right hand is assumed.
     return -normal if float(((bent - straight)[ends] @ normal).mean()) < -1e-4 else normal
 
 
 def anatomical_frames(
     joints: Float[np.ndarray, "16 3"], tips: Float[np.ndarray, "5 3"], normal: Float[np.ndarray, "3"]
 ) -> Float[np.ndarray, "16 3 3"]:
-    """Return the frames B of every body at rest, axes as columns. The wrist's is the model's."""
+    """Return the anatomical frame B of every body at rest, with axes as columns. The wrist has the model's axes."""
     target = joints[[0, 1, 4, 7, 10]].mean(0) + _OPPOSITION * normal
     frames = np.tile(np.eye(3), (len(BODIES), 1, 1))
     for body in range(1, len(BODIES)):
@@ -133,10 +133,10 @@ def anatomical_frames(
 def rotations_from_joints(
     frames: Float[Tensor, "16 3 3"], values: Float[Tensor, "batch 45"]
 ) -> Float[Tensor, "batch 16 3 3"]:
-    """Return the rotation of every body against its parent in the model's axes. The wrist's is the identity."""
+    """Return the rotation of every body relative to its parent, in model axes. The wrist has the identity."""
     sine, cosine = values.sin().unflatten(-1, (15, 3)), values.cos().unflatten(-1, (15, 3))
     (sx, sy, sz), (cx, cy, cz) = sine.unbind(-1), cosine.unbind(-1)
-    # Rx Ry Rz, written out.
+    # The entries of Rx Ry Rz.
     local = torch.stack(
         [
             cy * cz, -cy * sz, sy,
@@ -154,13 +154,13 @@ def _unit(vector: Float[np.ndarray, "3"]) -> Float[np.ndarray, "3"]:
     return vector / max(float(np.linalg.norm(vector)), 1e-12)
 
 
-# Of muscle and bone together [kg/m³].
+# Mean density of muscle and bone [kg/m³].
 _DENSITY = 1100.0
 
 
 @dataclass(frozen=True, eq=False)
 class _Rest:
-    """A shape at rest in the model's axes [m]. `owner` is the body of each vertex, `frames` are the anatomical ones."""
+    """A shape at rest in model axes [m]. `owner` is the body of each vertex, `frames` are the anatomical frames."""
 
     data: ManoData
     vertices: Float[np.ndarray, "vertices 3"]
@@ -177,13 +177,13 @@ class _Rest:
 
 @dataclass(frozen=True, eq=False)
 class ManoHand:
-    """A MANO model of one shape, as a hand and as a skin.
+    """A MANO model of one shape, as a hand model and as a skin.
 
     Attributes:
-        model: the hand that is planned with.
-        data: the file's content.
-        betas: the shape.
-        frames: anatomical frames at rest, model axes (`mano_joints`).
+        model: hand model for planning.
+        data: content of the file.
+        betas: shape coefficients.
+        frames: anatomical frames at rest, in model axes (`anatomical_frames`).
     """
 
     model: HandModel
@@ -192,7 +192,7 @@ class ManoHand:
     frames: Float[np.ndarray, "16 3 3"]
 
     def skinned_mesh(self, posture: Posture) -> TriangleMesh:
-        """Return MANO's own surface at a posture, wrist closed, in the posture's frame [m]."""
+        """Return MANO's own surface at a posture [m], in the frame of the posture's position. The wrist is closed."""
         skin, betas = _float64(self.data), torch.as_tensor(self.betas)[None]
         rotations = rotations_from_joints(torch.as_tensor(self.frames), torch.as_tensor(posture.joint_positions)[None])
         origin = rest(skin, betas)[1][:, 0]
@@ -203,9 +203,9 @@ class ManoHand:
 
 
 def load_mano(path: str | Path, betas: Sequence[float] = (), *, candidates: int = 600) -> ManoHand:
-    """Load the hand of a MANO file (.pkl) and a shape, the mean shape without betas.
+    """Load the hand of a MANO file (.pkl) with shape coefficients `betas`. Missing betas are zero (mean shape).
 
-    Raises HandError: the file cannot be used, or there are more betas than it has shapes.
+    Raises HandError: the file cannot be used, or has fewer shape coefficients than `betas`.
     """
     data = read_mano(Path(path))
     shape = np.zeros(data.shape_directions.shape[-1])
@@ -213,7 +213,7 @@ def load_mano(path: str | Path, betas: Sequence[float] = (), *, candidates: int 
         raise HandError(f"{path}: {len(betas)} betas, expected at most {len(shape)} finite numbers")
     shape[: len(betas)] = betas
     vertices, joints = (t[0].numpy() for t in rest(_float64(data), torch.as_tensor(shape)[None]))
-    closed_faces(data)  # a mesh that cannot be closed is refused here, not after an hour of planning
+    closed_faces(data)  # This refuses a mesh that cannot be closed before any planning.
     owner = data.weights.argmax(1)
     tips = _fingertips(vertices, joints, owner)
     normal = palm_normal(data, joints)
@@ -238,7 +238,7 @@ def _fingertips(
 
 
 def _bare_hand(still: _Rest) -> HandModel:
-    """Return the hand without candidates. Each body hangs from its parent by two massless links and its own."""
+    """Return the hand without candidates. Two massless links lie between each body and its parent."""
     data, normal = still.data, still.normal
     tree, link_of = _tree(still.joints, still.frames)
     count = len(tree["link_names"])
@@ -279,7 +279,7 @@ def _bare_hand(still: _Rest) -> HandModel:
 
 
 def _skins(hand: HandModel, still: _Rest) -> tuple[tuple[int, TriangleMesh], ...]:
-    """Return each body's link, and in its frame the faces of the skin that have a vertex of the body."""
+    """Return for each body its link, and the skin faces with a vertex of the body, in the link frame [m]."""
     faces = still.data.faces
     own = [faces[(still.owner[faces] == body).any(1)] for body in range(len(BODIES))]
     return tuple(
@@ -290,7 +290,7 @@ def _skins(hand: HandModel, still: _Rest) -> tuple[tuple[int, TriangleMesh], ...
 
 
 def _tree(joints: Float[np.ndarray, "16 3"], frames: Float[np.ndarray, "16 3 3"]) -> tuple[dict[str, Any], list[int]]:
-    """Return the fields of a hand that describe its tree, and the number of each body's own link."""
+    """Return the fields of a hand model that describe its tree, and the link index of each body."""
     names, parents, axes = [BODIES[0]], [-1], [np.zeros(3)]
     offsets = [(np.eye(3), np.zeros(3))]
     link_of = [0]
@@ -331,7 +331,7 @@ def _inertial(hull: Primitive) -> tuple[float, Float[np.ndarray, "3"], Float[np.
 def _palm_center(
     palm: Primitive, joints: Float[np.ndarray, "16 3"], normal: Float[np.ndarray, "3"]
 ) -> Float[np.ndarray, "3"]:
-    """Return where the normal through the middle of the palm's bones leaves the palm's hull, base frame [m]."""
+    """Return the point where the normal through the middle of the palm's bones leaves the hull, base frame [m]."""
     middle = joints[[1, 4, 7, 10]].mean(0) * 0.7 + joints[0] * 0.3 - joints[0]
     a, b, c = (palm.vertices[palm.faces[:, i]] for i in range(3))
     outward = np.cross(b - a, c - a)

@@ -1,7 +1,7 @@
-"""MANO's forward function in torch: blend shapes and linear blend skinning, batched and differentiable.
+"""Compute MANO's forward function in torch: blend shapes and linear blend skinning, batched and differentiable.
 
-Romero, Tzionas and Black, "Embodied Hands", 2017, after SMPL (Loper et al. 2015). Gradients are exact, in the shape, in
-the pose (that of the zero rotation included) and in the translation.
+Sources: Romero, Tzionas and Black, "Embodied Hands", 2017, after SMPL (Loper et al. 2015). Gradients are exact in the
+shape, the pose and the translation, also at zero rotation.
 """
 
 from __future__ import annotations
@@ -37,7 +37,7 @@ def make_skin(data: ManoData, device: torch.device | str = "cpu", dtype: torch.d
 def rest(
     skin: Skin, betas: Float[Tensor, "batch shapes"]
 ) -> tuple[Float[Tensor, "batch vertices 3"], Float[Tensor, "batch 16 3"]]:
-    """Return vertices and joints of a shape at rest [m]. Betas beyond those given are zero."""
+    """Return vertices and joints of a shape at rest [m]. Missing betas are zero."""
     shaped = skin.template + torch.einsum("vcs,bs->bvc", skin.shape_directions[..., : betas.shape[-1]], betas)
     return shaped, skin.joint_regressor @ shaped
 
@@ -53,8 +53,8 @@ def skin_vertices(
     Args:
         skin: the model.
         betas: shape coefficients.
-        rotations: of every body against its parent, in the model's axes. The first turns the hand about the wrist.
-        translation: added to everything [m].
+        rotations: rotation of every body relative to its parent, in model axes. The first turns the whole hand.
+        translation: added to all vertices and joints [m].
     """
     shaped, joints = rest(skin, betas)
     feature = (rotations[:, 1:] - torch.eye(3, dtype=rotations.dtype, device=rotations.device)).flatten(1)
@@ -73,7 +73,7 @@ def skin_vertices(
 
 
 def rotation_from_vector(vector: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch 3 3"]:
-    """Return the rotations of axis-angle vectors [rad], smooth at zero (through a quaternion of half the angle)."""
+    """Return the rotation matrices of axis-angle vectors [rad]. The function is smooth at zero."""
     half = 0.5 * safe_norm(vector)[..., None]
     return rotation_from_quaternion(torch.cat([half.cos(), 0.5 * torch.sinc(half / torch.pi) * vector], -1))
 
@@ -81,9 +81,9 @@ def rotation_from_vector(vector: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*b
 def pose_from_components(
     data: ManoData, coefficients: Float[Tensor, "batch components"], *, about_mean: bool = True
 ) -> Float[Tensor, "batch 15 3"]:
-    """Return the pose of the first k principal components: axis-angle vectors of bodies 1 to 15 [rad].
+    """Return the pose for coefficients of the first principal components: axis-angle of bodies 1 to 15 [rad].
 
-    Raises HandError: more coefficients than the model has components.
+    Raises HandError: there are more coefficients than components.
     """
     count = coefficients.shape[-1]
     if count > len(data.components):
@@ -94,9 +94,9 @@ def pose_from_components(
 
 
 def wrist_loop(data: ManoData) -> Int[np.ndarray, "loop"]:
-    """Return the vertices around the opening at the wrist, in the direction of the edges, none for a closed mesh.
+    """Return the vertices around the opening at the wrist, in edge direction. Empty for a closed mesh.
 
-    Raises HandError: the boundary is not one loop, so that the inside is not defined.
+    Raises HandError: the boundary is not a single loop.
     """
     edges = np.concatenate([data.faces[:, [0, 1]], data.faces[:, [1, 2]], data.faces[:, [2, 0]]])
     present = set(map(tuple, edges.tolist()))
@@ -116,14 +116,14 @@ def wrist_loop(data: ManoData) -> Int[np.ndarray, "loop"]:
 
 
 def closed_faces(data: ManoData) -> Int[np.ndarray, "faces 3"]:
-    """Return the faces with a fan over the wrist about one more vertex: MANO's 1538 become 1554."""
+    """Return the faces, with the wrist closed by a fan around one more vertex. MANO's 1538 faces become 1554."""
     loop = wrist_loop(data)
     hub = np.full(len(loop), len(data.template))
     return np.concatenate([data.faces, np.column_stack([np.roll(loop, -1), loop, hub])])
 
 
 def close_wrist(data: ManoData, vertices: Float[Tensor, "batch vertices 3"]) -> Float[Tensor, "batch closed 3"]:
-    """Return the vertices with the fan's hub, the middle of the loop, for `closed_faces`."""
+    """Return the vertices for `closed_faces`: the hub of the fan, the mean of the loop, is appended."""
     loop = wrist_loop(data)
     if len(loop) == 0:
         return vertices

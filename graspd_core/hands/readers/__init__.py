@@ -1,1 +1,1 @@
-"""Readers of hand files: URDF, MJCF, hand descriptions."""
+"""Read hand files: URDF, MJCF, and hand descriptions in YAML."""

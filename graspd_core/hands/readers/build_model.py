@@ -1,8 +1,8 @@
-"""A `HandModel` from links and joints of any format: checks, order, limits, couplings.
+"""Build a `HandModel` from links and joints of any file format: check them, order them, resolve limits and couplings.
 
-The order of links and joints is depth-first, children in the order of the file. Actuated joints get finite limits that
-keep their followers within their own. Joints without room are welded. Chains of coupled joints (`<mimic joint="..."
-multiplier="..." offset="..."/>`) are resolved to actuated joints.
+Links and joints are ordered depth-first, with children in file order. Actuated joints get finite limits, such that
+coupled joints stay within their limits too. Joints whose limits coincide become fixed. Chains of coupled joints
+(`<mimic joint="..." multiplier="..." offset="..."/>`) are resolved to actuated joints.
 """
 
 from __future__ import annotations
@@ -22,22 +22,22 @@ from graspd_core.hands.model import HandModel, JointKind, Mimic, Primitive
 from graspd_core.hands.readers.xml_io import read_numbers
 from graspd_core.se3 import axis_rotation
 
-# More than this is no hand, and would take minutes to check against itself.
+# Limits of a hand. Checking a larger one for self-collision would take minutes.
 _MOST_LINKS, _MOST_SOLIDS, _LONGEST_CHAIN = 300, 2000, 100
 _DEFAULTS = (("multiplier", "1"), ("offset", "0"))
-# No joint of a hand moves so much farther than another, nor starts so far off.
+# Greatest valid multiplier and offset of a coupled joint.
 _LARGEST = 1e6
-# A joint that moves less than this is welded [rad] or [m].
+# A joint with less travel than this becomes fixed [rad] or [m].
 _STILL = 1e-6
-# An angle beyond this, up to a whole circle in degrees, may be meant in degrees [rad].
+# A limit between these two values is probably given in degrees instead of [rad].
 _FULL_TURN, _CIRCLE = 2 * np.pi + 0.05, 360.5
-# Wider limits than this say nothing [rad]. A slide that is longer is in another unit [m].
+# A wider range counts as endless rotation [rad]. Longer travel of a prismatic joint is an error of the unit [m].
 _WIDEST, _LONGEST_SLIDE = 4 * np.pi, 2.0
 
 
 @dataclass(frozen=True, eq=False)
 class LinkSpec:
-    """One link as a file gives it: mass [kg], centre [m] and inertia about it [kg·m²] in link axes, and solids."""
+    """A link of a file: mass [kg], centre of mass [m], inertia about it in link axes [kg·m²], and solids."""
 
     name: str
     mass: float = 0.0
@@ -47,7 +47,7 @@ class LinkSpec:
 
 
 class Coupling(NamedTuple):
-    """A coupled joint's value is `multiplier` times that of joint `leader` plus `offset` [rad] or [m]."""
+    """The coupling of a joint to the joint `leader`: value = `multiplier` · value of leader + `offset` [rad] or [m]."""
 
     leader: str
     multiplier: float
@@ -56,15 +56,15 @@ class Coupling(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class JointSpec:
-    """One joint as a file gives it: where its child sits in the parent, and how it moves.
+    """A joint of a file.
 
     Attributes:
-        name: unique among joints.
-        parent, child: link names.
-        kind: how it moves.
+        name: unique name of the joint.
+        parent, child: names of the links.
+        kind: revolute, prismatic or fixed.
         rotation, translation: `T_parent_child` at joint value zero [m].
-        axis: unit, in the child's frame, zero where fixed.
-        lower, upper: limits [rad] or [m], infinite where unset.
+        axis: unit axis in the child's frame. Zero for a fixed joint.
+        lower, upper: joint limits [rad] or [m]. Infinite if not given.
         effort: greatest torque [N·m] or force [N].
         velocity: greatest speed [rad/s] or [m/s].
     """
@@ -83,7 +83,7 @@ class JointSpec:
 
 
 def refuse_crowds(path: Path, links: int, joints: int, solids: int) -> None:
-    """Raise HandError for more links, joints or solids than a hand has, before any of them is looked at."""
+    """Raise HandError if a file has too many links, joints or solids for a hand. It runs before they are read."""
     for what, count, most in (
         ("links", links, _MOST_LINKS),
         ("joints", joints, _MOST_LINKS),
@@ -101,16 +101,16 @@ def assemble(
     couplings: Mapping[str, Coupling],
     warnings: tuple[str, ...] = (),
 ) -> HandModel:
-    """Return the hand without candidates: postures mid-range, palm at the base's origin, no adjacent links yet.
+    """Return the hand without candidates and adjacent links. Postures are mid-range, the palm is at the base's origin.
 
     Args:
-        path, name: of the file, for errors, and of the hand.
-        links, joints: one tree.
-        couplings: of the coupled joints by name, chains resolved.
-        warnings: what reading has found.
+        path, name: path of the file for error messages, and name of the hand.
+        links, joints: links and joints that form one tree.
+        couplings: couplings to actuated joints, by name of the coupled joint.
+        warnings: warnings from reading the file.
 
     Raises:
-        HandError: the links are not one tree, or nothing in it moves. Names the file and the culprit.
+        HandError: the links do not form one tree, or no joint moves. The message names the file and the culprit.
     """
     order = _depth_first(path, links, joints)
     by_name, into = {link.name: link for link in links}, {joint.child: joint for joint in joints}
@@ -150,7 +150,7 @@ def _actuated(joints: Sequence[JointSpec]) -> dict[str, Any]:
 
 
 def _linked(order: Sequence[str], chain: Sequence[JointSpec], couplings: Mapping[str, Coupling]) -> dict[str, Any]:
-    """Return the fields of a hand that describe its tree. `chain` holds the joints of all links but the first."""
+    """Return the fields of a hand model that describe its tree. `chain` has the joint of each link but the first."""
     index = {link: i for i, link in enumerate(order)}
     actuated = [joint.name for joint in chain if joint.kind != "fixed" and joint.name not in couplings]
     number = {joint: i for i, joint in enumerate(actuated)}
@@ -158,7 +158,7 @@ def _linked(order: Sequence[str], chain: Sequence[JointSpec], couplings: Mapping
     mimics: list[Mimic] = []
     for link, joint in enumerate(chain, start=1):
         if joint.kind == "fixed":
-            # Links welded to each other have the number of the first of them.
+            # A rigid group has the index of its first link.
             group[link] = group[index[joint.parent]]
             continue
         leader, multiplier, offset = couplings.get(joint.name, Coupling(joint.name, 1.0, 0.0))
@@ -178,7 +178,7 @@ def _linked(order: Sequence[str], chain: Sequence[JointSpec], couplings: Mapping
 
 
 def _depth_first(path: Path, links: Sequence[LinkSpec], joints: Sequence[JointSpec]) -> list[str]:
-    """Return the link names depth-first. Raises HandError if links and joints do not make one tree."""
+    """Return the link names depth-first. Raises HandError: links and joints do not form one tree."""
     names = [link.name for link in links]
     _refuse_repeated(path, "link", names)
     _refuse_repeated(path, "joint", [joint.name for joint in joints])
@@ -200,8 +200,8 @@ def _depth_first(path: Path, links: Sequence[LinkSpec], joints: Sequence[JointSp
     lost = [link for link in names if not _reaches(roots[0], link, above)]
     if lost:
         raise HandError(
-            f"{path}: links in a loop or more than {_LONGEST_CHAIN} joints from the root, "
-            f"not reachable from the root: {', '.join(lost[:5])}"
+            f"{path}: links in a loop, or not reachable from the root: {', '.join(lost[:5])}; "
+            f"valid: a tree with at most {_LONGEST_CHAIN} joints from the root to a link"
         )
     order, ahead = [], roots
     while ahead:
@@ -230,8 +230,8 @@ def _settled(
 ) -> tuple[list[JointSpec], dict[str, Coupling], tuple[str, ...]]:
     """Return the joints with usable limits, the remaining couplings, and a warning for each change.
 
-    Actuated joints are kept within what their followers allow, endless ones within one turn. A joint that cannot move
-    is welded with its followers. Raises HandError: a joint slides farther than a hand's joint can.
+    Limits of actuated joints are reduced to what their coupled joints allow, and to one turn. A joint that cannot move
+    becomes fixed, together with the joints coupled to it. Raises HandError: a joint slides by more than 2 m.
     """
     moving = [joint for joint in joints if joint.kind != "fixed"]
     followers = [joint for joint in moving if joint.name in couplings]
@@ -278,7 +278,7 @@ def _settled(
 
 
 def _narrowed(leader: JointSpec, follower: JointSpec, coupling: Coupling) -> JointSpec:
-    """Return the leader with limits and speed that keep its follower within its own limits too."""
+    """Return the actuated joint with limits and speed reduced to what its coupled joint allows."""
     _, multiplier, offset = coupling
     if multiplier == 0:
         return leader
@@ -288,13 +288,13 @@ def _narrowed(leader: JointSpec, follower: JointSpec, coupling: Coupling) -> Joi
 
 
 def _finite(path: Path, joint: JointSpec) -> JointSpec:
-    """Return the joint, kept to one turn if it turns without end."""
+    """Return the joint, limited to one turn if it rotates endlessly. Raises HandError: it slides by more than 2 m."""
     reach = joint.upper - joint.lower
     if joint.kind == "prismatic" and not reach <= _LONGEST_SLIDE:
         raise _too_long(path, joint.name, reach)
     if joint.kind == "prismatic" or reach <= _WIDEST:
         return joint
-    # The turn from -π to π, moved no farther than the limits ask for.
+    # The turn is −π to π, or shifted as little as needed to lie within the limits.
     lower = min(max(-np.pi, joint.lower), joint.upper - 2 * np.pi)
     return replace(joint, lower=lower, upper=lower + 2 * np.pi)
 
@@ -308,15 +308,15 @@ def _welded(joint: JointSpec, value: float) -> JointSpec:
 
 def _too_long(path: Path, joint: str, slide: float) -> HandError:
     return HandError(
-        f"{path}: joint {joint!r} slides by {slide:g} m; a hand's slides are limited, to {_LONGEST_SLIDE:g} m at most"
+        f"{path}: joint {joint!r} slides by {slide:g} m; valid: limits that allow at most {_LONGEST_SLIDE:g} m"
     )
 
 
 def read_couplings(path: Path, joints: Sequence[ET.Element]) -> dict[str, Coupling]:
-    """Read the couplings of all joints with a `<mimic>`, by name.
+    """Read the couplings of all joints with a `<mimic>`, by name of the coupled joint.
 
-    Each leader is an actuated joint. The `<mimic>` of a fixed joint is ignored. Raises HandError: a joint follows
-    itself, a missing or a fixed joint, or has a bad number.
+    Each leader is an actuated joint. The `<mimic>` of a fixed joint is ignored. Raises HandError: the leader is the
+    joint itself, missing or fixed, or a number is invalid.
     """
     moving = {str(joint.get("name")): joint for joint in joints if joint.get("type") != "fixed"}
     direct: dict[str, Coupling] = {}
@@ -335,9 +335,9 @@ def read_couplings(path: Path, joints: Sequence[ET.Element]) -> dict[str, Coupli
 
 
 def resolved_couplings(path: Path, direct: Mapping[str, Coupling]) -> dict[str, Coupling]:
-    """Return the couplings, each led back to the actuated joint at the end of its chain.
+    """Return the couplings, each resolved to the actuated joint at the end of its chain.
 
-    Raises HandError: joints follow each other in a circle, or with a factor that no hand has.
+    Raises HandError: couplings form a circle, or a multiplier or offset is too large.
     """
     return {name: _resolved(path, name, direct) for name in direct}
 
@@ -358,6 +358,6 @@ def _resolved(path: Path, name: str, direct: Mapping[str, Coupling]) -> Coupling
     if not max(abs(coupling.multiplier), abs(coupling.offset)) <= _LARGEST:
         raise HandError(
             f"{path}: joint {name!r} mimics {coupling.leader!r} with multiplier {coupling.multiplier:g} and offset "
-            f"{coupling.offset:g}; the largest that is taken is {_LARGEST:g}"
+            f"{coupling.offset:g}; valid: at most {_LARGEST:g}"
         )
     return coupling

@@ -1,4 +1,4 @@
-"""A hand description: the YAML file beside a URDF that names the palm and how the hand opens and closes."""
+"""Read hand descriptions: YAML files with the palm, the postures and the efforts of a hand in a URDF or MJCF file."""
 
 from __future__ import annotations
 
@@ -19,30 +19,30 @@ from graspd_core.hands.model import HandModel, Mount
 
 _KEYS = ("name", "urdf", "root", "palm", "approach", "effort", "open", "closed", "mount")
 _PALM_KEYS, _MOUNT_KEYS = ("link", "center", "normal"), ("parent", "position", "quaternion_wxyz")
-# No length, angle or torque of a hand is larger, in any unit.
+# Greatest magnitude of a number in a description.
 _LARGEST = 1e9
 
 
 @dataclass(frozen=True, eq=False)
 class Source:
-    """A file and the line of each of its keys, `palm.center` for a nested one. Its methods check values."""
+    """A file and the line of each key. A nested key is written `palm.center`. The methods check values."""
 
     path: Path
     lines: Mapping[str, int]
 
     def error(self, key: str, message: str) -> HandError:
-        """Return the error to raise about a key: names file, line and key."""
+        """Return an error about a key. The message names file, line and key."""
         line = self.lines.get(key, self.lines.get(key.partition(".")[0], 1))
         return HandError(f"{self.path}:{line}: {key}: {message}")
 
     def mapping(self, key: str, value: Any) -> dict[str, Any]:
-        """Check a mapping. Keys become text, since some joints have bare numbers for names."""
+        """Check a mapping. Keys are converted to text, because the names of some joints are numbers."""
         if not isinstance(value, dict):
             raise self.error(key, f"expected a mapping of keys to values, got {shown(value)}")
         return {name if isinstance(name, str) else shown(name): entry for name, entry in value.items()}
 
     def section(self, key: str, value: Any, known: tuple[str, ...], required: tuple[str, ...]) -> dict[str, Any]:
-        """Check a mapping for unknown and missing keys. An empty `key` stands for the whole file."""
+        """Check a mapping for unknown and missing keys. An empty `key` means the whole file."""
         data, prefix = self.mapping(key or "the file", value), f"{key}." if key else ""
         for name in data:
             if name not in known:
@@ -82,7 +82,7 @@ class Source:
         return {joint: float(number) for joint, number in values.items()}
 
     def effort(self, value: Any) -> float | dict[str, float]:
-        """Check one positive torque for all joints, or some by name."""
+        """Check the effort: one positive number for all joints, or a mapping of joint names to positive numbers."""
         efforts = self.by_joint("effort", value) if isinstance(value, dict) else value
         values = list(efforts.values()) if isinstance(efforts, dict) else [efforts]
         if not all(_is_number(number) and number > 0 for number in values):
@@ -90,34 +90,34 @@ class Source:
         return efforts if isinstance(efforts, dict) else float(efforts)
 
     def mount(self, value: Any) -> Mount:
-        """Read the `mount` entry: the arm's link, and the pose of the base link in it, the identity unless given."""
+        """Read the `mount` entry: the arm's link, and the pose of the base link in it. The default is the identity."""
         given = self.section("mount", value, _MOUNT_KEYS, ("parent",))
         parent = self.text("mount.parent", given["parent"])
         x, y, z = self.numbers("mount.position", given.get("position", [0, 0, 0]), 3).tolist()
         quaternion = self.numbers("mount.quaternion_wxyz", given.get("quaternion_wxyz", [1, 0, 0, 0]), 4)
         length = float(np.linalg.norm(quaternion))
         if abs(length - 1.0) > 1e-2:
-            raise self.error("mount.quaternion_wxyz", f"a unit quaternion, w first, has length 1, not {length:.3g}")
+            raise self.error("mount.quaternion_wxyz", f"length {length:.3g}; valid: a unit quaternion, w first")
         w, i, j, k = (quaternion / length).tolist()
         return Mount(parent, (x, y, z), (w, i, j, k))
 
 
 @dataclass(frozen=True, eq=False)
 class HandDescription:
-    """A checked YAML file.
+    """The checked content of a description.
 
     Attributes:
-        source: the file, and in which line of it each key is.
-        name: the hand's name, the file's stem unless given.
+        source: the file, and the line of each key.
+        name: name of the hand. The default is the stem of the file name.
         urdf: path of the URDF or MJCF file.
-        palm_link: the link that palm_center and palm_normal are given in, None for the base link.
-        palm_center: the point of the palm that grasps centre on [m], None if the palm is to be guessed.
-        palm_normal: direction out of the palm, unit, None likewise.
-        approach: direction of approach in the base frame, unit, None for the palm's normal.
-        effort: one greatest torque for all joints, or some by name, or None for the URDF's [N·m].
-        open, closed: joint values by joint name [rad] or [m], None if they are to be guessed.
-        mount: where the base link sits on an arm, None if the file does not say.
-        root: the link that the hand begins at, in a URDF of a whole robot. None: all of it is the hand.
+        palm_link: link in whose frame palm_center and palm_normal are given. None for the base link.
+        palm_center: centre of the palm's surface [m]. None to guess the palm.
+        palm_normal: unit direction out of the palm. None to guess the palm.
+        approach: unit direction of approach in the base frame. None for the palm normal.
+        effort: greatest effort [N·m] or [N] of all joints, or of some by joint name. None for those of the URDF.
+        open, closed: joint values by joint name [rad] or [m]. None to guess the posture.
+        mount: pose of the base link on an arm. None if the file has no `mount`.
+        root: first link of the hand in a URDF of a whole robot. None if the whole URDF is the hand.
     """
 
     source: Source
@@ -141,7 +141,7 @@ def _is_number(value: object) -> bool:
 def read_description(path: Path) -> HandDescription:
     """Read and check a hand description.
 
-    Raises HandError: not YAML, an unknown or missing key, or a wrong value. Names file, line and key.
+    Raises HandError: the file is not YAML, or has an unknown or missing key or a wrong value. Names line and key.
     """
     try:
         node, data = parse_yaml(path.read_text(encoding="utf-8"))
@@ -158,7 +158,7 @@ def read_description(path: Path) -> HandDescription:
     def checked(key: str, check: Callable[[str, Any], Any], values: dict[str, Any] = root) -> Any:
         return check(key, values[key.rpartition(".")[2]]) if key.rpartition(".")[2] in values else None
 
-    # In this order, which decides what is told of a file with several mistakes.
+    # If a file has several mistakes, the order of these checks decides which of them is reported.
     return HandDescription(
         source=source,
         name=checked("name", source.text) or path.stem,
@@ -178,8 +178,8 @@ def read_description(path: Path) -> HandDescription:
 def apply_description(hand: HandModel, description: HandDescription) -> HandModel:
     """Return the hand with the description's palm, postures and efforts.
 
-    The rest is guessed, with a warning. Raises HandError: an unknown joint or link, a joint without a value, or a value
-    outside the joint's limits.
+    A missing palm or posture is guessed, with a warning. Raises HandError: a joint or link is unknown, a joint has no
+    value, or a value is outside the joint limits.
     """
     known_at_once = {"name": description.name, "effort": _efforts(hand, description), "mount": description.mount}
     hand = _with_palm(replace(hand, **known_at_once), description)
@@ -244,12 +244,12 @@ def _check_joints(hand: HandModel, description: HandDescription, key: str, value
 
 
 def _key_lines(node: yaml.Node | None, prefix: str = "") -> dict[str, int]:
-    """Return the line of every key of the file and of the mappings in it. Nested keys are joined by a dot."""
+    """Return the line of every key and of every key one level below. Nested keys are joined by a dot."""
     lines: dict[str, int] = {}
     if isinstance(node, yaml.MappingNode):
         for key, value in node.value:
             name = f"{prefix}{key.value}"
             lines[name] = key.start_mark.line + 1
-            # No deeper: by its aliases a mapping may hold itself.
+            # Only one level is read, because with YAML aliases a mapping may contain itself.
             lines |= {} if prefix else _key_lines(value, f"{name}.")
     return lines

@@ -1,4 +1,4 @@
-"""Mesh files that a hand names: where they lie, and their convex hulls."""
+"""Find the mesh files of a hand, and compute their convex hulls."""
 
 from __future__ import annotations
 
@@ -19,27 +19,27 @@ from graspd_core.mesh.convex_parts import limited_hull
 from graspd_core.mesh.mesh_files import load_mesh
 from graspd_core.types import TriangleMesh
 
-# The most corners of a hull: on a ball of 12 mm its facets lie up to 0.3 mm below the mesh's own surface.
+# Greatest number of corners of a hull. For a ball of 12 mm the facets lie up to 0.3 mm below the surface.
 _CORNERS = 200
-# The most corners that all hulls of a hand have between them, and the fewest that each may have, however many they are.
+# Greatest number of corners of all hulls of a hand together, and least number that every hull may have.
 _ALL_CORNERS, _FEWEST_CORNERS = 12_800, 48
-# Nothing of a hand is larger [m].
+# Greatest valid size of a part of a hand [m].
 LARGEST_SIZE = 2.0
 
 
 def resolve_mesh(urdf: Path, shape: ET.Element, filename: str) -> Path:
-    """Find the file of a mesh that a URDF names by a `package://`, `model://` or `file://` address or by a path.
+    """Find a mesh file of a URDF. `filename` is a `package://`, `model://` or `file://` address, or a path.
 
-    Packages are sought in ROS_PACKAGE_PATH and AMENT_PREFIX_PATH, then above the URDF and beside its package, by folder
-    name or by the name in package.xml. Relative paths start at the URDF's folder and the folders above. Raises
-    HandError: no such file, or one that would have to be fetched.
+    Packages are searched by folder name or by the name in package.xml: first in ROS_PACKAGE_PATH and AMENT_PREFIX_PATH,
+    then above the URDF and beside its package. Relative paths start at the URDF's folder or any folder above it. Raises
+    HandError: the file does not exist or is on the network.
     """
     scheme, rest = _address(filename)
     if scheme in ("http", "https", "ftp"):
         raise wrong(urdf, shape, f"mesh {filename!r} is not fetched from the network; name a local file")
     parents = urdf.resolve().parents
     if scheme in ("package", "model"):
-        # An unpacked archive often has another name than the package: then what follows the package's name decides.
+        # An unpacked archive often has another name than the package. So the path after the package name is tried too.
         folders, rest = [*_package_folders(rest.partition("/")[0], parents), *parents], rest.partition("/")[2]
     else:
         folders = list(parents)
@@ -51,7 +51,7 @@ def resolve_mesh(urdf: Path, shape: ET.Element, filename: str) -> Path:
 
 
 def _address(filename: str) -> tuple[str, str]:
-    """Return the scheme of a mesh's address, empty for a plain path, and the rest."""
+    """Return the scheme of a mesh address (empty for a plain path), and the remaining path."""
     scheme, separator, rest = filename.replace("\\", "/").partition("://")
     if not separator:
         return "", scheme
@@ -59,7 +59,7 @@ def _address(filename: str) -> tuple[str, str]:
 
 
 def missing_packages(urdf: Path, meshes: Iterable[ET.Element]) -> tuple[str, ...]:
-    """Warn of packages that were not found, whose meshes were taken from beside the URDF or above it."""
+    """Return warnings of packages that were not found. Their meshes are searched beside the URDF and above it."""
     addresses = (_address(mesh.get("filename") or "") for mesh in meshes)
     named = {rest.partition("/")[0] for scheme, rest in addresses if scheme in ("package", "model")}
     parents = urdf.resolve().parents
@@ -75,7 +75,7 @@ def _folder_exists(path: Path) -> bool:
 
 
 def inside_exists(path: Path) -> bool:
-    """Tell whether a file is there. A name that no file can have is not."""
+    """Return True if a file exists. An invalid file name gives False."""
     try:
         return path.is_file()
     except (OSError, ValueError):
@@ -83,16 +83,16 @@ def inside_exists(path: Path) -> bool:
 
 
 def corners_each(meshes: int) -> int:
-    """Return the greatest number of corners for the hull of each of so many meshes of one hand."""
+    """Return the greatest number of corners of each hull in a hand with this number of meshes."""
     return int(np.clip(_ALL_CORNERS // max(meshes, 1), _FEWEST_CORNERS, _CORNERS))
 
 
 def mesh_hull(
     urdf: Path, shape: ET.Element, filename: str, scale: Float[np.ndarray, "3"], corners: int = _CORNERS
 ) -> TriangleMesh:
-    """Return the convex hull of a mesh file, scaled along each axis, of at most `corners` corners [m].
+    """Return the convex hull [m] of a mesh file scaled along each axis, with at most `corners` corners.
 
-    A negative factor mirrors. Raises HandError: the file is not there, not a mesh, or not of a hand's size.
+    A negative factor mirrors the mesh. Raises HandError: the file does not exist, is no mesh, or is larger than a hand.
     """
     path = resolve_mesh(urdf, shape, filename)
     try:
@@ -108,12 +108,12 @@ def mesh_hull(
 
 
 def whole_mesh(urdf: Path, shape: ET.Element, filename: str, scale: Float[np.ndarray, "3"]) -> TriangleMesh:
-    """Read a mesh file, scaled along each axis [m]. Raises HandError: the file is not there or not a mesh."""
+    """Read a mesh file and scale it along each axis [m]. Raises HandError: the file does not exist or is no mesh."""
     try:
         mesh = load_mesh(resolve_mesh(urdf, shape, filename))
     except (MeshError, OSError) as error:
         raise wrong(urdf, shape, f"mesh {filename!r} cannot be read as a visual mesh: {error}") from error
-    # Mirrored, faces would be seen from inside.
+    # A mirrored mesh needs reversed faces, so that they still face outwards.
     return TriangleMesh(mesh.vertices * scale, mesh.faces[:, ::-1] if np.prod(scale) < 0 else mesh.faces)
 
 
@@ -121,19 +121,19 @@ def whole_mesh(urdf: Path, shape: ET.Element, filename: str, scale: Float[np.nda
 def _hull(path: Path, modified: int, scale: tuple[float, float, float], corners: int) -> TriangleMesh:
     del modified
     mesh = load_mesh(path)
-    # Scaled first and hulled then: a mirrored hull would be inside out.
+    # The points are scaled before the hull is computed, because mirroring a hull would turn it inside out.
     points = mesh.vertices[np.unique(mesh.faces)] * np.array(scale)
     return limited_hull(points, corners)
 
 
 def _package_folders(package: str, parents) -> list[Path]:
-    """Return where a package may lie, likeliest first."""
+    """Return the folders that may contain a package, most likely first."""
     named = [Path(entry) for entry in os.environ.get("ROS_PACKAGE_PATH", "").split(os.pathsep) if entry]
     installed = [Path(entry) / "share" for entry in os.environ.get("AMENT_PREFIX_PATH", "").split(os.pathsep) if entry]
     found = [folder for folder in named if folder.name == package or _package_name(folder) == package]
     found += [folder / package for folder in (*named, *installed, *parents)]
     found += [folder for folder in parents if _package_name(folder) == package]
-    # Beside the URDF's own package, where a workspace keeps the others.
+    # In a workspace other packages lie beside the URDF's own package.
     for folder in list(parents)[:4]:
         try:
             beside = sorted(folder.glob("*/package.xml"))

@@ -1,7 +1,7 @@
-"""MJCF to `HandModel`: MuJoCo reads and compiles the file, and the hand is taken from its model.
+"""Read a `HandModel` from an MJCF file. MuJoCo parses and compiles the file.
 
-MuJoCo gets what `read_xml` took, reduced to the sections that say how a hand moves. It opens no file: graspd reads
-meshes, in more formats, as convex hulls. Elements that change how the hand moves and are not read are refused by name.
+MuJoCo gets the XML of `read_xml`, reduced to the sections that describe how the hand moves. MuJoCo opens no file.
+graspd reads the meshes, in more formats, as convex hulls. Unsupported elements that affect motion are an error.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ from graspd_core.mesh.convex_parts import limited_hull
 from graspd_core.se3 import axis_rotation, rotation_from_quaternion
 from graspd_core.types import TriangleMesh
 
-# How many of a geom's sizes count.
+# Number of used `size` values for each geom type.
 _SIZES = {"sphere": 1, "capsule": 2, "cylinder": 2, "box": 3, "ellipsoid": 3}
 _PLAIN: dict[str, PrimitiveKind] = {"sphere": "sphere", "capsule": "capsule", "cylinder": "cylinder", "box": "box"}
 _CORNERS_OF_ELLIPSOID = 200
@@ -42,13 +42,13 @@ _CORNERS_OF_ELLIPSOID = 200
 
 @dataclass(frozen=True, eq=False)
 class _MeshAsset:
-    """A mesh of the file.
+    """A mesh asset of the file.
 
     Attributes:
-        place: its line and name, for errors.
-        file: relative to the file's folder, empty for a mesh whose vertices are in the file.
-        scale: of its coordinates, along each axis.
-        vertices: of a mesh without file [m].
+        place: line and name of the asset, for error messages.
+        file: path relative to the MJCF file's folder. Empty if the vertices are in the MJCF file.
+        scale: factors of the coordinates along each axis.
+        vertices: vertices of a mesh without file, before scaling [m].
     """
 
     place: Element
@@ -58,11 +58,11 @@ class _MeshAsset:
 
 
 def _read_assets(path: Path, spec: Any) -> dict[str, _MeshAsset]:
-    """Return the meshes of a parsed file by name. Raises HandError: one is moved, turned or scaled by zero."""
+    """Return the mesh assets by name. Raises HandError: a mesh has `refpos` or `refquat`, or a scale of zero."""
     assets = {}
     for mesh in spec.meshes:
         if np.any(mesh.refpos) or not np.array_equal(mesh.refquat, (1, 0, 0, 0)):
-            raise fault(path, mesh, "<mesh refpos=...> and <mesh refquat=...> are not read")
+            raise fault(path, mesh, "<mesh refpos=...> and <mesh refquat=...> are not read; move the vertices instead")
         if not np.all(mesh.scale):
             raise fault(path, mesh, f"<mesh scale={shown(list(mesh.scale))}>: a factor cannot be zero")
         file = str(Path(spec.meshdir) / mesh.file) if mesh.file else ""
@@ -72,7 +72,7 @@ def _read_assets(path: Path, spec: Any) -> dict[str, _MeshAsset]:
 
 
 def fault(path: Path, element: Any, message: str) -> HandError:
-    """Return the error to raise about an element of a `MjSpec`: names the file, the line and the owner."""
+    """Return an error about an element of an `MjSpec`. The message names the file, the line and the owner."""
     return wrong(path, _place(element), message)
 
 
@@ -89,23 +89,23 @@ def _type_name(element: Any) -> str:
 
 
 def pose(position: Float[np.ndarray, "3"], quaternion: Float[np.ndarray, "4"]) -> tuple[np.ndarray, np.ndarray]:
-    """Return rotation and translation [m] of one of a model's poses."""
+    """Return a pose of a MuJoCo model as rotation matrix and translation [m]. `quaternion` is wxyz."""
     return rotation_from_quaternion(torch.as_tensor(np.array(quaternion))).numpy(), np.array(position)
 
 
 def check_type(path: Path, geom: Any, assets: Mapping[str, _MeshAsset]) -> None:
-    """Raise HandError for a geom of a type that is not read, or a mesh that the file does not hold."""
+    """Raise HandError if a geom has an unsupported type or an unknown mesh."""
     kind, known = _type_name(geom), (*_SIZES, "mesh")
     if kind not in known or (geom.meshname and kind != "mesh"):
         raise fault(path, geom, f"<geom type={kind!r}> is not read; known: {', '.join(known)}")
     if kind == "mesh" and geom.meshname not in assets:
-        raise fault(path, geom, f"names the mesh {geom.meshname!r}; known: {', '.join(assets) or 'none'}")
+        raise fault(path, geom, f"unknown mesh {geom.meshname!r}; valid: {', '.join(assets) or 'none'}")
 
 
 def _read_geom(path: Path, model: Any, geom: Any, hull: TriangleMesh | None) -> Primitive:
-    """Return one geom as a primitive of link zero: meshes (`hull`) and ellipsoids as hulls.
+    """Return a geom as a primitive of link zero. A mesh gives its `hull`. An ellipsoid becomes a hull too.
 
-    Raises HandError: it is larger than anything of a hand.
+    Raises HandError: the geom is larger than `LARGEST_SIZE`.
     """
     rotation, translation = pose(model.geom_pos[geom.id], model.geom_quat[geom.id])
     if hull is not None:
@@ -123,9 +123,9 @@ def _read_geom(path: Path, model: Any, geom: Any, hull: TriangleMesh | None) -> 
 
 
 def _asset_hull(path: Path, mesh: _MeshAsset, corners: int) -> TriangleMesh:
-    """Return the hull of a mesh, of at most `corners` corners [m].
+    """Return the hull of a mesh with at most `corners` corners [m].
 
-    Raises HandError: its file is not there or not a mesh, or it is larger than anything of a hand.
+    Raises HandError: the file does not exist or is no mesh, or the mesh is larger than `LARGEST_SIZE`.
     """
     if mesh.file:
         return mesh_hull(path, mesh.place, mesh.file, mesh.scale, corners)
@@ -138,21 +138,22 @@ def _asset_hull(path: Path, mesh: _MeshAsset, corners: int) -> TriangleMesh:
 
 _KINDS: dict[str, JointKind] = {"hinge": "revolute", "slide": "prismatic"}
 _REFUSED = ("replicate", "attach", "composite", "flexcomp", "plugin")
-# What MuJoCo is shown: other sections and assets name files, ask for memory, or say nothing that counts here.
+# Sections that MuJoCo gets. Others may name files, allocate memory, or do not matter here.
 _SECTIONS = ("compiler", "default", "asset", "worldbody", "tendon", "equality", "actuator")
-# Words whose text may look like a number.
+# Attributes with names as values. A name may contain "nan" or "inf".
 _NAMES = {"name", "class", "childclass", "model", "mesh", "file"}
 _HEAVIEST, _MOST_CLASSES = 1e3, 300
-# Files that may be included together.
+# Greatest number of files, the main file included.
 _MOST_FILES = 30
 
 
 @dataclass(eq=False)
 class _Parts:
-    """A file as MuJoCo has parsed and compiled it, and what has been made of it so far.
+    """A file parsed (`spec`) and compiled (`model`) by MuJoCo, and the links and joints read from it so far.
 
     Attributes:
-        meshes: the asset of each geom that is a mesh, by the geom's number.
+        meshes: mesh asset of each mesh geom, by geom id.
+        labels, shown: joint names by joint id, and names of bodies without colliding geoms, which use visual geoms.
     """
 
     path: Path
@@ -166,10 +167,10 @@ class _Parts:
 
 
 def read_mjcf(path: Path, root: ET.Element | None = None) -> HandModel:
-    """Read the hand of an MJCF file, in the form of `read_urdf`.
+    """Read the hand of an MJCF file. The result is as from `read_urdf`.
 
-    The base is the one body of the world. Raises HandError: MuJoCo refuses the file, it has several bodies in the
-    world, or it uses what is not read.
+    The base is the only body of the world. Raises HandError: MuJoCo refuses the file, the world has several bodies, or
+    the file uses unsupported elements.
     """
     root = read_xml(path) if root is None else root
     _include(path, path, root, {path.resolve()})
@@ -178,7 +179,7 @@ def read_mjcf(path: Path, root: ET.Element | None = None) -> HandModel:
     world = parts.spec.worldbody
     if len(world.bodies) != 1:
         names = ", ".join(body.name for body in world.bodies)
-        raise wrong(path, root, f"the world has {len(world.bodies)} bodies, a hand has one: {names or 'none'}")
+        raise wrong(path, root, f"the world has {len(world.bodies)} bodies: {names or 'none'}; valid: one body")
     base, warnings = world.bodies[0], []
     if world.geoms:
         warnings.append("geoms of the world itself were dropped")
@@ -203,9 +204,9 @@ def read_mjcf(path: Path, root: ET.Element | None = None) -> HandModel:
 
 
 def _include(path: Path, holder: Path, parent: ET.Element, seen: set[Path], depth: int = 0) -> None:
-    """Replace each `<include>` below `parent`, which `holder` holds, by the included elements, as MuJoCo does.
+    """Replace each `<include>` below `parent` by the included elements, as MuJoCo does. `holder` is parent's file.
 
-    Raises HandError: a file is not there, is no MJCF, or is included twice.
+    Raises HandError: an included file does not exist, is no MJCF file, or is included twice.
     """
     children: list[ET.Element] = []
     for child in parent:
@@ -222,7 +223,7 @@ def _include(path: Path, holder: Path, parent: ET.Element, seen: set[Path], dept
 
 
 def _read_included(path: Path, holder: Path, place: ET.Element, seen: set[Path]) -> tuple[Path, ET.Element]:
-    """Read the file that an `<include>` names, beside the main file or beside `holder`. Return its path and root."""
+    """Read an included file, which lies beside the main file or beside `holder`. Return its path and root."""
     name = place.get("file") or ""
     told = f"<include file={shown(name)}>"
     found = next((folder / name for folder in (path.parent, holder.parent) if inside_exists(folder / name)), None)
@@ -233,21 +234,21 @@ def _read_included(path: Path, holder: Path, place: ET.Element, seen: set[Path])
     seen.add(found.resolve())
     root = read_xml(found)
     if root.tag not in ("mujoco", "mujocoinclude"):
-        raise wrong(path, place, f"{told}: its root element is <{root.tag}>; an MJCF file has <mujoco>")
+        raise wrong(path, place, f"{told}: the root element is <{root.tag}>; valid: <mujoco>, <mujocoinclude>")
     for element in root.iter():
-        # Its lines would be taken for those of the main file.
+        # Error messages would name these lines as lines of the main file.
         if isinstance(element, Element):
             element.line = 0
     return found, root
 
 
 def _refuse(path: Path, root: ET.Element) -> None:
-    """Raise HandError for what is not read, and for what MuJoCo should not see."""
+    """Raise HandError for unsupported elements, and for content that is dangerous for MuJoCo."""
     for element in root.iter():
         if element.tag in _REFUSED:
             raise wrong(path, element, f"<{element.tag}> is not read; save the compiled model as one plain MJCF file")
         for key, text in element.attrib.items():
-            # MuJoCo takes them, with a note on the terminal and in a file of its own.
+            # MuJoCo accepts nan and inf, but writes a note to the terminal and to a log file.
             if key not in _NAMES and re.search(r"(?i)(^|\s)[+-]?(nan|inf)", text):
                 raise wrong(path, element, f"<{element.tag} {key}={shown(text)}>: expected finite numbers")
     classes = len(root.findall(".//default"))
@@ -257,7 +258,7 @@ def _refuse(path: Path, root: ET.Element) -> None:
 
 
 def _compiled(path: Path, root: ET.Element) -> _Parts:
-    """Compile the file with MuJoCo, with a small sphere in place of each mesh, so that MuJoCo opens no mesh file."""
+    """Compile the file with MuJoCo. A small sphere replaces each mesh, so that MuJoCo opens no mesh file."""
     mujoco: Any = importlib.import_module("mujoco")  # it ships no type information
     root[:] = [section for section in root if section.tag in _SECTIONS]
     for assets in root.findall("asset"):
@@ -282,7 +283,7 @@ def _compiled(path: Path, root: ET.Element) -> _Parts:
 
 
 def _refusal(path: Path, root: ET.Element, text: str) -> HandError:
-    """Return MuJoCo's refusal as an error about the element that it names."""
+    """Convert MuJoCo's error message to an error about the element that it names."""
     line, tag = re.search(r",? line (\d+)", text), re.search(r"Element '(\w+)'", text)
     place = Element(tag.group(1) if tag else "mujoco")
     if line:
@@ -293,7 +294,7 @@ def _refusal(path: Path, root: ET.Element, text: str) -> HandError:
 
 
 def _read_body(parts: _Parts, body: Any, parent: str | None) -> None:
-    """Append a body's link and joints, then those of the bodies in it."""
+    """Append a body's link and joints to `parts`, then those of its child bodies."""
     model, name = parts.model, body.name or f"body_{len(parts.links)}"
     link = LinkSpec(name, *_inertial(parts, body), _primitives(parts, body, name))
     rotation, translation = pose(model.body_pos[body.id], model.body_quat[body.id])
@@ -305,7 +306,7 @@ def _read_body(parts: _Parts, body: Any, parent: str | None) -> None:
             offset = np.array(model.jnt_pos[joint.id])
             _refuse_far(parts, joint, offset)
             last = number == len(body.joints) - 1 and not offset.any()
-            # A joint beside the body's origin, or one of several, moves a link of its own that the body is welded to.
+            # A joint beside the body's origin, or one of several joints, gets an extra link without mass.
             child = name if last else f"{name}:{label}"
             at_joint = JointSpec(label, above, child, "fixed", rotation, translation + rotation @ offset)
             parts.joints.append(_moving(parts, joint, at_joint))
@@ -320,13 +321,13 @@ def _read_body(parts: _Parts, body: Any, parent: str | None) -> None:
 
 
 def _moving(parts: _Parts, joint: Any, placed: JointSpec) -> JointSpec:
-    """Return the joint of the file, made from a fixed one that stands in its place."""
+    """Return the moving joint. `placed` is a fixed joint in its place, with its name and links."""
     model, number = parts.model, joint.id
     kind = _KINDS.get(_type_name(joint))
     if kind is None:
         raise fault(parts.path, joint, f"is of type {_type_name(joint)!r}; known: {', '.join(_KINDS)}")
     axis, rotation, translation = np.array(model.jnt_axis[number]), placed.rotation, placed.translation
-    # At `ref` the joint is as drawn. A joint value of zero lies that far back.
+    # The file shows the joint at the value `ref`. So the pose at zero is `ref` back along the joint.
     if kind == "revolute":
         rotation = rotation @ axis_rotation(axis, -_reference(parts, number))
     else:
@@ -350,7 +351,7 @@ def _refuse_far(parts: _Parts, element: Any, position: Float[np.ndarray, "3"]) -
 
 
 def _primitives(parts: _Parts, body: Any, name: str) -> tuple[Primitive, ...]:
-    """Return the colliding geoms of a body, or all if none collides."""
+    """Return the colliding geoms of a body, or all geoms if none collides."""
     colliding = [geom for geom in body.geoms if geom.contype or geom.conaffinity]
     if body.geoms and not colliding:
         parts.shown.append(name)
@@ -364,35 +365,35 @@ def _primitives(parts: _Parts, body: Any, name: str) -> tuple[Primitive, ...]:
 
 
 def _inertial(parts: _Parts, body: Any) -> tuple[float, Float[np.ndarray, "3"], Float[np.ndarray, "3 3"]]:
-    """Return mass [kg], centre [m] and inertia about it [kg·m²], zero if the body gives none."""
+    """Return mass [kg], centre of mass [m] and inertia about it [kg·m²]. Zero if the body has no <inertial>."""
     if not body.explicitinertial:
         return 0.0, np.zeros(3), np.zeros((3, 3))
     model, number = parts.model, body.id
     rotation, com = pose(model.body_ipos[number], model.body_iquat[number])
     mass, moments = float(model.body_mass[number]), np.array(model.body_inertia[number])
     if body.mass < 0 or not max(mass, *moments) <= _HEAVIEST:
-        heavy = f"weighs {min(mass, body.mass):g} kg, with moments up to {moments.max():g} kg·m²: no hand"
+        heavy = f"weighs {min(mass, body.mass):g} kg, moments {moments.max():g} kg·m²; valid: 0 to {_HEAVIEST:g}"
         raise fault(parts.path, body, heavy)
     _refuse_far(parts, body, com)
     return mass, com, (rotation * moments) @ rotation.T
 
 
 def _couplings(parts: _Parts) -> dict[str, Coupling]:
-    """Return the joints that an equality ties to another by a straight line: q₁ − ref₁ = c₀ + c₁ (q₂ − ref₂)."""
+    """Return the couplings of joints by linear equalities: q₁ − ref₁ = c₀ + c₁ (q₂ − ref₂)."""
     direct: dict[str, Coupling] = {}
     for tie in parts.spec.equalities:
         if not tie.active:
             continue
         kind = tie.type.name.removeprefix("mjEQ_").lower()
         if kind != "joint" or not tie.name2:
-            told = f"equality <{kind}> is not read: only a joint tied to another is"
+            told = f"equality <{kind}> is not supported; valid: <joint> with joint1 and joint2"
             if kind in ("connect", "weld"):
-                told += "; to tie the joints of the loop that it closes, write <joint joint1 joint2 polycoef> instead"
+                told += "; to couple the joints of a loop, write <joint joint1 joint2 polycoef> instead"
             raise fault(parts.path, tie, told)
         constant, slope, *bends = tie.data[:5].tolist()
         if any(bends):
             given = shown(tie.data[:5].tolist())
-            raise fault(parts.path, tie, f"<joint polycoef={given}>: only a straight line is read")
+            raise fault(parts.path, tie, f"<joint polycoef={given}>: not linear; valid: zeros after the second number")
         one, two = (parts.model.joint(name).id for name in (tie.name1, tie.name2))
         offset = _reference(parts, one) + constant - slope * _reference(parts, two)
         direct[parts.labels[one]] = Coupling(parts.labels[two], slope, offset)
@@ -400,7 +401,7 @@ def _couplings(parts: _Parts) -> dict[str, Coupling]:
 
 
 def _efforts(parts: _Parts) -> dict[str, float]:
-    """Return the greatest torque or force of each joint's actuator, if it is limited."""
+    """Return the greatest torque [N·m] or force [N] by joint name, for joints whose actuator is limited."""
     mujoco: Any = importlib.import_module("mujoco")
     model, efforts = parts.model, {}
     for i in range(model.nu):

@@ -1,7 +1,6 @@
-"""URDF to `HandModel`: common mistakes of descriptions are mended with a warning or refused by name.
+"""Read a `HandModel` from a URDF. Common mistakes are repaired with a warning, or are errors that name the element.
 
-Boxes, spheres, cylinders and capsules stay as they are. Meshes become convex hulls. Visual shapes are read for
-pictures.
+Boxes, spheres, cylinders and capsules do not change. Meshes become convex hulls. Visual shapes are for the viewer.
 """
 
 from __future__ import annotations
@@ -25,18 +24,17 @@ from graspd_core.mesh.mesh_files import simplify
 from graspd_core.types import TriangleMesh
 
 _ROUND: dict[str, PrimitiveKind] = {"cylinder": "cylinder", "capsule": "capsule"}
-# Lengths that differ by less are the same [m].
+# Lengths that differ by less than this are equal [m].
 _SAME = 1e-6
 _SHAPES = ("box", "sphere", "cylinder", "capsule", "mesh")
-# Triangles of all meshes that a viewer draws of a hand together, and of each.
+# For the viewer: number of triangles of all meshes of a hand, and least number of each mesh.
 _MOST_TRIANGLES, _FEWEST_TRIANGLES = 4000, 60
-# Simplifying gets stuck on torn surfaces, and may lose a thin part: what stays so many times too fine, or comes out
-# smaller than this, is drawn as its hull.
+# Simplifying may fail on torn surfaces or lose a thin part. The hull is drawn instead if a mesh keeps more than this
+# multiple of the triangles, or less than this share of its extent.
 _STUCK, _SHRUNK = 1.5, 0.95
 
 
 def _colliding(link: ET.Element) -> list[ET.Element]:
-    """Return the `<collision>` elements of a link, its `<visual>` elements if it has none."""
     return link.findall("collision") or link.findall("visual")
 
 
@@ -47,7 +45,7 @@ def _shapes(
 
 
 def _with_capsules(shapes: Sequence[Primitive]) -> tuple[Primitive, ...]:
-    """Join each cylinder and two balls at its ends to one capsule, which URDF has no shape for."""
+    """Replace each cylinder with two spheres at its ends by a capsule, because URDF has no capsule."""
     found, taken = list(shapes), set[int]()
     for i, shape in enumerate(shapes):
         if shape.kind != "cylinder":
@@ -67,7 +65,7 @@ def _is_ball(shape: Primitive, center: Float[np.ndarray, "3"], radius: float) ->
 
 
 def _read_shape(path: Path, element: ET.Element, read_mesh: Callable[..., TriangleMesh]) -> Primitive:
-    """Read a `<collision>` or `<visual>` as a primitive of link zero. `read_mesh` gives the mesh of a file [m]."""
+    """Read a `<collision>` or `<visual>` as a primitive of link zero. `read_mesh` reads a mesh file [m]."""
     rotation, translation = read_origin(path, element)
     geometry = element.find("geometry")
     shapes = [] if geometry is None else list(geometry)
@@ -114,26 +112,26 @@ _KINDS: dict[str, JointKind] = {
 }
 # What to do with a xacro file.
 EXPAND = "expand it to a URDF first: xacro FILE > hand.urdf"
-# Joint types that only place a whole robot in the world.
+# Types of joints that place a whole robot in the world.
 _FREE = ("floating", "planar")
 _MOMENTS = ("xx", "xy", "xz", "yy", "yz", "zz")
-# Of a mass [kg] or a moment of inertia [kg·m²].
+# Greatest valid mass [kg] and moment of inertia [kg·m²].
 _HEAVIEST = 1e3
 
 
 def read_urdf(path: Path, root: ET.Element | None = None) -> HandModel:
     """Read the hand of a URDF, without candidates.
 
-    Postures are mid-range, the palm is at the base's origin. `continuous` joints are kept within ±π. An absent or zero
-    effort or velocity becomes infinite. A link without collision shapes takes its visual ones. A `world` link or a
-    floating joint above the base is dropped. All changes but the second leave a warning.
+    Postures are mid-range, the palm is at the base's origin. A missing or zero effort or velocity becomes infinite.
+    These changes give a warning: `continuous` joints are limited to ±π. A link without collision shapes gets its visual
+    shapes. A `world` link or a floating joint above the base is dropped.
 
     Args:
-        path: of the file.
-        root: its root element, if it has been read already.
+        path: path of the file.
+        root: root element, if it has been read already.
 
     Raises:
-        HandError: the file is missing, malformed, not a tree, has no moving joint, or has one of an unknown type.
+        HandError: the file is missing, malformed or not a tree, has no moving joint, or has an unknown joint type.
     """
     root = read_xml(path) if root is None else root
     if root.tag != "robot":
@@ -165,14 +163,14 @@ def read_urdf(path: Path, root: ET.Element | None = None) -> HandModel:
 
 
 def visual_solids(hand: HandModel, prefix: str = "") -> tuple[Primitive, ...]:
-    """Return the shapes that a viewer draws, placed as `hand.primitives` are.
+    """Return the shapes for a viewer, in link frames as `hand.primitives`.
 
-    A `hull` of them need not be convex. Meshes are simplified to about 4000 triangles together, 6000 at most. Links
-    without visuals, and hands without a URDF, get their collision solids.
+    A `hull` among them need not be convex. All meshes together are simplified to about 4000 triangles, at most 6000.
+    Links without visual shapes, and hands without a URDF, get their collision solids.
 
     Args:
         hand: any loaded hand.
-        prefix: that it was loaded with.
+        prefix: the `prefix` with which `load_hand` loaded the hand.
 
     Raises:
         HandError: a file cannot be read.
@@ -191,7 +189,7 @@ def visual_solids(hand: HandModel, prefix: str = "") -> tuple[Primitive, ...]:
 
 
 def _simpler(shape: Primitive, share: float) -> Primitive:
-    """Return a mesh with a share of its triangles."""
+    """Return a mesh simplified to this share of its triangles. Other shapes do not change."""
     count = max(int(len(shape.faces) * share), _FEWEST_TRIANGLES)
     if shape.kind != "hull" or len(shape.faces) <= count:
         return shape
@@ -203,7 +201,7 @@ def _simpler(shape: Primitive, share: float) -> Primitive:
 
 
 def below_link(path: Path, root: ET.Element, link: str) -> None:
-    """Drop all links and joints of a robot except `link` and those below. Raises HandError: no such link in a URDF."""
+    """Keep only `link` and the links and joints below it. Raises HandError: the file has no such link."""
     links = {str(element.get("name")): element for element in root.findall("link")}
     if link not in links:
         raise HandError(f"{path}: root: no link {link!r}; links: {', '.join(links) or 'none, it is no URDF'}")
@@ -239,7 +237,7 @@ def _refuse_xacro(path: Path, root: ET.Element) -> None:
 def _below_world(
     path: Path, links: list[ET.Element], joints: list[ET.Element]
 ) -> tuple[list[ET.Element], list[ET.Element], list[str]]:
-    """Return the links and joints below what only places the hand in the world, and a warning for each dropped link."""
+    """Drop links and joints that only place the hand in the world. Return the other links and joints, and warnings."""
     dropped: list[str] = []
     while True:
         children = {_end(joint, "child") for joint in joints}
@@ -291,7 +289,7 @@ def _axis(path: Path, joint: ET.Element) -> Float[np.ndarray, "3"]:
 
 
 def _limits(path: Path, joint: ET.Element) -> tuple[float, float, float, float]:
-    """Return lower, upper [rad] or [m], effort [N·m] or [N] and velocity, infinite if unset."""
+    """Return lower and upper limit [rad] or [m], effort [N·m] or [N], and velocity. Infinite if not given."""
     limit = joint.find("limit")
     continuous = joint.get("type") == "continuous"
     if limit is None:
@@ -314,7 +312,7 @@ def _unset_if_zero(path: Path, limit: ET.Element, key: str) -> float:
 
 
 def _inertial(path: Path, link: ET.Element) -> tuple[float, Float[np.ndarray, "3"], Float[np.ndarray, "3 3"]]:
-    """Return mass [kg], centre of mass [m] and inertia about it [kg·m²] in link axes, zero if the link gives none."""
+    """Return mass [kg], centre of mass [m] and inertia about it [kg·m²] in link axes. Zero without `<inertial>`."""
     inertial = link.find("inertial")
     if inertial is None:
         return 0.0, np.zeros(3), np.zeros((3, 3))
@@ -327,6 +325,7 @@ def _inertial(path: Path, link: ET.Element) -> tuple[float, Float[np.ndarray, "3
     if inertia is not None:
         moments = np.array([read_numbers(path, inertia, f"i{key}", 1, "0")[0] for key in _MOMENTS])
     if max(mass, *np.abs(moments)) > _HEAVIEST:
-        raise wrong(path, inertial, f"weighs {mass:g} kg with moments up to {np.abs(moments).max():g} kg·m²: no hand")
+        heavy = f"weighs {mass:g} kg, moments up to {np.abs(moments).max():g} kg·m²; valid: at most {_HEAVIEST:g}"
+        raise wrong(path, inertial, heavy)
     xx, xy, xz, yy, yz, zz = moments
     return mass, com, rotation @ np.array([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]]) @ rotation.T

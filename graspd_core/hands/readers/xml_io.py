@@ -1,7 +1,7 @@
-"""XML files of hands: read leniently where descriptions are sloppy, strictly where a file could do harm.
+"""Read XML files of hands. Harmless mistakes are accepted, dangerous content is refused.
 
-Namespaces are not resolved, so undeclared prefixes do no harm. Comments may stand before the header. A document type
-declaration is refused, because entities can blow up or reach for other files.
+Namespaces are not resolved, so undeclared prefixes are no error. Comments may come before the XML header. A document
+type declaration is refused, because its entities can use unlimited memory or read other files.
 """
 
 from __future__ import annotations
@@ -18,20 +18,20 @@ from jaxtyping import Float
 
 from graspd_core.errors import HandError
 
-# Of an error: a file may have a word of megabytes.
+# Greatest length of an error message, because a file may contain a word of megabytes.
 _LONGEST = 1000
 _LARGEST_FILE = 32 * 2**20
 DEEPEST = 150
-# The largest hand known has some 1000 elements. Each takes half a kilobyte, however short it is written.
+# The largest known hand has about 1000 elements. Each element needs half a kilobyte of memory.
 _MOST_ELEMENTS, _MOST_ATTRIBUTES = 20_000, 200
-# Nothing in a hand is farther than this from the frame that it is given in [m].
+# Greatest valid distance of a link, joint or shape from its reference frame [m].
 FARTHEST = 10.0
-# Elements that errors about their contents name.
+# Error messages name the innermost of these elements.
 _OWNERS = ("link", "joint", "body", "geom", "mesh")
 
 
 class Element(ET.Element):
-    """An element with its `line`, and the named element that it belongs to (`owner`), as text."""
+    """An XML element with its `line` in the file. `owner` is the tag and name of the enclosing named element."""
 
     line = 0
     owner = ""
@@ -40,14 +40,14 @@ class Element(ET.Element):
 def read_xml(path: Path) -> Element:
     """Read the root element of an XML file.
 
-    Raises HandError: it cannot be read, is not well-formed, has a document type declaration, or is too large.
+    Raises HandError: the file cannot be read, is not well-formed, has a document type declaration, or is too large.
     """
     try:
-        # By reading, not by the size that the system gives: a device has none, and no end.
+        # The size is checked by reading, because a device file has no size and no end.
         with path.open("rb") as file:
             data = file.read(_LARGEST_FILE + 1)
         if len(data) > _LARGEST_FILE:
-            raise HandError(f"{path}: larger than {_LARGEST_FILE >> 20} MiB: not a hand")
+            raise HandError(f"{path}: larger than {_LARGEST_FILE >> 20} MiB, the limit of a hand file")
         text = _decoded(data)
     except (OSError, ValueError) as error:
         raise HandError(f"{path}: cannot be read: {getattr(error, 'strerror', None) or error}") from error
@@ -63,9 +63,9 @@ def parse_xml(path: Path, text: str) -> Element:
 
 
 def as_text(root: ET.Element) -> str:
-    """Return the elements as XML, each in its line, without texts and comments."""
+    """Return the elements as XML text without comments. Each element keeps its line number."""
     pieces, line = [], 1
-    # An element of which only the end is left to write is None, with its tag.
+    # An entry (None, tag) means that only the end tag is left to write.
     ahead: list[tuple[ET.Element | None, str]] = [(root, root.tag)]
     while ahead:
         element, tag = ahead.pop()
@@ -80,7 +80,7 @@ def as_text(root: ET.Element) -> str:
 
 
 def wrong(path: Path, element: ET.Element, message: str) -> HandError:
-    """Return the error to raise about an element: names the file, the line, and the link or joint of the element."""
+    """Return an error about an element. The message names the file, the line, and the enclosing link or joint."""
     line, owner = getattr(element, "line", 0), getattr(element, "owner", "")
     where = f"{path}:{line}" if line else f"{path}"
     if owner:
@@ -101,14 +101,14 @@ def _decoded(data: bytes) -> str:
     declared = re.search(rb"<\?xml[^>]*?encoding=[\"']([\w.-]+)", data[:2000])
     try:
         name = codecs.lookup(declared.group(1).decode() if declared else "utf-8").name
-        # Punycode, for names in the internet, takes quadratic time.
+        # The decoder of punycode (for host names) takes quadratic time, so it is not used.
         return data.decode("utf-8" if name == "punycode" else name, errors="replace")
     except LookupError:
         return data.decode("utf-8", errors="replace")
 
 
 def _blanked(text: str, start: str, end: str) -> str:
-    """Replace everything from `start` to `end` by its line ends, in linear time, so that line numbers stay right."""
+    """Replace all text between `start` and `end` by its line ends, in linear time. Line numbers do not change."""
     pieces, at = [], 0
     while (first := text.find(start, at)) >= 0 and (last := text.find(end, first + len(start))) >= 0:
         pieces += [text[at:first], "\n" * text.count("\n", first, last)]
@@ -132,12 +132,12 @@ def _parsed(path: Path, text: str) -> Element:
         elif stack:
             element.owner = stack[-1].owner
         if tag in _OWNERS and not attributes.get("name", "").isprintable():
-            raise wrong(path, element, "has a name with a line end, or another character that cannot be printed")
+            raise wrong(path, element, "has a name with a line end or an unprintable character; use another name")
         if len(stack) >= DEEPEST:
             raise wrong(path, element, f"<{tag}> is nested more than {DEEPEST} deep")
         if count > _MOST_ELEMENTS or len(attributes) > _MOST_ATTRIBUTES:
-            limits = f"{_MOST_ELEMENTS} elements, nor an element more than {_MOST_ATTRIBUTES} attributes"
-            raise wrong(path, element, f"no hand has more than {limits}")
+            limits = f"{_MOST_ELEMENTS} elements, nor more than {_MOST_ATTRIBUTES} attributes of one element"
+            raise wrong(path, element, f"a hand file must not have more than {limits}")
         (stack[-1] if stack else top).append(element)
         stack.append(element)
 
@@ -151,7 +151,7 @@ def _parsed(path: Path, text: str) -> Element:
     parser.StartElementHandler, parser.EndElementHandler, parser.StartDoctypeDeclHandler = start, end, refuse
     try:
         body = text.lstrip()
-        # Line ends are left in front, so that line numbers stay right.
+        # The leading line ends are kept, so that line numbers stay correct.
         before = text.count("\n", 0, len(text) - len(body))
         parser.Parse(("\n" * before + body).encode("utf-8", errors="replace"), True)
     except expat.ExpatError as error:
@@ -160,9 +160,9 @@ def _parsed(path: Path, text: str) -> Element:
 
 
 def read_origin(path: Path, element: ET.Element) -> tuple[Float[np.ndarray, "3 3"], Float[np.ndarray, "3"]]:
-    """Return rotation and translation [m] of an element's `<origin>`, the identity if it has none.
+    """Return rotation and translation [m] of an element's `<origin>`. Without `<origin>` this is the identity.
 
-    Raises HandError: it holds no numbers, or is farther away than anything in a hand.
+    Raises HandError: a value is not a finite number, or a translation is longer than `FARTHEST`.
     """
     origin = element.find("origin")
     if origin is None:
@@ -175,7 +175,7 @@ def read_origin(path: Path, element: ET.Element) -> tuple[Float[np.ndarray, "3 3
 
 
 def read_numbers(path: Path, element: ET.Element, key: str, count: int, default: str) -> Float[np.ndarray, "n"]:
-    """Read an attribute of `count` finite numbers. Raises HandError: it holds something else."""
+    """Read an attribute of `count` finite numbers. Raises HandError: it has other content."""
     text = element.get(key) or default
     try:
         values = np.array([float(word) for word in text.split()])

@@ -1,1 +1,1 @@
-"""The closed form."""
+"""The closed-form relaxation of the grasp problem (docs/method.md)."""

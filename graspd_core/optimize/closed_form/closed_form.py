@@ -1,11 +1,11 @@
 """Solve the closed-form relaxation: projected Adam on all starts, then on the starts that are not hopeless.
 
-Coarse to fine: the padding radius and the contact width shrink together while exploring, and stay at their end values
-while refining. The best iterate of each start is judged at the end values only, so that early, padded ones never win.
+The padding radius and the contact width shrink while exploring, and keep their end values while refining. Only iterates
+at the end values may become the best iterate of a start.
 
 `ClosedForm` steps in torch. `minimise_compiled` runs the same schedule in the compiled kernel, with the same results up
-to rounding: every start by itself, on as many threads as torch has (`torch.set_num_threads`). There a start ends alike
-on one thread and on many, alone and in a batch.
+to rounding. The kernel optimises every start by itself, on as many threads as torch has (`torch.set_num_threads`). Its
+result for a start does not depend on the number of threads or on the other starts.
 """
 
 from __future__ import annotations
@@ -38,12 +38,12 @@ from graspd_core.optimize.loop import (
 from graspd_core.optimize.losses import hard_contact, soft_contact
 from graspd_core.optimize.problem import Problem, Terms, evaluate, least_distance
 
-# Share of the step size that is left at the end of the run.
+# Step size at the end of the run, as a share of that at the start.
 _FINAL_RATE = 0.05
-# Fewer rows than this are evaluated among copies of the first: products of one to three rows are summed in another
-# order than those of more, and from the last bit of a float32 a start would go another way alone than among others.
+# Smaller batches are padded to this many rows with copies of the first row. Matrix products of one to three rows are
+# summed in another order, so a start would give another result alone than in a batch.
 _FEWEST_ROWS = 8
-# However few grasps are asked for: a small batch costs hardly less than this one, and has little to choose from.
+# Least number of starts and of kept starts. A smaller batch takes hardly less time and gives less choice.
 _FEWEST_STARTS, _FEWEST_KEPT = 16, 8
 
 
@@ -51,8 +51,8 @@ _FEWEST_STARTS, _FEWEST_KEPT = 16, 8
 class AdamState:
     """Iterate, moments and best iterate of every start, as rows of one matrix (translation, quaternion, joints).
 
-    The translation is that of `pivot`, the point of the hand that a step of the quaternion leaves where it is: about
-    the origin of a base frame far from the palm, a small turn would throw the fingers off the object.
+    The translation is the position of `pivot`, the point about which a step turns the hand. If the base frame is far
+    from the palm, a small rotation about its origin would move the fingers away from the object.
     """
 
     pivot: Positions
@@ -68,14 +68,14 @@ class AdamState:
         return AdamState(**{name: value[rows] for name, value in vars(self).items()})
 
     def best(self) -> tuple[Poses, Values]:
-        """Return the best iterate of every start and its loss, the last iterate if none was scored."""
+        """Return the best iterate of every start and its loss. If no iterate was scored, return the last one."""
         scored = torch.isfinite(self.best_loss)
         poses = unpack(torch.where(scored[:, None], self.best_x, self.x))
         return moved_along(poses, -self.pivot), torch.where(scored, self.best_loss, self.loss)
 
 
 def initial_state(problem: Problem, starts: Poses, radius: Values) -> AdamState:
-    """Return the state before the first step, padded by `radius` [m]."""
+    """Return the state before the first step. `radius` [m] is the initial padding of the object for each start."""
     x = pack(moved_along(starts, problem.hand.pivot))
     worst = x.new_full((len(x),), torch.inf)
     pivot = problem.hand.pivot.expand(len(x), 3)
@@ -85,7 +85,7 @@ def initial_state(problem: Problem, starts: Poses, radius: Values) -> AdamState:
 def adam_step(
     problem: Problem, state: AdamState, gradient: Tensor, rate: float, count: int, config: ClosedFormConfig
 ) -> AdamState:
-    """Take an Adam step (Kingma & Ba 2015) with per-variable rates, and project joints onto their limits."""
+    """Take one Adam step (Kingma & Ba 2015) with per-variable step sizes, and clamp joints to their limits."""
     mean, square, top, root = adam_moments(state.mean, state.square, gradient, count)
     rates = torch.full_like(state.x[0], config.joint_rate)
     rates[:3] = config.translation_rate
@@ -104,7 +104,7 @@ def weighted(terms: Terms, weights: LossWeights) -> Values:
 
 @dataclass(frozen=True)
 class ClosedForm:
-    """The solver of docs/method.md, §2. `keep` starts are kept after exploring."""
+    """The solver of docs/method.md, §2. `keep` is the number of starts kept after exploring."""
 
     config: ClosedFormConfig
     keep: int
@@ -148,7 +148,7 @@ class ClosedForm:
     def value_and_gradient(
         self, problem: Problem, x: Rows, radius: Values, delta: float, *, fine: bool, sharp: bool
     ) -> tuple[Values, Rows]:
-        """Return the loss of every start and its gradient. A start whose gradient is not finite stands still."""
+        """Return the loss of every start and its gradient. If either is not finite: infinite loss, zero gradient."""
         rows = len(x)
         short = max(0, _FEWEST_ROWS - rows)
         x = torch.cat([x, x[:1].expand(short, -1)]).detach().requires_grad_(True)
@@ -166,7 +166,7 @@ class ClosedForm:
 def minimise_compiled(
     solver: ClosedForm, problem: Problem, compiled: KernelProblem, starts: Poses, hooks: Hooks
 ) -> Solution:
-    """Run `solver` as `loop.minimise` does, by the kernel. Raises MemoryError: too little memory for the threads."""
+    """Run `solver` like `loop.minimise`, but in the kernel. Raises MemoryError: too little memory for the threads."""
     config, x = solver.config, pack(moved_along(starts, problem.hand.pivot)).contiguous()
     nearest = torch.empty(len(x))
     compiled.call("graspd_least_distance", len(x), x, nearest)
@@ -183,7 +183,7 @@ def minimise_compiled(
 def _run_steps(
     compiled: KernelProblem, config: ClosedFormConfig, state: AdamState, span: tuple[int, int], follow: Follow
 ) -> None:
-    """Do the steps of a span in place, for every row of the state. An interruption ends it within milliseconds."""
+    """Run the steps `span` in the kernel and update `state` in place. A stop ends the run within milliseconds."""
     (begin, end), rows = span, len(state.x)
 
     def over(done: int) -> bool:
@@ -212,7 +212,7 @@ def _schedule(config: ClosedFormConfig) -> structs.Schedule:
 
 
 def plan(task: PlannerInput) -> PlannerOutput:
-    """Run the closed-form relaxation from `starts_per_grasp` starts for every grasp asked for."""
+    """Run the closed-form relaxation from `starts_per_grasp` starts for every requested grasp."""
     settings, problem = task.config.settings, task.problem
     count = max(_FEWEST_STARTS, round(task.count * settings.starts_per_grasp))
     drawn = {"fingertips": settings.fingertip_starts, "restrictions": task.restrictions}

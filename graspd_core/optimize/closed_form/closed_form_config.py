@@ -9,15 +9,15 @@ from typing import Literal
 
 @dataclass(frozen=True)
 class LossWeights:
-    """Weights of the loss terms. Every term is scaled so that one is a sensible weight.
+    """Weights of the loss terms. Every term is scaled so that 1 is a reasonable weight.
 
     Attributes:
         wrench_resistance: resistance against the worst disturbances.
         distance: attraction of the hand to the surface.
         penetration: depth below the padded surface.
         self_collision: overlap of the hand with itself.
-        posture: joints away from the middle of their range.
-        obstacle: depth in the support or in a neighbour. Scenes without any have no such term.
+        posture: distance of joints from the middle of their range.
+        obstacle: depth in the support or in an obstacle. A scene with neither has no such term.
     """
 
     wrench_resistance: float = 3.0
@@ -33,24 +33,24 @@ class ClosedFormConfig:
     """The closed-form relaxation (docs/method.md).
 
     Attributes:
-        starts_per_grasp: starts tried for each grasp asked for. Hopeless ones are dropped on the way.
-        fingertip_starts: share of them that begins with half-closed fingertips at the object, the others with the palm.
-        explore_steps: steps with all starts, before the hopeless ones are dropped.
-        refine_steps: steps with those that are kept.
-        polish_steps: last steps, with all of the object's sharp points and weights that make contact exact.
-        fine_steps: the last of them, with all candidates too.
-        keep_per_grasp: starts kept after exploring, for each grasp asked for.
-        drops: times that exploring drops starts, evenly spread, each time the same share of those left.
-        activation: whether contact fades over its width or, for the ablation, ends at `delta_end`.
+        starts_per_grasp: starts for each requested grasp. Exploring drops hopeless starts.
+        fingertip_starts: share of starts with half-closed fingertips at the object. The others have the palm there.
+        explore_steps: first steps, in which hopeless starts are dropped.
+        refine_steps: steps after exploring, with the kept starts.
+        polish_steps: last steps, with all sharp points of the object and with weights for exact contact.
+        fine_steps: last steps of polishing, with all contact candidates too.
+        keep_per_grasp: starts kept after exploring, for each requested grasp.
+        drops: how often exploring drops starts. Drops are evenly spread, and each drops the same share.
+        activation: `soft` contact decays over its width. `hard` contact, for the ablation, ends at `delta_end`.
         delta_start: width of the soft contact at the start [m].
         delta_end: width of the soft contact at the end [m].
         radius_start: greatest padding of the object at the start [m].
         translation_rate: step size of the base position [m].
         rotation_rate: step size of the base quaternion [half rad].
-        joint_rate: step size of the joints [rad]. Sliding ones take 0.05 m for a radian.
-        searches: times at most that starts are tried, again only where too few grasps are expected to hold.
-        weights: of the loss terms while exploring and refining.
-        polish_weights: of the loss terms while polishing.
+        joint_rate: step size of the joints [rad]. For prismatic joints 0.05 m count as one radian.
+        searches: greatest number of searches. It searches again only if too few grasps are expected to hold.
+        weights: weights of the loss terms while exploring and refining.
+        polish_weights: weights of the loss terms while polishing.
     """
 
     starts_per_grasp: float = 8.0
@@ -83,7 +83,7 @@ def drop_steps(settings: ClosedFormConfig) -> list[int]:
 
 
 def rows_kept(settings: ClosedFormConfig, keep: int, rows: int, index: int) -> int:
-    """Return how many of so many rows go on before step `index`. `keep` are left when exploring ends."""
+    """Return how many of `rows` starts are kept before step `index`. After exploring, `keep` starts are left."""
     at = drop_steps(settings)
     if index not in at or keep >= rows:
         return rows
@@ -92,9 +92,9 @@ def rows_kept(settings: ClosedFormConfig, keep: int, rows: int, index: int) -> i
 
 
 def at_budget(settings: ClosedFormConfig, budget: float) -> ClosedFormConfig:
-    """Return the settings at a budget: below one that share of the steps and one search, above one more starts.
+    """Return the settings for a budget. Below 1 it scales the steps with one search. Above 1 it scales the starts.
 
-    Steps are what a small batch costs, and fewer of them do on easy objects. Starts are what hard objects want.
+    The steps determine the time of a small batch, and easy objects need fewer. Hard objects need more starts.
     """
     share, times = min(budget, 1.0), max(budget, 1.0)
     steps = {

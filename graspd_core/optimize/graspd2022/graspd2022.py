@@ -1,27 +1,27 @@
-"""Solve Grasp'D as published (Turpin et al., ECCV 2022): forces that stop the object, a pose that supplies them.
+"""Solve Grasp'D as published (Turpin et al., ECCV 2022): find forces that stop the object, and a pose for them.
 
     min L_phys + L_range + L_inter  subject to  L_task < C_task, L_limit < C_limit
 
-by damped multipliers and Adamax, on contacts with the level set φ = r, r shrinking to zero (docs/method.md, §1).
+by damped multipliers and Adamax. Contact is with the level set φ = r, where r shrinks to zero (docs/method.md, §1).
 
-Physics is relaxed after contact-invariant optimisation: for every hand point and every simulation there is a force f̂ on
-the object that the pose need not supply. Whether f̂ stops the object is a constraint, L_task. Whether the pose supplies
-f̂ is a cost, L_phys.
+Physics is relaxed as in contact-invariant optimisation. Every hand point has in every simulation a desired force f̂ on
+the object. The pose need not supply it. L_task is a constraint: f̂ shall stop the object. L_phys is a cost: the pose
+shall supply f̂.
 
-For min f(x) subject to g(x) < C the Lagrangian is f + λ c + d c² / 2 with c = max(g − C, 0). x descends it while λ
-climbs it. The damping d c² / 2 makes the two settle instead of circling (Platt & Barr, NIPS 1987).
+For min f(x) subject to g(x) < C the Lagrangian is f + λ c + d c² / 2 with c = max(g − C, 0). Each step decreases it in
+x and increases it in λ. The damping d c² / 2 prevents oscillation (Platt & Barr, NIPS 1987).
 
-Hand points that sink in push the object by the penalty contact of Grasp'D:
+Hand points that penetrate the object push it by the penalty contact of Grasp'D:
 
     f_n = k_n min(φ − r, 0) ∇φ        f_t = −min(k_f ‖v_t‖, μ ‖f_n‖) v̂_t
 
-φ is the object's signed distance at the hand's point, v_t the object's velocity against the hand, less its part along
-∇φ. The whole simulation is one semi-implicit Euler step of a free rigid body, without gravity. Only velocities are
-asked for. All is in SI units and in the object's frame, torques and angular velocities about the centre of mass.
+φ is the object's signed distance at the hand's point. v_t is the tangential part of the object's velocity relative to
+the hand. The simulation is one semi-implicit Euler step of a free rigid body without gravity. Only velocities are
+computed. All values are in SI units and in the object frame. Torques and angular velocities are about the centre of
+mass.
 
-Gradients are exact with four exceptions: contacts leak (`leaky_min`), the tangential speed is floored so that friction
-is smooth where nothing slides, the pose has no part in L_task, and the projection of desired forces into their cones
-(`into_cone`) carries none.
+Gradients are exact with four exceptions. Contacts leak (`leaky_min`). The tangential speed has a floor, so that
+friction is smooth without sliding. L_task has no gradient in the pose. `into_cone` has no gradient.
 """
 
 from __future__ import annotations
@@ -47,21 +47,21 @@ from graspd_core.optimize.problem import PointSet, Problem, hand_forward, least_
 from graspd_core.perception.scene import Scene
 from graspd_core.se3 import EPSILON, aligning_rotation, quaternion_from_rotation, rotation_from_axis_angle
 
-# Floor of the squared tangential speed [m²/s²]: a micrometre a second is no motion.
+# Floor of the squared tangential speed [m²/s²]. A micrometre per second counts as no motion.
 _SLIP_FLOOR = 1e-12
 _BETA1, _EPSILON = 0.9, 1e-8
-# Places drawn for each start kept: those where the hand would touch are drawn again, as the released code does.
+# Poses drawn for each start kept. Poses that touch the object come last. The released code draws them again.
 _POOL = 4
-# L_task counts 1e5 times the squared speeds [m²/s²], summed over three simulations of which two start with 3e-4: 60.
+# L_task if nothing slows the object: 1e5 times the squared speeds [m²/s²] of three simulations: 0, 3e-4 and 3e-4.
 _ALL_MOTION = 60.0
-# A variable of every start.
+# One variable with a row for every start.
 Variable = Float[Tensor, "batch *shape"]
 # Forces on the object [N], or wrenches, at every point in every simulation.
 Forces = Float[Tensor, "batch points simulations components"]
 
 
 class LeakyMin(torch.autograd.Function):
-    """min(x, 0) whose slope is one below zero and `leak`, not zero, above: the leaky gradient of Grasp'D."""
+    """The function min(x, 0), with slope `leak` instead of zero for x ≥ 0: the leaky gradient of Grasp'D."""
 
     @staticmethod
     def forward(ctx: Any, x: Tensor, leak: float) -> Tensor:
@@ -93,9 +93,9 @@ def contact_forces(
     """Compute forces on the object at every hand point, once for each velocity of the object [N].
 
     Args:
-        height: of the hand's points above the level set, φ − r [m].
-        normals: ∇φ there. Zero gives no normal force.
-        velocities: of the object against the hand, without rotation [m/s].
+        height: height of the hand's points above the level set, φ − r [m].
+        normals: ∇φ at these points. A zero vector gives no normal force.
+        velocities: linear velocities of the object relative to the hand [m/s].
         stiffness: k_n [N/m].
         friction_stiffness: k_f [N·s/m].
         friction: Coulomb coefficient μ.
@@ -104,7 +104,7 @@ def contact_forces(
     push = stiffness * leaky_min(height, leak)
     along = normals @ velocities.T
     slip = ((velocities * velocities).sum(-1) - along * along).clamp_min(_SLIP_FLOOR).sqrt()
-    # A force per tangential speed. v_t = v − (n·v) n is put together below, in one go with the normal force.
+    # Friction force per tangential speed. The last line adds v_t = v − (n·v) n together with the normal force.
     drag = (-friction * push[..., None] / slip).clamp(max=friction_stiffness)
     return (push[..., None] + drag * along)[..., None] * normals[:, :, None] - drag[..., None] * velocities
 
@@ -116,9 +116,9 @@ class FreeBody:
     Attributes:
         mass: [kg].
         inertia: about the centre of mass [kg·m²].
-        inverse_inertia: its inverse.
+        inverse_inertia: inverse of `inertia`.
         center: centre of mass [m].
-        length: what angular velocities are multiplied by to be compared with linear ones [m].
+        length: angular velocity times this length is comparable with linear velocity [m].
     """
 
     mass: float
@@ -136,7 +136,7 @@ def make_body(
     device: torch.device | str,
     dtype: torch.dtype,
 ) -> FreeBody:
-    """Lay the body out. Thin objects keep a radius of gyration of at least a tenth of `length` about every axis."""
+    """Build the body. Thin objects get a radius of gyration of at least `length` / 10 about every axis."""
     moments, axes = np.linalg.eigh(inertia)
     moments = np.maximum(moments, mass * (0.1 * length) ** 2)
     options: dict[str, Any] = {"device": device, "dtype": dtype}
@@ -153,7 +153,7 @@ def net_wrench(
     forces: Float[Tensor, "batch points simulations 3"], arms: Points
 ) -> tuple[Float[Tensor, "batch simulations 3"], Float[Tensor, "batch simulations 3"]]:
     """Return Σ f [N] and Σ r × f [N·m] for every simulation, with `arms` r from the centre of mass [m]."""
-    # Σ rᵢ fⱼ in one matrix product. The torque is what is antisymmetric in it.
+    # One matrix product gives Σ rᵢ fⱼ. Its antisymmetric part is the torque.
     products = (arms.transpose(1, 2) @ forces.flatten(2)).unflatten(2, forces.shape[2:])
     x, y, z = products.unbind(1)
     torque = torch.stack([y[..., 2] - z[..., 1], z[..., 0] - x[..., 2], x[..., 1] - y[..., 0]], -1)
@@ -184,7 +184,7 @@ def speed_left(
 
 
 def actual(forces: Float[Tensor, "batch points simulations 3"], arms: Points, length: float, components: int) -> Forces:
-    """Return contact forces in the components of desired ones: forces (3), or wrenches, torques over `length` (6)."""
+    """Return the contact forces as forces (3 components), or as wrenches with torques over `length` (6 components)."""
     if components == 3:
         return forces
     torques = torch.linalg.cross(arms[:, :, None] / length, forces)
@@ -200,9 +200,9 @@ def physics(desired: Forces, supplied: Forces) -> Values:
 def motion_left(
     body: FreeBody, forces: Forces, arms: Points, velocities: Float[Tensor, "simulations 3"], time_step: float
 ) -> Float[Tensor, "batch simulations"]:
-    """Return the object's squared speed after one step, over the mean of its squares before (1: nothing stopped).
+    """Return the object's squared speed after one step, relative to the mean before it. 1 if no motion is stopped.
 
-    Forces with six components bring their own torques, over the body's length.
+    Forces with six components contain torques, divided by the body's length.
     """
     if forces.shape[-1] == 3:
         force, torque = net_wrench(forces, arms)
@@ -217,11 +217,11 @@ def motion_left(
 def into_cone(
     forces: Float[Tensor, "batch points simulations 3"], normals: Points, friction: float
 ) -> Float[Tensor, "batch points simulations 3"]:
-    """Return the nearest forces that only push on a surface with outward `normals`, within Coulomb friction."""
+    """Project forces into the friction cones of pushing contacts on a surface with outward `normals`."""
     along = -(forces * normals[:, :, None]).sum(-1)
     across = forces + along[..., None] * normals[:, :, None]
     side = across.norm(dim=-1)
-    # Inside the cone nothing moves. Outside, the nearest point is on its rim, or its apex.
+    # Forces inside the cone do not change. For others the nearest point is on the cone's surface or at its apex.
     rim = ((along + friction * side) / (1 + friction**2)).clamp_min(0.0)
     inside = side <= friction * along
     push = torch.where(inside, along, rim)
@@ -231,12 +231,12 @@ def into_cone(
 
 @dataclass(frozen=True)
 class Adamax:
-    """A variable of every start and its moments (Kingma & Ba 2015, §7.1).
+    """A variable of every start, with its moments (Kingma & Ba 2015, §7.1).
 
     Attributes:
         value: the iterate.
         mean: running mean of the gradient.
-        top: decaying maximum of the gradient's size, with Adam the running mean of its squares.
+        top: decaying maximum of the gradient's magnitude. With Adam, the running mean of its square.
     """
 
     value: Variable
@@ -250,14 +250,14 @@ def adamax(value: Variable) -> Adamax:
 
 
 def adamax_step(state: Adamax, gradient: Variable, rate: float, count: int, memory: float = 0.999) -> Adamax:
-    """Take step number `count`, from one. A negative rate climbs. `memory` is the share of `top` that is kept."""
+    """Take Adamax step `count`, counted from one. A negative rate maximises. `memory` is the decay rate of `top`."""
     mean = torch.lerp(gradient, state.mean, _BETA1)
     top = torch.maximum(memory * state.top, gradient.abs())
     return Adamax(torch.addcdiv(state.value, mean, top + _EPSILON, value=-rate / (1 - _BETA1**count)), mean, top)
 
 
 def adam_step(state: Adamax, gradient: Variable, rate: float, count: int, memory: float = 0.999) -> Adamax:
-    """Take Adam's step number `count`, from one (Kingma & Ba 2015, §2). `memory` is its β2."""
+    """Take Adam step `count`, counted from one (Kingma & Ba 2015, §2). `memory` is β2."""
     mean = torch.lerp(gradient, state.mean, _BETA1)
     squares = torch.lerp(gradient * gradient, state.top, memory)
     size = (squares / (1 - memory**count)).sqrt() + _EPSILON
@@ -265,23 +265,23 @@ def adam_step(state: Adamax, gradient: Variable, rate: float, count: int, memory
 
 
 def excess(value: Float[Tensor, "*shape"], bound: float) -> Float[Tensor, "*shape"]:
-    """Return how far a constraint g < C is broken, max(g − C, 0): the gradient of the Lagrangian in λ."""
+    """Return the violation of a constraint g < C: max(g − C, 0). This is the gradient of the Lagrangian in λ."""
     return (value - bound).clamp_min(0.0)
 
 
 def damped(broken: Variable, multiplier: Variable, damping: float) -> Variable:
-    """Return what a broken constraint adds to the Lagrangian: λ c + d c² / 2."""
+    """Return the term of a violated constraint in the Lagrangian: λ c + d c² / 2."""
     return broken * (multiplier + 0.5 * damping * broken)
 
 
 @torch.no_grad()
 def published_starts(problem: Problem, scene: Scene, hand: HandModel, count: int, seed: int, standoff: float) -> Poses:
-    """Draw `count` starts: palm `standoff` [m] off a random surface point, random roll, fingers open.
+    """Draw `count` starts: palm at `standoff` [m] from a random surface point, random roll, fingers open.
 
     Starts that touch the object are chosen last.
     """
     generator = torch.Generator().manual_seed(seed)
-    # Samples come in the order of the mesh's faces: unshuffled, the first that are clear would all lie on one side.
+    # Samples come in the order of the mesh's faces. Without shuffling, the chosen ones would all lie on one side.
     order = torch.randperm(_POOL * count, generator=generator)
     points, normals = (torch.as_tensor(x)[order] for x in surface_samples(scene.object.mesh, _POOL * count, seed))
     roll = math.pi * (2 * torch.rand(len(points), generator=generator, dtype=torch.float64) - 1)
@@ -297,7 +297,7 @@ def published_starts(problem: Problem, scene: Scene, hand: HandModel, count: int
 
 
 class Evaluation(NamedTuple):
-    """Terms of one evaluation, one value per start, and the outward normals at the hand's points."""
+    """Loss terms with one value per start, and the outward normals at the hand's points."""
 
     physics: Values
     task: Values
@@ -309,7 +309,7 @@ class Evaluation(NamedTuple):
 
 
 class Slope(NamedTuple):
-    """Cost, broken constraints and the Lagrangian's gradients at an iterate, by the forces too if there are any."""
+    """Cost, constraint violations, and gradients of the Lagrangian. `by_force` is None without desired forces."""
 
     cost: Values
     broken: Float[Tensor, "batch constraints"]
@@ -324,10 +324,10 @@ class RelaxedState:
 
     Attributes:
         pose: rows of translation, quaternion, joints.
-        forces: desired forces [N], of no points without relaxation.
-        multipliers: of L_task and L_limit.
-        radius: level set at the start [m].
-        loss: of the last evaluation.
+        forces: desired forces [N]. Empty without relaxation.
+        multipliers: multipliers of L_task and L_limit.
+        radius: level set r at the first step [m].
+        loss: loss of the last evaluation.
     """
 
     pose: Adamax
@@ -358,14 +358,14 @@ class Graspd2022:
 
     @property
     def time_step(self) -> float:
-        """Length of the one step [s]."""
+        """Duration of the simulation step [s]."""
         config = self.config
         if config.simulation.scaling == "published":
             return config.simulation.time_step
         return self.body.mass * config.simulation.speed * math.sqrt(3) / config.simulation.stopping_force
 
     def points(self, problem: Problem) -> PointSet:
-        """Return the hand's points that may touch."""
+        """Return the contact candidates that are used."""
         return problem.hand.fine if self.config.contact.all_candidates else problem.hand.coarse
 
     def init(self, problem: Problem, starts: Poses) -> RelaxedState:
@@ -396,7 +396,7 @@ class Graspd2022:
         loss = slope.cost + damped(slope.broken, torch.ones_like(slope.broken), 1.0).sum(-1)
         finite = torch.isfinite(slope.by_pose).all(-1) & torch.isfinite(loss)
         loss = torch.where(finite, loss, torch.inf)
-        # On a padded surface no iterate is judged.
+        # An iterate on a padded surface cannot become the best.
         better = (loss < state.best_loss) & (remaining == 0.0)
         rate = self.rate(index) * config.relaxation.force_rate
         pulled, count = state.forces, index + 1
@@ -424,7 +424,7 @@ class Graspd2022:
     def slope(
         self, problem: Problem, state: RelaxedState, index: int, radius: Values, *, pose_only: bool = False
     ) -> Slope:
-        """Differentiate the Lagrangian at an iterate, against the level set φ = `radius` [m]."""
+        """Compute the gradients of the Lagrangian at an iterate, for contact with the level set φ = `radius` [m]."""
         bounds = self.config.constraints
         pose = state.pose.value.detach().requires_grad_(True)
         forces = state.forces.value.detach().requires_grad_(not pose_only)
@@ -438,15 +438,15 @@ class Graspd2022:
         return Slope(cost.detach(), broken.detach(), by_pose, by_force[0] if by_force else None, found.normals.detach())
 
     def rate(self, index: int) -> float:
-        """Return the share of the step sizes at a step: grown while warming up, faded along half a cosine."""
+        """Return the factor of the step sizes at step `index`: a linear warm-up times a half-cosine decay."""
         config = self.config
         fade = config.final_rate + (1 - config.final_rate) * 0.5 * (1 + math.cos(math.pi * index / self.steps))
         return fade * min(1.0, index / config.warm_up) if config.warm_up else fade
 
     def moved(self, problem: Problem, pose: Adamax, gradient: Rows, when: tuple[int, int]) -> Adamax:
-        """Move the pose. `when` is the index of the step and the turn in the step.
+        """Move the pose. `when` is the index of the step, and the turn (0 or 1) in the step.
 
-        All moments follow the gradient, also of variables whose turn it is not, as in the released code.
+        As in the released code, the moments of all variables are updated, also of variables that do not move this turn.
         """
         config, (index, turn) = self.config, when
         steps = config.pose_steps
@@ -468,13 +468,13 @@ class Graspd2022:
         return unpack(x), torch.where(scored, state.best_loss, state.loss)
 
     def cost(self, found: Evaluation) -> Values:
-        """Return L_phys, or the motion itself without relaxation, with L_range and L_inter."""
+        """Return L_phys + L_range + L_inter, weighted. Without relaxation the remaining motion replaces L_phys."""
         config = self.config
         goal = config.weights.physics * found.physics if config.relaxation.enabled else found.motion
         return goal + config.weights.range * found.range + config.weights.inter * found.inter
 
     def evaluate(self, problem: Problem, pose: Rows, desired: Forces, radius: Values) -> Evaluation:
-        """Compute all terms at a pose, with desired forces, against the level set φ = `radius` [m]."""
+        """Compute all terms at a pose with desired forces, for contact with the level set φ = `radius` [m]."""
         config, body, poses, velocities = self.config, self.body, unpack(pose), self.velocities
         placed = hand_forward(problem, self.points(problem), poses)
         distance, normals = sample_sdf(problem.object.sdf, placed.points)
@@ -491,7 +491,7 @@ class Graspd2022:
         none = torch.zeros_like(radius)
         if config.relaxation.enabled:
             difference = physics(desired, actual(supplied, arms, body.length, desired.shape[-1]))
-            # The pose answers to L_phys alone, as in the released code: L_task is a matter of the forces.
+            # As in the released code, L_task depends on the forces alone. `detach` drops its gradient in the pose.
             left = motion_left(body, desired, arms.detach(), velocities, self.time_step)
             task, motion = _ALL_MOTION * left.mean(-1), none
         else:
@@ -513,7 +513,7 @@ class Graspd2022:
 
 
 def move_shares(steps: PoseStepsConfig, turn: int, joints: int) -> list[float]:
-    """Return the share of the step size of each variable in a turn of a step: position, quaternion, joints."""
+    """Return factors of the step size for position, quaternion and joints in a turn of a step. 0 for no move."""
     position, others = (1 - turn, turn) if steps.in_turns else (1, 1)
     return [position * steps.translation_share] * 3 + [others * steps.rotation_share] * 4 + [float(others)] * joints
 
@@ -525,7 +525,7 @@ def _clean(gradient: Tensor, finite: Tensor) -> Tensor:
 
 
 def plan(task: PlannerInput) -> PlannerOutput:
-    """Run Grasp'D from `starts_per_grasp` starts for every grasp asked for."""
+    """Run Grasp'D from `starts_per_grasp` starts for every requested grasp."""
     settings, thing, problem = task.config.settings, task.scene.object, task.problem
     drawn = max(1, round(task.count * settings.initial.starts_per_grasp))
     if settings.initial.kind == "published":

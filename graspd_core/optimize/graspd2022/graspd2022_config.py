@@ -8,11 +8,11 @@ from typing import Literal
 
 @dataclass(frozen=True)
 class InitialPosesConfig:
-    """Where the optimiser starts.
+    """The starts of the optimiser.
 
     Attributes:
-        starts_per_grasp: starts for each grasp asked for.
-        kind: `published`, palm towards a random surface point from `standoff` away, or `hull`, as the other methods.
+        starts_per_grasp: starts for each requested grasp.
+        kind: `published` has the palm at `standoff` from a random surface point. `hull` uses `draw_starts`.
         standoff: distance of the palm from the surface point [m].
     """
 
@@ -23,13 +23,13 @@ class InitialPosesConfig:
 
 @dataclass(frozen=True)
 class LevelSetConfig:
-    """Coarse to fine: contact with the level set φ = r, r shrinking to zero.
+    """Coarse-to-fine search: contact with the level set φ = r, where r shrinks to zero.
 
     Attributes:
-        schedule: level set at the start: `radius_start` (`paper`), or the least distance less `clearance` (`code`).
-        radius_start: of the paper [m].
-        clearance: of the hand at the start from the level set of the code [m].
-        coarse_steps: first steps, in which the level set shrinks to the surface. Zero leaves coarse to fine out.
+        schedule: first r. `paper` takes `radius_start`. `code` takes the hand's least distance minus `clearance`.
+        radius_start: first r of the paper [m].
+        clearance: distance of the hand from the first level set of the code [m].
+        coarse_steps: number of steps in which r shrinks to zero. 0 disables coarse-to-fine.
     """
 
     schedule: Literal["paper", "code"] = "paper"
@@ -43,11 +43,11 @@ class ContactConfig:
     """The penalty contact.
 
     Attributes:
-        leak: slope of the depth out of contact. Zero makes the gradient the plain one.
-        stiffness: normal force of a contact by its depth [N/m].
-        friction_stiffness: friction by tangential speed, below Coulomb's bound [N·s/m].
+        leak: slope of the penalty out of contact. 0 gives the exact gradient.
+        stiffness: normal force per depth [N/m].
+        friction_stiffness: friction force per tangential speed, below Coulomb's bound [N·s/m].
         friction: Coulomb coefficient.
-        all_candidates: contacts at all of the hand's candidates, rather than at those of `problem.candidates`.
+        all_candidates: use all contact candidates of the hand. Otherwise the first `problem.candidates` are used.
     """
 
     leak: float = 0.1
@@ -59,14 +59,13 @@ class ContactConfig:
 
 @dataclass(frozen=True)
 class SimulationConfig:
-    """The one step of the object.
+    """The single simulation step of the object.
 
     Attributes:
-        scaling: `published`, stiffness and time step as they are, in SI, or `object`, the time step in which
-            `stopping_force` stops this object.
-        stopping_force: of the scaling by object [N].
-        time_step: of the published scaling [s].
-        speed: of the object in each of its three coordinates, forwards, backwards and none [m/s].
+        scaling: `published` uses `time_step`. `object` uses the time in which `stopping_force` stops the object.
+        stopping_force: for the scaling `object` [N].
+        time_step: for the scaling `published` [s].
+        speed: initial speed along each axis [m/s]: 0, positive and negative in the three simulations.
     """
 
     scaling: Literal["published", "object"] = "published"
@@ -77,11 +76,11 @@ class SimulationConfig:
 
 @dataclass(frozen=True)
 class RelaxationConfig:
-    """Desired forces as variables (after contact-invariant optimisation).
+    """Desired forces as variables, as in contact-invariant optimisation.
 
     Attributes:
-        enabled: desired forces as variables. Without it the motion after one step is minimised directly.
-        desired: a desired force is a free `force`, a free `wrench` (the code's) or one in the friction `cone`.
+        enabled: optimise desired forces. If false, the motion after one step is minimised directly.
+        desired: kind of desired force: a free `force`, a free `wrench` (as in the code), or a force in the `cone`.
         force_rate: step size of the desired forces [N].
     """
 
@@ -92,14 +91,14 @@ class RelaxationConfig:
 
 @dataclass(frozen=True)
 class PoseStepsConfig:
-    """How the pose is stepped. The defaults are the paper's, other choices those of grasping/src/cio.py.
+    """Steps of the pose. The defaults follow the paper, the alternatives follow grasping/src/cio.py.
 
     Attributes:
-        optimiser: `adamax`, or the code's `adam`.
-        translation_share: step size of the base's position, by `pose_rate`.
-        rotation_share: step size of the base's quaternion, by `pose_rate`.
-        in_turns: a step moves the position of the base alone, then orientation and joints at what that led to.
-        within_limits: joints are put inside their limits after every move, else limits are a constraint alone.
+        optimiser: `adamax`, or `adam` as in the code.
+        translation_share: step size of the base position, relative to `pose_rate`.
+        rotation_share: step size of the base quaternion, relative to `pose_rate`.
+        in_turns: a step first moves the base position. Then it moves orientation and joints with a new gradient.
+        within_limits: clamp joints to their limits after every move. If false, limits are only a constraint.
     """
 
     optimiser: Literal["adamax", "adam"] = "adamax"
@@ -114,9 +113,9 @@ class ConstraintsConfig:
     """Bounds on L_task and L_limit, and their multipliers.
 
     Attributes:
-        task_bound: how much motion the desired forces may leave: 60 is all of it, the code's 10 a sixth [1/60 of v²].
-        limit_bound: joints may exceed their limits by this much in sum [rad].
-        damping: of the multipliers.
+        task_bound: bound on the motion that desired forces leave [1/60 of v²]. 60 is all motion. The code has 10.
+        limit_bound: bound on the sum by which joints exceed their limits [rad].
+        damping: damping coefficient of the multipliers.
         multiplier_rate: step size of the multipliers.
     """
 
@@ -128,12 +127,12 @@ class ConstraintsConfig:
 
 @dataclass(frozen=True)
 class ObjectiveWeights:
-    """Weights of what is minimised.
+    """Weights of the minimised terms.
 
     Attributes:
-        physics: of the squared differences between desired and actual forces [1/N²].
-        range: of the joints' distance from mid-range.
-        inter: of the hand's overlap with itself, and with obstacles where there are any.
+        physics: weight of the squared differences between desired and actual forces [1/N²].
+        range: weight of the joints' distance from mid-range.
+        inter: weight of self-collision, and of collision with obstacles if there are any.
     """
 
     physics: float = 0.01
@@ -143,23 +142,23 @@ class ObjectiveWeights:
 
 @dataclass(frozen=True)
 class Graspd2022Config:
-    """Grasp'D as published (docs/method.md, §1). Where paper and released code differ, a switch, the paper's first.
+    """Grasp'D as published (docs/method.md, §1). A switch selects the paper's or the code's way if they differ.
 
     Attributes:
-        initial: where the optimiser starts.
-        level_set: coarse to fine: contact with the level set φ = r, r shrinking to zero.
-        contact: the penalty contact.
-        simulation: the one step of the object.
-        relaxation: desired forces as variables (after contact-invariant optimisation).
-        pose_steps: how the pose is stepped.
+        initial: starts of the optimiser.
+        level_set: coarse-to-fine search.
+        contact: penalty contact.
+        simulation: single simulation step of the object.
+        relaxation: desired forces as variables.
+        pose_steps: steps of the pose.
         constraints: bounds on L_task and L_limit, and their multipliers.
-        weights: weights of what is minimised.
-        steps: of the optimiser.
-        pose_rate: step size of the pose [m], [half rad] and [rad].
-        beta2: decay rate of the gradient's infinity norm (Adamax) or of its squares (Adam).
-        warm_up: first steps, in which the step sizes of pose and forces grow linearly from zero.
-        final_rate: share of the step sizes that is left at the end, faded along half a cosine. One keeps them.
-        keep: the `best` iterate on the true surface, or the `last`.
+        weights: weights of the minimised terms.
+        steps: number of optimiser steps.
+        pose_rate: step size of position [m], quaternion [half rad] and joints [rad].
+        beta2: decay rate of the gradient's infinity norm (Adamax) or of its square (Adam).
+        warm_up: number of first steps, in which the step sizes of pose and forces grow linearly from zero.
+        final_rate: step sizes at the end relative to the start, after a half-cosine decay. 1 keeps them constant.
+        keep: return the `best` iterate on the true surface, or the `last` one.
     """
 
     initial: InitialPosesConfig = field(default_factory=InitialPosesConfig)

@@ -1,1 +1,1 @@
-"""The closed form's step in C++: one start at a time, value and gradient in one pass (docs/kernel.md)."""
+"""Steps of the closed-form method in C++, with value and gradient of a start in one pass (docs/kernel.md)."""

@@ -1,7 +1,7 @@
-"""Load the build of the compiled kernel that this machine can run, or say why there is none.
+"""Load the build of the compiled kernel that this machine can run, or report why there is none.
 
-`GRASPD_KERNEL` chooses: `off` for torch alone, or the name of a build, or the path of a library. Without it the best
-build that runs here is taken. The structures mirror src/layout.hpp, field by field. `load` compares their sizes.
+The environment variable `GRASPD_KERNEL` is `off` (torch alone), the name of a build, or the path of a library. The
+default is the best build that runs here. The structures mirror src/layout.hpp by field. `load` compares their sizes.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ from pathlib import Path
 
 from graspd_core.errors import ConfigError
 
-# What `setup.py` builds, best first: name of the file, instructions it needs of /proc/cpuinfo.
+# The builds of `setup.py`, best first: name of the file, and required flags in /proc/cpuinfo.
 BUILDS = {
     "v4": frozenset({"avx512f", "avx512bw", "avx512cd", "avx512dq", "avx512vl"}),
     "v3": frozenset({"avx2", "fma", "bmi2", "f16c"}),
@@ -23,7 +23,7 @@ BUILDS = {
 }
 POLL = ctypes.CFUNCTYPE(ctypes.c_int32, ctypes.c_int64)
 _INT, _FLOAT, _AT = ctypes.c_int32, ctypes.c_float, ctypes.c_void_p
-# What each function takes.
+# Argument types of each function.
 _ARGUMENTS = {
     "graspd_evaluate": [_AT, _AT, _INT, _AT, _AT, _FLOAT, _INT, _INT, _INT, _AT, _AT, _AT, _INT],
     "graspd_least_distance": [_AT, _INT, _AT, _AT, _INT],
@@ -38,7 +38,7 @@ _ARGUMENTS = {
 
 @dataclass(frozen=True)
 class Kernel:
-    """A build of the kernel and its functions. Without a library, torch evaluates and `reason` says why."""
+    """A build of the kernel. If `library` is None, torch evaluates instead and `reason` says why."""
 
     name: str
     library: ctypes.CDLL | None
@@ -46,7 +46,7 @@ class Kernel:
 
 
 def kernel() -> Kernel:
-    """Return the build that this process uses. Raises ConfigError: GRASPD_KERNEL names none."""
+    """Return the build that this process uses. Raises ConfigError: GRASPD_KERNEL names no build and no file."""
     return _kernel(os.environ.get("GRASPD_KERNEL", ""))
 
 
@@ -72,7 +72,7 @@ def _kernel(wanted: str) -> Kernel:
 
 
 def load(name: str) -> Kernel:
-    """Load one build, whether this machine has its instructions or not."""
+    """Load a build without a check that this machine supports its instructions."""
     paths = sorted(Path(__file__).parent.glob(f"{name}.*so"))
     if not paths:
         return Kernel("", None, "not built; was there a C++ compiler when graspd was installed?")
@@ -96,7 +96,7 @@ def _load(path: Path, name: str) -> Kernel:
 
 
 def _instructions() -> frozenset[str]:
-    """Return the instruction sets of this machine's processor, none where they cannot be read."""
+    """Return the instruction sets of this machine's processor. Empty if they cannot be read."""
     if platform.machine() != "x86_64":
         return frozenset()
     try:

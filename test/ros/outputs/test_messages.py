@@ -108,7 +108,7 @@ def test_with_an_arm_every_grasp_has_its_joints_and_what_is_out_of_reach_is_told
     client.send_request(id="far", header=header, object_pose=far, **SPHERE, **FEW)
     answer = client.answer("far")
     assert (answer.status, answer.error_code) == (GraspArray.FAILED, "NO_GRASP")
-    assert "m from the base of panda_like, which brings allegro_right" in answer.message
+    assert "m from the base of panda_like, whose reach with allegro_right" in answer.message
 
 
 def test_whatever_cannot_be_served_is_refused_by_name(client, node):
