@@ -247,7 +247,7 @@ def test_a_block_without_a_candidate_is_a_block(copied: DatasetStore):
         (["validate", "nowhere"], "no data set"),
         (["shape:box"], "--out is missing"),
         (["shape:box", "--out", "x", "--workers", "0"], "workers: 0"),
-        (["sample", "a", "--out", "x.csv"], ".parquet file"),
+        (["sample", "a", "--out", "x.csv"], "ends with .parquet"),
         (["merge", "a"], "--out is missing"),
         (["shape:box", "--out", "nowhere://x"], "nowhere://x"),
         (

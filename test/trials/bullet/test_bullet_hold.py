@@ -76,7 +76,7 @@ def test_coupled_joints_are_refused(gripper):
     coupled = replace(gripper, mimics=(Mimic("right_slide", 2, 0, 1.0, 0.0),))
     with (
         simulation(timestep=0.001, solver_iterations=10) as client,
-        pytest.raises(SimulatorError, match=r"no coupled joints.*right_slide"),
+        pytest.raises(SimulatorError, match=r"coupled joints .*right_slide"),
     ):
         load_hand_urdf(client, coupled, armature=0.0)
 
