@@ -229,7 +229,7 @@ def test_limits_up_to_the_largest_float_are_none(fuzz: ModuleType, folder: Path)
     ("old", "new", "message"),
     [
         ("<p>0 1 2<", "<p>0 1 99999999999999999999<", "too large"),
-        ("4 3</vcount>", "-4 11</vcount>", "names vertices that are not there"),
+        ("4 3</vcount>", "-4 11</vcount>", "names vertices that the file does not hold"),
         ('1.0"?>', '1.0" encoding="no-such"?>', "unknown encoding"),
         (
             '<instance_geometry url="#g"/>',
