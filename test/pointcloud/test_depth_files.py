@@ -157,5 +157,5 @@ def test_it_is_an_object_by_library_and_command_line(depth, camera: Path, tmp_pa
     capsys.readouterr()
     for command in (["synthesize"], ["reconstruct", "--out", str(tmp_path / "m.ply")]):
         assert main([command[0], str(image), *command[1:]]) == 2
-        told = "depth.png: an image, of depth perhaps: name the camera that took it, --camera camera.json"
+        told = "depth.png: a depth image needs the camera that took it: --camera camera.json"
         assert told in capsys.readouterr().err
