@@ -94,7 +94,7 @@ def _coerce(hint: Any, value: Any, where: str, start: Any = None, *, signed: boo
     if typing.get_origin(hint) is tuple:
         return _tuple(typing.get_args(hint), value, where)
     if isinstance(value, int) and abs(value) > _LARGEST_INTEGER:
-        raise ConfigError(f"{where}: {shown(value)} is too large")
+        raise ConfigError(f"{where}: {shown(value)} is too large; valid: up to {_LARGEST_INTEGER}")
     if hint is float and isinstance(value, int) and not isinstance(value, bool):
         value = float(value)
     if not isinstance(value, hint) or (isinstance(value, bool) and hint is not bool):
@@ -111,7 +111,7 @@ def _tuple(hints: tuple[Any, ...], value: Any, where: str) -> tuple[Any, ...]:
     return tuple(_coerce(hint, given, f"{where}[{k}]", signed=True) for k, (hint, given) in pairs)
 
 
-# Most entries of a mapping after its `<<` merges. Nested merges can multiply the entries without limit.
+# Maximum number of entries of a mapping after its `<<` merges. Nested merges can multiply the entries without limit.
 _MOST_MERGED = 10_000
 
 
@@ -128,8 +128,8 @@ class _Loader(yaml.SafeLoader):
 def parse_yaml(text: str) -> tuple[yaml.Node | None, Any]:
     """Return the node tree of a YAML text, whose nodes hold line numbers, and the value of the text.
 
-    Both are None for an empty text. Raises YamlError, a ValueError, if the text is malformed or a value does not fit
-    its tag or its form.
+    Both are None for an empty text. Raises YamlError, a ValueError, if the text is malformed or a value is invalid for
+    its tag or its format.
     """
     try:
         return yaml.compose(text, Loader=yaml.SafeLoader), yaml.load(text, Loader=_Loader)

@@ -69,7 +69,7 @@ class RoundsConfig:
     multiplies the number of starts.
 
     Attributes:
-        most: most rounds.
+        most: maximum number of rounds.
         first_budget: effort of the first round for an object of known shape that stands alone. For others it is 1.
         growth: factor on the effort from one round to the next.
     """

@@ -23,7 +23,7 @@ class SegmentationConfig:
         roi_high: upper corner of the workspace, in the cloud's frame [m]. None means no bound.
         max_range: points farther than this from their camera are ignored [m].
         voxel: side of the voxels that the scene is downsampled to, below half of `gap` [m].
-        max_voxels: most voxels of a scene. Larger scenes get larger voxels, which bounds the time.
+        max_voxels: maximum number of voxels of a scene. Larger scenes get larger voxels, which bounds the time.
         plane_tolerance: points up to this height above a plane still belong to it, higher for noisy cameras [m].
         max_plane_tolerance: greatest value of this height for noisy cameras [m].
         plane_search_width: largest distance of inliers when a plane is searched, larger for noisy cameras [m].
@@ -35,7 +35,7 @@ class SegmentationConfig:
         gap: points at least this far apart belong to two objects [m].
         max_link: points farther apart than this never belong to one object, however sparse the cloud is [m].
         neighbour_share: points with fewer neighbours than this fraction of the median are flying pixels.
-        hanging_reach: a piece that ends above the support, such as a handle, joins an object this near [m].
+        hanging_reach: a piece that ends above the support, such as a handle, belongs to an object this near [m].
         unsupported_reach: without a support, pieces this near that touch in an image form one object [m].
         smallest_object: objects smaller than this are noise [m].
         largest_object: objects larger than this are background: walls, floors, furniture [m].
@@ -81,7 +81,7 @@ class ReconstructionConfig:
     """Settings for reconstructing a closed mesh from the views of an object.
 
     Attributes:
-        max_points: most points of all views together that are used, which bounds the time.
+        max_points: maximum number of points used, of all views together, which bounds the time.
         neighbours: number of points that each local plane is fitted to. More points smooth noise and detail alike.
         stray_distance: points farther than this from their neighbours' plane are flying pixels [m].
         outline_slack: precision to which cameras see outlines and surfaces [m].
@@ -93,7 +93,7 @@ class ReconstructionConfig:
         poisson_cell: approximate width of the finest cells of Open3D's solver, twice the camera's noise [m].
         min_cell: least cell width of the grid that the surface is closed on, also twice the noise [m].
         fit_distance: a mesh is refused unless 85 % of the seen points are this near to it [m].
-        max_faces: most faces of the mesh.
+        max_faces: maximum number of faces of the mesh.
         seen_distance: surface this near to a seen point has confidence 1 [m].
         guessed_distance: surface farther than this from all seen points has confidence 0 [m].
     """

@@ -45,7 +45,7 @@ class _Builder(ET.TreeBuilder):
     """A tree builder that refuses document type declarations in any encoding."""
 
     def doctype(self, *_: object) -> None:
-        raise ValueError("a document type declaration is refused")
+        raise ValueError("a document type declaration is not allowed; remove it")
 
 
 def _joined(root: ET.Element) -> TriangleMesh:
@@ -67,7 +67,7 @@ def _joined(root: ET.Element) -> TriangleMesh:
             surfaces[geometry] = _surface(geometry, named)
         count += max(map(len, surfaces[geometry]))
         if count > _MOST_FACES:
-            raise ValueError(f"shows more than {_MOST_FACES} faces or vertices")
+            raise ValueError(f"holds more than {_MOST_FACES} faces or vertices")
         parts.append(_placed(*surfaces[geometry], pose))
     vertices = np.concatenate([np.zeros((0, 3)), *(corners for corners, _ in parts)]) * scale
     starts = np.cumsum([0, *(len(corners) for corners, _ in parts)])

@@ -69,7 +69,7 @@ def convex_parts(
     Args:
         sdf: the object's signed distance grid.
         tolerance: largest bulge of a part [m]: how far the 98th percentile of its surface may lie outside the object.
-        max_parts: most parts. If the object needs more, the bulges of some parts exceed the tolerance.
+        max_parts: maximum number of parts. If the object needs more, the bulges of some parts exceed the tolerance.
         surface_points: number of surface samples to form clusters of. Up to half as many mesh vertices are added.
     """
     points = np.vstack([_thin(mesh.vertices[np.unique(mesh.faces)], surface_points // 2),
@@ -258,7 +258,7 @@ def even_directions(count: int) -> Float[np.ndarray, "3 count"]:
 
 
 def limited_hull(points: Points, most: int) -> TriangleMesh:
-    """Return a hull of at most `most` points: the extremes along even directions, then those farthest outside it."""
+    """Return a hull of at most `most` points: the extremes along even directions, then the farthest outside these."""
     hull = _hull(points)
     if hull is None:
         return _slab(points)

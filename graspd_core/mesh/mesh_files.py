@@ -1,6 +1,6 @@
 """Mesh files: reading, checking, cleaning, writing and mass properties. Lengths are in metres.
 
-A file that holds no mesh, or half of one, raises an error that says what it holds. A guess at the unit of a file only
+A file that holds no mesh, or a part of one, raises an error that says what it holds. A guess at the unit of a file only
 goes into a message and is never applied.
 """
 
@@ -142,8 +142,8 @@ def load_mesh(path: str | Path, *, scale: float = 1.0) -> TriangleMesh:
     """Read a mesh file. Join the parts of its scene where they stand, and multiply coordinates by `scale`.
 
     Raises:
-        MeshError: the path is missing, a directory, or of an unknown ending, or the file is no mesh, cut off,
-            unreadable, or without a finite surface, or the scale is not positive.
+        MeshError: the path is missing, a directory or of an unknown ending. Or the file is no mesh, cut off, or
+            unreadable, or it has no finite surface. Or the scale is not positive.
     """
     return read_mesh(path, scale=scale)[0]
 
@@ -233,7 +233,7 @@ def check_mesh(
 
 
 def simplify(mesh: TriangleMesh, faces: int, *, aggressiveness: int = 7) -> TriangleMesh:
-    """Reduce a mesh to about `faces` triangles by quadric edge collapse. Less `aggressiveness` is slower but safer."""
+    """Reduce a mesh to about `faces` faces by quadric edge collapse. Low `aggressiveness` is slow but tears less."""
     import fast_simplification
 
     if len(mesh.faces) <= faces:

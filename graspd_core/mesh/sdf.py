@@ -150,7 +150,7 @@ def sample_sdf(
 
 
 def is_solid(sdf: GridSDF) -> bool:
-    """Return True if any node lies inside the object. None does in an open sheet or a wall much thinner than a cell."""
+    """Return True if any node lies inside the object. In open sheets and walls far thinner than a cell, none does."""
     return bool((sdf.field[0] < 0).any())
 
 
@@ -220,7 +220,7 @@ def _inside(mesh: TriangleMesh, nodes: _Vectors, distance: _Lengths, spacing: fl
 def _field(
     offset: _Vectors, normals: _Vectors, inside: Bool[np.ndarray, "x y z"], spacing: float
 ) -> Float[np.ndarray, "4 x y z"]:
-    """Return φ and its unit gradient (x − c)/φ, c the surface point of node x, or the outward face normal if φ ≈ 0."""
+    """Return φ and its unit gradient: (x − c)/φ for node x with surface point c, the outward face normal if φ ≈ 0."""
     distance = _length(offset)
     phi = np.where(inside, -distance, distance)
     far = distance > NEAR_SURFACE * spacing

@@ -106,7 +106,7 @@ def farthest_first(
 
     Args:
         size: number of points.
-        count: most indices to return. All of `chosen` are returned even if they are more.
+        count: maximum number of indices to return. All of `chosen` are returned even if they are more.
         chosen: indices of the first points.
         distances: returns the distances of a chosen point to its mates, in any unit that grows with distance.
         mates: returns the points that a chosen point is compared with. All others count as infinitely far from it.

@@ -161,7 +161,7 @@ def closest_points(
 
 # Faces within this distance of a point [m] contribute to its normal: the two of an edge, or the many of a rounding.
 _ABOUT = 3e-4
-# Most rounds of adjusting the weights of these faces, and the change of a weight below which they end.
+# Maximum rounds of adjusting the weights of these faces, and the change of a weight below which they end.
 _SWEEPS, _SETTLED = 100, 1e-7
 # Directions in which these faces are searched: towards the corners and face centres of a cube.
 _AROUND = np.array(

@@ -49,7 +49,7 @@ def merge_vertices(mesh: TriangleMesh) -> tuple[Vertices, Faces]:
 def drop_strays(mesh: TriangleMesh) -> tuple[TriangleMesh, int]:
     """Return the mesh without the vertices that no face uses, and their number.
 
-    Degenerate faces, which repeat a vertex, do not count as using it. They stay in the mesh and stay degenerate.
+    Degenerate faces, which repeat a vertex, do not count as using vertices. They stay in the mesh and stay degenerate.
     """
     a, b, c = mesh.faces.T
     used = np.zeros(len(mesh.vertices), dtype=bool)

@@ -28,7 +28,7 @@ from graspd_core.se3 import perpendicular
 from graspd_core.types import Plane, TriangleMesh
 
 GRID_RESOLUTION = 32
-# Most parts along each axis of a neighbour whose hull would contain the object.
+# Maximum number of parts along each axis of a neighbour whose hull would contain the object.
 MAX_PARTS_ACROSS = 8
 _TARGET_SAMPLES = 2000
 # A collision object is the target itself if their hulls overlap by at least this intersection over union. A box around
@@ -157,7 +157,7 @@ def _hull_corners(points: Float[np.ndarray, "_ 3"]) -> Float[np.ndarray, "_ 3"]:
 
 
 def _points_within(shape: TriangleMesh, low: Vector, high: Vector) -> Float[np.ndarray, "_ 3"]:
-    """Return surface points of a shape inside a box, and the box's corners inside the shape. Their hull bounds both."""
+    """Return points whose hull is that of a shape's part inside a box: surface points, and corners of the box."""
     from trimesh.intersections import slice_faces_plane
 
     vertices, faces = shape.vertices, shape.faces

@@ -126,7 +126,7 @@ def test_a_camera_that_says_something_else_is_named(tmp_path: Path, keys: dict[s
         ("gray.png", np.zeros((240, 320), "u1"), "a picture"),
         ("small.png", np.full((120, 160), 500, "u2"), "160 x 120 pixels, but its camera has 320 x 240"),
         ("far.npy", np.full((240, 320), 850.0), "beyond 850 m at 1 m a unit; say the unit: --units mm, or depth_unit"),
-        ("mug.ply", None, "its ending may be: png, tif, tiff, npy, npz"),
+        ("mug.ply", None, "valid endings: png, tif, tiff, npy, npz"),
         ("spoilt.png", None, "not a readable image"),
         ("nowhere.png", None, "no such depth image"),
     ],

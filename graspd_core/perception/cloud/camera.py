@@ -102,7 +102,7 @@ def camera_from_calibration(
 ) -> PinholeCamera:
     """Return the camera of a CameraInfo, from its `width`, `height`, `k` (row by row), `d` and `distortion_model`.
 
-    Raises CloudError if the model is unknown or has fewer coefficients, or if `k` is not a calibration.
+    Raises CloudError if the model is unknown or has fewer coefficients than `d`, or if `k` is not a calibration.
     """
     if len(matrix) != 9:
         raise CloudError(f"camera: its matrix K has {len(matrix)} numbers; 9 are needed")
@@ -136,12 +136,12 @@ def project(points: Float[np.ndarray, "*batch 3"], camera: PinholeCamera) -> _Pl
 
 
 def distort(ideal: _Places, coefficients: _Numbers) -> _Places:
-    """Return the distorted positions of undistorted ones, both on the plane of unit depth."""
+    """Apply the lens distortion to positions on the plane of unit depth."""
     return _lens(ideal, coefficients)[0] if any(coefficients) else np.array(ideal, dtype=float)
 
 
 def undistort(seen: _Places, coefficients: _Numbers) -> _Places:
-    """Return the undistorted positions of distorted ones, on the plane of unit depth, NaN if there are none."""
+    """Return the inverse of `distort`, NaN where the lens model has no inverse."""
     if not any(coefficients):
         return np.array(seen, dtype=float)
     target = np.asarray(seen, dtype=float)
@@ -185,7 +185,7 @@ def _lens(ideal: _Places, coefficients: _Numbers) -> tuple[_Places, Float[np.nda
 def reaches_image_border(
     points: Float[np.ndarray, "points 3"], eye: Vector, mine: Bool[np.ndarray, "points"], width: float
 ) -> bool:
-    """Return True if an object touches an image border, which is a side of the view's outline that others touch too.
+    """Return True if an object touches an image border: a side of the view's outline that other points touch too.
 
     The outline is the convex hull of all viewing directions. Points within `width` [rad] of it touch it.
     """
@@ -262,7 +262,7 @@ def size_of_compressed(data: memoryview) -> tuple[int, int]:
     """Return width and height [pixels] of the PNG in a CompressedImage. Raises CloudError if there is no usable PNG."""
     at = _png_begins(data) + 16
     if len(data) < at + _PNG_SIZES.size:
-        raise CloudError(f"depth image: {len(data)} bytes are no whole PNG")
+        raise CloudError(f"depth image: its PNG is cut off, the message has {len(data)} bytes")
     width, height = _PNG_SIZES.unpack_from(data, at)
     if width * height > _MOST_PIXELS:
         raise CloudError(f"depth image: a PNG of {width} x {height} pixels; at most {_MOST_PIXELS} are read")
@@ -317,7 +317,7 @@ def _png_begins(data: memoryview) -> int:
 def cloud_from_depth(
     depth: DepthImage, camera: PinholeCamera, T_frame_camera: Float[np.ndarray, "4 4"] | None = None
 ) -> PointCloud:
-    """Return the points of a depth image, in the camera frame, or in `frame` if `T_frame_camera` is given.
+    """Return the points of a depth image in the camera frame, or moved by `T_frame_camera` if that is given.
 
     Args:
         depth: depth along the optical axis [m]. Pixels of 0, NaN or infinity give no point.

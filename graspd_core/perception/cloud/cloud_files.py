@@ -20,7 +20,7 @@ from graspd_core.perception.cloud.camera import camera_from_calibration, cloud_f
 from graspd_core.perception.cloud.point_cloud import PointCloud, Points, Vector
 from graspd_core.perception.cloud.viewpoint_check import seen_from
 
-# Most bytes that one byte of LZF, the compression of pcd files, can expand to: three bytes make 264.
+# One byte of LZF, the compression of pcd files, expands to at most this many: three bytes make 264.
 _DENSEST = 88
 _ORDERS = {"ascii": "", "binary_little_endian": "<", "binary_big_endian": ">"}
 _TYPES = {
@@ -32,7 +32,7 @@ RECORDINGS = ("mcap", "db3", "bag")
 CLOUD_ENDINGS = ("npy", "npz", "pcd", "ply", "xyz")
 
 _ROTATION_TOLERANCE = 1e-4
-# Most bytes that an archive may unpack to. 100 depth images of two million pixels are a quarter of it.
+# Maximum number of bytes that an archive may unpack to. 100 depth images of two million pixels are a quarter of it.
 _MAX_UNPACKED_BYTES = 2**31
 
 
@@ -107,11 +107,11 @@ def read_pcd_points(path: Path) -> Points | None:
         columns = [sum(counts[:place]) for place in places]
         return _numbers_of_text(data[at:], 0, points, sum(counts))[:, columns]
     if header["DATA"][0] not in ("binary", "binary_compressed"):
-        raise ValueError(f"its DATA {header['DATA'][0][:40]!r} is none of ascii, binary and binary_compressed")
+        raise ValueError(f"its DATA {header['DATA'][0][:40]!r} is unknown; valid: ascii, binary, binary_compressed")
     # Other words could be NumPy types, or even expressions that NumPy evaluates.
     odd = [kind for kind in header["TYPE"] if kind.upper() not in ("F", "I", "U")]
     if odd:
-        raise ValueError(f"its TYPE {odd[0][:40]!r} is none of F, I and U")
+        raise ValueError(f"its TYPE {odd[0][:40]!r} is unknown; valid: F, I, U")
     sizes = [int(word) * count for word, count in zip(header["SIZE"], counts, strict=True)]
     if header["DATA"][0] == "binary_compressed":
         _refuse_false_sizes(data[at:], points * sum(sizes))
@@ -184,7 +184,9 @@ def is_cloud_file(path: str | Path) -> bool:
 
 
 def load_views(path: str | Path, viewpoint: Vector | None = None) -> tuple[PointCloud, ...]:
-    """Read the views of one or several cameras from a file, in one frame. For points, `viewpoint` replaces the file's.
+    """Read the views of one or several cameras from a file, in one frame.
+
+    `viewpoint` is the camera's position [m] for a file of points. It replaces the position in the file.
 
     * ply, xyz, npy (n×3 or h×w×3): points [m], seen from the origin.
     * pcd: points [m], seen from its `VIEWPOINT`. The format does not give the camera's direction.

@@ -158,7 +158,7 @@ def _pixels(path: Path) -> np.ndarray:
         raise CloudError(f"{path}: no such depth image")
     if path.suffix.lower().lstrip(".") not in DEPTH_ENDINGS:
         valid = ", ".join(DEPTH_ENDINGS)
-        raise CloudError(f"{path}: with a camera a depth image is needed; its ending may be: {valid}")
+        raise CloudError(f"{path}: a camera file needs a depth image; valid endings: {valid}")
     if not is_depth_image(path):
         arrays = read_numpy(path)
         name = "points" if path.suffix.lower() == ".npy" else "depth"

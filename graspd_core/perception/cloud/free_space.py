@@ -1,7 +1,7 @@
-"""Free space: the space that the cameras saw to be empty, before seen surface and beside the object's outline.
+"""Free space: the space that the cameras saw to be empty, in front of surfaces and beside the object's outline.
 
-Each view's points of the object become a small depth image. A guessed point before the surface in this image, or beside
-the outline, contradicts the camera. A point behind the surface is hidden, so it is possible.
+Each view's points of the object become a small depth image. A guessed point in front of the surface in this image, or
+beside the outline, contradicts the camera. A point behind the surface is hidden, so it is possible.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from graspd_core.se3 import perpendicular
 Places = Float[np.ndarray, "*batch 3"]
 Depths = Float[np.ndarray, "*batch"]
 
-# Most cells of a depth image across the object. More cells would show no more.
+# Maximum number of cells of a depth image across the object. More cells would show no more.
 MAX_IMAGE_CELLS = 160
 # Number of nearest points, including the point itself, that define the spacing at a point.
 SPACING_NEIGHBOURS = 5
@@ -92,7 +92,7 @@ def make_view_depths(views: Sequence[PointCloud], whole: Sequence[PointCloud] = 
 def _make_view_depth(view: PointCloud, whole: PointCloud | None) -> ViewDepth | None:
     """Return the depth image of a view's points. Holes of a few cells are filled, since they are missing pixels.
 
-    Return None if fewer than five points are before the camera, or if all points are in one line of sight.
+    Return None if fewer than five points are in front of the camera, or if all points are in one line of sight.
     """
     from scipy.ndimage import binary_closing, distance_transform_edt, minimum_filter
     from scipy.spatial import KDTree
@@ -135,7 +135,7 @@ def _occluders(
     cell: float,
     depth: Float[np.ndarray, "x y"],
 ) -> Float[np.ndarray, "x y"]:
-    """Return the depth of the occluder before the object in each cell [m], infinite if there is none."""
+    """Return the depth of the occluder in front of the object in each cell [m], infinite if there is none."""
     from scipy.ndimage import binary_closing, distance_transform_edt
 
     # Only few of the points are in the object's image. Points that are not finite compare as false.

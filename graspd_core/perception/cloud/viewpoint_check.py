@@ -29,7 +29,7 @@ Surfaces = tuple[Float[np.ndarray, "n 3"], Int[np.ndarray, "n"], Bool[np.ndarray
 MAX_HIDDEN_SHARE, MAX_AWAY_SHARE = 0.006, 0.06
 MAX_MISFIT = 0.5  # pixels
 MAX_STRETCH, MAX_SKEW = 1.15, 0.05  # of a camera's pixels, which are square
-# Most points and pixels to check, and fewest.
+# Maximum numbers of points and pixels to check, and minimum numbers.
 MOST_POINTS, MOST_PIXELS = 4000, 4000
 FEWEST_POINTS, FEWEST_PIXELS = 50, 100
 NEIGHBOURS = 8
@@ -106,7 +106,7 @@ def check_scene(views: Sequence[PointCloud]) -> None:
 
 
 def check_thing(thing: PointCloud, view: PointCloud, up: Vector | None = None) -> str:
-    """Check that a view of an object can have been seen from its viewpoint, and not from behind or through others.
+    """Check that a view of an object can have been seen from its viewpoint: not from behind, nor through surfaces.
 
     Args:
         thing: the points of the object that was cut out of the view.
@@ -136,7 +136,7 @@ def check_thing(thing: PointCloud, view: PointCloud, up: Vector | None = None) -
         raise _refusal(view.viewpoint, f"{100 * away:.0f} % of the object would be seen from behind")
     hidden = hidden_share(near, view.viewpoint, nearer, tree)
     if hidden > MAX_HIDDEN_SHARE:
-        raise _refusal(view.viewpoint, f"{100 * hidden:.1f} % of what is about the object is hidden from there")
+        raise _refusal(view.viewpoint, f"{100 * hidden:.1f} % of the points around the object are hidden from there")
     if up is None and bulge(own, surfaces, view.viewpoint) < LEAST_BULGE:
         return f"from {_said(view.viewpoint)} the object is hollow, or seen from the back of its surface"
     middle = own.mean(0)
@@ -371,7 +371,7 @@ def _pinhole_place(grid: Pixels) -> Vector | None:
 
 
 def _pixels(grid: Pixels) -> tuple[Points, Points]:
-    """Return a sample of the pixels, in homogeneous units of the image's larger side, and their points [m]."""
+    """Return some pixels, homogeneous and in units of the image's larger side, and their points [m]."""
     height, width = grid.shape[:2]
     step = max(1, int(np.sqrt(height * width / MOST_PIXELS)))
     some = grid[::step, ::step]

@@ -126,7 +126,7 @@ def orient_view(view: PointCloud, step: float, settings: ReconstructionConfig) -
 
 
 def thin(surfels: Surfels, step: float) -> Surfels:
-    """Return the mean surfel of each cube of side `step` [m], one for each of six directions that normals face."""
+    """Return one mean surfel for each cube of side `step` [m] and each of six directions that normals face."""
     if len(surfels.points) == 0:
         return surfels
     facing = np.abs(surfels.normals).argmax(1)

@@ -241,7 +241,7 @@ def _finished(mesh: TriangleMesh, seen: Surfels, settings: ReconstructionConfig)
     fitted = float((surface_distance(make_surface(mesh), seen.points) < settings.fit_distance).mean())
     if not is_closed(mesh) or fitted < MIN_FITTED_SHARE:
         raise CloudError(
-            f"cloud: no closed surface fits its {len(seen.points)} points ({fitted:.0%} do); more views are needed, "
+            f"cloud: no closed surface fits its {len(seen.points)} points ({fitted:.0%} fit); more views are needed, "
             "or more points where its walls are thin"
         )
     return mesh
