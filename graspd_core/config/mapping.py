@@ -69,7 +69,7 @@ def yaml_values(path: Path) -> Iterator[Any]:
 
 
 def _line_of(node: yaml.Node | None, keys: list[str]) -> int:
-    """Return the line of the last of nested keys, or of the last one that is there."""
+    """Return the line of the innermost of nested keys, or of the innermost key that the file holds."""
     line = 1
     for key in keys:
         found = [pair for pair in node.value if pair[0].value == key] if isinstance(node, yaml.MappingNode) else []

@@ -171,12 +171,12 @@ def read_mesh(path: str | Path, *, scale: float = 1.0) -> tuple[TriangleMesh, tu
 def save_mesh(path: str | Path | TriangleMesh, mesh: TriangleMesh | str | Path) -> None:
     """Write a mesh in the format of the path's ending. Raises MeshError for an ending that cannot be written.
 
-    The order of version 0.1, with the mesh first, is taken with a warning until 0.3.
+    Version 0.1 took the mesh first. This order still works until 0.3, with a DeprecationWarning.
     """
     import trimesh
 
     if isinstance(path, TriangleMesh):
-        warnings.warn("save_mesh(mesh, path) goes with version 0.3; the path comes first", DeprecationWarning, 2)
+        warnings.warn("save_mesh(mesh, path) is removed in version 0.3; pass the path first", DeprecationWarning, 2)
         path, mesh = mesh, path
     path, mesh = Path(cast(str, path)), cast(TriangleMesh, mesh)
     ending = path.suffix.lower().lstrip(".")

@@ -437,6 +437,6 @@ def test_a_broken_file_is_refused(tmp_path: Path, old: str, new: str, message: s
 
 
 def test_the_order_of_an_earlier_version_still_saves_with_a_warning(tmp_path: Path):
-    with pytest.warns(DeprecationWarning, match="the path comes first"):
+    with pytest.warns(DeprecationWarning, match="pass the path first"):
         save_mesh(make_shape("box"), tmp_path / "box.ply")
     assert len(load_mesh(tmp_path / "box.ply").faces) == len(make_shape("box").faces)

@@ -188,7 +188,7 @@ def hidden_share(points: Points, viewpoint: Vector, nearer: Float[np.ndarray, "p
     ray = points - viewpoint
     distance = np.linalg.norm(ray, axis=1)
     length = float(np.linalg.norm(ray.mean(0)))
-    # From the middle of the points one direction is as good as another.
+    # From the mean of the points, any direction is as good as another.
     axis = ray.mean(0) / length if length > 1e-12 else np.array([0.0, 0.0, 1.0])
     right = perpendicular(axis)
     across = np.column_stack([ray @ right, ray @ np.cross(axis, right)])

@@ -38,9 +38,9 @@ MIN_VIEW_COSINE = 0.1
 MAX_RISE_CELLS = 4.0
 LAYERED_SHARE, LAYERED_SHARE_OF_CAMERA = 0.15, 0.45
 
-# Number of points to check whether they enclose a body, and limits. Openness is 0 to 0.056 for shapes from all round (thin
-# walls, 1 mm noise), 0.075 to 0.32 for single views of `CHOSEN_ON` (studies/cameras.py). Normals of a whole scene may
-# cancel, but it is flat: three volumes over area and size are 0.003 to 0.028, and 0.12 or more for bodies.
+# Number of points to check whether they enclose a body, and limits. Openness is 0 to 0.056 for shapes from all round
+# (thin walls, 1 mm noise), 0.075 to 0.32 for single views of `CHOSEN_ON` (studies/cameras.py). Normals of a whole scene
+# may cancel, but it is flat: three volumes over area and size are 0.003 to 0.028, and 0.12 or more for bodies.
 ENCLOSING_POINTS, MOST_OPEN, LEAST_VOLUME = 4000, 0.06, 0.06
 # For an all-round cloud: neighbours for a normal, directions from which the cloud is viewed, and passes of orientation.
 NORMAL_NEIGHBOURS, UNPOSED_DIRECTIONS, UNPOSED_PASSES = 24, 150, 3
