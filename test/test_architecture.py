@@ -64,7 +64,7 @@ MAY_IMPORT = {
 # The layout aims at 22,000 of graspd_core, 4,500 of graspd_ros and 26,000 of test. What inputs are checked for, which
 # came after it, took 1,700, 500 and 3,300.
 MAX_PACKAGE_LINES = {
-    "graspd_core": 27_271,
+    "graspd_core": 27_266,
     "graspd_ros": 5_200,
     "graspd_bench": 8_800,
     "graspd_dataset": 2_959,
@@ -74,7 +74,7 @@ MAX_PACKAGE_LINES = {
 }
 # Lines that a program reaches through its imports, those inside functions too.
 # The layout aims at 22,000 of the node.
-MAX_REACH = {"graspd_core.cli.synthesize_command": 22_025, "graspd_ros.node": 25_821}
+MAX_REACH = {"graspd_core.cli.synthesize_command": 22_020, "graspd_ros.node": 25_816}
 
 # Docstrings with a semicolon, by path prefix, at most. The longest prefix of a path counts, all other files have none.
 MAX_SEMICOLONS = {

@@ -1,4 +1,4 @@
-"""Settings that several folders share: frozen dataclasses. A method's own lie in its folder."""
+"""Settings that several folders share, as frozen dataclasses. The folder of each method holds the method's own."""
 
 from __future__ import annotations
 

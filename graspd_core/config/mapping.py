@@ -1,4 +1,4 @@
-"""Config dataclasses from nested mappings and from a user's YAML, with errors that name the key."""
+"""Reading of config dataclasses from nested mappings and YAML files, with errors that name the key."""
 
 from __future__ import annotations
 
@@ -18,15 +18,15 @@ from graspd_core.errors import ConfigError, choices, shown
 
 T = TypeVar("T")
 
-# Beyond this no library takes a whole number.
+# Larger integers do not fit into the 64 bits of the libraries.
 _LARGEST_INTEGER = 2**63 - 1
 
 
 def from_mapping(cls: type[T], values: Any, where: str = "config", start: T | None = None) -> T:
     """Build a config dataclass from nested mappings.
 
-    Missing values are those of `start`, or the defaults of the class. Raises ConfigError: an unknown key or a value of
-    the wrong type, by its dotted name, with the valid choices.
+    Missing values come from `start`, or else from the defaults of the class. Raises ConfigError for an unknown key or a
+    value of the wrong type. The error names the dotted key and the valid choices.
     """
     fields = dataclasses.fields(typing.cast(Any, cls))
     factories = {f.name: f.default_factory for f in fields if f.default_factory is not dataclasses.MISSING}
@@ -38,7 +38,7 @@ def from_mapping(cls: type[T], values: Any, where: str = "config", start: T | No
 def coerced(
     hints: Mapping[str, Any], values: Any, where: str, starts: Mapping[str, Any] = types.MappingProxyType({})
 ) -> dict[str, Any]:
-    """Return a mapping's values, each as the type that `hints` names for its key. Raises ConfigError: see above."""
+    """Return a mapping's values, converted to the types in `hints`. Raises ConfigError like `from_mapping`."""
     if not isinstance(values, Mapping):
         raise ConfigError(f"{where}: expected a mapping of {sorted(hints)}, got {shown(values)}")
     if unknown := sorted(set(values) - set(hints), key=shown):
@@ -48,10 +48,10 @@ def coerced(
 
 @contextmanager
 def yaml_values(path: Path) -> Iterator[Any]:
-    """Give the values of a YAML file, an empty mapping for an empty one.
+    """Yield the values of a YAML file, an empty mapping for an empty file.
 
-    A ConfigError inside that begins with a dotted key, of which the file's name may be the start, gets the path and the
-    line of that key. Raises ConfigError: missing or malformed.
+    If a ConfigError raised inside the block begins with a dotted key, with or without the file's name, it gets the path
+    and the line of that key. Raises ConfigError if the file is missing or malformed.
     """
     try:
         node, values = parse_yaml(path.read_text(encoding="utf-8"))
@@ -69,7 +69,7 @@ def yaml_values(path: Path) -> Iterator[Any]:
 
 
 def _line_of(node: yaml.Node | None, keys: list[str]) -> int:
-    """Return the line of the last of nested keys, or of the last one that is there."""
+    """Return the line of the innermost of nested keys, or of the innermost key that the file holds."""
     line = 1
     for key in keys:
         found = [pair for pair in node.value if pair[0].value == key] if isinstance(node, yaml.MappingNode) else []
@@ -94,7 +94,7 @@ def _coerce(hint: Any, value: Any, where: str, start: Any = None, *, signed: boo
     if typing.get_origin(hint) is tuple:
         return _tuple(typing.get_args(hint), value, where)
     if isinstance(value, int) and abs(value) > _LARGEST_INTEGER:
-        raise ConfigError(f"{where}: {shown(value)} is too large")
+        raise ConfigError(f"{where}: {shown(value)} is too large; valid: up to {_LARGEST_INTEGER}")
     if hint is float and isinstance(value, int) and not isinstance(value, bool):
         value = float(value)
     if not isinstance(value, hint) or (isinstance(value, bool) and hint is not bool):
@@ -111,12 +111,12 @@ def _tuple(hints: tuple[Any, ...], value: Any, where: str) -> tuple[Any, ...]:
     return tuple(_coerce(hint, given, f"{where}[{k}]", signed=True) for k, (hint, given) in pairs)
 
 
-# Entries of a mapping once what it merges is in it. Each `<<` may take in all of another mapping, twice and again.
+# Maximum number of entries of a mapping after its `<<` merges. Nested merges can multiply the entries without limit.
 _MOST_MERGED = 10_000
 
 
 class _Loader(yaml.SafeLoader):
-    """The safe loader, with an end to merging."""
+    """The safe YAML loader, with a limit on the entries that `<<` merges add."""
 
     def flatten_mapping(self, node: yaml.MappingNode) -> None:
         super().flatten_mapping(node)
@@ -126,15 +126,15 @@ class _Loader(yaml.SafeLoader):
 
 
 def parse_yaml(text: str) -> tuple[yaml.Node | None, Any]:
-    """Return the node tree of a YAML text, which knows its lines, and its value.
+    """Return the node tree of a YAML text, whose nodes hold line numbers, and the value of the text.
 
-    Both are None for an empty text. Raises YamlError, a ValueError: the text is not well-formed, or a value is not what
-    its tag or its looks say.
+    Both are None for an empty text. Raises YamlError, a ValueError, if the text is malformed or a value is invalid for
+    its tag or its format.
     """
     try:
         return yaml.compose(text, Loader=yaml.SafeLoader), yaml.load(text, Loader=_Loader)
-    # Beside its own errors the library lets through whatever a value brings about that is not what its tag or its looks
-    # say: a date of a thirteenth month, a number without end, `!!timestamp x`.
+    # Beside its own errors, the library passes on whatever a value raises that does not fit its tag or its form: a date
+    # in month 13, an endless number, `!!timestamp x`.
     except Exception as error:
         mark = getattr(error, "problem_mark", None)
         problem = getattr(error, "problem", None) or getattr(error, "reason", None) or type(error).__name__
@@ -142,7 +142,7 @@ def parse_yaml(text: str) -> tuple[yaml.Node | None, Any]:
 
 
 class YamlError(ValueError):
-    """The problem of a YAML text and its line."""
+    """A problem in a YAML text, with its line number."""
 
     def __init__(self, line: int, problem: str) -> None:
         super().__init__(f"line {line}: {problem}")

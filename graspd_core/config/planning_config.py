@@ -1,4 +1,4 @@
-"""Settings of planning that every method shares, and the certainty that a verified grasp of a seen object needs."""
+"""Planning settings that all methods share, and the certainty that a verified grasp of a seen object needs."""
 
 from __future__ import annotations
 
@@ -9,19 +9,19 @@ from graspd_core.errors import ConfigError
 
 @dataclass(frozen=True)
 class ProblemConfig:
-    """How scene and hand are laid out as tensors. Every method's poses become grasps and are ranked in these terms.
+    """Settings of the optimisation problem made from scene and hand. All methods rank their grasps by this problem.
 
     Attributes:
-        candidates: contact candidates looked at by most steps.
-        fine_candidates: contact candidates looked at while polishing.
-        patch_size: how many of them make a patch that is drawn to the surface by itself, so that all of the hand comes
-            to touch. Zero: of each rigid group of links the nearest candidate is drawn.
-        softness: how deep the hand gives, as flesh does [m]: the object is planned with as so much thinner, without its
-            sharp points. Trials know nothing of it.
-        features: sharp points of the object looked at while polishing, more on large thin walls.
-        directions: disturbance wrenches.
-        friction: coefficient planned with, below the object's own, so that contacts keep a margin.
-        confidence_floor: weight of a contact on surface that was only guessed, against one on seen surface.
+        candidates: number of contact candidates that most steps use.
+        fine_candidates: number of contact candidates that polishing uses.
+        patch_size: number of contact candidates in a patch. Each patch is drawn to the surface separately, so that all
+            of the hand touches. Zero draws only the nearest candidate of each rigid group of links.
+        softness: depth by which the hand yields, as flesh does [m]. Planning makes the object thinner by this depth and
+            ignores its sharp points. Trials do not model it.
+        features: number of sharp points of the object that polishing uses, more on large thin walls.
+        directions: number of disturbance wrenches.
+        friction: friction coefficient for planning, below the object's own, so that contacts keep a margin.
+        confidence_floor: weight of a contact on guessed surface, relative to a contact on seen surface.
     """
 
     candidates: int = 256
@@ -36,18 +36,18 @@ class ProblemConfig:
 
 @dataclass(frozen=True)
 class GraspStagesConfig:
-    """Pregrasp and squeeze.
+    """Settings of the pregrasp and squeeze postures.
 
     Attributes:
         touch_reach: links this near to the object count as touching [m].
         grip_force: sum of the normal forces of the squeeze [N].
-        stiffness: position gain of the hand's joint controllers, of turning joints [N·m/rad].
-        slide_stiffness: the same of sliding joints [N/m].
-        effort_share: share of a joint's effort limit that the squeeze may use.
-        clearance: distance from the object that the pregrasp opens to [m].
-        open_steps: steps of the search for the pregrasp.
-        open_joint_rate: its step size of the joints [rad]. Sliding ones take 0.05 m for a radian.
-        open_base_rate: its step size of the base [m].
+        stiffness: position gain of the controllers of the hand's revolute joints [N·m/rad].
+        slide_stiffness: position gain of the controllers of the hand's prismatic joints [N/m].
+        effort_share: fraction of a joint's effort limit that the squeeze may use.
+        clearance: distance from the object to which the pregrasp opens [m].
+        open_steps: number of steps in the search for the pregrasp.
+        open_joint_rate: step size of revolute joints in this search [rad]. Prismatic joints move 0.05 m per radian.
+        open_base_rate: step size of the hand's base in this search [m].
     """
 
     touch_reach: float = 0.002
@@ -63,15 +63,15 @@ class GraspStagesConfig:
 
 @dataclass(frozen=True)
 class RoundsConfig:
-    """Rounds of optimiser and trial: if too few grasps held, the next round starts from other poses.
+    """Settings for rounds of optimisation and trials. If too few grasps held, the next round starts from other poses.
 
-    An effort of one is the method's settings as they are. Less is that share of its steps, more is as many times its
-    starts.
+    An effort of 1 means the method's settings unchanged. Below 1, it multiplies the number of steps. Above 1, it
+    multiplies the number of starts.
 
     Attributes:
-        most: rounds at most.
-        first_budget: effort of the first round on an object of known shape that stands alone, one for all others.
-        growth: times as much effort with every further round.
+        most: maximum number of rounds.
+        first_budget: effort of the first round for an object of known shape that stands alone. For others it is 1.
+        growth: factor on the effort from one round to the next.
     """
 
     most: int = 3
@@ -81,13 +81,13 @@ class RoundsConfig:
 
 @dataclass(frozen=True)
 class RobustConfig:
-    """Verified grasps tried again with the hand out of place by up to 5 mm and 5°: those that still hold come first.
+    """Settings for further trials of verified grasps, with the hand misplaced by up to 5 mm and 5°.
 
     Attributes:
-        rank: whether that is done, by `trials` further hold trials for every verified grasp.
-        trials: hold trials of each.
-        hold_time: how long each of their six pulls lasts [s].
-        friction: whether the least friction at which each verified grasp holds is measured.
+        rank: whether to run these trials, and rank grasps that still hold first.
+        trials: number of these hold trials for each verified grasp.
+        hold_time: duration of each of a trial's six pulls [s].
+        friction: whether to measure the least friction at which each verified grasp holds.
     """
 
     rank: bool = False
@@ -98,14 +98,14 @@ class RobustConfig:
 
 @dataclass(frozen=True)
 class HeldShares:
-    """Shares of the grasps of a single view that hold on the true object at its own mass (docs/clouds.md).
+    """Fraction of grasps planned from a single view that hold on the true object at its true mass (docs/clouds.md).
 
     Attributes:
-        likeliest: of those that hold on the likeliest shape.
-        places: of these, that hold out of place as well.
-        shapes: of these, that hold on two other shapes of the hidden side as well.
-        fails_places: of those that hold on the likeliest shape but not out of place.
-        fails_shapes: of those that hold out of place but not on two other shapes.
+        likeliest: among the grasps whose trial on the likeliest shape holds.
+        places: among the grasps that also hold with the hand misplaced.
+        shapes: among the grasps that also hold on two other shapes of the hidden side.
+        fails_places: among the grasps that hold on the likeliest shape but not with the hand misplaced.
+        fails_shapes: among the grasps that hold with the hand misplaced but not on two other shapes.
     """
 
     likeliest: float
@@ -115,34 +115,34 @@ class HeldShares:
     fails_shapes: float
 
 
-# Over 1,323 grasps of 186 single views (docs/clouds.md says of what). Where the mass is the heavy end of what the
-# volume allows, trials ask for more than most things weigh. Where it is known, places and friction leave less room.
+# Measured on 1,323 grasps of 186 single views (docs/clouds.md). An assumed mass is the heavy end of what the volume
+# allows, so trials lift more than most objects weigh. With a known mass, grasps that hold have less margin.
 MASS_ASSUMED = HeldShares(0.92, 0.94, 0.98, 0.87, 0.83)
 MASS_KNOWN = HeldShares(0.70, 0.89, 0.95, 0.60, 0.59)
-# Of 325 drawn household things and ten scans, about this much times x weigh at most x of the heavy end of their volume:
-# 0.26 at 0.25, 0.64 at 0.5, 0.85 at 0.7. A hand whose payload is less than the heavy end holds no more of them.
+# The fraction of objects that weigh at most x times the heavy end of their volume is about this times x. Of 325 drawn
+# household objects and ten scans it is 0.26 at x = 0.25, 0.64 at 0.5, 0.85 at 0.7.
 _LIGHT_GROWTH = 1.3
-# A grasp is verified at less than the heavy end only if at least this share of the things weighs less than the payload.
+# With a payload below the heavy end, a grasp is verified only if at least this fraction of objects is lighter than it.
 LEAST_LIGHT = 0.5
-# The share that holds of grasps on a scene that something speaks against, as a cloud whose camera stood elsewhere.
+# Fraction of grasps that hold on a doubtful scene, such as one whose camera may have stood elsewhere.
 DOUBTED_SHARE = 0.6
 
 
 def share_as_light(mass: float, heavy: float) -> float:
-    """Return the share of things whose volume allows `heavy` that weigh at most `mass` [kg]."""
+    """Return the fraction of objects that weigh at most `mass` [kg], if their volume allows up to `heavy` [kg]."""
     return min(1.0, _LIGHT_GROWTH * mass / heavy)
 
 
 @dataclass(frozen=True)
 class CertaintyConfig:
-    """What a grasp of an object that cameras saw must survive to be called verified.
+    """How certain a grasp of an object seen by cameras must be to count as verified.
 
     Attributes:
-        probability: of holding on the true object, at least. 0 asks for trials of the likeliest shape alone, more for
-            further ones (docs/clouds.md).
+        probability: least probability of holding on the true object. With 0, only the likeliest shape is tried. Higher
+            values require further trials (docs/clouds.md).
 
     Raises:
-        ConfigError: no trials make a grasp so sure.
+        ConfigError: the probability is higher than any trials can ensure.
     """
 
     probability: float = 0.95

@@ -1,4 +1,4 @@
-"""Settings of the way from clouds to a scene, and the file that holds them."""
+"""Settings for building a scene from point clouds, and the YAML file that holds them."""
 
 from __future__ import annotations
 
@@ -10,42 +10,42 @@ from typing import Any, Literal
 from graspd_core.config.mapping import from_mapping, yaml_values
 from graspd_core.errors import ConfigError
 
-# Below these nothing is left to work with. Every other number is above zero.
+# Least values of some settings. All other numbers must be above zero.
 _MINIMA = {"max_voxels": 1000, "neighbours": 4, "max_points": 1000, "max_faces": 100}
 
 
 @dataclass(frozen=True)
 class SegmentationConfig:
-    """How an object is cut out of a scene that depth cameras saw.
+    """Settings for cutting the object to grasp out of a scene that depth cameras saw.
 
     Attributes:
-        roi_low: lower corner of the workspace, in the cloud's frame [m]. None: no bound.
-        roi_high: upper corner of the workspace, in the cloud's frame [m]. None: no bound.
+        roi_low: lower corner of the workspace, in the cloud's frame [m]. None means no bound.
+        roi_high: upper corner of the workspace, in the cloud's frame [m]. None means no bound.
         max_range: points farther than this from their camera are ignored [m].
-        voxel: side of the voxels that the scene is thinned by, finer than half of `gap` [m].
-        max_voxels: larger scenes get larger voxels, which bounds the time.
-        plane_tolerance: least height above the support that counts as above it, more where the camera is noisier [m].
-        max_plane_tolerance: the most that this height may become where the camera is noisy [m].
-        plane_search_width: half width of the slab in which a plane is searched, wider for noisy cameras [m].
-        ransac_trials: planes that are tried, more if the support is a small share of the scene.
-        support_size: the smaller side of a support's visible part is at least this [m].
-        support_margin: a flat part goes on so far beyond what was seen of it [m].
-        support_area_ratio: area of a support over the area of what stands on it, at least.
-        contact: what stands on a support comes at least this near to it, occlusion and noise considered [m].
-        gap: things at least this far apart are two [m].
-        max_link: points farther apart than this are never one thing, however sparse the cloud is [m].
-        neighbour_share: points with fewer neighbours than this share of the median are flying pixels.
-        hanging_reach: a piece that ends above the support, a handle, belongs to what is this near [m].
-        unsupported_reach: without a support, pieces this near that touch in an image are one thing [m].
-        smallest_object: things smaller than this are noise [m].
-        largest_object: things larger than this are background: walls, floors, furniture [m].
-        min_points: things seen by fewer points than this are noise.
-        border_width: what is this near to the edge of the image may go on beyond, some three pixels [rad].
-        target_reach: a target point this near to a thing means that thing [m].
-        target_share: a box or mask that covers this share of a thing means all of it.
-        obstacle_range: other things are reported as far as this from the object [m].
-        piled: things lie on each other: parts at a seam are things although they do not reach the support, and a heap
-            of any size may stand on it.
+        voxel: side of the voxels that the scene is downsampled to, below half of `gap` [m].
+        max_voxels: maximum number of voxels of a scene. Larger scenes get larger voxels, which bounds the time.
+        plane_tolerance: points up to this height above a plane still belong to it, higher for noisy cameras [m].
+        max_plane_tolerance: greatest value of this height for noisy cameras [m].
+        plane_search_width: largest distance of inliers when a plane is searched, larger for noisy cameras [m].
+        ransac_trials: number of planes that RANSAC tries. Use more if the support is a small part of the scene.
+        support_size: least width of the visible part of a support plane [m].
+        support_margin: a flat part is assumed to continue this far beyond its visible part [m].
+        support_area_ratio: least area of a support, divided by the area of the objects on it.
+        contact: largest gap between a support and an object on it, beyond occlusion and noise [m].
+        gap: points at least this far apart belong to two objects [m].
+        max_link: points farther apart than this never belong to one object, however sparse the cloud is [m].
+        neighbour_share: points with fewer neighbours than this fraction of the median are flying pixels.
+        hanging_reach: a piece that ends above the support, such as a handle, belongs to an object this near [m].
+        unsupported_reach: without a support, pieces this near that touch in an image form one object [m].
+        smallest_object: objects smaller than this are noise [m].
+        largest_object: objects larger than this are background: walls, floors, furniture [m].
+        min_points: objects with fewer points than this are noise.
+        border_width: objects this near to the image border may continue beyond it, some three pixels [rad].
+        target_reach: a target point selects an object within this distance [m].
+        target_share: a box or mask that covers this fraction of an object selects all of it.
+        obstacle_range: other objects up to this distance from the object become obstacles [m].
+        piled: whether objects lie on each other. If so, parts divided by a seam are objects even if they do not reach
+            the support, and a heap of any size may stand on it.
     """
 
     roi_low: tuple[float, float, float] | None = None
@@ -78,22 +78,22 @@ class SegmentationConfig:
 
 @dataclass(frozen=True)
 class ReconstructionConfig:
-    """How the views of an object become a closed mesh.
+    """Settings for reconstructing a closed mesh from the views of an object.
 
     Attributes:
-        max_points: points of all views together that are used, which bounds the time.
-        neighbours: points that each local plane is fitted to. More smooth noise and detail alike.
+        max_points: maximum number of points used, of all views together, which bounds the time.
+        neighbours: number of points that each local plane is fitted to. More points smooth noise and detail alike.
         stray_distance: points farther than this from their neighbours' plane are flying pixels [m].
-        outline_slack: cameras see outlines and surfaces to within this [m].
+        outline_slack: precision to which cameras see outlines and surfaces [m].
         surface_tolerance: a guessed point this near to a seen surface confirms the guess [m].
-        open_share: a surface with a smaller share missing is not completed.
-        revolution_share: a body of revolution explains this share of what was seen, at least.
-        symmetry_worth: a symmetry of a lower score is chance. The highest score is 2.6.
-        poisson: whose surface goes through the points: of a grid, then of Open3D where that does not fit, or of open3d.
-        poisson_cell: the finest cells of Open3D's are about so wide: twice the camera's noise [m].
-        min_cell: least cell of the grid that the surface is closed on, likewise [m].
-        fit_distance: 85 % of the seen points lie this near to the mesh, or it is refused [m].
-        max_faces: faces of the mesh, at most.
+        open_share: the hidden side is guessed only if at least this fraction of the surface is missing.
+        revolution_share: least fraction of the seen surface that a body of revolution must explain.
+        symmetry_worth: symmetries with a lower score are ignored as chance. The highest score is 2.6.
+        poisson: solver for the surface: "open3d", or "grid", which uses Open3D only if its own surface does not fit.
+        poisson_cell: approximate width of the finest cells of Open3D's solver, twice the camera's noise [m].
+        min_cell: least cell width of the grid that the surface is closed on, also twice the noise [m].
+        fit_distance: a mesh is refused unless 85 % of the seen points are this near to it [m].
+        max_faces: maximum number of faces of the mesh.
         seen_distance: surface this near to a seen point has confidence 1 [m].
         guessed_distance: surface farther than this from all seen points has confidence 0 [m].
     """
@@ -117,12 +117,12 @@ class ReconstructionConfig:
 
 @dataclass(frozen=True)
 class ObstacleConfig:
-    """How the things beside the object become convex hulls that the hand keeps out of.
+    """Settings for the convex hulls of neighbouring objects, which the hand avoids.
 
     Attributes:
-        padding: skin around what was seen [m].
-        part_size: a thing whose hull would hold the object, a tray, is split into parts of this size [m].
-        min_points: things of fewer points are noise.
+        padding: thickness added around the seen points [m].
+        part_size: a neighbour whose hull would contain the object, e.g. a tray, is split into parts of this size [m].
+        min_points: neighbours with fewer points are noise.
     """
 
     padding: float = 0.005
@@ -132,12 +132,12 @@ class ObstacleConfig:
 
 @dataclass(frozen=True)
 class SceneConfig:
-    """How clouds become a scene.
+    """Settings for building a scene from point clouds.
 
     Attributes:
-        segmentation: the object is cut out of the cloud.
-        reconstruction: the object's points become a closed mesh.
-        obstacles: the things beside it become hulls.
+        segmentation: for cutting the object out of the cloud.
+        reconstruction: for making a closed mesh of the object's points.
+        obstacles: for making hulls of the neighbouring objects.
     """
 
     segmentation: SegmentationConfig = field(default_factory=SegmentationConfig)
@@ -146,10 +146,10 @@ class SceneConfig:
 
 
 def load_scene_config(path: str | Path) -> SceneConfig:
-    """Read the settings of a scene from a YAML file.
+    """Read the settings of a scene from a YAML file. Missing settings keep their defaults.
 
-    Missing ones have their defaults. Raises ConfigError: no such file, malformed YAML, an unknown key (the valid ones
-    are listed), or a bad value.
+    Raises ConfigError for a missing file, malformed YAML, an unknown key or a bad value. The error lists the valid
+    keys.
     """
     with yaml_values(path := Path(path)) as values:
         config = from_mapping(SceneConfig, values, where=path.name)

@@ -1,1 +1,1 @@
-"""Meshes: read, mended, measured. Signed distance, convex parts, sharp features, authored shapes."""
+"""Triangle meshes: files, repair, mass properties, signed distance, convex parts, sharp features, built-in shapes."""

@@ -1,8 +1,8 @@
-"""COLLADA (.dae) meshes: the surface only, without the libraries that read the whole format.
+"""Reader of the surfaces in COLLADA (.dae) files. It needs no COLLADA library.
 
-It reads triangles, strips, fans, polylists and polygons of every geometry that the visual scene instances, with the
-node transforms, in metres by the file's `<unit>`. Polygons are cut into fans, which is exact for convex ones. The up
-axis is ignored, as ROS viewers do. Format: COLLADA 1.4.1 specification, Khronos Group, 2008.
+It reads the triangles, strips, fans, polylists and polygons of every geometry that the visual scene instances. It
+applies the node transforms, and converts lengths to metres by the file's `<unit>`. Polygons are split into fans, which
+is exact for convex ones. The up axis is ignored, as ROS viewers do. Format: COLLADA 1.4.1, Khronos Group, 2008.
 """
 
 from __future__ import annotations
@@ -17,22 +17,22 @@ from graspd_core.se3 import axis_rotation
 from graspd_core.types import TriangleMesh
 
 _MOST_NODES = 4000
-# A page of nodes can show a geometry many times over.
+# A few nodes can instance the same geometry very many times.
 _MOST_FACES = 20_000_000
 _FACES = ("triangles", "tristrips", "polylist", "polygons", "trifans")
 
 
 def read_dae(path: Path) -> TriangleMesh:
-    """Read all surfaces of a COLLADA file, joined, in the file's coordinates [m].
+    """Read all surfaces of a COLLADA file and join them into one mesh [m], with the axes of the file.
 
     Raises:
-        ValueError: the file is not COLLADA, declares entities, holds no faces, or refers to something missing.
-        OSError: it cannot be read.
+        ValueError: the file is not COLLADA, declares a document type, holds no faces, or refers to a missing element.
+        OSError: the file cannot be read.
     """
     data = path.read_bytes()
     try:
         root = ET.fromstring(data, parser=ET.XMLParser(target=_Builder()))
-        # What is too large for a float or an integer is found below, where numbers and indices are checked.
+        # Numbers too large for a float or an integer are found below, where values and indices are checked.
         with np.errstate(over="ignore", invalid="ignore"):
             return _joined(root)
     except (ET.ParseError, LookupError) as error:
@@ -45,7 +45,7 @@ class _Builder(ET.TreeBuilder):
     """A tree builder that refuses document type declarations in any encoding."""
 
     def doctype(self, *_: object) -> None:
-        raise ValueError("a document type declaration is refused")
+        raise ValueError("a document type declaration is not allowed; remove it")
 
 
 def _joined(root: ET.Element) -> TriangleMesh:
@@ -67,7 +67,7 @@ def _joined(root: ET.Element) -> TriangleMesh:
             surfaces[geometry] = _surface(geometry, named)
         count += max(map(len, surfaces[geometry]))
         if count > _MOST_FACES:
-            raise ValueError(f"shows more than {_MOST_FACES} faces or vertices")
+            raise ValueError(f"holds more than {_MOST_FACES} faces or vertices")
         parts.append(_placed(*surfaces[geometry], pose))
     vertices = np.concatenate([np.zeros((0, 3)), *(corners for corners, _ in parts)]) * scale
     starts = np.cumsum([0, *(len(corners) for corners, _ in parts)])
@@ -87,7 +87,7 @@ def _instances(roots: list[ET.Element], named: dict[str, ET.Element]) -> list[tu
         above, node = stack.pop()
         visits += 1
         if visits > _MOST_NODES:
-            raise ValueError(f"more than {_MOST_NODES} nodes, or nodes in a circle")
+            raise ValueError(f"more than {_MOST_NODES} nodes, or a node that contains itself")
         pose = above @ _pose(node)
         for instance in (*node.findall("instance_geometry"), *node.findall("instance_controller")):
             geometry = _target(named, instance.get("url"))
@@ -123,7 +123,7 @@ def _pose(node: ET.Element) -> Float[np.ndarray, "4 4"]:
 def _surface(
     geometry: ET.Element, named: dict[str, ET.Element]
 ) -> tuple[Float[np.ndarray, "vertices 3"], Int[np.ndarray, "faces 3"]]:
-    """Return vertices and faces of a geometry in its own frame. Parts that share vertices share them here too."""
+    """Return the vertices and faces of a geometry in its own frame. Vertices that parts share stay shared."""
     vertices, faces, count = [np.zeros((0, 3))], [np.zeros((0, 3), dtype=np.int64)], 0
     known: dict[ET.Element, tuple[int, int]] = {}
     for element in geometry.iterfind("mesh/*"):
@@ -151,10 +151,10 @@ def _surface(
             sides = np.array((element.findtext("vcount") or "").split(), dtype=np.int64)
         else:
             sides = np.array([len(loop) for loop in loops], dtype=np.int64)
-        # Each count for itself: the sum of absurd ones could come round to a small number.
+        # Each count is checked alone, because the sum of absurd counts could overflow to a small number.
         few = not (sides < 0).any() and (sides <= len(indices)).all() and sides.sum() <= len(indices)
         if not few or (len(indices) and not 0 <= indices.min() <= indices.max() < available):
-            raise ValueError(f"<{element.tag}> names vertices that are not there")
+            raise ValueError(f"<{element.tag}> names vertices that the file does not hold")
         faces.append(_fans(indices, sides) + start)
     return np.concatenate(vertices), np.concatenate(faces)
 

@@ -1,6 +1,6 @@
-"""Pieces of one mesh. Tiny floating pieces are dropped, and separate bodies are reported.
+"""Connected pieces of a mesh: dropping tiny floating pieces, and counting separate bodies.
 
-Scanners and careless exports leave floating pieces. A hand grasps separate bodies as if they were one rigid body.
+Scanners and careless exports leave floating pieces. Planning would treat separate bodies as one rigid body.
 """
 
 from __future__ import annotations
@@ -15,15 +15,15 @@ from graspd_core.mesh.surface_queries import make_surface, surface_distance, win
 from graspd_core.mesh.topology import scaled_normals
 from graspd_core.types import TriangleMesh
 
-# A piece is tiny below this share of the extent of the piece with the most area, and what stays must hold this share of
-# all area: a surface that is in pieces everywhere, as loose triangles are, loses none.
+# A piece is tiny if its extent is below this fraction of the extent of the piece with the most area. Nothing is dropped
+# unless the other pieces hold at least this fraction of all area, so a mesh of loose triangles stays whole.
 TINY, STAYS = 0.05, 0.98
 
 
 def drop_small_components(mesh: TriangleMesh) -> tuple[TriangleMesh, int]:
-    """Return the mesh without its small components, and their number.
+    """Return the mesh without its small floating pieces, and the number of dropped pieces.
 
-    A small component shares no vertex with the rest, is tiny, and lies farther from the rest than it is large. A bump,
+    Such a piece is tiny, shares no vertex with the rest, and its distance from the rest exceeds its own extent. A bump,
     a screw's head or a loose triangle that touches the body stays.
     """
     piece = face_components(mesh)
@@ -48,7 +48,7 @@ def drop_small_components(mesh: TriangleMesh) -> tuple[TriangleMesh, int]:
 
 
 def face_components(mesh: TriangleMesh) -> Int[np.ndarray, "faces"]:
-    """Return the number of the piece that each face belongs to. Pieces share no vertex."""
+    """Return the index of the connected piece of each face. Pieces share no vertex."""
     a, b, c = mesh.faces.T
     rows, columns = np.concatenate([a, b]), np.concatenate([b, c])
     shared = coo_matrix((np.ones(len(rows), dtype=bool), (rows, columns)), shape=(len(mesh.vertices),) * 2)
@@ -64,17 +64,17 @@ def _extents(corners: Float[np.ndarray, "faces 3 3"], piece: Int[np.ndarray, "fa
     return np.linalg.norm(high - low, axis=1)
 
 
-# Pieces of surface that come nearer to each other than this share of the mesh's extent are of one body: parts that were
-# modelled one by one touch, reach into each other, or miss each other by little.
+# Pieces nearer to each other than this fraction of the mesh's extent form one body. Parts that were modelled one by one
+# touch, overlap, or miss each other by little.
 _APART = 0.05
-# Points that stand for the surface beside its vertices: from one to the next it is half of that or less.
+# Sample points that represent the surface beside its vertices. Neighbouring samples are at most half of that apart.
 _SAMPLES = 4096
 
 
 def bodies_apart(mesh: TriangleMesh) -> tuple[int, float]:
-    """Return the number of bodies, and the gap from the largest to its nearest [m], infinite for one body.
+    """Return the number of separate bodies, and the gap [m] from the largest to the nearest other body.
 
-    What lies within the largest, as the inside of a hollow wall does, belongs to it.
+    For one body the gap is infinite. Pieces inside the largest body belong to it, such as the inner side of a wall.
     """
     pieces = face_components(mesh)
     if not pieces.any():
@@ -98,7 +98,7 @@ def bodies_apart(mesh: TriangleMesh) -> tuple[int, float]:
 def _points(
     mesh: TriangleMesh, pieces: Int[np.ndarray, "faces"]
 ) -> tuple[Float[np.ndarray, "points 3"], Int[np.ndarray, "points"]]:
-    """Return the corners of all faces, points spread over them by area, and the piece of each point."""
+    """Return the vertices of all faces and points spread over the faces by area, with the piece of each point."""
     rng = np.random.default_rng(0)
     corners = mesh.vertices[mesh.faces]
     area = np.linalg.norm(scaled_normals(mesh.vertices, mesh.faces), axis=1)
@@ -114,7 +114,7 @@ def _grown(
     among: Bool[np.ndarray, "points"],
     reach: float,
 ) -> Bool[np.ndarray, "points"]:
-    """Return which of the points `among` belong to the most extended piece, or to pieces joined to it."""
+    """Return which points in `among` are of the longest piece or of pieces linked to it by gaps below `reach` [m]."""
     low, high = np.full((2, int(owner.max()) + 1, 3), np.inf)
     np.minimum.at(low, owner[among], points[among])
     np.minimum.at(high, owner[among], -points[among])

@@ -1,8 +1,8 @@
-"""Convex parts that fill an object and leave its hollows hollow, by greedy planar cuts. Metres, in the object's frame.
+"""Approximate convex decomposition of an object by greedy planar cuts, in the object frame [m]. Hollows stay hollow.
 
-A cluster of surface points stands for the convex hull of its points. The cluster whose hull reaches farthest outside
-the object, by the signed distance grid, is cut by the plane that leaves the least bulge. This goes on until no hull
-bulges by more than the tolerance or the parts are used up.
+Each part is the convex hull of a cluster of surface points. The bulge of a cluster is how far its hull extends outside
+the object, by the signed distance grid. The cluster with the largest bulge is cut by the plane that leaves the least
+bulge, until all bulges are within tolerance or there are enough parts. Then touching clusters are joined again.
 """
 
 from __future__ import annotations
@@ -22,15 +22,15 @@ from graspd_core.mesh.sdf import GridSDF
 from graspd_core.types import TriangleMesh
 
 SURFACE_POINTS = 6000
-# Points and hull samples that a bulge is measured on. The parts themselves are hulls of all their points.
+# Numbers of points and of hull samples that a bulge is measured on. The parts themselves are hulls of all their points.
 TRIAL_POINTS, TRIAL_SAMPLES = 320, 100
-# Cuts lie between so many slices of equal thickness. They are compared on segments between pairs of points, given as
-# shares of the list of points that cover all pairs evenly (Roberts' sequence). The best are compared by their hulls.
+# Candidate cuts lie between this many slices of equal thickness. They are compared on segments between pairs of points,
+# and the best ones then by their hulls. Roberts' sequence spreads the pairs, as fractions of the list of points.
 SLICES, SHORTLIST = 12, 3
 PAIRS = np.modf(np.arange(1, 2001)[:, None] * [0.7548776662, 0.5698402910])[0]
-# Two clusters are compared on the segments between all pairs of so many points of each.
+# The bulge of two joined clusters is estimated on segments between all pairs of this many points of each.
 PAIRED_POINTS, PAIRED_QUANTILE = 12, 0.95
-# Cuts go on to this many times the parts asked for, because many are joined again.
+# Cutting continues to this many times `max_parts`, because many parts are joined again.
 SURPLUS = 1.5
 SHARES = (np.arange(TRIAL_SAMPLES) + 0.5) / TRIAL_SAMPLES
 # Places within a triangle (barycentric), spread by the golden ratio.
@@ -39,12 +39,12 @@ SPOTS = np.stack([1 - _root, _root * (1 - _along), _root * _along], 1)
 
 # Parts overlap by twice this [m], so that nothing slips between them.
 OVERLAP = 0.0005
-# Corners of a part: the fewer the parts, the more each can have.
+# Least and most vertices of one part, and vertices of all parts together.
 FEWEST_VERTICES, MOST_VERTICES, ALL_VERTICES = 48, 256, 1536
-# Points of a round hull that its corners are chosen from, for each corner.
+# Points of a large hull that are considered for each vertex of its simplified hull.
 CHOICE = 12
 
-# Any number of rows: clusters of one list differ in theirs.
+# The number of rows is free, because the clusters of a list differ in size.
 Points = Float[np.ndarray, "_ 3"]
 
 
@@ -67,10 +67,10 @@ def convex_parts(
     """Return convex closed meshes whose union approximates the object.
 
     Args:
-        sdf: the object's distance grid, which says what lies outside.
-        tolerance: how far a part may reach outside the object [m] (98th percentile of its surface) before it is cut.
-        max_parts: parts at most. An object that needs more keeps its last parts bulging.
-        surface_points: number of points that the parts are made of, plus up to half as many vertices of the mesh.
+        sdf: the object's signed distance grid.
+        tolerance: largest bulge of a part [m]: how far the 98th percentile of its surface may lie outside the object.
+        max_parts: maximum number of parts. If the object needs more, the bulges of some parts exceed the tolerance.
+        surface_points: number of surface samples to form clusters of. Up to half as many mesh vertices are added.
     """
     points = np.vstack([_thin(mesh.vertices[np.unique(mesh.faces)], surface_points // 2),
                         surface_samples(mesh, surface_points, 0)[0]])  # fmt: skip
@@ -82,7 +82,7 @@ def convex_parts(
 
 
 def _cut_up(sdf: GridSDF, points: Points, tolerance: float, most: int) -> list[Points]:
-    """Cut the worst cluster until none bulges by more than the tolerance, or there are `most`."""
+    """Cut the cluster with the largest bulge until all bulges are within `tolerance` [m] or `most` clusters exist."""
     ticket = count()
     heap: list[tuple[float, int, Points]] = []
     done: list[Points] = []
@@ -90,7 +90,7 @@ def _cut_up(sdf: GridSDF, points: Points, tolerance: float, most: int) -> list[P
     def sort(cluster: Points) -> None:
         bulge = _bulge(sdf, _thin(cluster, 2 * TRIAL_POINTS))
         if bulge > tolerance + _blur(sdf, cluster):
-            # The ticket settles ties, because arrays have no order.
+            # The ticket breaks ties, because arrays have no order.
             heapq.heappush(heap, (-bulge, next(ticket), cluster))
         else:
             done.append(cluster)
@@ -115,11 +115,11 @@ def _best_cut(sdf: GridSDF, cluster: Points) -> _Cut | None:
 
 
 def _promising_cuts(sdf: GridSDF, cluster: Points) -> list[_Cut]:
-    """Return the best cut across each axis of space and of the cluster, at most `SHORTLIST`, best first.
+    """Return the best cut across each coordinate axis and each principal axis, at most `SHORTLIST` cuts, best first.
 
-    Segments between points of a cluster lie in its hull, so the distance of their middles outside the object samples
-    the bulge. A cut leaves the segments with both ends on one side. Their mean, times the points of that side, stands
-    for the volume of the bulge there. One set of segments compares all cuts without a hull.
+    Segments between points of a cluster lie in its hull. So the bulge is sampled by how far their midpoints lie outside
+    the object. After a cut, only segments with both ends on one side remain. Their mean distance times the number of
+    points on that side estimates the volume of the bulge. One set of segments scores all cuts without computing hulls.
     """
     pairs = (PAIRS * len(cluster)).astype(int)
     outside = (_outside(sdf, cluster[pairs].mean(1)) - _blur(sdf, cluster)).clip(0)
@@ -133,9 +133,9 @@ def _promising_cuts(sdf: GridSDF, cluster: Points) -> list[_Cut]:
     left_below = _sums_below(slices[pairs].max(1), outside)
     left_above = outside.sum() - _sums_below(slices[pairs].min(1), outside)
     share = np.arange(1, SLICES) / SLICES
-    # Where no segment shows anything, halves are as good as any.
+    # If no segment is outside the object, cuts near the middle are preferred.
     left = left_below / np.maximum(below, 1) + left_above / np.maximum(above, 1) + 1e-9 * np.abs(share - 0.5)
-    # Fewer than four points a side span no hull. A side thinner than the overlap would get the other side back.
+    # Fewer than four points span no hull. A side thinner than the overlap would get the points of the other side back.
     thin = span[:, None] * np.minimum(share, 1 - share) < 2 * OVERLAP
     left[(below < 4) | (above < 4) | thin] = np.inf
     best = left.argmin(1)
@@ -148,7 +148,7 @@ def _sums_below(
 ) -> Float[np.ndarray, "directions cuts"]:
     directions = slices.shape[1]
     flat = (slices + SLICES * np.arange(directions)).ravel()
-    # Of no weights at all numpy counts in integers.
+    # Without any weights, NumPy returns integers.
     sums = np.bincount(flat, np.repeat(weights, directions), minlength=SLICES * directions).astype(float, copy=False)
     return np.cumsum(sums.reshape(directions, SLICES), axis=1)[:, :-1]
 
@@ -160,7 +160,7 @@ def _bulge_left(sdf: GridSDF, points: Points, cut: _Cut) -> float:
 
 
 def _join(sdf: GridSDF, clusters: list[Points], tolerance: float, most: int) -> list[Points]:
-    """Join touching clusters, least bulge first, while that stays in tolerance, and on until `most` are left."""
+    """Join touching clusters, least bulge first, while that is within `tolerance` [m] or over `most` clusters exist."""
     alive = dict(enumerate(clusters))
     boxes = {name: (cluster.min(0), cluster.max(0) + OVERLAP) for name, cluster in alive.items()}
     heap: list[tuple[float, bool, int, int]] = []
@@ -226,9 +226,9 @@ def _hull(points: Points) -> ConvexHull | None:
 
 
 def _hull_samples(hull: ConvexHull) -> Float[np.ndarray, "_ 3"]:
-    """Return one point per equal share of the hull's area, faster than `surface_samples`."""
+    """Return points spread evenly over the hull's area. This is faster than `surface_samples`."""
     a, b, c = hull.points[hull.simplices].transpose(1, 0, 2)
-    # Twice the area, without np.cross: that costs as much as all the rest.
+    # Twice the area. `np.cross` would take as long as the whole rest of the function.
     (ux, uy, uz), (vx, vy, vz) = (b - a).T, (c - a).T
     total = np.cumsum(np.sqrt((uy * vz - uz * vy) ** 2 + (uz * vx - ux * vz) ** 2 + (ux * vy - uy * vx) ** 2))
     chosen = np.minimum(np.searchsorted(total, SHARES * total[-1]), len(total) - 1)
@@ -251,14 +251,14 @@ def _evenly(points: Points, count: int) -> Float[np.ndarray, "count 3"]:
 
 
 def even_directions(count: int) -> Float[np.ndarray, "3 count"]:
-    """Return unit directions spread evenly on a golden spiral, a column each."""
+    """Return unit vectors spread evenly over the sphere on a golden spiral, one per column."""
     turn = np.arange(count) + 0.5
     polar, azimuth = np.arccos(1 - 2 * turn / count), np.pi * (1 + 5**0.5) * turn
     return np.stack([np.cos(azimuth) * np.sin(polar), np.sin(azimuth) * np.sin(polar), np.cos(polar)])
 
 
 def limited_hull(points: Points, most: int) -> TriangleMesh:
-    """Return the hull of at most `most` of the points: extremes along even directions, then always the farthest out."""
+    """Return a hull of at most `most` points: the extremes along even directions, then the farthest outside these."""
     hull = _hull(points)
     if hull is None:
         return _slab(points)
@@ -269,7 +269,7 @@ def limited_hull(points: Points, most: int) -> TriangleMesh:
         while len(chosen) < most:
             found = _hull(corners[sorted(chosen)])
             if found is None:
-                # All even directions ended in one plane, or in less: so thin that only its own axes span it.
+                # The extremes lie in one plane, on a line or in a point. Add the extremes along the principal axes.
                 along = corners @ np.linalg.eigh(np.cov(corners.T))[1]
                 ends = {*along.argmin(0).tolist(), *along.argmax(0).tolist()}
                 chosen |= ends if not ends <= chosen else set(range(len(corners)))
@@ -281,20 +281,20 @@ def limited_hull(points: Points, most: int) -> TriangleMesh:
 
 
 def _slab(points: Points) -> TriangleMesh:
-    """Return a flat cluster as a plate one millimetre thick, across its thinnest direction."""
+    """Return a flat cluster as a plate that is one millimetre thick along the cluster's thinnest direction."""
     _, principal = np.linalg.eigh(np.cov(points.T))
     lift = principal[:, 0] * OVERLAP
     spread = np.vstack([points - lift, points + lift])
     hull = _hull(spread)
     if hull is not None:
         return hull_surface(spread[hull.vertices])
-    # All on a line, or one point: a small box about them.
+    # The points lie on a line or coincide, so a small box is put around them.
     corners = np.stack(np.meshgrid(*[(-OVERLAP, OVERLAP)] * 3), -1).reshape(-1, 3)
     return hull_surface(np.vstack([points.min(0) + corners, points.max(0) + corners]))
 
 
 def hull_surface(corners: Points) -> TriangleMesh:
-    """Return the surface of the convex hull of points, wound outwards."""
+    """Return the convex hull of points as a mesh whose faces wind outwards."""
     hull = ConvexHull(corners)
     a, b, c = corners[hull.simplices].transpose(1, 0, 2)
     inward = (np.cross(b - a, c - a) * hull.equations[:, :3]).sum(1) < 0

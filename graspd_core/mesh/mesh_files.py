@@ -1,7 +1,7 @@
-"""Meshes in and out: reading, checking, cleaning, measuring. Lengths in metres.
+"""Mesh files: reading, checking, cleaning, writing and mass properties. Lengths are in metres.
 
-Files that hold no mesh, or half of one, are refused by what they are. A guess at the unit of a file goes into a message
-and is never applied.
+A file that holds no mesh, or a part of one, raises an error that says what it holds. A guess at the unit of a file only
+goes into a message and is never applied.
 """
 
 from __future__ import annotations
@@ -25,14 +25,14 @@ from graspd_core.mesh.components import drop_small_components, face_components
 from graspd_core.mesh.surface_queries import winding_inside
 from graspd_core.types import TriangleMesh
 
-# The largest extent that a mesh may have [m]: what lies outside is a mistake of units, not a thing to grasp.
+# A mesh's longest side must lie in this range [m]. Outside it, the unit of the file is wrong.
 SMALLEST, LARGEST = 0.002, 2.0
-# Outside this [m] a size is allowed, and doubted aloud.
+# A size outside this range [m] is accepted with a warning.
 SMALL, LARGE = 0.008, 0.5
-# A graspable thing is about this large [m], and within this ratio of it.
+# Usual size of a graspable object [m], and the largest usual ratio between an object's size and that.
 USUAL, SPREAD = 0.12, 6.0
 
-# What would turn a file's coordinates into metres: the number that library, command line and node take, and the factor.
+# Scales that may turn a file's coordinates into metres: as users pass them, and as a factor.
 REMEDIES = {
     "scale 0.001 (from mm)": 1e-3,
     "scale 0.01 (from cm)": 1e-2,
@@ -42,18 +42,18 @@ REMEDIES = {
 
 
 def unit_advice(size: float, scale: float = 1.0) -> str:
-    """Return the scales that turn `size` [m] into the size of a graspable object, the likeliest first.
+    """Return advice on the scales that turn `size` [m] into the size of a graspable object, likeliest first.
 
     Args:
-        scale: what was passed already. The advice replaces it.
+        scale: the scale that `size` already includes. The advised scales replace it.
     """
-    # Of absurd numbers, whose ratio overflows, too.
+    # Limited, so that the ratio of absurd numbers does not overflow.
     given = min(max(size / scale, 1e-200), 1e200)
     remedies = REMEDIES if scale == 1 else {"scale 1": 1.0} | REMEDIES
     likely = sorted(remedies, key=lambda option: _strangeness(given * remedies[option]))
     kept = {option: remedies[option] for option in likely if _strangeness(given * remedies[option]) < log(SPREAD)}
     if not kept:
-        # No unit that files come in: scaled once too often, or for another purpose.
+        # No usual unit fits, so the nearest power of ten is advised.
         factor = 10.0 ** ceil(log10(USUAL / given) - 0.5)
         kept = {f"scale {factor:g}": factor}
     return ", ".join(f"{option} makes it {_length(given * factor)}" for option, factor in kept.items())
@@ -67,7 +67,7 @@ def _length(size: float) -> str:
     return f"{1000 * size:.3g} mm" if size < 1 else f"{size:.3g} m"
 
 
-# How other things begin that come under a mesh's name.
+# First bytes of other kinds of file that are found under a mesh's file name.
 _OTHERS = (
     (b"version https://git-lfs", "a git-LFS pointer to the mesh, not the mesh; `git lfs pull` fetches it"),
     (b"\x89PNG", "a PNG picture, not a mesh"),
@@ -79,14 +79,14 @@ _OTHERS = (
     (b"<!doctype html", "a page of HTML, not a mesh"),
     (b"<html", "a page of HTML, not a mesh"),
 )
-# What is looked at of either end [bytes].
+# Number of bytes that are inspected at each end of a file.
 _LOOK = 4096
-# A binary STL: its header with the number of triangles, and each triangle [bytes]. Nobody writes more triangles.
+# Binary STL: bytes of the header with the triangle count, bytes per triangle, and the greatest plausible count.
 _HEADER, _TRIANGLE, _MOST_TRIANGLES = 84, 50, 10**8
 
 
 def refuse_broken(path: Path) -> None:
-    """Raise MeshError for a file that is no mesh, or an STL or OBJ that was cut off."""
+    """Raise MeshError if a file is empty or another kind of file, or if it is an STL or OBJ that is cut off."""
     with path.open("rb") as file:
         head = file.read(_LOOK)
         size = file.seek(0, os.SEEK_END)
@@ -114,7 +114,7 @@ def _cut_stl(head: bytes, tail: bytes, size: int) -> str:
 
 
 def _cut_obj(tail: bytes) -> str:
-    """Return what is missing of an unfinished last line, empty for a whole one."""
+    """Return a description of an unfinished last line, empty if the last line is complete."""
     line = tail.replace(b"\r", b"\n").rpartition(b"\n")[2].decode("utf-8", errors="replace")
     words = line.split()
     if not words or words[0] not in ("v", "vn", "f"):
@@ -133,23 +133,23 @@ def _is_number(word: str) -> bool:
 
 MESH_ENDINGS = ("dae", "glb", "obj", "off", "ply", "stl")
 
-# Points for the volume of a mesh that is not one closed body: about 1 % of volume, 0.3 s. A Sobol sequence, because a
-# lattice aligned with a wall counts its layers wrong. It is evenest at powers of two.
+# Points that sample the volume of a mesh that is not one closed body, to about 1 % of volume in 0.3 s. They are a Sobol
+# sequence, because a lattice aligned with a wall miscounts its layers. Powers of two spread most evenly.
 SPREAD_POINTS = 2**15
 
 
 def load_mesh(path: str | Path, *, scale: float = 1.0) -> TriangleMesh:
-    """Read a mesh file. Parts of a scene are joined in place, and coordinates multiplied by `scale`.
+    """Read a mesh file. Join the parts of its scene where they stand, and multiply coordinates by `scale`.
 
     Raises:
-        MeshError: the file is missing, a directory, of an unknown ending, no mesh, cut off, unreadable, or holds no
-            finite surface.
+        MeshError: the path is missing, a directory or of an unknown ending. Or the file is no mesh, cut off, or
+            unreadable, or it has no finite surface. Or the scale is not positive.
     """
     return read_mesh(path, scale=scale)[0]
 
 
 def read_mesh(path: str | Path, *, scale: float = 1.0) -> tuple[TriangleMesh, tuple[str, ...]]:
-    """Read a mesh file like `load_mesh`, with its defects, one sentence each."""
+    """Read a mesh file like `load_mesh`. Return the mesh and warnings about its defects, one sentence each."""
     path = Path(path)
     _refuse_path(path)
     if not (np.isfinite(scale) and scale > 0):
@@ -158,9 +158,9 @@ def read_mesh(path: str | Path, *, scale: float = 1.0) -> tuple[TriangleMesh, tu
     text = b"\n" + path.read_bytes() if path.suffix.lower() == ".obj" else b""
     named = text.count(b"\nv ")
     if named and not len(faces):
-        raise MeshError(f"{path}: {named} vertices and no face: cut off before them, or no mesh")
+        raise MeshError(f"{path}: {named} vertices and no face: cut off before its faces, or no mesh")
     mesh, warnings = _without_strays(TriangleMesh(vertices, faces), str(path))
-    # Those of an OBJ its reader has left out without a word.
+    # The OBJ reader drops unused vertices silently, so they are counted in the text.
     warnings += _strays_told(str(path), named - len(vertices))
     torn = text and not text.endswith((b"\n", b"\r")) and np.ptp(mesh.vertices, axis=0).max() < 1e6
     if torn and not topology.is_closed(TriangleMesh(*topology.merge_vertices(mesh))):
@@ -171,12 +171,12 @@ def read_mesh(path: str | Path, *, scale: float = 1.0) -> tuple[TriangleMesh, tu
 def save_mesh(path: str | Path | TriangleMesh, mesh: TriangleMesh | str | Path) -> None:
     """Write a mesh in the format of the path's ending. Raises MeshError for an ending that cannot be written.
 
-    The order of version 0.1, with the mesh first, is taken with a warning until 0.3.
+    Version 0.1 took the mesh first. This order still works until 0.3, with a DeprecationWarning.
     """
     import trimesh
 
     if isinstance(path, TriangleMesh):
-        warnings.warn("save_mesh(mesh, path) goes with version 0.3; the path comes first", DeprecationWarning, 2)
+        warnings.warn("save_mesh(mesh, path) is removed in version 0.3; pass the path first", DeprecationWarning, 2)
         path, mesh = mesh, path
     path, mesh = Path(cast(str, path)), cast(TriangleMesh, mesh)
     ending = path.suffix.lower().lstrip(".")
@@ -189,18 +189,18 @@ def save_mesh(path: str | Path | TriangleMesh, mesh: TriangleMesh | str | Path) 
 def check_mesh(
     mesh: TriangleMesh, source: str, most_faces: int | None = None, *, scale: float = 1.0, dusty: bool = False
 ) -> tuple[TriangleMesh, tuple[str, ...]]:
-    """Return a cleaned mesh and its defects, one sentence each.
+    """Clean a mesh. Return it with warnings about its defects, one sentence each.
 
-    Drops vertices that no face uses, merges coincident ones, drops degenerate and repeated faces, and makes the winding
-    consistent. Position and scale stay.
+    Cleaning drops unused vertices, merges coincident vertices, drops degenerate and repeated faces, and makes the
+    winding consistent. It does not move or scale the mesh.
 
     Args:
-        most_faces: a mesh of more is simplified to about this many.
-        scale: factor that the file's coordinates were multiplied by, for the advice on its unit.
-        dusty: tiny pieces that float clear of the rest are dropped.
+        most_faces: meshes with more faces are simplified to about this many. None never simplifies.
+        scale: factor that the file's coordinates were multiplied by. Advice on the unit refers to it.
+        dusty: whether to drop tiny pieces that float clear of the rest.
 
     Raises:
-        MeshError: no usable faces, vertices of faces that are not finite, or an extent outside 2 mm to 2 m.
+        MeshError: no usable faces, vertices of faces that are not finite, or a longest side outside 2 mm to 2 m.
     """
     mesh, strays = _without_strays(mesh, source)
     _doubted_size(mesh, source, scale)
@@ -210,13 +210,13 @@ def check_mesh(
         warnings.append(f"{source}: dropped {dropped} faces without area")
     if repeated:
         warnings.append(f"{source}: dropped {repeated} repeated faces")
-    # Before any question about neighbours: a million faces take seconds for each.
+    # Simplified before any check of neighbours, because each check takes seconds for a million faces.
     given = mesh
     if most_faces is not None and len(mesh.faces) > most_faces:
         warnings.append(f"{source}: simplified from {len(mesh.faces)} to {most_faces} faces")
         mesh, _, _ = _distinct(simplify(mesh, most_faces), source)
     if dusty:
-        # First, because the size and the holes reported below could be those of the small pieces.
+        # Dropped first, because the size and the holes reported below could be those of the small pieces.
         mesh, small = drop_small_components(mesh)
         if small:
             warnings.append(f"{source}: dropped {small} tiny pieces that float clear of the rest")
@@ -226,14 +226,14 @@ def check_mesh(
         warnings.append(f"{source}: neighbouring faces disagreed on their winding; it was made consistent")
     used, compact = np.unique(faces, return_inverse=True)
     clean = TriangleMesh(mesh.vertices[used], compact.reshape(-1, 3))
-    # Simplifying can tear a surface. That is no fault of the input, and the winding number bears it.
+    # Simplifying can tear a surface. That is no defect of the input, and the winding number tolerates it.
     if not topology.is_closed(clean) and not topology.is_closed(given):
         warnings.append(f"{source}: the surface is not closed; the winding number decides what is inside")
     return clean, (*_doubted_size(clean, source, scale), *warnings)
 
 
 def simplify(mesh: TriangleMesh, faces: int, *, aggressiveness: int = 7) -> TriangleMesh:
-    """Reduce a mesh to about `faces` triangles by quadric edge collapse, in an order that `aggressiveness` changes."""
+    """Reduce a mesh to about `faces` faces by quadric edge collapse. Low `aggressiveness` is slow but tears less."""
     import fast_simplification
 
     if len(mesh.faces) <= faces:
@@ -246,17 +246,17 @@ def simplify(mesh: TriangleMesh, faces: int, *, aggressiveness: int = 7) -> Tria
 
 
 def content_hash(mesh: TriangleMesh) -> str:
-    """Return the SHA-256 of the vertices (float64) and faces (int64), hexadecimal."""
+    """Return the SHA-256 of the vertices (float64) and faces (int64) as a hexadecimal string."""
     digest = hashlib.sha256(np.ascontiguousarray(mesh.vertices, dtype="<f8").tobytes())
     digest.update(np.ascontiguousarray(mesh.faces, dtype="<i8").tobytes())
     return digest.hexdigest()
 
 
 def mass_properties(mesh: TriangleMesh) -> tuple[float, Float[np.ndarray, "3"], Float[np.ndarray, "3 3"]]:
-    """Return volume [m³], centre of mass [m] and inertia about it per unit density [m⁵] of the enclosed solid.
+    """Return volume [m³], centre of mass [m], and inertia [m⁵] about it at unit density, of the enclosed solid.
 
-    Exact for one closed, consistently wound body. Otherwise summed over points that the winding number calls inside, to
-    about 1 % of volume. A surface that encloses nothing counts as a solid of its bounding box.
+    The result is exact for one closed, consistently wound body. Otherwise it is a sum over points inside by the winding
+    number, to about 1 % of volume. A surface that encloses nothing counts as its solid bounding box.
     """
     far = topology.far_centre(mesh.vertices)
     if far.any():
@@ -278,7 +278,7 @@ def mass_properties(mesh: TriangleMesh) -> tuple[float, Float[np.ndarray, "3"], 
 def surface_samples(
     mesh: TriangleMesh, count: int, seed: int
 ) -> tuple[Float[np.ndarray, "count 3"], Float[np.ndarray, "count 3"]]:
-    """Return points spread evenly by area, and the unit normals of their faces."""
+    """Return surface points [m] spread evenly by area, and the unit normals of their faces."""
     rng = np.random.default_rng(seed)
     cross = topology.scaled_normals(mesh.vertices, mesh.faces)
     area = np.linalg.norm(cross, axis=1)
@@ -339,7 +339,7 @@ def _strays_told(source: str, strays: int) -> tuple[str, ...]:
 
 
 def _doubted_size(mesh: TriangleMesh, source: str, scale: float) -> list[str]:
-    """Return a warning for an odd size, none for a usual one. Raises MeshError for an absurd one."""
+    """Return a warning if the size is outside `SMALL` to `LARGE`. Raises MeshError outside `SMALLEST` to `LARGEST`."""
     size = float(np.ptp(mesh.vertices, axis=0).max())
     if not SMALLEST <= size <= LARGEST:
         advice = unit_advice(size, scale) if size > 0 else "its vertices all lie in one point"
@@ -352,7 +352,7 @@ def _doubted_size(mesh: TriangleMesh, source: str, scale: float) -> list[str]:
 
 
 def _distinct(mesh: TriangleMesh, source: str) -> tuple[TriangleMesh, int, int]:
-    """Merge coincident vertices, and drop and count degenerate and repeated faces."""
+    """Merge coincident vertices. Drop degenerate and repeated faces, and return how many of each were dropped."""
     vertices, faces = topology.merge_vertices(mesh)
     distinct = topology.drop_degenerate(vertices, faces)
     unique = topology.drop_repeated(distinct)
@@ -362,7 +362,7 @@ def _distinct(mesh: TriangleMesh, source: str) -> tuple[TriangleMesh, int, int]:
 
 
 def _solid_moments(mesh: TriangleMesh) -> tuple[float, Float[np.ndarray, "3"], Float[np.ndarray, "3 3"]]:
-    """Return volume, centre and inertia of a closed body, wound either way, by tetrahedra with a corner at zero."""
+    """Return volume, centre and inertia of a closed body of either winding, summed over tetrahedra from the origin."""
     corners = mesh.vertices[mesh.faces]
     sixfold = np.einsum("fi,fi->f", corners[:, 0], np.cross(corners[:, 1], corners[:, 2]))
     total, middle = sixfold.sum(), corners.sum(1)
@@ -370,7 +370,7 @@ def _solid_moments(mesh: TriangleMesh) -> tuple[float, Float[np.ndarray, "3"], F
     # The second moment of a tetrahedron at zero: det/120 · (Σ c cᵀ + (Σ c)(Σ c)ᵀ), c its other corners.
     second = np.einsum("f,fki,fkj->ij", sixfold, corners, corners) + np.einsum("f,fi,fj->ij", sixfold, middle, middle)
     spread = np.sign(total) * (second / 120 - total / 6 * np.outer(centre, centre))
-    # What is rounding noise is zero: else it alone would choose a symmetric body's principal axes.
+    # Rounding noise is set to zero. Otherwise it would choose the principal axes of a symmetric body.
     spread[np.abs(spread) < 1e-9 * np.trace(spread)] = 0.0
     centre[np.abs(centre) < 1e-12 * np.abs(corners).max()] = 0.0
     return float(abs(total) / 6), centre, np.trace(spread) * np.eye(3) - spread

@@ -1,8 +1,7 @@
-"""Authored test objects, each the size of something a hand picks up.
+"""Built-in objects of graspable size, e.g. a sphere, a mug and a hammer.
 
-Curved surfaces are tessellated with vertices on the true surface, so that a mesh has up to 1 % less volume. The mug
-(cup and handle) and the hammer (shaft and head) are overlapping closed bodies. Their inside has a winding number other
-than zero.
+Curved surfaces are tessellated with vertices on the true surface, so a mesh has up to 1 % less volume. The mug (cup and
+handle) and the hammer (shaft and head) are overlapping closed bodies. The winding number inside them is never zero.
 """
 
 from __future__ import annotations
@@ -38,7 +37,7 @@ HEAD_HALF = (0.045, 0.015, 0.015)
 
 
 def make_shape(name: str) -> TriangleMesh:
-    """Build the authored shape of that name [m]. Raises MeshError for an unknown name."""
+    """Build the built-in shape called `name` [m]. Raises MeshError for an unknown name."""
     if name not in SHAPES:
         raise MeshError(f"unknown shape {name!r}; {choices(name, sorted(SHAPES))}")
     return SHAPES[name]()
@@ -114,7 +113,7 @@ def _box(half: tuple[float, float, float], centre: tuple[float, float, float] = 
 
 
 def _revolve(profile, closed: bool = False) -> TriangleMesh:
-    """Turn an (r, z) profile about z: from axis to axis going up outside, or a closed counter-clockwise loop."""
+    """Revolve an (r, z) profile about z. It rises outside from axis to axis, or is a closed counter-clockwise loop."""
     profile = np.asarray(profile, dtype=float)
     if not closed:
         profile[[0, -1], 0] = 0.0
@@ -127,7 +126,7 @@ def _revolve(profile, closed: bool = False) -> TriangleMesh:
 def _ribbon(outer: Float[np.ndarray, "n 2"], inner: Float[np.ndarray, "n 2"], half_width: float) -> TriangleMesh:
     corners = [(outer, -half_width), (outer, half_width), (inner, half_width), (inner, -half_width)]
     rings = np.stack([np.column_stack([c[:, 0], np.full(len(c), y), c[:, 1]]) for c, y in corners], 1)
-    # A ring shrunk to a point closes either end.
+    # A ring that is shrunk to a point closes each end.
     ends = [np.broadcast_to(ring.mean(0), ring.shape)[None] for ring in (rings[0], rings[-1])]
     return _stitch(np.concatenate([ends[0], rings, ends[1]]), wrap_rows=False)
 
@@ -171,7 +170,7 @@ SHAPES: dict[str, Callable[[], TriangleMesh]] = {
 
 
 def object_sources(sources: Sequence[str]) -> tuple[str, ...]:
-    """Return shapes, mesh files and the meshes of folders. Raises MeshError: a source does not exist."""
+    """Return the sources, with each folder replaced by its mesh files. Raises MeshError if a source does not exist."""
     found: list[str] = []
     for source in sources:
         path = Path(source)
@@ -188,12 +187,12 @@ def object_sources(sources: Sequence[str]) -> tuple[str, ...]:
 
 @lru_cache
 def object_hash(source: str) -> str:
-    """Return the hash of the content of a shape or a mesh file. Raises MeshError: it does not exist."""
+    """Return the SHA-256 of the content of a shape or a mesh file. Raises MeshError if it does not exist."""
     if source.startswith("shape:"):
         return content_hash(make_shape(source.removeprefix("shape:")))
     path = Path(source)
     if not path.is_file():
-        raise MeshError(f"{path}: no such mesh file; shape:NAME is an authored shape: {', '.join(sorted(SHAPES))}")
+        raise MeshError(f"{path}: no such mesh file; shape:NAME is a built-in shape: {', '.join(sorted(SHAPES))}")
     if path.suffix.lower().lstrip(".") not in MESH_ENDINGS:
         raise MeshError(f"{path}: unknown mesh ending {path.suffix!r}; valid endings: {', '.join(MESH_ENDINGS)}")
     return hashlib.sha256(path.read_bytes()).hexdigest()

@@ -1,6 +1,6 @@
-"""Points on the sharp convex parts of a surface: edges, corners, rims, thin walls.
+"""Sample points on the sharp convex parts of a surface: edges, corners, rims, thin walls.
 
-A hand sampled every few millimetres misses an edge that sinks in between its samples. These points do not.
+Hand samples are millimetres apart, so an object's edge can penetrate the hand between them. These points detect it.
 """
 
 from __future__ import annotations
@@ -17,31 +17,31 @@ from graspd_core.types import TriangleMesh
 
 Points = Float[np.ndarray, "n 3"]
 
-# How deep below the surface the probe looks [m], and how much nearer than that the surface must be to count as sharp.
+# Depth of the probe below the surface [m]. Fraction by which the surface must be nearer than that to count as sharp.
 _PROBE, _SHARP = 0.003, 0.15
 _POOL = 6000
 # Cosine of half the angle at which an edge is no longer flat.
 _FLAT_EDGE = float(np.cos(np.deg2rad(10.0)))
-# Share of thin surface from which an object counts as thin-walled.
+# Fraction of thin surface from which an object counts as thin-walled.
 THIN_WALLED = 0.6
-# A finger goes through a wall between points that are far apart: a thin-walled object has at least one point on so much
-# of its surface [m²], up to so many times the points asked for.
+# A finger can pass through a thin wall between sparse points. So a thin-walled object gets one point for each area of
+# this size [m²], up to this many times the requested points.
 _AREA_OF_POINT, _MOST = 5e-5, 16
 
 
 def sharp_points(mesh: TriangleMesh, count: int, seed: int = 0, *, pool: int = _POOL) -> tuple[Points, float]:
-    """Return evenly spread surface points [m] with less than a probe's depth of material below them.
+    """Return evenly spread points [m] on edges, corners and thin walls, where little material lies below the surface.
 
-    A point a depth d below a flat surface is d away from it. Below an edge or in a thin wall it is nearer. There are at
-    most `count` points, more for thin walls, fewer on a smooth object, possibly none. Each is the farthest from all
-    before, so that the first of them are evenly spread too.
+    A probe is placed 3 mm below each candidate. Under a flat surface its distance to the surface is 3 mm. Under an edge
+    or in a thin wall it is less. There are at most `count` points, more on thin-walled objects, fewer or none on smooth
+    ones. They are in farthest-point order, so the first k points are evenly spread for every k.
 
     Args:
-        pool: number of candidate places: of vertices, of edges, and half as many of faces.
+        pool: number of candidates at vertices and on edges each. Half as many lie on faces.
 
     Returns:
-        The points, and the share of the surface with less than two probe depths of material below it: near one for
-        cups and sheets.
+        The points, and the fraction of the surface with less than 6 mm of material below it. The fraction is near one
+        for cups and sheets.
     """
     query = make_distance_query(mesh)
     points, normals = _pool(mesh, seed, pool)
@@ -59,9 +59,9 @@ def _is_thin(query: DistanceQuery, points: Points, normals: Points, probe: float
 
 
 def crease_points(mesh: TriangleMesh, count: int, seed: int) -> Float[np.ndarray, "points 3"]:
-    """Return `count` points evenly along the edges where faces meet at over 20°, or end [m].
+    """Return `count` points [m], spread evenly along open edges and along edges where face normals differ by over 20°.
 
-    None without such edges.
+    If there are no such edges, return no points.
     """
     scaled, faces = scaled_normals(mesh.vertices, mesh.faces), mesh.faces
     normals = scaled / np.maximum(np.linalg.norm(scaled, axis=1, keepdims=True), 1e-300)
@@ -69,7 +69,7 @@ def crease_points(mesh: TriangleMesh, count: int, seed: int) -> Float[np.ndarray
     _, first, of, faces_at = np.unique(packed_rows(sides), return_index=True, return_inverse=True, return_counts=True)
     turned = np.zeros((len(first), 3))
     np.add.at(turned, of, np.tile(normals, (3, 1)))
-    # Two normals that enclose an angle add up to twice the cosine of its half.
+    # Two unit normals at an angle a add up to a vector of length 2 cos(a/2).
     sharp = (faces_at != 2) | (np.linalg.norm(turned, axis=1) < 2 * _FLAT_EDGE)
     start, end = mesh.vertices[sides[first[sharp]].T]
     lengths = np.linalg.norm(end - start, axis=1)
@@ -102,14 +102,14 @@ def farthest_first(
     distances: Callable[[int], np.ndarray],
     mates: Callable[[int], np.ndarray | slice] = lambda _: slice(None),
 ) -> Int[np.ndarray, "count"]:
-    """Choose points, each the farthest from all that were chosen before (Gonzalez 1985).
+    """Return indices of points, each the farthest from all points chosen before it (Gonzalez 1985).
 
     Args:
-        size: how many points there are.
-        count: how many are chosen at most, but all of `chosen`.
-        chosen: indices of the first ones.
-        distances: of a chosen point to its mates, in any unit that grows with the distance.
-        mates: the points that a chosen point counts for. All others are infinitely far from it.
+        size: number of points.
+        count: maximum number of indices to return. All of `chosen` are returned even if they are more.
+        chosen: indices of the first points.
+        distances: returns the distances of a chosen point to its mates, in any unit that grows with distance.
+        mates: returns the points that a chosen point is compared with. All others count as infinitely far from it.
     """
     picked, gap = [int(index) for index in chosen], np.full(size, np.inf)
     for number in range(max(min(count, size), len(picked))):
@@ -121,9 +121,9 @@ def farthest_first(
 
 
 def neighbours_together(points: Points) -> Int[np.ndarray, "n"]:
-    """Return an order in which successive points lie near each other, by halving along the widest side.
+    """Return an order of the points in which neighbours are close, by recursive halving along the widest side.
 
-    Every sixteen from the first lie together, and so do any eight or four of them.
+    Counted from the first, each block of sixteen points is compact, and so is each block of eight or four.
     """
     if len(points) <= 4:
         return np.arange(len(points))
@@ -135,7 +135,7 @@ def neighbours_together(points: Points) -> Int[np.ndarray, "n"]:
 
 
 def _pool(mesh: TriangleMesh, seed: int, size: int) -> tuple[Points, Points]:
-    """Return vertices, points along edges, and surface samples, with normals, at most `size` of each."""
+    """Return positions and unit normals of up to `size` vertices, `size` edge points and `size // 2` face points."""
     scaled = scaled_normals(mesh.vertices, mesh.faces)
     vertex_normals = np.zeros_like(mesh.vertices)
     for corner in range(3):
@@ -148,7 +148,7 @@ def _pool(mesh: TriangleMesh, seed: int, size: int) -> tuple[Points, Points]:
     along = rng.choice(len(edges), size=size, p=lengths / lengths.sum())
     a = rng.random((size, 1))
     start, end = edges[along].T
-    # An edge point's normal is that of its two ends blended: on a sharp edge the bisector, on a flat one the face's.
+    # An edge point's normal blends those of both ends. On a sharp edge it is the bisector, on a flat one the face's.
     on_edges = (1 - a) * mesh.vertices[start] + a * mesh.vertices[end]
     edge_normals = (1 - a) * vertex_normals[start] + a * vertex_normals[end]
     edge_normals /= np.maximum(np.linalg.norm(edge_normals, axis=-1, keepdims=True), 1e-20)

@@ -1,8 +1,8 @@
-"""Exact queries to a triangle mesh by libigl's bounding volume hierarchy, in float64. No grid, no gradient.
+"""Exact distance and inside queries on a triangle mesh by libigl, in float64, without a grid or gradient.
 
-Signed distances, which metrics use, are negative inside by the generalised winding number (Barill et al. 2018). Open,
-overlapping, doubled and inverted surfaces have an inside too. Only rays use Open3D (Embree), which takes half a second
-to import. No plan on a mesh needs them.
+Signed distances are negative inside. The generalised winding number (Barill et al. 2018) defines the inside, also of
+open, overlapping, doubled and inverted surfaces. Only ray casting uses Open3D (Embree), which takes half a second to
+import. Planning on a mesh casts no rays.
 """
 
 from __future__ import annotations
@@ -20,14 +20,14 @@ from graspd_core.types import TriangleMesh
 
 @dataclass(frozen=True, eq=False)
 class DistanceQuery:
-    """A mesh prepared for queries of distance, safe to use from several threads."""
+    """A mesh prepared for distance queries, safe to use from several threads."""
 
     surface: Surface
     tree: WindingTree
 
 
 def make_distance_query(mesh: TriangleMesh) -> DistanceQuery:
-    """Prepare a mesh: some 30 ms for 16,000 faces."""
+    """Prepare a mesh for distance queries. This takes about 30 ms for 16,000 faces."""
     return DistanceQuery(make_surface(mesh), make_winding_tree(mesh))
 
 
@@ -36,7 +36,7 @@ def signed_distance(
 ) -> Float[np.ndarray, "n"]:
     """Return the distance [m] to the nearest triangle, negative inside by the winding number.
 
-    Points farther than `reach` [m] from the bounding box get their distance to the box, a lower bound above `reach`.
+    For points farther than `reach` [m] from the bounding box, return the distance to the box, which is a lower bound.
     """
     tree = query.tree
     distance = np.linalg.norm(np.maximum(0.0, np.maximum(tree.low - points, points - tree.high)), axis=1)
@@ -46,31 +46,31 @@ def signed_distance(
 
 
 def inside(query: DistanceQuery, points: Float[np.ndarray, "n 3"]) -> Bool[np.ndarray, "n"]:
-    """Return which points are inside by the winding number, without a distance."""
+    """Return which points are inside by the winding number, without computing distances."""
     return is_inside(query.tree, points)
 
 
 def unsigned_distance(query: DistanceQuery, points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n"]:
-    """Return the distance [m] to the nearest triangle on either side, without a winding number."""
+    """Return the unsigned distance [m] to the nearest triangle, without computing the winding number."""
     return surface_distance(query.surface, points)
 
 
-# Points per call: libigl holds Python's lock during one, so this bounds how long other threads wait (about 2 ms).
+# Points per call. libigl holds Python's global lock during a call, so this limits the wait of other threads (to 2 ms).
 _POINTS_AT_ONCE = 256
-# Accuracy scales of the tree: at the coarse one numbers are off by up to 0.3 at a quarter of the fine one's cost.
+# Accuracy scales of the tree. The coarse one costs a quarter of the fine one, and its numbers are off by up to 0.3.
 _COARSE, _FINE = 1.0, 2.0
-# A coarse number this near to one half is asked for again. Far from holes the true number is whole, so that a wrong
-# answer would take an error of 0.8.
+# Coarse numbers this near to one half are computed again at the fine scale. Far from holes the true number is whole, so
+# a wrong answer would need an error of 0.8.
 _DOUBT = 0.3
 
 
 @dataclass(frozen=True, eq=False)
 class WindingTree:
-    """A mesh prepared for many questions.
+    """A mesh prepared for winding number queries.
 
     Attributes:
         low, high: corners of the bounding box [m].
-        centre: what the tree's coordinates are about [m].
+        centre: origin of the tree's coordinates, in the mesh's frame [m].
         tree: the `igl.FastWindingNumberBVH`.
     """
 
@@ -81,12 +81,12 @@ class WindingTree:
 
 
 def make_winding_tree(mesh: TriangleMesh) -> WindingTree:
-    """Prepare a mesh: some 20 ms for 16,000 faces."""
+    """Prepare a mesh for winding number queries. This takes about 20 ms for 16,000 faces."""
     import igl
 
     low, high, centre = mesh.vertices.min(0), mesh.vertices.max(0), mesh.vertices.mean(0)
-    # Centred, because the tree's expansion loses digits far from the origin. Cut up, because the tree sums every face
-    # that is long for its distance, which makes slivers ten times slower.
+    # The mesh is centred, because the tree's expansion loses digits far from the origin. Long faces are cut, because
+    # the tree sums every face that is long for its distance, which makes slivers ten times slower.
     cut = cut_long_faces(TriangleMesh(mesh.vertices - centre, mesh.faces), float((high - low).max()) / 10)
     tree = igl.FastWindingNumberBVH()
     tree.init(np.asarray(cut.vertices, dtype=float), np.asarray(cut.faces, dtype=np.int64))
@@ -94,7 +94,7 @@ def make_winding_tree(mesh: TriangleMesh) -> WindingTree:
 
 
 def is_inside(tree: WindingTree, points: Float[np.ndarray, "points 3"]) -> Bool[np.ndarray, "points"]:
-    """Return which points lie inside: a winding number beyond one half, of either sign, within the bounding box."""
+    """Return which points lie inside: in the bounding box, with an absolute winding number above one half."""
     inside = np.all((points >= tree.low) & (points <= tree.high), axis=1)
     asked = points[inside] - tree.centre
     number = _numbers(tree, asked, _COARSE)
@@ -105,7 +105,7 @@ def is_inside(tree: WindingTree, points: Float[np.ndarray, "points 3"]) -> Bool[
 
 
 def winding_inside(mesh: TriangleMesh, points: Float[np.ndarray, "points 3"]) -> Bool[np.ndarray, "points"]:
-    """Return `is_inside` for one set of points. For several, keep the mesh's tree."""
+    """Return which points lie inside a mesh. For several sets of points, make the tree once and use `is_inside`."""
     return is_inside(make_winding_tree(mesh), points)
 
 
@@ -117,12 +117,12 @@ def _numbers(tree: WindingTree, points: Float[np.ndarray, "n 3"], accuracy: floa
 
 @dataclass(frozen=True, eq=False)
 class Surface:
-    """A mesh prepared for many queries.
+    """A mesh prepared for closest point queries.
 
     Attributes:
-        mesh: its arrays as libigl takes them: contiguous, float64 [m] and int64.
-        normals: of the faces, unit, zero for a face without area.
-        hierarchy: the `igl.AABB`.
+        mesh: the mesh with contiguous arrays of float64 [m] and int64, as libigl needs them.
+        normals: unit normals of the faces, zero for a face without area.
+        hierarchy: the `igl.AABB` tree.
     """
 
     mesh: TriangleMesh
@@ -131,7 +131,7 @@ class Surface:
 
 
 def make_surface(mesh: TriangleMesh) -> Surface:
-    """Prepare a mesh: some 10 ms for 16,000 faces."""
+    """Prepare a mesh for closest point queries. This takes about 10 ms for 16,000 faces."""
     import igl
 
     vertices = np.ascontiguousarray(mesh.vertices, dtype=float)
@@ -159,11 +159,11 @@ def closest_points(
     return np.where(found[:, None], closest, np.nan), np.where(found[:, None], normals, np.nan)
 
 
-# How far about a point the faces lie that its normal may be of [m]: the two of an edge, the many of a rounding.
+# Faces within this distance of a point [m] contribute to its normal: the two of an edge, or the many of a rounding.
 _ABOUT = 3e-4
-# Rounds of weighing these faces at most, and a change of a weight that ends them.
+# Maximum rounds of adjusting the weights of these faces, and the change of a weight below which they end.
 _SWEEPS, _SETTLED = 100, 1e-7
-# Directions in which they are looked for: to the corners and the middles of the faces of a cube.
+# Directions in which these faces are searched: towards the corners and face centres of a cube.
 _AROUND = np.array(
     [[x, y, z] for x in (-1, 0, 1) for y in (-1, 0, 1) for z in (-1, 0, 1) if abs(x) + abs(y) + abs(z) != 2]
 )
@@ -175,12 +175,12 @@ def pressed_points(
 ) -> tuple[Float[np.ndarray, "n 3"], Float[np.ndarray, "n 3"]]:
     """Return the closest surface points [m], and the outward unit normals there that are nearest to `normals`.
 
-    On a face this is the face's own normal. On an edge or a corner every direction between those of its faces counts.
+    On a face this is the face's normal. On an edge or a corner, any direction between the normals of its faces counts.
     """
     closest, own = closest_points(surface, points)
     around = closest_points(surface, (closest[:, None] + _ABOUT * _AROUND).reshape(-1, 3))[1]
     between = np.concatenate([own[:, None], around.reshape(len(points), -1, 3)], 1)
-    # The nearest sum of the faces' normals with weights of at least zero, one weight after the other.
+    # Fit `normals` by a sum of face normals with weights of at least zero, one weight after the other.
     weights, rest = np.zeros(between.shape[:2]), np.array(normals)
     for _ in range(_SWEEPS):
         before = weights.copy()
@@ -197,11 +197,11 @@ def pressed_points(
 def first_hits(
     mesh: TriangleMesh, directions: Float[np.ndarray, "*batch 3"]
 ) -> tuple[Float[np.ndarray, "*batch"], Integer[np.ndarray, "*batch"], Float[np.ndarray, "*batch 3"]]:
-    """Cast rays from the origin. Return the lengths in `directions` (infinite: no hit), faces and unit normals."""
+    """Cast rays from the origin. Return distances in lengths of `directions` (inf: no hit), faces and unit normals."""
     with Extra("clouds"):
         import open3d as o3d
 
-    # Embree counts in float32: about the mesh's centre it need not be near the origin.
+    # Embree uses float32. Centring the mesh keeps the precision of a mesh far from the origin.
     centre = 0.5 * (mesh.vertices.min(0) + mesh.vertices.max(0))
     scene = o3d.t.geometry.RaycastingScene()
     scene.add_triangles(_tensor(mesh.vertices - centre, np.float32), _tensor(mesh.faces, np.uint32))
@@ -214,14 +214,14 @@ def first_hits(
 def _nearest(
     surface: Surface, points: Float[np.ndarray, "n 3"]
 ) -> tuple[Float[np.ndarray, "n"], Integer[np.ndarray, "n"], Float[np.ndarray, "n 3"]]:
-    """Return squared distance [m²], face and point of the surface nearest to each point."""
+    """Return the squared distance [m²], face and position [m] of the surface point nearest to each point."""
     vertices, faces = surface.mesh.vertices, surface.mesh.faces
     points = np.ascontiguousarray(points, dtype=float)
-    # One call at least: without points, too, the arrays have their shapes.
+    # At least one call is made, so that the arrays have their shapes even without points.
     starts = range(0, max(len(points), 1), _POINTS_AT_ONCE)
     parts = [surface.hierarchy.squared_distance(vertices, faces, points[i : i + _POINTS_AT_ONCE]) for i in starts]
     squared, face, closest = (np.concatenate(part) for part in zip(*parts, strict=True))
-    # The wheel says long long, which NumPy holds to be another type.
+    # libigl returns long long, which NumPy treats as another type than int64.
     return squared, face.astype(np.int64), closest
 
 

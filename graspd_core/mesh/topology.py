@@ -1,4 +1,4 @@
-"""Topology of a triangle soup, and its repair. Rows of integers and voxels are packed into single numbers."""
+"""Topology and repair of triangle meshes. Integer rows and voxels are packed into single integers for sorting."""
 
 from __future__ import annotations
 
@@ -11,35 +11,35 @@ from graspd_core.types import TriangleMesh
 
 
 def packed_rows(rows: Int[np.ndarray, "n k"]) -> Int[np.ndarray, "n"]:
-    """Return one number for each row, in the order of the rows, equal for equal rows.
+    """Return one integer for each row, equal for equal rows. The integers sort in the same order as the rows.
 
-    NumPy sorts numbers several times as fast as rows, and lets other threads run meanwhile.
+    NumPy sorts integers several times as fast as rows, and lets other threads run meanwhile.
     """
     if not len(rows):
         return np.zeros(0, dtype=np.int64)
-    # Column by column: NumPy takes seven times as long for the least of short rows.
+    # Computed column by column, because NumPy takes seven times as long for the minimum of many short rows.
     columns = tuple(column - column.min() for column in rows.T)
     sides = tuple(int(column.max()) + 1 for column in columns)
     if math.prod(sides) < 2**63:
         return np.asarray(np.ravel_multi_index(columns, sides))
-    # No room: the rows' ranks among each other.
+    # 64 bits are too few, so each row gets its rank among the distinct rows.
     return np.unique(rows, axis=0, return_inverse=True)[1].reshape(-1)
 
 
 def voxel_keys(points: Float[np.ndarray, "n k"], size: float) -> Int[np.ndarray, "n"]:
-    """Return one number for the cell of side `size` of each point, in the order of the cells' coordinates."""
+    """Return one integer for the voxel of side `size` of each point. They sort in the order of the voxels' indices."""
     return packed_rows(np.floor(points / size).astype(np.int64))
 
 
 Vertices = Float[np.ndarray, "vertices 3"]
 Faces = Int[np.ndarray, "faces 3"]
 
-# Vertices nearer than this are one [m]: far below any scanner's noise, far above float32 rounding at 2 m.
+# Vertices nearer than this [m] are merged. It is far below any scanner's noise, and far above float32 rounding at 2 m.
 MERGE_DISTANCE = 1e-6
 
 
 def merge_vertices(mesh: TriangleMesh) -> tuple[Vertices, Faces]:
-    """Merge the vertices of each lattice cell of 1 µm."""
+    """Merge all vertices that lie in the same cell of a 1 µm lattice."""
     low = mesh.vertices.min(0)
     cells = np.round((mesh.vertices - low) / MERGE_DISTANCE).astype(np.int64)
     _, first, inverse = np.unique(packed_rows(cells), return_index=True, return_inverse=True)
@@ -49,7 +49,7 @@ def merge_vertices(mesh: TriangleMesh) -> tuple[Vertices, Faces]:
 def drop_strays(mesh: TriangleMesh) -> tuple[TriangleMesh, int]:
     """Return the mesh without the vertices that no face uses, and their number.
 
-    A face that names a vertex twice uses none. It comes to name one vertex three times.
+    Degenerate faces, which repeat a vertex, do not count as using vertices. They stay in the mesh and stay degenerate.
     """
     a, b, c = mesh.faces.T
     used = np.zeros(len(mesh.vertices), dtype=bool)
@@ -61,13 +61,13 @@ def drop_strays(mesh: TriangleMesh) -> tuple[TriangleMesh, int]:
 
 
 def scaled_normals(vertices: Vertices, faces: Faces) -> Float[np.ndarray, "faces 3"]:
-    """Return the normals of faces, as long as twice their area [m²]."""
+    """Return the normal of each face, with a length of twice the face's area [m²]."""
     a, b, c = vertices[faces].transpose(1, 0, 2)
     return np.cross(b - a, c - a)
 
 
 def drop_degenerate(vertices: Vertices, faces: Faces) -> Int[np.ndarray, "kept 3"]:
-    """Return the faces with an area (height above 1e-9 of the longest side)."""
+    """Return the faces with an area: their height is above 1e-9 of their longest side."""
     a, b, c = vertices[faces].transpose(1, 0, 2)
     area = np.linalg.norm(scaled_normals(vertices, faces), axis=1)
     longest = np.max([np.einsum("ij,ij->i", e, e) for e in (b - a, c - b, a - c)], axis=0)
@@ -75,7 +75,7 @@ def drop_degenerate(vertices: Vertices, faces: Faces) -> Int[np.ndarray, "kept 3
 
 
 def drop_repeated(faces: Faces) -> Int[np.ndarray, "kept 3"]:
-    """Return the first face on each set of three vertices, whatever its winding."""
+    """Return the faces without repetitions. Faces on the same three vertices are the same, whatever their winding."""
     _, first = np.unique(packed_rows(np.sort(faces, axis=1)), return_index=True)
     return faces[np.sort(first)]
 
@@ -85,7 +85,7 @@ def _edges(faces: Faces) -> Int[np.ndarray, "edges 2"]:
 
 
 def is_oriented(faces: Faces) -> bool:
-    """Tell whether every edge between just two faces is walked once in either direction."""
+    """Return True if the winding is consistent: two faces run through their common edge in opposite directions."""
     edges = _edges(faces)
     low, high = edges.min(1), edges.max(1)
     _, which, counts = np.unique(low * (int(faces.max()) + 1) + high, return_inverse=True, return_counts=True)
@@ -94,18 +94,18 @@ def is_oriented(faces: Faces) -> bool:
 
 
 def is_closed(mesh: TriangleMesh) -> bool:
-    """Tell whether every edge has an even number of faces."""
+    """Return True if every edge belongs to an even number of faces."""
     a, b = _edges(mesh.faces).T
     _, counts = np.unique(np.minimum(a, b) * len(mesh.vertices) + np.maximum(a, b), return_counts=True)
     return bool((counts % 2 == 0).all())
 
 
 def orient(vertices: Vertices, faces: Faces) -> Faces:
-    """Make each connected patch agree with itself, and face outwards as a whole."""
+    """Make the winding consistent within each connected patch of faces, and turn each patch outwards."""
     import igl
 
     oriented, patch = igl.bfs_orient(np.ascontiguousarray(faces))
-    # The wheel says long long, which NumPy holds to be another type.
+    # libigl returns long long, which NumPy treats as another type than int64.
     oriented, patch = np.asarray(oriented, dtype=np.int64), np.asarray(patch, dtype=np.int64)
     a, b, c = (vertices - vertices.mean(0))[oriented].transpose(1, 0, 2)
     volume = np.bincount(patch, weights=np.einsum("ij,ij->i", a, np.cross(b, c)))
@@ -115,7 +115,7 @@ def orient(vertices: Vertices, faces: Faces) -> Faces:
 def cut_long_faces(mesh: TriangleMesh, longest: float) -> TriangleMesh:
     """Return the same surface with no edge above `longest` [m].
 
-    Longest edges are halved. Faces share no corners then.
+    Faces are halved at their longest edge. The returned faces share no vertices.
     """
     corners = mesh.vertices[mesh.faces]
     done = []
@@ -133,17 +133,17 @@ def cut_long_faces(mesh: TriangleMesh, longest: float) -> TriangleMesh:
     return TriangleMesh(soup.reshape(-1, 3), np.arange(3 * len(soup)).reshape(-1, 3))
 
 
-# A thing is far that is this many times its own size away: float32 still tells a hundred-thousandth of its size.
+# A mesh is far if its distance is this many times its size. There float32 still resolves 1e-5 of the size.
 _FAR = 100.0
 
 
 def far_centre(vertices: Float[np.ndarray, "vertices 3"]) -> Float[np.ndarray, "3"]:
-    """Return the middle of a body if it is farther from the origin than a hundred times its size [m], else zero."""
+    """Return the centre of a mesh [m] if it is over a hundred times the mesh's size from the origin, else zero."""
     low, high = vertices.min(0), vertices.max(0)
     centre = (low + high) / 2
     return centre if np.linalg.norm(centre) > _FAR * (high - low).max() else np.zeros(3)
 
 
 def moved_mesh(mesh: TriangleMesh, offset: Float[np.ndarray, "3"]) -> TriangleMesh:
-    """Return the mesh moved by an offset [m], the mesh itself for zero."""
+    """Return the mesh moved by an offset [m]. For a zero offset, return the same mesh."""
     return TriangleMesh(mesh.vertices + offset, mesh.faces) if offset.any() else mesh

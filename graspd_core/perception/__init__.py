@@ -1,1 +1,1 @@
-"""Scenes from cameras and files."""
+"""Building scenes from camera data and files."""

@@ -1,4 +1,4 @@
-"""A scene from a mesh file, a cloud file, a depth image, an authored shape, or a mesh."""
+"""Building a scene from a mesh file, a point cloud file, a depth image, a built-in shape, or a mesh."""
 
 from __future__ import annotations
 
@@ -49,19 +49,19 @@ def load_scene(
 
     Args:
         source: a mesh file, a point cloud file (the object is cut out and reconstructed), `shape:NAME`, or a mesh.
-        mass: [kg]. None assumes the heavy end of what the volume allows, and warns of it.
-        friction: Coulomb coefficient between hand and object.
-        scale: factor on the file's coordinates to make them metres.
-        resolution: the distance grid has at most the cube of it in nodes. `plan_grasps` goes by its preset.
-        target: which object of a cloud is meant.
-        alone: a cloud shows the object and nothing else.
-        view_point: position of a cloud's camera [m]. None: that of its file, else the origin.
-        settings: how a cloud becomes a scene.
-        camera: file of the camera that took the depth image `source` (docs/clouds.md). There `scale` is
-            metres per unit of depth, and 1 leaves it to the camera's file.
+        mass: mass of the object [kg]. None assumes the heavy end of what the volume allows, with a warning.
+        friction: Coulomb friction coefficient between hand and object.
+        scale: factor that converts the file's coordinates to metres.
+        resolution: the distance grid has at most `resolution`³ nodes. `plan_grasps` uses the value of its preset.
+        target: which object of a point cloud to grasp.
+        alone: whether a point cloud shows only the object.
+        view_point: position of a point cloud's camera [m]. None uses the position in the file, or else the origin.
+        settings: settings for building a scene from a point cloud.
+        camera: file of the camera that took the depth image `source` (docs/clouds.md). With a depth image, `scale` is
+            in metres per unit of depth, and 1 means the unit that the camera's file gives.
 
     Raises:
-        MeshError: the mesh cannot be read or used, has a target, or a number is out of range.
+        MeshError: the mesh cannot be read or used, comes with a target, or a number is out of range.
         CloudError: the cloud cannot be read or shows no object.
     """
     started = time.perf_counter()
@@ -75,9 +75,9 @@ def load_scene(
         mesh, warnings = _read_mesh(source, scale)
         view = view_in_mesh(mesh, given)
         if view is not None:
-            views, warnings = (view,), (f"{given}: one camera's open sheet: its points are taken as a cloud",)
+            views, warnings = (view,), (f"{given}: one camera's view, not a solid: its points are taken as a cloud",)
     if views or mesh is None:
-        # A mesh needs none of what makes an object of a cloud.
+        # Imported here, because a mesh does not need it.
         from graspd_core.perception.scene_from_views import scene_from_views
 
         about = {"target": target, "alone": alone, "settings": settings, "source": given, "device": device}
@@ -86,20 +86,20 @@ def load_scene(
     if view_point is not None:
         raise MeshError(f"view_point: {given} is a mesh; only a cloud has a camera")
     if target is not None:
-        raise MeshError(f"target: given with {given}, a mesh; valid with clouds, where it says which thing is meant")
+        raise MeshError(f"target: given with {given}, a mesh; valid with clouds, where it says which object is meant")
     return build_scene(mesh, source=given, scale=scale, device=device, started=started, warnings=warnings, **numbers)
 
 
 def scaled_views(
     source: str | Path, camera: str | Path | None, scale: float = 1.0, view_point: Sequence[float] | None = None
 ) -> list[PointCloud]:
-    """Return the views of a cloud file or a depth image [m]. Raises CloudError: see `load_scene`."""
+    """Return the views of a point cloud file or a depth image [m]. Raises CloudError like `load_scene`."""
     if camera is not None:
         if view_point is not None:
-            raise CloudError(f"view_point: {source} is a depth image, which tells where its camera stood")
+            raise CloudError(f"view_point: {source} is a depth image; valid with clouds of points only")
         return [load_depth_view(source, camera, None if scale == 1.0 else scale)]
     if is_depth_image(source):
-        raise CloudError(f"{source}: an image, of depth perhaps: name the camera that took it, --camera camera.json")
+        raise CloudError(f"{source}: a depth image needs the camera that took it: --camera camera.json")
     place = None if view_point is None else np.asarray(view_point, dtype=float) / scale
     views = load_views(source, place)
     return [replace(view, points=view.points * scale, viewpoint=view.viewpoint * scale) for view in views]

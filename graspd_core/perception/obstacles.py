@@ -1,8 +1,8 @@
-"""Obstacles about the object: hulls that the hand avoids, of seen points or of shapes known as a whole.
+"""Obstacles around the object: convex hulls that the hand avoids, made from seen points or from known shapes.
 
-The back of a neighbour is not seen. Its obstacle is the convex hull of its points and their shadow on the table, so
-space beneath overhangs counts as full. Behind the seen face the hull is thin on purpose, because a bulging guess would
-block free space. An object that surrounds the target is split into parts.
+The back of a neighbouring object is not seen. Its obstacle is the convex hull of its points and their projection onto
+the support plane, so space beneath overhangs counts as full. Nothing is guessed behind the seen side, because a thick
+guess would block free space. A neighbour that surrounds the target is split into parts.
 """
 
 from __future__ import annotations
@@ -28,14 +28,14 @@ from graspd_core.se3 import perpendicular
 from graspd_core.types import Plane, TriangleMesh
 
 GRID_RESOLUTION = 32
-# Parts across a thing whose hull would hold the object.
+# Maximum number of parts along each axis of a neighbour whose hull would contain the object.
 MAX_PARTS_ACROSS = 8
 _TARGET_SAMPLES = 2000
-# From this share of what the hulls of a thing and of the object fill together, the thing is the object itself: a box
-# about a ball has half of it, a box a quarter too large every way still 0.5, things that only touch have nothing.
+# A collision object is the target itself if their hulls overlap by at least this intersection over union. A box around
+# a ball has 0.5, and so has a box that is a quarter too large every way. Objects that only touch have 0.
 _SAME = 0.3
 _OVERLAP_SAMPLES = 4000
-# Area of a sample of a shape near the object [m²], and the least and most samples of one.
+# Surface area for each sample of a shape near the object [m²], and the least and most samples of a shape.
 _AREA_OF_A_SAMPLE = 1e-4
 _FEWEST, _MOST = 200, 4000
 _CORNERS = 200
@@ -48,14 +48,14 @@ def make_obstacles(
     reach: float,
     settings: ObstacleConfig | None = None,
 ) -> tuple[Obstacle, ...]:
-    """Return the obstacles of neighbours from their seen points, in the frame of the points [m].
+    """Return the obstacles of neighbouring objects, made from their seen points, in the frame of the points [m].
 
     Args:
-        points: those of each object. Objects of too few finite points are left out.
-        support: what they stand on, if anything. Their points are extruded down to it.
+        points: the points of each neighbour. Neighbours with too few finite points are left out.
+        support: plane that the neighbours stand on, or None. Their points are extruded down to this plane.
         target: the object to grasp.
-        reach: objects farther than this from the target are left out [m].
-        settings: of the hulls.
+        reach: neighbours farther than this from the target are left out [m].
+        settings: settings of the hulls.
     """
     settings = settings or ObstacleConfig()
     near = KDTree(np.vstack([target.vertices, surface_samples(target, _TARGET_SAMPLES, 0)[0]]))
@@ -69,7 +69,7 @@ def make_obstacles(
         if not (sample_sdf(whole.sdf, at)[0] < -2 * settings.padding).any():
             found.append(whole)
             continue
-        # A tray, a box or a ring about the object: its hull is no obstacle but the object's own place.
+        # The neighbour surrounds the object, like a tray, a box or a ring. Its hull would fill the object's own place.
         parts = [part for part in _cells(seen, support, settings.part_size) if near.query(part)[0].min() <= reach]
         found += [_obstacle(part, support, settings.padding) for part in parts]
     return tuple(found)
@@ -81,7 +81,7 @@ def _obstacle(points: Points, support: Plane | None, padding: float) -> Obstacle
 
 
 def _cells(points: Points, support: Plane | None, side: float) -> list[Float[np.ndarray, "_ 3"]]:
-    """Split the points by a grid of cubes, or of columns that stand on the support."""
+    """Split the points by a grid of cubes, or by a grid of columns normal to the support if there is one."""
     if support is None:
         local = points
     else:
@@ -93,12 +93,12 @@ def _cells(points: Points, support: Plane | None, side: float) -> list[Float[np.
 
 
 def padded_hull(points: Points, support: Plane | None, padding: float) -> TriangleMesh:
-    """Return the closed convex surface about points, their projection onto the support, and a skin of `padding` [m]."""
+    """Return the convex hull of points and of their projection onto the support, grown by `padding` [m]."""
     corners = points
     if support is not None:
         height = points @ support.normal - support.offset
         corners = np.vstack([points, points - height[:, None] * support.normal])
-    # A flat face that stands on nothing has no hull yet: the skin gives it a body.
+    # Points of a flat face without a support have no hull until the padding makes them thicker.
     with suppress(QhullError):
         corners = corners[ConvexHull(corners).vertices]
     skin = padding * np.vstack([np.eye(3), -np.eye(3)])
@@ -108,15 +108,15 @@ def padded_hull(points: Points, support: Plane | None, padding: float) -> Triang
 def with_neighbours(
     scene: Scene, things: Mapping[str, Sequence[TriangleMesh]], settings: SceneConfig | None = None
 ) -> Scene:
-    """Return the scene with collision objects about the object as obstacles, by name.
+    """Return the scene with collision objects of a planning scene added as obstacles.
 
-    An object that fills the target's own place is the target in a planning scene. It is left out, with a warning. An
-    object that does not rise above the support is left out too. Objects far away cost next to nothing.
+    A collision object that fills the target's own place is taken for the target. It is left out, with a warning. A
+    collision object that does not rise above the support is left out too. Distant collision objects cost little time.
 
     Args:
-        scene: of the object.
-        things: closed shapes of each, in the object's frame [m].
-        settings: how near objects are taken (`segmentation.obstacle_range`), and the hulls (`obstacles`).
+        scene: the scene of the object to grasp.
+        things: closed meshes of each collision object by its name, in the object's frame [m].
+        settings: `segmentation.obstacle_range` limits how far obstacles are considered, `obstacles` sets their hulls.
     """
     settings = settings or SceneConfig()
     mesh, reach = scene.object.mesh, settings.segmentation.obstacle_range
@@ -127,7 +127,7 @@ def with_neighbours(
     for name, shapes in things.items():
         near = [s for s in shapes if (s.vertices.min(0) <= high).all() and (s.vertices.max(0) >= low).all()]
         if near and _overlap(np.concatenate([s.vertices for s in shapes]), mesh.vertices) >= _SAME:
-            same.append(f"collision object {name!r} fills the object's own place: taken for the object, no obstacle")
+            same.append(f"collision object {name!r} fills the object's own place: taken for it, not for an obstacle")
             continue
         points = [_points_within(shape, low, high) for shape in near]
         found += [p for p in points if len(p) and (support is None or (p @ support.normal).max() > level)]
@@ -137,7 +137,7 @@ def with_neighbours(
 
 
 def _overlap(a: Float[np.ndarray, "_ 3"], b: Float[np.ndarray, "_ 3"]) -> float:
-    """Return the shared volume of the hulls of points, divided by that of their union, 0 for a flat one."""
+    """Return the intersection over union of the convex hulls of two sets of points, 0 if a hull is flat."""
     try:
         hulls = [ConvexHull(_hull_corners(a)), ConvexHull(_hull_corners(b))]
     except QhullError:
@@ -157,7 +157,7 @@ def _hull_corners(points: Float[np.ndarray, "_ 3"]) -> Float[np.ndarray, "_ 3"]:
 
 
 def _points_within(shape: TriangleMesh, low: Vector, high: Vector) -> Float[np.ndarray, "_ 3"]:
-    """Return points whose hull is that of the shape within a box: of its surface and of the box's corners."""
+    """Return points whose hull is that of a shape's part inside a box: surface points, and corners of the box."""
     from trimesh.intersections import slice_faces_plane
 
     vertices, faces = shape.vertices, shape.faces

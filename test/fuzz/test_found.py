@@ -86,13 +86,13 @@ PCD = "# .PCD\nFIELDS x y z\nSIZE 4 4 4\nTYPE F F F\nCOUNT 1 1 1\nWIDTH {n}\nHEI
         (PCD.replace("4 4 4", "4 4 5").format(n=1, data="binary").encode() + bytes(24), "not a readable pcd cloud"),
         (
             PCD.replace("F F F", "F F " + 5000 * "1").format(n=1, data="binary").encode() + bytes(12),
-            "is none of F, I and U",
+            "is unknown; valid: F, I, U",
         ),
         (
             PCD.format(n=1, data="binary_compressed").encode() + struct.pack("<II", 8, 24) + bytes(8),
             "12 bytes, its data 8",
         ),
-        (PCD.format(n=1, data="packed").encode() + bytes(12), "its DATA 'packed' is none of ascii, binary and"),
+        (PCD.format(n=1, data="packed").encode() + bytes(12), "its DATA 'packed' is unknown; valid: ascii, binary"),
         (b"# 7\nFIELDS x y z\n", "its header has no SIZE"),
     ],
     ids=str,
@@ -229,7 +229,7 @@ def test_limits_up_to_the_largest_float_are_none(fuzz: ModuleType, folder: Path)
     ("old", "new", "message"),
     [
         ("<p>0 1 2<", "<p>0 1 99999999999999999999<", "too large"),
-        ("4 3</vcount>", "-4 11</vcount>", "names vertices that are not there"),
+        ("4 3</vcount>", "-4 11</vcount>", "names vertices that the file does not hold"),
         ('1.0"?>', '1.0" encoding="no-such"?>', "unknown encoding"),
         (
             '<instance_geometry url="#g"/>',

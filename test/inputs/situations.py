@@ -224,7 +224,7 @@ MESHES = (
         BOTTLE,
         "realsenseai/librealsense/issues/2036",
         {},
-        "open sheet: its points are taken as a cloud",
+        "not a solid: its points are taken as a cloud",
     ),
     Situation(
         "a camera viewer's mesh, y and z turned",
@@ -245,7 +245,7 @@ MESHES = (
     Situation(
         "a camera viewer's mesh in another frame",
         mesh_file("a.ply", sheet_in_world()),
-        "an open sheet as camera viewers export it",
+        "an open mesh of one camera's view, and not in the camera's frame",
         "PointCloudLibrary/pcl/issues/1474",
     ),
     Situation(

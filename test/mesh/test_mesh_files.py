@@ -338,7 +338,7 @@ def test_other_binary_files_that_were_cut_off(tmp_path: Path, ending: str):
         ("v 0 0 -", "cut off: it ends in the middle of a line, 'v 0 0 -'"),
         ("f 1 2", "cut off: it ends in the middle of a line, 'f 1 2'"),
         ("f 1 2 9\n", "a face names a vertex that the file does not hold"),
-        ("", "3 vertices and no face: cut off before them, or no mesh"),
+        ("", "3 vertices and no face: cut off before its faces, or no mesh"),
     ],
 )
 def test_an_obj_that_was_cut_off(tmp_path: Path, last: str, told: str):
@@ -420,11 +420,11 @@ def test_what_is_no_surface_may_be_broken(tmp_path: Path, before: str, beside: s
         ("</COLLADA>", "", "not well-formed XML"),
         ("<COLLADA", "<!DOCTYPE x><COLLADA", "document type declaration"),
         ("#v", "#w", "refers to '#w', which is not in the file"),
-        ("0 9 1 9 4 9", "0 9 1 9 7 9", "names vertices that are not there"),
-        ("<vcount>4 3", "<vcount>4 30", "names vertices that are not there"),
+        ("0 9 1 9 4 9", "0 9 1 9 7 9", "names vertices that the file does not hold"),
+        ("<vcount>4 3", "<vcount>4 30", "names vertices that the file does not hold"),
         ("<vcount>4 3", "<vcount>1 2", "holds no triangles"),
         ('semantic="VERTEX"', 'semantic="COLOR"', "has no VERTEX input"),
-        ("<node><translate>", '<node id="n"><instance_node url="#n"/><translate>', "nodes in a circle"),
+        ("<node><translate>", '<node id="n"><instance_node url="#n"/><translate>', "a node that contains itself"),
     ],
 )
 def test_a_broken_file_is_refused(tmp_path: Path, old: str, new: str, message: str) -> None:
@@ -437,6 +437,6 @@ def test_a_broken_file_is_refused(tmp_path: Path, old: str, new: str, message: s
 
 
 def test_the_order_of_an_earlier_version_still_saves_with_a_warning(tmp_path: Path):
-    with pytest.warns(DeprecationWarning, match="the path comes first"):
+    with pytest.warns(DeprecationWarning, match="pass the path first"):
         save_mesh(make_shape("box"), tmp_path / "box.ply")
     assert len(load_mesh(tmp_path / "box.ply").faces) == len(make_shape("box").faces)

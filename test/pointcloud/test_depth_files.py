@@ -97,11 +97,11 @@ def test_a_matrix_is_read_in_every_usual_form(tmp_path: Path, matrix: dict[str, 
     ("keys", "told"),
     [
         ({"width": None}, "width is missing: the size of the image that the matrix is for; it has height, fx"),
-        ({"fx": None}, "K is missing, and of fx, fy, cx, cy fx; it has width"),
+        ({"fx": None}, "K is missing, and so is fx of fx, fy, cx, cy; it has width"),
         ({"fx": "300"}, None),
         ({"fx": float("nan")}, "fx: nan; expected a number"),
         ({"K": [1, 2]}, "its matrix K has 2 numbers; 9 are needed"),
-        ({"depth_scale": 0.1}, "depth_scale: 0.1 means metres, millimetres or units of a metre by who wrote it"),
+        ({"depth_scale": 0.1}, "depth_scale: 0.1 is ambiguous, because programs disagree on its unit"),
         ({"depth_unit": 1000}, "depth_unit: 1000; valid: metres per unit up to 1, or m, cm, mm, um"),
         ({"depth_unit": "miles"}, "depth_unit: 'miles'; valid"),
         ({"T_world_camera": np.full((4, 4), 2).tolist()}, "'T_world_camera' is no rigid transform"),
@@ -126,7 +126,7 @@ def test_a_camera_that_says_something_else_is_named(tmp_path: Path, keys: dict[s
         ("gray.png", np.zeros((240, 320), "u1"), "a picture"),
         ("small.png", np.full((120, 160), 500, "u2"), "160 x 120 pixels, but its camera has 320 x 240"),
         ("far.npy", np.full((240, 320), 850.0), "beyond 850 m at 1 m a unit; say the unit: --units mm, or depth_unit"),
-        ("mug.ply", None, "its ending may be: png, tif, tiff, npy, npz"),
+        ("mug.ply", None, "valid endings: png, tif, tiff, npy, npz"),
         ("spoilt.png", None, "not a readable image"),
         ("nowhere.png", None, "no such depth image"),
     ],
@@ -157,5 +157,5 @@ def test_it_is_an_object_by_library_and_command_line(depth, camera: Path, tmp_pa
     capsys.readouterr()
     for command in (["synthesize"], ["reconstruct", "--out", str(tmp_path / "m.ply")]):
         assert main([command[0], str(image), *command[1:]]) == 2
-        told = "depth.png: an image, of depth perhaps: name the camera that took it, --camera camera.json"
+        told = "depth.png: a depth image needs the camera that took it: --camera camera.json"
         assert told in capsys.readouterr().err

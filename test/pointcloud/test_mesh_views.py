@@ -21,7 +21,7 @@ def test_a_sheet_of_pixels_is_a_view_however_it_is_wound(turn):
 
 
 def test_a_sheet_in_another_frame_is_refused_by_that_name():
-    with pytest.raises(MeshError, match=r"a.ply: one side of a scene, .* give the points as a cloud"):
+    with pytest.raises(MeshError, match=r"a.ply: an open mesh of one camera's view, .* the points as a cloud"):
         view_in_mesh(sheet_in_world(), "a.ply")
 
 

@@ -1,1 +1,1 @@
-"""Cameras, depth images, clouds and their files."""
+"""Cameras, depth images, point clouds, and files of these."""

@@ -1,8 +1,8 @@
-"""Pinhole cameras, the lens distortion of CameraInfo, and depth images.
+"""Pinhole cameras with lens distortion, conversion of depth images to points, and objects at the image border.
 
 Camera frames follow the optical convention: z forward, x right, y down. Distortion is that of OpenCV's camera model
 (Brown and Conrady), which ROS calls plumb_bob (k1, k2, p1, p2, k3) and rational_polynomial (k4, k5, k6 after those).
-Depth images become points here. An object that reaches the border of a picture may go on beyond it.
+An object that reaches the border of an image may continue beyond it.
 """
 
 from __future__ import annotations
@@ -23,55 +23,55 @@ from graspd_core.perception.cloud.point_cloud import PointCloud, Vector, convex_
 DISTORTION_MODELS = {"plumb_bob": 5, "rational_polynomial": 8}
 
 _Numbers = Sequence[float | int]
-# Places on the plane of unit depth, or in an image [pixels].
+# Positions on the plane of unit depth, or in an image [pixels].
 _Places = Float[np.ndarray, "*batch 2"]
 DepthImage = Float[np.ndarray, "height width"]
 
-# Newton's method on a smooth lens doubles its digits each round: five suffice, extreme lenses take a few more.
+# Newton's method doubles the correct digits in each step. Five steps suffice, and extreme lenses need a few more.
 _NEWTON_STEPS = 20
 _NEWTON_TOLERANCE = 1e-10
-# Of a focal length and of any other number of a calibration [pixels]: beyond them rays are no longer numbers.
+# Least focal length, and greatest value of any number of a calibration [pixels]. Beyond them rays are not finite.
 _MIN_FOCAL_PX, _MAX_CALIBRATION_PX = 1e-2, 1e7
-# So many points on one side of the hull, of the object and of other things each: an object that stands out alone
-# against nothing makes a hull of its own.
+# A side of the hull is an image border only if it has this many points of the object, and as many of other objects. An
+# object alone in front of nothing makes a hull of its own.
 MIN_BORDER_POINTS = 8
-# Shorter sides than this share of the outline's size are no border of a picture.
+# Sides shorter than this fraction of the outline's size are not borders of an image.
 MIN_SIDE_SHARE = 0.1
-# A border of a picture has points all along it, in so large a share of so many parts of its length: a side from the top
-# of a thing to the corner of the table behind it has none between.
+# An image border has points all along it: in at least this fraction of its parts of equal length. A hull side from the
+# top of an object to the table's corner behind it has none between.
 SIDE_PARTS, MIN_FILLED_SHARE = 20, 0.6
-# Most objects are far from the outline, which the hull of so many points shows as well as that of all.
+# Number of points whose hull is checked first, because most objects are far from the outline.
 HULL_POINTS = 2000
-# Encoding: type of a pixel, and metres per unit of it.
+# For each encoding, the type of a pixel, and metres per unit.
 ENCODINGS = {"16UC1": ("u2", 1e-3), "mono16": ("u2", 1e-3), "32FC1": ("f4", 1.0), "64FC1": ("f8", 1.0)}
-# What a picture of another encoding is asked for instead, by the beginning of its name.
+# Advice for images of another encoding, by the beginning of the encoding's name.
 _REMEDIES = {
-    "8U": "8 bits a pixel hold no depth that can be measured by: publish 16UC1 (millimetres) or 32FC1 (metres)",
-    "mono8": "8 bits a pixel hold no depth that can be measured by: publish 16UC1 (millimetres) or 32FC1 (metres)",
+    "8U": "8 bits per pixel are too few for depth: publish 16UC1 (millimetres) or 32FC1 (metres)",
+    "mono8": "8 bits per pixel are too few for depth: publish 16UC1 (millimetres) or 32FC1 (metres)",
     "rgb": "it is a colour picture: name the depth image's topic",
     "bgr": "it is a colour picture: name the depth image's topic",
 }
-# CompressedImage of `compressedDepth`: the format of its inverse depth as int32, then the two numbers of its
-# quantisation as float32. A PNG begins with 8 bytes that are always the same. Its sizes follow at byte 16.
+# A `compressedDepth` CompressedImage begins with its format as int32 and two quantisation numbers as float32. A PNG
+# begins with 8 fixed bytes, and its width and height are at byte 16.
 _QUANTISED = struct.Struct("<iff")
 _PNG, _PNG_SIZES = b"\x89PNG\r\n\x1a\n", struct.Struct(">II")
 _MOST_PIXELS = 2**26
-# Depth in mm that was cut to 8 bits ends here [m], at this share of the pixels.
+# Depth in mm that was cut to 8 bits has this greatest value [m] at more than this fraction of the pixels.
 _MOST_OF_8_BITS, _CUT_SHARE = 0.255, 0.2
-# A principal point so far from the middle, as a share of it, the same across and down to this share, is of an image of
-# another size. One that a crop moved is seldom off by the same share both ways.
+# A principal point this far off the middle (relative), by the same factor across and down within this tolerance, is of
+# an image of another size. Cropping seldom moves it by the same factor both ways.
 _OFF_MIDDLE, _SAME_MIDDLE, _MOST_SCALED = 0.3, 0.08, 4.5
 
 
 @dataclass(frozen=True)
 class PinholeCamera:
-    """A camera with an ideal lens unless it has a distortion.
+    """A pinhole camera, with optional lens distortion.
 
     Attributes:
-        width, height: size of its image [pixels].
+        width, height: size of the image [pixels].
         fx, fy: focal lengths [pixels].
-        cx, cy: where the optical axis meets the image [pixels].
-        distortion: k1, k2, p1, p2, k3, k4, k5, k6, zero if left out.
+        cx, cy: principal point, where the optical axis meets the image [pixels].
+        distortion: k1, k2, p1, p2, k3, k4, k5, k6. Missing coefficients are zero.
     """
 
     width: int
@@ -89,7 +89,10 @@ class PinholeCamera:
         if not (
             all(abs(number) <= _MAX_CALIBRATION_PX for number in numbers) and min(self.fx, self.fy) >= _MIN_FOCAL_PX
         ):
-            raise CloudError(f"camera: fx={self.fx}, fy={self.fy}, cx={self.cx}, cy={self.cy} is no calibration")
+            raise CloudError(
+                f"camera: fx={self.fx}, fy={self.fy}, cx={self.cx}, cy={self.cy} is no calibration; "
+                "valid: finite numbers, fx and fy above 0"
+            )
         if len(self.distortion) > 8:
             raise CloudError(f"camera: {len(self.distortion)} distortion coefficients; at most 8 are understood")
 
@@ -97,9 +100,9 @@ class PinholeCamera:
 def camera_from_calibration(
     width: int, height: int, matrix: _Numbers, distortion: _Numbers = (), model: str = "plumb_bob"
 ) -> PinholeCamera:
-    """Return the camera of a CameraInfo's `width`, `height`, `k` (row by row), `d` and `distortion_model`.
+    """Return the camera of a CameraInfo, from its `width`, `height`, `k` (row by row), `d` and `distortion_model`.
 
-    Raises CloudError: an unknown model, more coefficients than it has, or no calibration at all.
+    Raises CloudError if the model is unknown or has fewer coefficients than `d`, or if `k` is not a calibration.
     """
     if len(matrix) != 9:
         raise CloudError(f"camera: its matrix K has {len(matrix)} numbers; 9 are needed")
@@ -118,7 +121,7 @@ def camera_from_calibration(
 
 @lru_cache(maxsize=8)
 def camera_rays(camera: PinholeCamera) -> Float[np.ndarray, "height width 3"]:
-    """Return directions of unit depth through each pixel, camera frame, NaN where the lens shows nothing. Read-only."""
+    """Return the ray of unit depth through each pixel, in the camera frame, NaN beyond the lens model. Read-only."""
     column, row = np.meshgrid(np.arange(camera.width), np.arange(camera.height))
     image = np.stack([(column - camera.cx) / camera.fx, (row - camera.cy) / camera.fy], -1)
     rays = np.concatenate([undistort(image, camera.distortion), np.ones((*image.shape[:2], 1))], -1)
@@ -127,23 +130,23 @@ def camera_rays(camera: PinholeCamera) -> Float[np.ndarray, "height width 3"]:
 
 
 def project(points: Float[np.ndarray, "*batch 3"], camera: PinholeCamera) -> _Places:
-    """Return the pixel coordinates (column, row) of points in front of the camera, camera frame [m]."""
+    """Return the pixel coordinates (column, row) of points [m] in the camera frame, in front of the camera."""
     seen = distort(points[..., :2] / points[..., 2:], camera.distortion)
     return seen * [camera.fx, camera.fy] + [camera.cx, camera.cy]
 
 
 def distort(ideal: _Places, coefficients: _Numbers) -> _Places:
-    """Return the image of the lens for the image of an ideal one, both on the plane of unit depth."""
+    """Apply the lens distortion to positions on the plane of unit depth."""
     return _lens(ideal, coefficients)[0] if any(coefficients) else np.array(ideal, dtype=float)
 
 
 def undistort(seen: _Places, coefficients: _Numbers) -> _Places:
-    """Return the inverse of `distort` where there is one, NaN elsewhere."""
+    """Return the inverse of `distort`, NaN where the lens model has no inverse."""
     if not any(coefficients):
         return np.array(seen, dtype=float)
     target = np.asarray(seen, dtype=float)
     ideal = target.copy()
-    # Beyond the lens's range the iteration runs off to infinity. Such pixels are sorted out below.
+    # Beyond the range of the lens model, the iteration diverges. Such pixels become NaN below.
     with np.errstate(over="ignore", invalid="ignore", divide="ignore"):
         for _ in range(_NEWTON_STEPS):
             image, slope = _lens(ideal, coefficients)
@@ -156,7 +159,7 @@ def undistort(seen: _Places, coefficients: _Numbers) -> _Places:
                 break
         image, slope = _lens(ideal, coefficients)
         a, b, d = np.moveaxis(slope, -1, 0)
-        # A lens model folds back at its rim: there the determinant, or the stretch along the radius, is negative.
+        # Beyond its rim a lens model folds back, which makes the determinant or the trace of the derivative negative.
         found = (np.abs(target - image).max(-1) < _NEWTON_TOLERANCE) & (a * d - b * b > 0) & (a + d > 0)
     return np.where(found[..., None], ideal, np.nan)
 
@@ -182,9 +185,9 @@ def _lens(ideal: _Places, coefficients: _Numbers) -> tuple[_Places, Float[np.nda
 def reaches_image_border(
     points: Float[np.ndarray, "points 3"], eye: Vector, mine: Bool[np.ndarray, "points"], width: float
 ) -> bool:
-    """Tell whether an object touches a side of the view's outline that other points touch too.
+    """Return True if an object touches an image border: a side of the view's outline that other points touch too.
 
-    Directions within `width` [rad] of the hull of all directions are on the outline.
+    The outline is the convex hull of all viewing directions. Points within `width` [rad] of it touch it.
     """
     if not mine.any():
         return False
@@ -201,7 +204,7 @@ def reaches_image_border(
     ends = plane[hull.simplices]
     long = np.linalg.norm(ends[:, 0] - ends[:, 1], axis=1) > MIN_SIDE_SHARE * longest_side(plane)
     for (*normal, offset), (start, end) in zip(hull.equations[long], ends[long], strict=True):
-        # The object's few points first: most sides are none of theirs.
+        # The object's few points are checked first, because they are far from most sides.
         near = own[own @ np.array(normal) + offset > -width]
         if len(near) < MIN_BORDER_POINTS:
             continue
@@ -220,10 +223,10 @@ def _filled(near: Float[np.ndarray, "near 2"], start: Float[np.ndarray, "2"], en
 
 
 def depth_in_metres(image: UInt16[np.ndarray, "height width"] | DepthImage, encoding: str) -> DepthImage:
-    """Return the depth along the optical axis [m], 0 where the image has none: zero, negative, NaN or infinite.
+    """Return the depth along the optical axis [m], 0 for missing depth: zero, negative, NaN or infinite values.
 
     Raises:
-        CloudError: an encoding that is no depth, or pixels that are not of its type.
+        CloudError: the encoding is not one of depth, or the pixels are not of the encoding's type.
     """
     kind, unit = _encoding(encoding)
     if image.dtype.kind != kind[0] or (kind[0] == "u" and image.dtype.itemsize != 2):
@@ -236,9 +239,9 @@ def depth_in_metres(image: UInt16[np.ndarray, "height width"] | DepthImage, enco
 def depth_from_bytes(
     data: memoryview, *, width: int, height: int, step: int, encoding: str, is_bigendian: bool = False
 ) -> DepthImage:
-    """Return depth [m] from the bytes of an Image message: rows of `step` bytes, padded or not, in either byte order.
+    """Return depth [m] from the bytes of an Image message, whose rows have `step` bytes with or without padding.
 
-    Raises CloudError: an encoding that is no depth, an empty image, or sizes that contradict each other.
+    Raises CloudError if the encoding is not one of depth, the image is empty, or its sizes disagree.
     """
     if width == 0 or height == 0:
         raise CloudError(f"the depth image is empty: width={width}, height={height}")
@@ -256,10 +259,10 @@ def depth_from_bytes(
 
 
 def size_of_compressed(data: memoryview) -> tuple[int, int]:
-    """Return width and height [pixels] of the PNG in a CompressedImage. Raises CloudError: there is none."""
+    """Return width and height [pixels] of the PNG in a CompressedImage. Raises CloudError if there is no usable PNG."""
     at = _png_begins(data) + 16
     if len(data) < at + _PNG_SIZES.size:
-        raise CloudError(f"depth image: {len(data)} bytes are no whole PNG")
+        raise CloudError(f"depth image: its PNG is cut off, the message has {len(data)} bytes")
     width, height = _PNG_SIZES.unpack_from(data, at)
     if width * height > _MOST_PIXELS:
         raise CloudError(f"depth image: a PNG of {width} x {height} pixels; at most {_MOST_PIXELS} are read")
@@ -269,14 +272,14 @@ def size_of_compressed(data: memoryview) -> tuple[int, int]:
 def depth_from_compressed(data: memoryview, told: str) -> DepthImage:
     """Return depth [m] of a sensor_msgs/CompressedImage of `compressedDepth`, or of a plain PNG of 16 bits.
 
-    32FC1 comes as inverse depth v, quantised with two numbers a and b that stand before the PNG: a / (v - b).
+    For 32FC1, pixels v hold quantised inverse depth. Depth is a / (v - b), with a and b stored before the PNG.
 
     Args:
         data: the message's bytes.
-        told: its `format`, an encoding and "compressedDepth png".
+        told: the message's `format`: an encoding and "compressedDepth png".
 
     Raises:
-        CloudError: a format that is no depth, or bytes that are not what it says.
+        CloudError: the format is not one of depth, or the bytes do not fit it.
     """
     from PIL import Image
 
@@ -287,7 +290,7 @@ def depth_from_compressed(data: memoryview, told: str) -> DepthImage:
     try:
         with Image.open(io.BytesIO(data[begins:])) as picture:
             mode, pixels = picture.mode, np.asarray(picture)
-    except Exception as error:  # what the library lets through of a spoilt file is of any kind
+    except Exception as error:  # for a broken file, the library may raise any exception
         raise CloudError(f"depth image: a broken PNG ({error})") from None
     if not mode.startswith("I"):
         raise CloudError(f"depth image: format {told[:64]!r} holds a PNG of mode {mode}; one of 16 bits is depth")
@@ -314,15 +317,15 @@ def _png_begins(data: memoryview) -> int:
 def cloud_from_depth(
     depth: DepthImage, camera: PinholeCamera, T_frame_camera: Float[np.ndarray, "4 4"] | None = None
 ) -> PointCloud:
-    """Return what a camera saw, in its own frame or, with its pose, in that frame. Pixels without depth give no point.
+    """Return the points of a depth image in the camera frame, or moved by `T_frame_camera` if that is given.
 
     Args:
-        depth: along the optical axis [m]. 0, NaN and infinite mean none.
-        camera: of the same size as the image.
+        depth: depth along the optical axis [m]. Pixels of 0, NaN or infinity give no point.
+        camera: the camera, of the same size as the image.
         T_frame_camera: pose of the camera (z forward, x right, y down).
 
     Raises:
-        CloudError: the image is not of the camera's size, was cut to 8 bits, or the camera is of another resolution.
+        CloudError: image and camera differ in size, depth was cut to 8 bits, or K is of another resolution.
     """
     if depth.shape != (camera.height, camera.width):
         raise CloudError(
@@ -342,7 +345,7 @@ def cloud_from_depth(
 
 
 def _check_image(depth: Float[np.ndarray, "pixels"], camera: PinholeCamera) -> None:
-    """Refuse depth of millimetres that ends at 255, and a camera's matrix that is of another resolution."""
+    """Raise CloudError if depth was cut to 255 mm, or if the camera's matrix is of another resolution."""
     known = depth[np.isfinite(depth) & (depth > 0)]
     if known.size and abs(float(known.max()) - _MOST_OF_8_BITS) < 1e-6:
         share = float((known > _MOST_OF_8_BITS - 1e-6).mean())

@@ -1,7 +1,7 @@
-"""Clouds from files: point formats, arrays, and depth images with the camera that took them.
+"""Reading of point clouds from files: point formats, arrays, and depth images with their camera.
 
-Open3D does not read ply and pcd files here: it makes room for as many points as a header promises, and returns
-uninitialised memory for a file cut short. Formats: "The PLY Polygon File Format" (Turk, 1994) and "The PCD file
+Open3D does not read ply and pcd files here. It allocates as many points as the header promises, and returns
+uninitialised memory if the file is cut short. Formats: "The PLY Polygon File Format" (Turk, 1994) and "The PCD file
 format", version 0.7 (Point Cloud Library).
 """
 
@@ -20,7 +20,7 @@ from graspd_core.perception.cloud.camera import camera_from_calibration, cloud_f
 from graspd_core.perception.cloud.point_cloud import PointCloud, Points, Vector
 from graspd_core.perception.cloud.viewpoint_check import seen_from
 
-# The most that a byte of LZF, the method of compressed pcd, can stand for: 264 bytes by three.
+# One byte of LZF, the compression of pcd files, expands to at most this many: three bytes make 264.
 _DENSEST = 88
 _ORDERS = {"ascii": "", "binary_little_endian": "<", "binary_big_endian": ">"}
 _TYPES = {
@@ -32,13 +32,13 @@ RECORDINGS = ("mcap", "db3", "bag")
 CLOUD_ENDINGS = ("npy", "npz", "pcd", "ply", "xyz")
 
 _ROTATION_TOLERANCE = 1e-4
-# What an archive may unpack to [bytes]: 100 depth images of two million pixels are a quarter of it.
+# Maximum number of bytes that an archive may unpack to. 100 depth images of two million pixels are a quarter of it.
 _MAX_UNPACKED_BYTES = 2**31
 
 
 @dataclass
 class _Element:
-    """One element of a ply header: its count, its properties and their types, "" for a list."""
+    """One element of a ply header: its count, and its properties with their NumPy types, "" for a list."""
 
     name: str
     count: int
@@ -47,12 +47,12 @@ class _Element:
 
 
 def read_ply_points(path: Path) -> Points:
-    """Read the vertices of a ply file, text or binary in either byte order.
+    """Read the vertices of a ply file, text or binary in either byte order. NaN is kept.
 
-    NaN is kept. Raises ValueError: it is no ply file, lacks x, y or z, is cut short, or has lists before its vertices
-    end.
+    Raises ValueError if the file is not a ply file, lacks x, y or z, is cut short, or has list properties in or before
+    the vertices.
     """
-    # At the start of a line: a comment may hold the word.
+    # The word must start a line, because a comment may contain it.
     head, *more = re.split(rb"[\r\n]end_header", path.read_bytes(), maxsplit=1)
     rest = more[0] if more else b""
     body = rest[rest.find(b"\n") + 1 :]
@@ -60,7 +60,7 @@ def read_ply_points(path: Path) -> Points:
     start = 0
     for element in elements:
         if "" in element.codes:
-            raise ValueError(f"element {element.name!r} has a list, and stands in or before the vertices")
+            raise ValueError(f"element {element.name!r} has a list; none may be in or before the vertices")
         if element.name == "vertex":
             break
         start += element.count * sum(np.dtype(code).itemsize if order else 1 for code in element.codes)
@@ -77,10 +77,9 @@ def read_ply_points(path: Path) -> Points:
 
 
 def read_pcd_points(path: Path) -> Points | None:
-    """Read the points of a pcd file, text or binary.
+    """Read the points of a pcd file, text or binary. NaN is kept. Return None for compressed data.
 
-    NaN is kept. Returns None for compressed data. Raises ValueError: its header lacks what is needed, or it is cut
-    short.
+    Raises ValueError if the header is incomplete or inconsistent, or if the file is cut short.
     """
     header: dict[str, list[str]] = {}
     data, at = path.read_bytes(), 0
@@ -95,11 +94,11 @@ def read_pcd_points(path: Path) -> Points | None:
     if missing:
         raise ValueError(f"its header has no {missing[0]}")
     fields = header["FIELDS"]
-    # Not all writers say again what width and height say.
+    # POINTS repeats WIDTH times HEIGHT, and some writers leave it out.
     points = int(header["POINTS"][0]) if header.get("POINTS") else int(header["WIDTH"][0]) * int(header["HEIGHT"][0])
     counts = [int(word) for word in header.get("COUNT", ["1"] * len(fields))]
     if {len(counts), len(header["SIZE"]), len(header["TYPE"])} != {len(fields)} or min(counts) < 1 or points < 0:
-        raise ValueError("its header has not as many SIZE, TYPE and COUNT as FIELDS, or less than none of something")
+        raise ValueError("its header needs SIZE, TYPE and COUNT (1 or more) for all FIELDS, and POINTS of 0 or more")
     lost = [name for name in "xyz" if name not in fields]
     if lost:
         raise ValueError(f"its points have no {lost[0]!r}")
@@ -108,11 +107,11 @@ def read_pcd_points(path: Path) -> Points | None:
         columns = [sum(counts[:place]) for place in places]
         return _numbers_of_text(data[at:], 0, points, sum(counts))[:, columns]
     if header["DATA"][0] not in ("binary", "binary_compressed"):
-        raise ValueError(f"its DATA {header['DATA'][0][:40]!r} is none of ascii, binary and binary_compressed")
-    # Whatever else numpy would take for a type, or for a page of Python.
+        raise ValueError(f"its DATA {header['DATA'][0][:40]!r} is unknown; valid: ascii, binary, binary_compressed")
+    # Other words could be NumPy types, or even expressions that NumPy evaluates.
     odd = [kind for kind in header["TYPE"] if kind.upper() not in ("F", "I", "U")]
     if odd:
-        raise ValueError(f"its TYPE {odd[0][:40]!r} is none of F, I and U")
+        raise ValueError(f"its TYPE {odd[0][:40]!r} is unknown; valid: F, I, U")
     sizes = [int(word) * count for word, count in zip(header["SIZE"], counts, strict=True)]
     if header["DATA"][0] == "binary_compressed":
         _refuse_false_sizes(data[at:], points * sum(sizes))
@@ -129,7 +128,7 @@ def _refuse_false_sizes(packed: bytes, needed: int) -> None:
 
 
 def _ply_header(lines: list[str]) -> tuple[str, list[_Element]]:
-    """Return the byte order, empty for text, and the elements in their order."""
+    """Return the byte order (empty for text) and the elements, in the order of the header."""
     order, elements = None, []
     for words in (line.split() for line in lines[1:]):
         match words:
@@ -138,7 +137,7 @@ def _ply_header(lines: list[str]) -> tuple[str, list[_Element]]:
             case ["element", name, count]:
                 elements.append(_Element(name, int(count)))
                 if elements[-1].count < 0:
-                    raise ValueError(f"element {name!r} comes {count} times")
+                    raise ValueError(f"element {name!r} has a count of {count}")
             case ["property", "list", _, _, name] if elements:
                 elements[-1].names.append(name)
                 elements[-1].codes.append("")
@@ -148,7 +147,7 @@ def _ply_header(lines: list[str]) -> tuple[str, list[_Element]]:
             case [("property" | "element"), *_]:
                 raise ValueError(f"header line {' '.join(words)[:80]!r} is not understood")
     if not lines or lines[0].strip() != "ply" or order is None:
-        raise ValueError("it has no header of a ply file")
+        raise ValueError("it has no valid ply header")
     return order, elements
 
 
@@ -162,7 +161,7 @@ def _rows(data: bytes, dtype: np.dtype, count: int, start: int) -> Float[np.ndar
     if there < count:
         raise ValueError(f"cut short: {there} of {count} points")
     rows = np.frombuffer(data, dtype, count, start)
-    # A NaN of any kind stays one: numpy would warn of those that signal.
+    # Signalling NaNs stay NaN. NumPy would warn of them.
     with np.errstate(invalid="ignore"):
         return np.stack([rows[name].astype(float) for name in "xyz"], axis=1)
 
@@ -176,7 +175,7 @@ def _numbers_of_text(body: bytes, start: int, rows: int, width: int) -> Float[np
 
 
 def is_cloud_file(path: str | Path) -> bool:
-    """Tell whether a path names a cloud by its ending. A ply counts when its header declares no faces."""
+    """Return True if a path has the ending of a point cloud file. A ply counts only if its header declares no faces."""
     path = Path(path)
     ending = path.suffix.lower().lstrip(".")
     if ending == "ply":
@@ -185,17 +184,19 @@ def is_cloud_file(path: str | Path) -> bool:
 
 
 def load_views(path: str | Path, viewpoint: Vector | None = None) -> tuple[PointCloud, ...]:
-    """Read what one or several cameras saw, in one frame. `viewpoint` says where the camera of points stood.
+    """Read the views of one or several cameras from a file, in one frame.
+
+    `viewpoint` is the camera's position [m] for a file of points. It replaces the position in the file.
 
     * ply, xyz, npy (n×3 or h×w×3): points [m], seen from the origin.
-    * pcd: points [m], seen from its `VIEWPOINT`. The format does not say which way the camera looked.
-    * npz with `points`, and where known `viewpoint` [m] and `forward` (the direction of the optical axis).
-    * npz with `depth` (h×w, integers in millimetres, floats in metres) and the camera's matrix `K` (3×3), where known
-      also `distortion` (k1 k2 p1 p2 k3) and the camera's pose `T_world_camera` (4×4).
-    * npz with `depths` (views×h×w), `K`, `poses` (views×4×4, each `T_world_camera`), where known `distortion`.
+    * pcd: points [m], seen from its `VIEWPOINT`. The format does not give the camera's direction.
+    * npz with `points`, and optionally `viewpoint` [m] and `forward` (the direction of the optical axis).
+    * npz with `depth` (h×w, integers in millimetres, floats in metres) and the camera matrix `K` (3×3), and optionally
+      `distortion` (k1 k2 p1 p2 k3) and the camera's pose `T_world_camera` (4×4).
+    * npz with `depths` (views×h×w), `K`, `poses` (views×4×4, each `T_world_camera`), and optionally `distortion`.
 
     Raises:
-        CloudError: the file is missing, of an unknown ending, unreadable, or does not hold one of these.
+        CloudError: the file is missing, has an unknown ending, is unreadable, or holds none of these.
     """
     path = Path(path)
     ending = path.suffix.lower().lstrip(".")
@@ -217,7 +218,7 @@ def load_views(path: str | Path, viewpoint: Vector | None = None) -> tuple[Point
     try:
         if "depth" in arrays or "depths" in arrays:
             if viewpoint is not None:
-                raise CloudError("holds depth, which tells where its camera stood; view_point is for points")
+                raise CloudError("holds depth, which has its own camera pose; view_point is valid for points only")
             return _depth_views(arrays)
         return (_points_view(arrays, viewpoint),)
     except CloudError as error:
@@ -225,7 +226,7 @@ def load_views(path: str | Path, viewpoint: Vector | None = None) -> tuple[Point
 
 
 def recording_told(path: Path) -> str:
-    """Return what a recording is, and the command that reads it."""
+    """Return a message on the kind of a recording, with the command that reads or converts it."""
     if path.suffix.lower() != ".bag":
         return f"is a recording of ROS 2: graspd replay {path.name}"
     return f"is a bag of ROS 1; convert it first: rosbags-convert --src {path.name} --dst {path.stem}"
@@ -243,7 +244,7 @@ def _points_view(arrays: Mapping[str, np.ndarray], said: Vector | None) -> Point
         told = "colours or normals" if points.shape[1] > 4 else "an intensity"
         raise CloudError(f"shape {points.shape}: {told} beside x, y, z? save the coordinates alone: points[:, :3]")
     if pixels.ndim != 3 or pixels.shape[2] != 3 or viewpoint.shape != (3,):
-        raise CloudError(f"shape {points.shape}, viewpoint {viewpoint.shape}; points × 3 and 3 are needed")
+        raise CloudError(f"points of shape {points.shape}, viewpoint {viewpoint.shape}; (n, 3) and (3,) are needed")
     if not np.isfinite(viewpoint).all():
         raise CloudError("'viewpoint' is NaN or infinite")
     if forward is not None:
@@ -286,7 +287,7 @@ def _metres(image: np.ndarray, name: str) -> Float[np.ndarray, "height width"]:
     if image.dtype.kind in "iu":
         return depth_in_metres(image.astype(float).clip(0, 2**16 - 1).astype(np.uint16), "16UC1")
     if image.dtype.kind == "f":
-        # What is too far for a number of 32 bits is infinitely far, which means no depth.
+        # Values too large for float32 become infinite, which means missing depth.
         with np.errstate(over="ignore", invalid="ignore"):
             return depth_in_metres(image.astype(np.float32), "32FC1")
     raise CloudError(f"{name!r} holds {image.dtype}; integers (mm) or floats (m) are needed")
@@ -306,15 +307,15 @@ def rigid(pose: np.ndarray, name: str) -> Float[np.ndarray, "4 4"]:
 def _numbers(arrays: Mapping[str, np.ndarray], name: str) -> np.ndarray:
     if arrays[name].dtype.kind not in "biuf":
         raise CloudError(f"{name!r} not readable as numbers: it holds {str(arrays[name].dtype)[:80]}")
-    # A NaN of any kind stays one: numpy would warn of those that signal.
+    # Signalling NaNs stay NaN. NumPy would warn of them.
     with np.errstate(invalid="ignore", over="ignore"):
         return arrays[name].astype(float)
 
 
 def read_numpy(path: Path) -> dict[str, np.ndarray]:
-    """Read the arrays of an npz, or that of an npy as `points`."""
+    """Read the arrays of an npz by name, or the array of an npy as `points`."""
     try:
-        # numpy leaves a spoilt file open when it is given the path.
+        # If NumPy is given the path, it leaves a broken file open.
         with path.open("rb") as file:
             stored = np.load(file, allow_pickle=False)
             if isinstance(stored, np.ndarray):
@@ -323,14 +324,12 @@ def read_numpy(path: Path) -> dict[str, np.ndarray]:
             if unpacked > _MAX_UNPACKED_BYTES:
                 raise ValueError(f"{unpacked} bytes when unpacked; at most {_MAX_UNPACKED_BYTES} are taken")
             return {name: stored[name] for name in stored.files}
-    # A spoilt file shows as whatever it brings about in numpy, its zip reader and its reader of Python's literals.
-    # A header that promises more than there is shows as a lack of memory.
+    # For a broken file, NumPy and the readers that it uses may raise any exception. A header that promises too much
+    # raises MemoryError.
     except Exception as error:
         told = _first_line(error)
         if "allow_pickle" in told:
-            told = (
-                "it holds a pickled object of Python, a dictionary say, which is not run: np.savez(path, points=points)"
-            )
+            told = "it holds a pickled object of Python, which is not loaded for safety: np.savez(path, points=points)"
         raise CloudError(f"{path}: not readable as numbers ({told})") from error
 
 
@@ -342,7 +341,7 @@ def _ply_has_faces(path: Path) -> bool:
 
 
 def _pcd_viewpoint(path: Path) -> Vector:
-    """Return the sensor's position by the header, by default the origin."""
+    """Return the sensor's position [m] from the header, or the origin if the header has none."""
     words = _pcd_header(path, b"VIEWPOINT")[:3] or [b"0"] * 3
     try:
         place = np.array([float(word) for word in words])
@@ -390,7 +389,7 @@ def _read_open3d(path: Path) -> Points:
     with Extra("clouds"):
         import open3d as o3d
 
-    # Open3D prints its complaints and returns nothing. The error below says it once.
+    # Open3D prints errors and returns no points. It is kept silent, because the caller raises its own error.
     with o3d.utility.VerbosityContextManager(o3d.utility.VerbosityLevel.Error):
         try:
             cloud = o3d.io.read_point_cloud(path, remove_nan_points=False, remove_infinite_points=False)

@@ -1,9 +1,9 @@
-"""A depth image from a file, and its camera from another, as `--camera` takes it.
+"""Reading of a depth image from one file, and of its camera from another, the `--camera` file.
 
-The camera's file is JSON: `width`, `height`, and `K` (row by row), Open3D's `intrinsic_matrix` (column by column), or
-`fx fy cx cy`. Optional are `distortion` and `distortion_model` as in CameraInfo, `T_world_camera` (4×4) and
-`depth_unit`: metres per unit of the image, or m, cm, mm or um. A `depth_scale` is refused, because its unit differs
-from writer to writer.
+The camera file is JSON with `width`, `height`, and one of `K` (row by row), Open3D's `intrinsic_matrix` (column by
+column), or `fx fy cx cy`. Optional keys are `distortion` and `distortion_model` as in CameraInfo, `T_world_camera`
+(4×4), and `depth_unit`: metres per unit of the image, or m, cm, mm or um. A `depth_scale` is refused, because programs
+disagree on its unit.
 """
 
 from __future__ import annotations
@@ -30,21 +30,21 @@ from graspd_core.perception.cloud.point_cloud import PointCloud
 
 IMAGE_ENDINGS, DEPTH_ENDINGS = ("png", "tif", "tiff"), ("png", "tif", "tiff", "npy", "npz")
 _UNITS = {"m": 1.0, "cm": 1e-2, "mm": 1e-3, "um": 1e-6}
-# Whole numbers are millimetres, as cameras send them.
+# Integers are millimetres by default, as cameras send them.
 _WHOLE = 1e-3
-# Depth beyond this on the median is in another unit [m].
+# If the median depth is above this [m], the unit must be another.
 _FARTHEST = 50.0
 _SIMPLE = ("fx", "fy", "cx", "cy")
 
 
 @dataclass(frozen=True)
 class DepthCamera:
-    """A camera as its file describes it.
+    """A camera as described by its file.
 
     Attributes:
-        camera: its image's size, matrix and lens.
-        T_world_camera: its pose (z forward, x right, y down). None where the file does not say.
-        unit: metres per unit of its depth images. None where the file does not say.
+        camera: image size, camera matrix and lens distortion.
+        T_world_camera: pose of the camera (z forward, x right, y down). None if not in the file.
+        unit: metres per unit of its depth images. None if not in the file.
     """
 
     camera: PinholeCamera
@@ -53,21 +53,21 @@ class DepthCamera:
 
 
 def is_depth_image(path: str | Path) -> bool:
-    """Tell whether a path names an image by its ending, which needs a camera to become points."""
+    """Return True if the ending of a path is that of an image, which needs a camera to become points."""
     return Path(path).suffix.lower().lstrip(".") in IMAGE_ENDINGS
 
 
 def load_depth_view(image: str | Path, camera: str | Path, unit: float | None = None) -> PointCloud:
-    """Read what one camera saw from its depth image and its own file, in the world's frame where the file has a pose.
+    """Read the points of a depth image and its camera file, in the world frame if the file has a pose.
 
     Args:
         image: a png or tiff of 16 bits or floats, an npy, or an npz with `depth`.
-        camera: see the top of this module.
-        unit: metres per unit of the image. None: what the camera's file says, else millimetres for whole numbers and
+        camera: the camera file, described at the top of this module.
+        unit: metres per unit of the image. None uses the camera file's unit, or else millimetres for integers and
             metres for floats.
 
     Raises:
-        CloudError: a file cannot be read, is no depth image or camera, or they do not fit each other.
+        CloudError: a file cannot be read, is not a depth image or a camera, or the two do not fit each other.
     """
     taken_by = load_depth_camera(camera)
     pixels = _pixels(Path(image))
@@ -79,7 +79,7 @@ def load_depth_view(image: str | Path, camera: str | Path, unit: float | None = 
 
 
 def load_depth_camera(path: str | Path) -> DepthCamera:
-    """Read a camera's file. Raises CloudError: it is missing, no JSON, or lacks a key, which is named."""
+    """Read a camera file. Raises CloudError if it is missing, not JSON, or lacks a key, which the error names."""
     try:
         told = json.loads(Path(path).read_text(encoding="utf-8"))
     except OSError as error:
@@ -100,7 +100,7 @@ def _camera_of(told: Mapping[str, Any]) -> DepthCamera:
             raise CloudError(f"{key} is missing: the size of the image that the matrix is for; it has {_keys(told)}")
     if "depth_scale" in told and "depth_unit" not in told:
         raise CloudError(
-            f"depth_scale: {shown(told['depth_scale'])} means metres, millimetres or units of a metre by who wrote it; "
+            f"depth_scale: {shown(told['depth_scale'])} is ambiguous, because programs disagree on its unit; "
             "write depth_unit, in metres per unit: 0.001 for millimetres"
         )
     width, height = (int(_numbers(told[key], (), key)) for key in ("width", "height"))
@@ -114,20 +114,20 @@ def _camera_of(told: Mapping[str, Any]) -> DepthCamera:
 
 
 def _matrix(told: Mapping[str, Any]) -> list[float]:
-    """Return the nine numbers of K, row by row."""
+    """Return the nine numbers of the camera matrix K, row by row."""
     if "K" in told:
         return _numbers(told["K"], None, "K").reshape(-1).tolist()
     if "intrinsic_matrix" in told:
         return _numbers(told["intrinsic_matrix"], (9,), "intrinsic_matrix").reshape(3, 3).T.reshape(-1).tolist()
     lost = [key for key in _SIMPLE if key not in told]
     if lost:
-        raise CloudError(f"K is missing, and of fx, fy, cx, cy {lost[0]}; it has {_keys(told)}")
+        raise CloudError(f"K is missing, and so is {lost[0]} of fx, fy, cx, cy; it has {_keys(told)}")
     fx, fy, cx, cy = (float(_numbers(told[key], (), key)) for key in _SIMPLE)
     return [fx, 0.0, cx, 0.0, fy, cy, 0.0, 0.0, 1.0]
 
 
 def _unit(told: Any) -> float:
-    """Return metres per unit, from a number or from text that begins with a unit."""
+    """Return metres per unit, from a number or from a text that begins with the name of a unit."""
     word = told.replace(",", " ").split()[:1] if isinstance(told, str) else None
     if word and word[0] in _UNITS:
         return _UNITS[word[0]]
@@ -153,12 +153,12 @@ def _keys(told: Mapping[str, Any]) -> str:
 
 
 def _pixels(path: Path) -> np.ndarray:
-    """Read the pixels of an image as the file has them."""
+    """Read the pixels of an image, unchanged."""
     if not path.is_file():
         raise CloudError(f"{path}: no such depth image")
     if path.suffix.lower().lstrip(".") not in DEPTH_ENDINGS:
         valid = ", ".join(DEPTH_ENDINGS)
-        raise CloudError(f"{path}: with a camera a depth image is needed; its ending may be: {valid}")
+        raise CloudError(f"{path}: a camera file needs a depth image; valid endings: {valid}")
     if not is_depth_image(path):
         arrays = read_numpy(path)
         name = "points" if path.suffix.lower() == ".npy" else "depth"
@@ -170,18 +170,18 @@ def _pixels(path: Path) -> np.ndarray:
     try:
         with Image.open(path) as image:
             return np.asarray(image)
-    # A spoilt file shows as whatever it brings about in Pillow.
+    # For a broken file, Pillow may raise any exception.
     except Exception as error:
         raise CloudError(f"{path}: not a readable image ({str(error)[:200] or type(error).__name__})") from None
 
 
 def _metres(pixels: np.ndarray, unit: float | None, name: str) -> DepthImage:
-    """Return depth [m], 0 for none. Raises CloudError: it is a picture, or its unit is hardly the assumed one."""
+    """Return depth [m], 0 for missing depth. Raises CloudError if pixels hold no depth or the unit seems wrong."""
     if pixels.ndim != 2 or pixels.dtype.kind not in "iuf" or pixels.dtype.itemsize < 2:
         size = f"{' × '.join(map(str, pixels.shape))} of {pixels.dtype}"
         raise CloudError(f"{name}: holds {size}, a picture; depth has one number of 16 bits or more a pixel")
     unit = unit or (1.0 if pixels.dtype.kind == "f" else _WHOLE)
-    # What is too far for a number of 32 bits is infinitely far, which means no depth.
+    # Values too large for float32 become infinite, which means missing depth.
     with np.errstate(over="ignore", invalid="ignore"):
         depth = depth_in_metres((pixels.astype(float) * unit).astype(np.float32), "32FC1")
     seen = depth[depth > 0]

@@ -1,7 +1,7 @@
-"""Space that the cameras saw to be empty: before a seen surface, and beside the object's outline.
+"""Free space: the space that the cameras saw to be empty, in front of surfaces and beside the object's outline.
 
-Each view's own object points give a small depth image of it. A guessed point before that surface, or beside the
-outline, contradicts the camera. A point behind it is hidden, and may be there.
+Each view's points of the object become a small depth image. A guessed point in front of the surface in this image, or
+beside the outline, contradicts the camera. A point behind the surface is hidden, so it is possible.
 """
 
 from __future__ import annotations
@@ -16,36 +16,36 @@ from graspd_core.config import ReconstructionConfig
 from graspd_core.perception.cloud.point_cloud import PointCloud, Points, Vector
 from graspd_core.se3 import perpendicular
 
-# Positions or normals, and a depth [m] or share of each.
+# Positions or normals, and a depth [m] or fraction for each.
 Places = Float[np.ndarray, "*batch 3"]
 Depths = Float[np.ndarray, "*batch"]
 
-# Depth images of more cells than this across the object tell no more.
+# Maximum number of cells of a depth image across the object. More cells would show no more.
 MAX_IMAGE_CELLS = 160
-# Points, itself among them, that a point's spacing is taken from.
+# Number of nearest points, including the point itself, that define the spacing at a point.
 SPACING_NEIGHBOURS = 5
 
-# What is this much nearer than the object's surface beside it stands before it [m].
+# Points this much nearer to the camera than the object's surface there belong to an occluder [m].
 OCCLUDER_GAP_M = 0.01
-# Beside what was seen, hidden parts are looked for so far [m].
+# Hidden parts may lie up to this far beside the seen part [m].
 HIDDEN_REACH_M = 0.1
 
-# A point so much deeper in empty space than the slack is impossible.
+# A point this much deeper in empty space than the slack is a full contradiction [m].
 CONTRADICTION_DEPTH_M = 0.01
 
 
 @dataclass(frozen=True)
 class ViewDepth:
-    """One camera's depth image of the object, in directions from the camera (a pinhole of focal length 1).
+    """One camera's depth image of the object, as a pinhole of focal length 1.
 
     Attributes:
-        eye: where the camera stood [m].
-        frame: columns right, down and forward.
-        low: the first cell's direction. `cell`: the width of one.
-        depth: along forward [m], of the surface or, beside the outline, of the nearest cell of it, infinite where
-            something stands before it.
-        nearest: the same, the smallest over the cell's neighbours, or the depth of what stands before it.
-        beside: cells between this one and the outline, 0 within it and where something hides what is behind.
+        eye: position of the camera [m].
+        frame: axes of the camera, as columns right, down and forward.
+        low, cell: image coordinates of the first cell, and width of a cell, at unit depth.
+        depth: depth of the surface along forward [m]. Beside the outline, it is the depth of the nearest cell inside.
+            Cells that an occluder hides are infinite.
+        nearest: least depth over a cell and its neighbours, or the depth of the occluder [m].
+        beside: distance from the outline in cells, 0 inside the outline and where an occluder hides the object.
     """
 
     eye: Vector
@@ -59,14 +59,14 @@ class ViewDepth:
 
 @dataclass(frozen=True)
 class FreeSpace:
-    """The space that the object does not fill.
+    """The space that the object cannot fill, in the local frame of the reconstruction.
 
     Attributes:
-        view_depths: one a camera, none for unknown cameras.
-        standing: the object stands on a support that fills z < 0.
-        lowest: height of the lowest points seen [m]: segmentation cuts the rest off with the support, so that outlines
-            end too high by up to this.
-        slack: outlines and surfaces are seen to within this [m].
+        view_depths: one depth image per camera, none if the cameras are unknown.
+        standing: whether the object stands on a support that fills z < 0.
+        lowest: height of the lowest seen points [m]. Segmentation cuts lower points off with the support, so outlines
+            may end too high by this much.
+        slack: precision of seen outlines and surfaces [m].
         tolerance: a guessed point this near to a seen surface confirms the guess [m].
     """
 
@@ -78,11 +78,11 @@ class FreeSpace:
 
 
 def make_view_depths(views: Sequence[PointCloud], whole: Sequence[PointCloud] = ()) -> tuple[ViewDepth, ...]:
-    """Return the depth images of the views' points of the object. Views with too few points make none.
+    """Return a depth image of the object for each view. Views with too few points are left out.
 
     Args:
         views: the object's points alone.
-        whole: all that each camera saw, in the same order. Without it, nothing stood between cameras and object.
+        whole: all points that each camera saw, in the same order. If empty, occluders are not considered.
     """
     around = whole or [None] * len(views)
     made = (_make_view_depth(view, all_seen) for view, all_seen in zip(views, around, strict=True))
@@ -90,10 +90,9 @@ def make_view_depths(views: Sequence[PointCloud], whole: Sequence[PointCloud] = 
 
 
 def _make_view_depth(view: PointCloud, whole: PointCloud | None) -> ViewDepth | None:
-    """Return the depth image of a view's points.
+    """Return the depth image of a view's points. Holes of a few cells are filled, since they are missing pixels.
 
-    Holes of a few cells are filled, since they are missing pixels. None for fewer than five points before the camera,
-    or for points all in one line of sight.
+    Return None if fewer than five points are in front of the camera, or if all points are in one line of sight.
     """
     from scipy.ndimage import binary_closing, distance_transform_edt, minimum_filter
     from scipy.spatial import KDTree
@@ -108,7 +107,7 @@ def _make_view_depth(view: PointCloud, whole: PointCloud | None) -> ViewDepth | 
     cell = max(1.5 * spacing, float(np.ptp(plane, axis=0).max()) / MAX_IMAGE_CELLS)
     if cell < 1e-9:
         return None
-    # What is hidden may go on as far beside what is seen.
+    # The margin around the seen part must hold the hidden parts.
     margin = 6 if whole is None else max(6, int(HIDDEN_REACH_M / (cell * float(np.median(local[:, 2])))))
     low = plane.min(0) - margin * cell
     index = tuple(np.floor((plane - low) / cell).astype(int).T)
@@ -136,10 +135,10 @@ def _occluders(
     cell: float,
     depth: Float[np.ndarray, "x y"],
 ) -> Float[np.ndarray, "x y"]:
-    """Return the depth of what stands before the object in each cell [m], infinite for nothing."""
+    """Return the depth of the occluder in front of the object in each cell [m], infinite if there is none."""
     from scipy.ndimage import binary_closing, distance_transform_edt
 
-    # Of all that a camera saw little is in the object's image. Points that are not finite compare as false.
+    # Only few of the points are in the object's image. Points that are not finite compare as false.
     x, y, forward = ((whole.points - whole.viewpoint) @ frame).T
     high = low + cell * np.array(depth.shape)
     ahead = (forward > 1e-3) & (x >= low[0] * forward) & (x < high[0] * forward)
@@ -153,24 +152,24 @@ def _occluders(
     known = np.isfinite(before)
     if not known.any():
         return before
-    # Holes of a few cells are missing pixels of it.
+    # Holes of a few cells are missing pixels of the occluder.
     _, at = distance_transform_edt(~known, return_indices=True)  # pyright: ignore[reportGeneralTypeIssues]
     return np.where(binary_closing(known, np.ones((3, 3)), iterations=2), before[tuple(at)], np.inf)
 
 
 def empty_depth(free_space: FreeSpace, points: Places) -> Depths:
-    """Return how deep points lie in the support, or in space that a camera saw to be empty [m]."""
+    """Return how deep points lie in the support or in space seen to be empty [m], 0 if in neither."""
     return _classify(free_space, points, None)[1]
 
 
 def weigh(free_space: FreeSpace, points: Places, normals: Places) -> tuple[Bool[np.ndarray, "*batch"], Depths]:
-    """Return whether guessed points lie on a seen surface that faces its camera, and their contradiction, 0 to 1."""
+    """Return whether guessed points lie on seen surface and face its camera, and how much they contradict (0 to 1)."""
     confirmed, deep = _classify(free_space, points, normals)
     return confirmed, np.clip((deep - free_space.slack) / CONTRADICTION_DEPTH_M, 0.0, 1.0)
 
 
 def on_seen(free_space: FreeSpace, points: Places) -> Bool[np.ndarray, "*batch"]:
-    """Return whether points lie on a seen surface, within one and a half of the tolerance."""
+    """Return which points lie on seen surface, within 1.5 times the tolerance."""
     found = np.zeros(points.shape[:-1], dtype=bool)
     for view_depth in free_space.view_depths:
         empty, behind = _look(view_depth, points)
@@ -180,7 +179,7 @@ def on_seen(free_space: FreeSpace, points: Places) -> Bool[np.ndarray, "*batch"]
 
 
 def facing(free_space: FreeSpace, points: Points, normals: Points) -> Float[np.ndarray, "n"]:
-    """Return the cosine between normals and the direction to the camera that they face most."""
+    """Return the cosine between each normal and the direction to the camera that it faces most."""
     most = np.full(len(points), -1.0)
     for view_depth in free_space.view_depths:
         way = view_depth.eye - points
@@ -205,13 +204,13 @@ def _classify(
 
 
 def _look(view_depth: ViewDepth, points: Places) -> tuple[Depths, Depths]:
-    """Return how deep points lie in empty space, and how far behind the seen surface [m], infinite beside it."""
+    """Return how deep points lie in empty space, and how far behind seen surface, infinite beside the outline [m]."""
     local = (points - view_depth.eye) @ view_depth.frame
     forward = np.maximum(local[..., 2], 1e-6)
     place = (local[..., :2] / forward[..., None] - view_depth.low) / view_depth.cell
     inner = np.clip(place, 0, np.array(view_depth.depth.shape) - 1)
     index = tuple(np.moveaxis(inner.astype(int), -1, 0))
-    # Beyond the image's edge, the way to the edge adds up.
+    # For points beyond the image, the distance to the image is added.
     beside = (view_depth.beside[index] + np.abs(place - inner).sum(-1)) * view_depth.cell * forward
     before = np.maximum(view_depth.nearest[index] - local[..., 2], 0.0)
     within = view_depth.beside[index] == 0
@@ -220,7 +219,7 @@ def _look(view_depth: ViewDepth, points: Places) -> tuple[Depths, Depths]:
 
 
 def view_frame(view: PointCloud) -> Float[np.ndarray, "3 3"]:
-    """Return a camera frame that looks at the middle of the points. Columns: right, down and forward."""
+    """Return the axes of a camera that looks at the mean of the points, as columns right, down and forward."""
     forward = view.points.mean(0) - view.viewpoint
     length = float(np.linalg.norm(forward))
     forward = forward / length if length > 1e-6 else np.array([0.0, 0.0, 1.0])

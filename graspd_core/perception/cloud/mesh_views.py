@@ -1,7 +1,7 @@
-"""Meshes that are views: points of one camera with faces between neighbouring pixels, as camera viewers write them.
+"""Detection of view meshes: one camera's points with faces between neighbouring pixels, as camera viewers export them.
 
-Such a sheet is open, all of it faces the camera, and its triangles are halves of pixels. As a solid, a table and the
-objects on it would be one body.
+A view mesh is open, all of it faces the camera, and each triangle is half a pixel. It must not be used as a solid,
+because a table and the objects on it would be one body.
 """
 
 from __future__ import annotations
@@ -14,22 +14,22 @@ from graspd_core.mesh.topology import scaled_normals
 from graspd_core.perception.cloud.point_cloud import PointCloud, Points, Vector
 from graspd_core.types import TriangleMesh
 
-# Fewer vertices are no camera's picture.
+# A mesh with fewer vertices is not a camera's image.
 MIN_VERTICES = 2000
-# So large a share of the faces turns the same side to the camera, and all lie within this angle of its axis.
+# At least this fraction of the faces turn the same side to the camera. All lie within this cosine of its axis.
 FACING_SHARE, MIN_COSINE = 0.98, 0.25
-# Faces of half a pixel each have areas in the image that differ by less than this share of the usual one.
+# Faces of half a pixel have areas in the image that differ by less than this fraction of the median area.
 PIXEL_SPREAD = 0.1
-# In a grid of pixels six faces meet at this share of the vertices inside, and edges of depth leave several borders.
+# In a grid of pixels, six faces meet at this fraction of inner vertices. Depth edges leave at least so many borders.
 GRID_SHARE, MIN_BORDERS = 0.75, 3
 _MOST_FACES, _STEPS = 20_000, 300
 
 
 def view_in_mesh(mesh: TriangleMesh, source: str) -> PointCloud | None:
-    """Return the view that a mesh is, seen from the origin, or None if the mesh is not one camera's sheet.
+    """Return the points of a view mesh as a cloud seen from the origin, or None if the mesh is not a view mesh.
 
-    Raises MeshError: the mesh is a camera's sheet in another frame than the camera's, which does not say where it
-    stood.
+    Raises MeshError if the mesh is a view mesh in another frame than the camera's, because the camera's position is
+    then unknown.
     """
     if len(mesh.vertices) < MIN_VERTICES or len(mesh.faces) < MIN_VERTICES or not np.isfinite(mesh.vertices).all():
         return None
@@ -44,14 +44,14 @@ def view_in_mesh(mesh: TriangleMesh, source: str) -> PointCloud | None:
         return PointCloud(mesh.vertices, np.zeros(3), posed=True)
     if _borders(mesh) >= MIN_BORDERS and _is_grid(mesh) and _camera_place(corners, normals) is not None:
         raise MeshError(
-            f"{source}: one side of a scene, an open sheet as camera viewers export it, not in the camera's frame; "
-            "a mesh is a solid; give the points as a cloud with its camera's place (npz: points, viewpoint)"
+            f"{source}: an open mesh of one camera's view, and not in the camera's frame; "
+            "give a closed mesh, or the points as a cloud with the camera's position (npz: points, viewpoint)"
         )
     return None
 
 
 def _faces(corners: Float[np.ndarray, "n 3 3"], normals: Points, eye: Vector) -> bool:
-    """Tell whether all faces turn the same side to a place, and lie ahead of it."""
+    """Return True if nearly all faces turn the same side to a camera at `eye`, and all lie ahead of it."""
     way = corners.mean(1) - eye
     distance = np.linalg.norm(way, axis=1)
     if not distance.min() > 0:
@@ -64,7 +64,7 @@ def _faces(corners: Float[np.ndarray, "n 3 3"], normals: Points, eye: Vector) ->
 
 
 def _pixels(corners: Float[np.ndarray, "n 3 3"]) -> bool:
-    """Tell whether the faces are halves of pixels of a camera at the origin that looks along an axis."""
+    """Return True if each face is half a pixel of a camera at the origin that looks along a coordinate axis."""
     for axis in range(3):
         depth = corners[..., axis]
         if np.abs(depth).min() < 1e-9:
@@ -79,7 +79,7 @@ def _pixels(corners: Float[np.ndarray, "n 3 3"]) -> bool:
 
 
 def _camera_place(corners: Float[np.ndarray, "n 3 3"], normals: Points) -> Vector | None:
-    """Return a place outside that all faces turn the same side to, None if none is found."""
+    """Return a camera position outside the mesh to which nearly all faces turn the same side, or None."""
     centre, middle = corners.mean(1), corners.mean((0, 1))
     size = float(np.ptp(centre, axis=0).max())
     for side in (1.0, -1.0):
@@ -99,9 +99,9 @@ def _edges(mesh: TriangleMesh) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _is_open(mesh: TriangleMesh) -> bool:
-    """Whether an edge is of one face only. The edges about a share of the vertices are looked at first."""
+    """Return True if some edge belongs to one face only. Edges at a sample of the vertices are checked first."""
     for share in (32, 1):
-        # All faces of an edge have both its ends: none is lost by taking the faces about a vertex.
+        # Every face of an edge contains both ends of the edge, so the faces at a vertex include all faces of its edges.
         wanted = np.arange(len(mesh.vertices)) % share == 0
         faces = mesh.faces[wanted[mesh.faces].any(1)] if share > 1 else mesh.faces
         edges = np.sort(faces[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2), axis=1)
@@ -112,7 +112,7 @@ def _is_open(mesh: TriangleMesh) -> bool:
 
 
 def _borders(mesh: TriangleMesh) -> int:
-    """Return the number of closed lines that the surface ends at."""
+    """Return the number of border loops of the surface."""
     from scipy.sparse import coo_matrix
     from scipy.sparse.csgraph import connected_components
 

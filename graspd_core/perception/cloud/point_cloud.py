@@ -1,4 +1,4 @@
-"""Point clouds [m] of one camera: moved to other frames, cleaned, and read from a PointCloud2's bytes."""
+"""Point clouds [m] of one camera: transforming, cleaning, and reading from the bytes of a PointCloud2."""
 
 from __future__ import annotations
 
@@ -12,29 +12,29 @@ from jaxtyping import Bool, Float
 from graspd_core.errors import CloudError, Extra
 from graspd_core.mesh.topology import voxel_keys
 
-# Positions or directions, one of them, and where the cameras of several views stood.
+# Several positions or directions, a single one, and the camera positions of several views.
 Points = Float[np.ndarray, "n 3"]
 Vector = Float[np.ndarray, "3"]
 Eyes = Float[np.ndarray, "views 3"]
 
 MIN_POINTS = 50
-# Points this many times the cloud's size away from its middle are no part of it.
+# Points farther from the cloud's median than this many times its size are outliers.
 MAX_DISTANCE_IN_SIZES = 1e3
-# No camera measures what is this near to itself [m]. Drivers that have no depth send that.
+# Points this near to the camera [m] are not measured. Some drivers send them for missing depth.
 CAMERA_PLACE_TOLERANCE_M = 1e-5
-# So many numbers tell a byte order.
+# Count of numbers that are checked for the byte order.
 _SOME_NUMBERS = 5000
 
 
 @dataclass(frozen=True)
 class PointCloud:
-    """Points that one camera saw. Several views of a scene are several of these, in one frame.
+    """Points that one camera saw. Several views of a scene are several point clouds in one frame.
 
     Attributes:
-        points: positions [m], which may hold NaN until cleaned.
-        viewpoint: where the camera stood, in the same frame [m].
-        forward: unit direction of its optical axis, in the same frame, None if unknown.
-        posed: whether the points tell that they were seen from there, as those of a depth image do.
+        points: positions [m]. They may hold NaN until cleaned.
+        viewpoint: position of the camera, in the same frame [m].
+        forward: unit direction of the camera's optical axis, in the same frame, None if unknown.
+        posed: whether the points prove the viewpoint, as the pixels of a depth image do.
     """
 
     points: Float[np.ndarray, "points 3"]
@@ -48,7 +48,7 @@ class PointCloud:
 
 
 def transform_cloud(cloud: PointCloud, T_a_b: Float[np.ndarray, "4 4"]) -> PointCloud:
-    """Return a cloud of frame b, with its camera's position, in frame a."""
+    """Return a cloud given in frame b, with its camera's position and axis, in frame a."""
     rotation, position = T_a_b[:3, :3], T_a_b[:3, 3]
     points = cloud.points @ rotation.T
     points += position
@@ -57,9 +57,9 @@ def transform_cloud(cloud: PointCloud, T_a_b: Float[np.ndarray, "4 4"]) -> Point
 
 
 def measured(points: Points, viewpoint: Vector) -> Bool[np.ndarray, "n"]:
-    """Return which points were measured: finite, and neither zero nor at the camera, as drivers fill gaps."""
+    """Return which points were measured: finite, not zero and not at the camera. Drivers fill gaps with such points."""
     zero = near = finite = np.ones(len(points), dtype=bool)
-    # Column by column: NumPy takes ten times as long for what all of a short row is.
+    # Computed column by column, because NumPy takes ten times as long for `all` over many short rows.
     for column, place in zip(points.T, viewpoint, strict=True):
         zero = zero & (column == 0)
         near = near & (np.abs(column - place) < CAMERA_PLACE_TOLERANCE_M)
@@ -68,12 +68,12 @@ def measured(points: Points, viewpoint: Vector) -> Bool[np.ndarray, "n"]:
 
 
 def longest_side(points: Float[np.ndarray, "n k"]) -> float:
-    """Return the longest side of the bounding box along the axes."""
+    """Return the longest side of the axis-aligned bounding box, in the unit of the points."""
     return max(float(np.ptp(column)) for column in points.T)
 
 
 def convex_hull(points: Float[np.ndarray, "n k"]) -> Any:
-    """Return SciPy's convex hull of points, or None where they are too few, flat, or not finite."""
+    """Return SciPy's convex hull of points, or None if the points are too few, flat, or not finite."""
     from scipy.spatial import ConvexHull, QhullError
 
     try:
@@ -83,10 +83,9 @@ def convex_hull(points: Float[np.ndarray, "n k"]) -> Any:
 
 
 def least_axes(spreads: Float[np.ndarray, "n 3 3"]) -> Points:
-    """Return the unit axis of least spread of each symmetric matrix of squared spreads, any axis if all are alike.
+    """Return the unit eigenvector of the least eigenvalue of each covariance matrix, any if all eigenvalues are equal.
 
-    The closed form (the eigenvalues are roots of a cubic, by its cosines) takes a quarter of `eigh`'s time for
-    thousands.
+    The closed form (trigonometric roots of a cubic) takes a quarter of the time of `eigh` for thousands of matrices.
     """
     xx, yy, zz = (spreads[:, i, i] for i in range(3))
     xy, xz, yz = spreads[:, 0, 1], spreads[:, 0, 2], spreads[:, 1, 2]
@@ -97,7 +96,7 @@ def least_axes(spreads: Float[np.ndarray, "n 3 3"]) -> Points:
     cosine = np.clip(half_determinant / np.maximum(size**3, 1e-300), -1.0, 1.0)
     least = 2 * size * np.cos(np.arccos(cosine) / 3 + 2 * np.pi / 3)
     a, b, c = a - least, b - least, c - least
-    # The rows that are left lie in a plane, whose normal is sought: of two rows that differ the most.
+    # The eigenvector is normal to the plane of the three rows. Take the cross product of the two that differ most.
     normals = np.stack(
         [
             np.column_stack([xy * yz - xz * b, xz * xy - a * yz, a * b - xy * xy]),
@@ -110,16 +109,16 @@ def least_axes(spreads: Float[np.ndarray, "n 3 3"]) -> Points:
     rows = np.arange(len(spreads))
     longest = lengths[best, rows]
     found = normals[best, rows] / np.maximum(longest, 1e-300)[:, None]
-    # On a line, or where all are alike, no two rows differ.
+    # If the rows lie on a line, or all eigenvalues are equal, no two rows differ.
     unclear = longest <= 1e-9 * mean**2
     found[unclear] = np.linalg.eigh(spreads[unclear])[1][:, :, 0]
     return found
 
 
 def clean_cloud(points: Points, viewpoint: Vector) -> PointCloud:
-    """Drop points that are not finite, thin to an even density, drop outliers.
+    """Drop points that are not finite, thin the rest to an even density, and drop outliers.
 
-    Raises CloudError: empty, all NaN, or fewer than 50 points left.
+    Raises CloudError if the cloud is empty or all NaN, or if fewer than 50 points are left.
     """
     with Extra("clouds"):
         import open3d as o3d
@@ -130,7 +129,7 @@ def clean_cloud(points: Points, viewpoint: Vector) -> PointCloud:
     if len(finite) == 0:
         raise CloudError(f"cloud: all {len(points)} points are NaN or infinite")
     _refuse_few(len(finite), len(points), "finite")
-    # Numbers near the largest there are add up to infinity.
+    # Sums of numbers near the largest float are infinite.
     with np.errstate(over="ignore", invalid="ignore"):
         spread = np.percentile(finite, 98, axis=0) - np.percentile(finite, 2, axis=0)
         size = float(np.linalg.norm(spread))
@@ -156,7 +155,7 @@ def _refuse_few(left: int, given: int, kind: str) -> None:
         raise CloudError(f"cloud: only {left} {kind} points of {given}; at least {MIN_POINTS} are needed")
 
 
-# The numbers of sensor_msgs/PointField.
+# Type numbers of sensor_msgs/PointField, with their names and NumPy types.
 FIELD_TYPES = {
     1: ("INT8", "i1"),
     2: ("UINT8", "u1"),
@@ -171,14 +170,14 @@ FIELD_TYPES = {
 
 @dataclass(frozen=True)
 class CloudLayout:
-    """A cloud as a driver sends it.
+    """The content of a PointCloud2 message.
 
     Attributes:
-        width, height: points in a row, and rows. Height 1: the cloud is not organised as an image.
-        point_step, row_step: bytes from one point, or row, to the next.
-        is_bigendian: byte order.
-        fields: byte offset within a point and number of the type (`FIELD_TYPES`) of each field.
-        data: the bytes.
+        width, height: points per row, and number of rows. With height 1 the cloud is not organised as an image.
+        point_step, row_step: bytes from one point, or one row, to the next.
+        is_bigendian: whether the bytes are in big-endian order.
+        fields: for each field, its byte offset within a point and its type number (`FIELD_TYPES`).
+        data: the bytes of all points.
     """
 
     width: int
@@ -193,16 +192,16 @@ class CloudLayout:
 def points_from_layout(layout: CloudLayout) -> Points:
     """Return the finite points of a cloud, in row order, in the cloud's own frame and unit.
 
-    Organised or not, padded points and rows, float32 or float64, either byte order, x, y and z at any offset. Raises
-    CloudError: no points, x, y or z missing or not a float, sizes that contradict each other, or nothing finite.
+    The cloud may be organised or not, padded, of float32 or float64, in either byte order, with fields at any offset.
+    Raises CloudError if it is empty, x, y or z are missing or not floats, sizes disagree, or no point is finite.
     """
     return finite_points(organised_points(layout))
 
 
 def finite_points(pixels: Float[np.ndarray, "height width 3"]) -> Points:
-    """Return the finite points of an organised cloud, in row order. Raises CloudError: there is none."""
+    """Return the finite points of an organised cloud, in row order. Raises CloudError if there are none."""
     points = pixels.reshape(-1, 3)
-    # Column by column: three times as fast as `isfinite(points).all(1)`.
+    # Computed column by column, which is three times as fast as `isfinite(points).all(1)`.
     finite = np.isfinite(points[:, 0]) & np.isfinite(points[:, 1]) & np.isfinite(points[:, 2])
     kept = points[finite] if not finite.all() else points
     if len(kept) == 0:
@@ -211,18 +210,18 @@ def finite_points(pixels: Float[np.ndarray, "height width 3"]) -> Points:
 
 
 def organised_points(layout: CloudLayout) -> Float[np.ndarray, "height width 3"]:
-    """Return every point of a cloud in its place, NaN and infinite too. Raises CloudError as `points_from_layout`."""
+    """Return all points of a cloud as an image, NaN and infinity too. Raises CloudError like `points_from_layout`."""
     width, height = layout.width, layout.height
     if width == 0 or height == 0:
         raise CloudError(f"the cloud is empty: width={width}, height={height}")
     layout = _with_rows(layout)
     _check_sizes(layout)
-    # Before the array is made: a message's numbers can ask for any amount of memory, its bytes cannot.
+    # Fields are checked before memory is allocated, because a message's sizes can ask for any amount of it.
     places = [_place_of(layout, name) for name in "xyz"]
     points = np.empty((height, width, 3))
     for axis, (dtype, offset) in enumerate(places):
         strides = (layout.row_step, layout.point_step)
-        # A NaN of any kind stays one: numpy would warn of those that signal.
+        # Signalling NaNs stay NaN. NumPy would warn of them.
         with np.errstate(invalid="ignore"):
             points[..., axis] = np.ndarray((height, width), dtype, layout.data, offset, strides)
     _check_order(layout, points)
@@ -230,14 +229,14 @@ def organised_points(layout: CloudLayout) -> Float[np.ndarray, "height width 3"]
 
 
 def _with_rows(layout: CloudLayout) -> CloudLayout:
-    """Set the length of a row where a driver left it 0 or that of all rows, and the data say how long rows are."""
+    """Correct a `row_step` that a driver set to 0 or to the size of all rows, if the size of the data shows it."""
     row = layout.width * layout.point_step
     unset = layout.row_step in (0, layout.data.nbytes) and layout.data.nbytes == layout.height * row
     return replace(layout, row_step=row) if unset else layout
 
 
 def _check_order(layout: CloudLayout, points: Float[np.ndarray, "height width 3"]) -> None:
-    """Refuse a cloud whose numbers are lengths in the other byte order than the one that it says."""
+    """Raise CloudError if the numbers of a cloud are plausible lengths only in the other byte order."""
     some = points.reshape(-1)[:: 1 + points.size // _SOME_NUMBERS]
     if _odd_share(some) < 0.5:
         return
@@ -246,11 +245,11 @@ def _check_order(layout: CloudLayout, points: Float[np.ndarray, "height width 3"
         swapped = some.astype(kind).byteswap().astype(float)
     if _odd_share(swapped) < 0.01:
         said, other = ("true", "false") if layout.is_bigendian else ("false", "true")
-        raise CloudError(f"is_bigendian={said}, but the cloud's numbers are lengths as is_bigendian={other} reads them")
+        raise CloudError(f"is_bigendian={said}, but the cloud's numbers are lengths only with is_bigendian={other}")
 
 
 def _odd_share(numbers: Float[np.ndarray, "n"]) -> float:
-    """Share of the finite numbers other than 0 that are no lengths in any unit."""
+    """Return the fraction of the finite, non-zero numbers that are not plausible as lengths in any unit."""
     size = np.abs(numbers[np.isfinite(numbers) & (numbers != 0)])
     return float(((size < 1e-6) | (size > 1e9)).mean()) if len(size) else 0.0
 
@@ -270,7 +269,7 @@ def _check_sizes(layout: CloudLayout) -> None:
 
 
 def _place_of(layout: CloudLayout, name: str) -> tuple[np.dtype, int]:
-    """Return type and byte offset of a coordinate within a point."""
+    """Return the NumPy type and the byte offset of a coordinate within a point."""
     if name not in layout.fields:
         raise CloudError(f"the cloud has no field {name!r}; it has: {', '.join(layout.fields) or 'none'}")
     offset, number = layout.fields[name]

@@ -1,9 +1,9 @@
-"""Whether a cloud can have been seen from where its camera is said to have stood.
+"""Check whether a cloud can have been seen from the given position of its camera.
 
-An organised cloud tells by itself: a pinhole camera's pixels and the lines of sight to their points differ by a
-homography, since errors of depth move points along those lines. Without pixels, one camera sees no surface through
-another, and none from behind. From a wrong place, points lie behind others on all sides of them, and a part of each
-surface that bends turns away.
+An organised cloud shows this itself: a homography maps the pixels of a pinhole camera to the lines of sight, and depth
+errors only move points along these lines. Without pixels, the check is that a camera sees no surface through another
+and none from behind. From a wrong position, other points surround and hide some points, and a part of each curved
+surface faces away.
 """
 
 from __future__ import annotations
@@ -21,45 +21,45 @@ from graspd_core.se3 import perpendicular
 
 # An organised cloud, NaN where nothing was seen.
 Pixels = Float[np.ndarray, "height width 3"]
-# Of each point its normal, the surface that it is of, and whether that is clear.
+# Normal of each point, index of the surface that it belongs to, and whether both are certain.
 Surfaces = tuple[Float[np.ndarray, "n 3"], Int[np.ndarray, "n"], Bool[np.ndarray, "n"]]
 
-# Shares of points that lie behind others, and of a thing's points that turn away. Chosen on 91 views by four cameras of
-# the families of `CHOSEN_ON` in graspd_bench/studies/cameras.py, thinned and cut out or not.
+# Limits of the fractions of points that others hide, and of an object's points that face away. Chosen on 91 views by
+# four cameras of the families `CHOSEN_ON` in graspd_bench/studies/cameras.py, some thinned, some cut out.
 MAX_HIDDEN_SHARE, MAX_AWAY_SHARE = 0.006, 0.06
 MAX_MISFIT = 0.5  # pixels
 MAX_STRETCH, MAX_SKEW = 1.15, 0.05  # of a camera's pixels, which are square
-# Some of the points stand for all.
+# Maximum numbers of points and pixels to check, and minimum numbers.
 MOST_POINTS, MOST_PIXELS = 4000, 4000
 FEWEST_POINTS, FEWEST_PIXELS = 50, 100
 NEIGHBOURS = 8
-# An image of the points has cells of so many times their spacing, at most so many in a row. A point is hidden if so
-# many of the eight cells about its own show something nearer. Flying pixels behind an edge are no surface: of a hidden
-# point's neighbours in space so many are hidden too.
+# Cell size of the image of the points, in point spacings, and most cells in a row. A point is hidden if this many of
+# the eight cells around its own show something nearer. Flying pixels behind an edge are no surface, so this fraction of
+# the hidden point's neighbours in space must be hidden too.
 CELL_SPACINGS, MOST_CELLS, NEARER_CELLS, AGREEING_SHARE = 1.5, 1000, 7, 0.75
-# How much nearer [m]: more than this, than a share of the distance in whole scenes, than so many times the roughness.
+# "Nearer" means by at least this [m], this fraction of the distance (whole scenes), or this multiple of the roughness.
 HIDDEN_DEPTH, HIDDEN_DEPTH_SHARE, ROUGHNESS_TIMES = 0.03, 0.05, 8.0
-# Neighbours whose normals agree but for their sign are of one surface, and where their spread across it is less than
-# this share of that along it, the normal is one. What turns by less than this from grazing is on neither side.
+# Neighbours belong to one surface if the absolute cosine of their normals is above this. A normal is certain if the
+# spread across the surface is below this fraction of that along it. Grazing points within this cosine do not count.
 SAME_SURFACE, FLATNESS, GRAZING = 0.6, 0.15, 0.1
 LINK_SPACINGS = 3.0
 THING_SPACING = 0.004  # [m]
 ABOUT_THING, FARTHEST = 0.12, 1e7  # [m]
-# Places on other sides of the thing are tried too. Nothing speaks for the one that is said where this share of them
-# fits as well: the true place has 0.2 in nine of ten clouds of scenes, and 0.34 of cut-out things.
+# Camera positions on other sides of the object are tried too. The given one is doubtful if more than this fraction of
+# them fit as well. For true positions it is 0.2 in nine of ten clouds of scenes, and 0.34 of cut-out objects.
 OTHER_SIDE, MOST_CHANCE = float(np.cos(np.pi / 4)), 0.3
-# A thing without its table looks the same from right behind it, but hollow. Few things bulge less than this.
+# Seen from right behind, an object without its table looks the same, but hollow. Few objects bulge less than this.
 LEAST_BULGE = 0.05
-# A plane that holds this share of the points is a table; things on it are no farther from it than that [m].
+# A plane with this fraction of the points is a table. Points up to this height above it are objects on it [m].
 PLANE_SHARE, PLANE_TRIALS, PLANE_TOLERANCE, THING_HEIGHT = 0.25, 200, 0.01, 0.35
-# No camera sees a table along its plane: it is higher by this share of its distance.
+# A camera does not lie in the plane of a table. It is higher by at least this fraction of its distance.
 LEAST_ELEVATION = 0.03
-# Root mean square of a table seen by a camera [m]; points all through the slab would have 0.0058.
+# Largest root mean square of a table seen by a camera [m]. Points spread evenly within the tolerance have 0.0058.
 PLANE_NOISE = 0.004
-# Singular values of the camera matrix's equations: the two least are as far apart where the points are not in a plane.
+# Least ratio of the two smallest singular values of the camera equations. It is smaller if the points are coplanar.
 MIN_CONDITION = 100.0
 
-# Even on the sphere (a golden spiral). With 24 a box's share of places that fit was 0.25 to 0.5 by chance, for 0.21.
+# Even directions on a golden spiral. With only 24, the fraction that fits for a box was 0.25 to 0.5 instead of 0.21.
 _TURNS = np.pi * (3 - np.sqrt(5)) * np.arange(72)
 _HEIGHTS = 1 - (2 * np.arange(72) + 1) / 72
 _DIRECTIONS = np.column_stack([np.cos(_TURNS), np.sin(_TURNS)]) * np.sqrt(1 - _HEIGHTS**2)[:, None]
@@ -67,12 +67,12 @@ _DIRECTIONS = np.column_stack([_DIRECTIONS, _HEIGHTS])
 
 
 def seen_from(pixels: Pixels, viewpoint: Vector, forward: Vector | None = None) -> PointCloud:
-    """Return an organised cloud, NaN and all, with `posed` set if its pixels fit a camera at the viewpoint.
+    """Return the cloud of an organised image, with `posed` set if its pixels fit a camera at `viewpoint`.
 
-    A grid of one row or column tells nothing.
+    NaN points are kept. An image of one row or column is not checked.
 
     Raises:
-        CloudError: the pixels show that the camera stood elsewhere, and where.
+        CloudError: the pixels show that the camera stood elsewhere. The error says where.
     """
     fits = None if min(pixels.shape[:2]) < 2 else _pinhole_fits(pixels, viewpoint)
     place = _pinhole_place(pixels) if fits is False else None
@@ -83,10 +83,10 @@ def seen_from(pixels: Pixels, viewpoint: Vector, forward: Vector | None = None) 
 
 
 def check_scene(views: Sequence[PointCloud]) -> None:
-    """Refuse views of a whole scene, in one frame, that show that their cameras stood elsewhere.
+    """Check that views of a whole scene, in one frame, can have been seen from their viewpoints.
 
     Raises:
-        CloudError: and why the camera cannot have stood there.
+        CloudError: a view cannot. The error says why.
     """
     from scipy.spatial import KDTree
 
@@ -106,18 +106,18 @@ def check_scene(views: Sequence[PointCloud]) -> None:
 
 
 def check_thing(thing: PointCloud, view: PointCloud, up: Vector | None = None) -> str:
-    """Refuse a view in which the thing that was cut out of it is seen from behind or through others.
+    """Check that a view of an object can have been seen from its viewpoint: not from behind, nor through surfaces.
 
     Args:
-        thing: the points of it.
-        view: all that the same camera saw.
-        up: normal of what the thing stands on, if that is seen.
+        thing: the points of the object that was cut out of the view.
+        view: all points that the same camera saw.
+        up: normal of the support plane of the object, None if the support is not seen.
 
     Returns:
-        What is doubtful, for a warning: cameras in many other places would see the same. Empty: nothing.
+        A warning if cameras in many other positions would see the same. Otherwise an empty string.
 
     Raises:
-        CloudError: and why the camera cannot have stood there.
+        CloudError: the camera cannot have stood there. The error says why.
     """
     from scipy.spatial import KDTree
 
@@ -136,7 +136,7 @@ def check_thing(thing: PointCloud, view: PointCloud, up: Vector | None = None) -
         raise _refusal(view.viewpoint, f"{100 * away:.0f} % of the object would be seen from behind")
     hidden = hidden_share(near, view.viewpoint, nearer, tree)
     if hidden > MAX_HIDDEN_SHARE:
-        raise _refusal(view.viewpoint, f"{100 * hidden:.1f} % of what is about the object is hidden from there")
+        raise _refusal(view.viewpoint, f"{100 * hidden:.1f} % of the points around the object are hidden from there")
     if up is None and bulge(own, surfaces, view.viewpoint) < LEAST_BULGE:
         return f"from {_said(view.viewpoint)} the object is hollow, or seen from the back of its surface"
     middle = own.mean(0)
@@ -145,7 +145,7 @@ def check_thing(thing: PointCloud, view: PointCloud, up: Vector | None = None) -
     ways = [way for way in _DIRECTIONS if way @ said < OTHER_SIDE and (up is None or way @ up > 0)]
     most, fit = int(MOST_CHANCE * len(ways)), 0
     for tried, place in enumerate(middle + far * way for way in ways):
-        # Once the rest cannot change the answer, it is not tried.
+        # The loop ends as soon as the other positions cannot change the answer.
         if not fit <= most < fit + len(ways) - tried:
             break
         fit += _away_share(own, surfaces, place) <= MAX_AWAY_SHARE and (
@@ -158,7 +158,7 @@ def check_thing(thing: PointCloud, view: PointCloud, up: Vector | None = None) -
 
 
 def fits_nowhere(thing: PointCloud) -> bool:
-    """Tell whether no camera on any side sees all points of a thing, as where it is shown from all round."""
+    """Return True if no camera on any side can see all points of an object, e.g. if they show it from all round."""
     own = _thinned(thing)
     if len(own) < FEWEST_POINTS:
         return False
@@ -168,7 +168,7 @@ def fits_nowhere(thing: PointCloud) -> bool:
 
 
 def _refusal(viewpoint: Vector, reason: str) -> CloudError:
-    hint = "say where it stood: sensor_frame or view_point (--view-point X Y Z); several cameras are several views"
+    hint = "say where it stood: sensor_frame or view_point (--view-point X Y Z); pass several cameras as several views"
     return CloudError(f"cloud: its camera did not stand at {_said(viewpoint)}: {reason}; {hint}")
 
 
@@ -178,24 +178,24 @@ def _said(viewpoint: Vector) -> str:
 
 
 def hidden_share(points: Points, viewpoint: Vector, nearer: Float[np.ndarray, "points"], tree: Any) -> float:
-    """Return the share of points that a surface hides.
+    """Return the fraction of points that a surface hides from the viewpoint.
 
-    A hidden point has points nearer by `nearer` [m] all round it, and most of its neighbours in space have such too.
-    `tree` is the KD-tree of the points.
+    A hidden point is surrounded in the image by points that are nearer by `nearer` [m], and so are most of its
+    neighbours in space. `tree` is the KD-tree of the points.
     """
     from scipy.spatial import KDTree
 
     ray = points - viewpoint
     distance = np.linalg.norm(ray, axis=1)
     length = float(np.linalg.norm(ray.mean(0)))
-    # From the middle of the points one direction is as good as another.
+    # From the mean of the points, any direction is as good as another.
     axis = ray.mean(0) / length if length > 1e-12 else np.array([0.0, 0.0, 1.0])
     right = perpendicular(axis)
     across = np.column_stack([ray @ right, ray @ np.cross(axis, right)])
     aside = np.maximum(np.linalg.norm(across, axis=1), 1e-12)
-    # Angles, not shares of depth: a wrong place may lie among the points.
+    # Image coordinates are angles instead of x/z and y/z, because a wrong viewpoint may lie among the points.
     image = across * (np.arctan2(aside, ray @ axis) / aside)[:, None]
-    # A tree for few questions: balance would cost more than it saves.
+    # There are few queries, so balancing the tree would cost more time than it saves.
     in_image = KDTree(image, balanced_tree=False, compact_nodes=False)
     spacing = float(np.median(in_image.query(image[::8], k=5)[0][:, -1]))
     cell = max(CELL_SPACINGS * spacing, longest_side(image) / MOST_CELLS, 1e-12)
@@ -207,14 +207,14 @@ def hidden_share(points: Points, viewpoint: Vector, nearer: Float[np.ndarray, "p
     beside = [k * rows + n for k in (-1, 0, 1) for n in (-1, 0, 1) if k or n]
     hidden = np.sum([front[own + step] < distance - nearer for step in beside], axis=0) >= NEARER_CELLS
     if hidden.mean() <= MAX_HIDDEN_SHARE:
-        # Neighbours only make it less.
+        # The test of neighbours can only lower the fraction.
         return float(hidden.mean())
     around = tree.query(points[hidden], k=NEIGHBOURS + 1)[1][:, 1:]
     return float((hidden[around].mean(1) >= AGREEING_SHARE).sum() / len(points))
 
 
 def _away_share(points: Points, surfaces: Surfaces, viewpoint: Vector) -> float:
-    """Return the share of points that turn away from the viewpoint, of each surface the side that has fewer."""
+    """Return the fraction of points that face away from the viewpoint. Most points of each surface count as facing."""
     normal, surface, clear = surfaces
     ray = viewpoint - points
     cosine = (normal * ray).sum(1) / np.maximum(np.linalg.norm(ray, axis=1), 1e-12)
@@ -223,7 +223,7 @@ def _away_share(points: Points, surfaces: Surfaces, viewpoint: Vector) -> float:
 
 
 def bulge(points: Points, surfaces: Surfaces, viewpoint: Vector) -> float:
-    """Return how far a surface bulges towards the viewpoint, from -1 (a hollow) to 1."""
+    """Return how far a surface bulges towards the viewpoint, from -1 (hollow) to 1 (convex)."""
     normal, _, clear = surfaces
     offset = points[clear] - points[clear].mean(0)
     facing = normal[clear] * np.sign((normal[clear] * (viewpoint - points[clear])).sum(1))[:, None]
@@ -231,9 +231,9 @@ def bulge(points: Points, surfaces: Surfaces, viewpoint: Vector) -> float:
 
 
 def _surfaces(points: Points) -> Surfaces:
-    """Return normals that agree in sign within a surface, the surface of each point, and where that is clear.
+    """Return normals with a consistent sign within each surface, each point's surface, and where both are certain.
 
-    Every point stands in a graph twice, once with each sign of its normal. Edges join signs that agree.
+    The graph has two nodes for each point, one for each sign of its normal. Edges join neighbours whose signs agree.
     """
     from scipy.sparse import coo_matrix
     from scipy.sparse.csgraph import connected_components
@@ -258,7 +258,7 @@ def _surfaces(points: Points) -> Surfaces:
 
 
 def _roughness(points: Points, tree: Any) -> float:
-    """Return how far the middle point is off the plane through its neighbours [m]."""
+    """Return the median over the points of the RMS distance of their neighbours from a fitted plane [m]."""
     around = tree.query(points[::8], k=NEIGHBOURS + 1)[1]
     patch = points[around] - points[around].mean(1, keepdims=True)
     spread = np.linalg.eigvalsh(np.einsum("nka,nkb->nab", patch, patch) / (NEIGHBOURS + 1))
@@ -266,9 +266,9 @@ def _roughness(points: Points, tree: Any) -> float:
 
 
 def things_behind(points: Points, viewpoint: Vector) -> bool:
-    """Tell whether more stands on the far side of a table, over what is seen of it, than on the viewpoint's side.
+    """Return True if more points lie behind the seen part of a table than on the viewpoint's side of it.
 
-    Also True if the viewpoint lies in the plane of the table, as the origin of a robot's base often does.
+    Also return True if the viewpoint lies in the plane of the table, as the origin of a robot's base often does.
     """
     rng = np.random.default_rng(0)
     if len(points) <= NEIGHBOURS:
@@ -279,7 +279,7 @@ def things_behind(points: Points, viewpoint: Vector) -> bool:
     normals, corners = normals[lengths > 0] / lengths[lengths > 0, None], corners[lengths > 0]
     if not len(normals):
         return False
-    # By columns: BLAS starts threads for this product, which wait for each other on a busy machine.
+    # Written out by coordinates, because BLAS would start threads that wait for each other on a busy machine.
     (x, y, z), (a, b, c) = (points[:: 1 + len(points) // 2000, None].T.astype(np.float32), normals.T.astype(np.float32))
     height = np.abs(x.T * a + y.T * b + z.T * c - (corners[:, 0] * normals).sum(1).astype(np.float32))
     best = int(np.argmax(np.count_nonzero(height < PLANE_TOLERANCE, axis=0)))
@@ -305,7 +305,7 @@ def things_behind(points: Points, viewpoint: Vector) -> bool:
 
 
 def _thinned(thing: PointCloud) -> Float[np.ndarray, "m 3"]:
-    """Return some of a thing's points, none where their numbers cannot be metres."""
+    """Return some of an object's points [m], or none if the coordinates are too large to be metres."""
     known = thing.points[measured(thing.points, thing.viewpoint)]
     if not len(known) or np.abs(known).max() > FARTHEST:
         return np.zeros((0, 3))
@@ -313,7 +313,7 @@ def _thinned(thing: PointCloud) -> Float[np.ndarray, "m 3"]:
 
 
 def _in_box(points: Points, thing: Float[np.ndarray, "k 3"]) -> Int[np.ndarray, "m"]:
-    """Return which points lie about a thing, axis by axis since most lie elsewhere."""
+    """Return the indices of points near an object. Axes are checked one by one, because most points are far away."""
     inside = np.arange(len(points))
     for axis in range(3):
         side = points[inside, axis]
@@ -323,14 +323,14 @@ def _in_box(points: Points, thing: Float[np.ndarray, "k 3"]) -> Int[np.ndarray, 
 
 
 def _some(points: Points, viewpoint: Vector, most: int) -> Float[np.ndarray, "m 3"]:
-    # In any order: clouds are often sorted by place, and the first of them would be a part of the scene.
+    # Points are drawn at random, because clouds are often sorted by position.
     rng = np.random.default_rng(0)
     points = points[rng.choice(len(points), min(2 * most, len(points)), replace=False)]
     return points[measured(points, viewpoint)][:most].astype(float)
 
 
 def _pinhole_fits(grid: Pixels, viewpoint: Vector) -> bool | None:
-    """Tell whether a pinhole camera at the viewpoint explains the pixels, None where there are too few."""
+    """Return whether a pinhole camera at the viewpoint explains the pixels, or None if there are too few pixels."""
     pixels, points = _pixels(grid)
     ray = points - viewpoint
     distance = np.linalg.norm(ray, axis=1)
@@ -342,7 +342,7 @@ def _pinhole_fits(grid: Pixels, viewpoint: Vector) -> bool | None:
     guess = pixel @ H.T
     guess /= np.linalg.norm(guess, axis=1, keepdims=True)
     angle = np.arcsin(np.clip(np.linalg.norm(np.cross(guess, ray), axis=1), 0.0, 1.0))
-    # H is a rotation times the inverse of the camera's matrix, but for its scale.
+    # Up to scale, H is a rotation times the inverse of the camera matrix.
     square = H.T @ H
     widths = np.linalg.norm(square[:2, :2], axis=1)
     pixel_angle = np.linalg.norm(H[:, 0]) / np.linalg.norm(H[:, 2]) / size
@@ -353,7 +353,7 @@ def _pinhole_fits(grid: Pixels, viewpoint: Vector) -> bool | None:
 
 
 def _pinhole_place(grid: Pixels) -> Vector | None:
-    """Return where the camera of these pixels stood, None where no pinhole fits or the scene is too flat to tell."""
+    """Return the camera position [m] that the pixels imply, or None if no pinhole fits or the scene is too flat."""
     pixels, points = _pixels(grid)
     points, pixels = points[points.any(1)], pixels[points.any(1)]
     if len(points) < FEWEST_PIXELS:
@@ -371,7 +371,7 @@ def _pinhole_place(grid: Pixels) -> Vector | None:
 
 
 def _pixels(grid: Pixels) -> tuple[Points, Points]:
-    """Return some of the pixels, homogeneous and as shares of the image's larger side, and their points."""
+    """Return some pixels, homogeneous and in units of the image's larger side, and their points [m]."""
     height, width = grid.shape[:2]
     step = max(1, int(np.sqrt(height * width / MOST_PIXELS)))
     some = grid[::step, ::step]

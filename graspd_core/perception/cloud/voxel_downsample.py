@@ -1,6 +1,6 @@
-"""Scenes as cameras saw them, cropped to the workspace and thinned to one point a voxel.
+"""Cropping of point clouds to the workspace, and downsampling to one mean point per voxel.
 
-All decisions about a scene are taken on the thinned points. The full points follow their voxels.
+Segmentation decides on the mean points only. Every full point gets the label of its voxel.
 """
 
 from __future__ import annotations
@@ -16,28 +16,28 @@ from graspd_core.errors import CloudError
 from graspd_core.mesh.topology import packed_rows
 from graspd_core.perception.cloud.point_cloud import MIN_POINTS, PointCloud, Points, longest_side, measured
 
-# A mask of a scene's voxels. The object that each is part of, numbered from the largest, -1 for none.
+# A mask of a scene's voxels. The object that each voxel is part of, numbered from the largest, -1 for none.
 Mask = Bool[np.ndarray, "voxels"]
 Labels = Int[np.ndarray, "voxels"]
 
-# Of more points than this, every second, or third, ... is taken.
+# If there are more points than this, only every second (third, ...) point is used.
 MAX_SCENE_POINTS = 5_000_000
-# Units that clouds come in by mistake, how many of them a metre has, and the least distance that is told from them [m].
+# Units that clouds have by mistake, how many of them make a metre, and the least plausible camera distance [m].
 UNITS_PER_METRE, MIN_CAMERA_DISTANCE_M = (("millimetres", 1000), ("centimetres", 100)), 0.1
 
 
 @dataclass(frozen=True)
 class VoxelScene:
-    """All views' points inside the workspace, and one mean point for each voxel.
+    """The points of all views inside the workspace, and one mean point for each voxel.
 
     Attributes:
         points: the kept points of all views, one view after another [m].
-        distance: of each from its camera [m].
-        rows: for each view, which of its points were kept.
-        voxel: of each kept point, the index of its mean point.
-        mean: the mean points [m].
-        mean_distance: mean distance of a voxel's points from their cameras [m].
-        count: points in each voxel.
+        distance: distance of each kept point from its camera [m].
+        rows: for each view, the indices of its kept points.
+        voxel: for each kept point, the index of its voxel.
+        mean: mean point of each voxel [m].
+        mean_distance: mean distance of each voxel's points from their cameras [m].
+        count: number of points in each voxel.
         size: side of a voxel [m].
     """
 
@@ -52,7 +52,7 @@ class VoxelScene:
 
     @property
     def weight(self) -> Float[np.ndarray, "voxels"]:
-        """Points in each voxel, made independent of the distance of the cameras [m²]."""
+        """Return the point count of each voxel times its squared distance [m²]. It hardly depends on the distance."""
         return self.count * self.mean_distance**2
 
     def of_view(self, view: int) -> slice:
@@ -62,9 +62,9 @@ class VoxelScene:
 
 
 def voxel_downsample(views: Sequence[PointCloud], settings: SegmentationConfig) -> VoxelScene:
-    """Crop all views to the workspace and thin them to one mean point a voxel.
+    """Crop all views to the workspace and downsample them to one mean point per voxel.
 
-    Raises CloudError: no view, no point, none measured, too few inside the workspace, or cameras too far apart.
+    Raises CloudError if there are no views, no measured points, too few in the workspace, or cameras too far apart.
     """
     given = sum(len(view.points) for view in views)
     if given == 0:
@@ -97,7 +97,7 @@ def voxel_downsample(views: Sequence[PointCloud], settings: SegmentationConfig) 
 def _inside(
     view: PointCloud, stride: int, settings: SegmentationConfig
 ) -> tuple[Int[np.ndarray, "kept"], Float[np.ndarray, "kept 3"], Float[np.ndarray, "kept"], int]:
-    """Return rows, positions and distances of every `stride`-th point inside the workspace, and the number measured."""
+    """Return row, position and camera distance of every `stride`-th point in the workspace, and the number measured."""
     rows = stride * np.flatnonzero(measured(view.points[::stride], view.viewpoint))
     points = view.points[rows].astype(float)
     distance = np.linalg.norm(points - view.viewpoint, axis=1)
@@ -110,7 +110,7 @@ def _inside(
 
 
 def _refuse_far_apart(views: Sequence[PointCloud], rows: Sequence[Int[np.ndarray, "_"]], farthest: float) -> None:
-    """Raise CloudError for cameras too far apart to see anything in common."""
+    """Raise CloudError if two cameras are too far apart to see a common point."""
     first, *others = [k for k, kept in enumerate(rows) if len(kept)] or [0]
     for k in others:
         apart = float(np.linalg.norm(views[k].viewpoint - views[first].viewpoint))
@@ -123,12 +123,12 @@ def _refuse_far_apart(views: Sequence[PointCloud], rows: Sequence[Int[np.ndarray
 
 def _unmeasured(views: Sequence[PointCloud], given: int) -> str:
     if any(np.isfinite(view.points).all(1).any() for view in views):
-        return f"cloud: all {given} points are zero or at the camera, as a driver fills in where it has no depth"
+        return f"cloud: all {given} points are zero or at the camera, as a driver fills in for missing depth"
     return f"cloud: all {given} points are NaN or infinite"
 
 
 def unit_hint(views: Sequence[PointCloud], farthest: float) -> str:
-    """Return the unit in which the points would be near the camera, as a hint for an error."""
+    """Return a hint for an error on the likely unit of the points, empty if their distances are plausible metres."""
     some = np.concatenate([view.points[:: 1 + len(view.points) // 10_000] - view.viewpoint for view in views])
     away = float(np.median([0.0, *np.abs(some[np.isfinite(some).all(1)]).max(1, initial=0.0)]))
     for name, per_metre in UNITS_PER_METRE:
@@ -140,10 +140,10 @@ def unit_hint(views: Sequence[PointCloud], farthest: float) -> str:
 
 
 def _voxels(points: Points, size: float, most: int) -> tuple[Int[np.ndarray, "n"], float]:
-    """Return the voxel of each point, counted without gaps, and the resulting side."""
-    # Column by column: NumPy takes seven times as long for the least of short rows.
+    """Return the index of each point's voxel, without gaps, and the side at which there are at most `most` voxels."""
+    # Computed column by column, because NumPy takes seven times as long for the minimum of many short rows.
     low = np.array([column.min() for column in points.T])
-    # So many cells an axis have room in one number.
+    # A limit of 2^20 cells per axis lets the three indices fit into one integer.
     size = max(size, longest_side(points) / 2**20)
     cell, voxel = _distinct(((points - low) / size).astype(np.int64))
     while len(cell) > most:

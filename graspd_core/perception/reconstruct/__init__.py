@@ -1,1 +1,1 @@
-"""From points of an object to a closed mesh."""
+"""Reconstruction of a closed mesh from the points of an object."""

@@ -1,4 +1,4 @@
-"""Surfaces between an object and its support: walls beneath the outline seen from above, skirt and base."""
+"""Guessed surfaces between an object and its support: walls beneath the outline seen from above, and the base."""
 
 from __future__ import annotations
 
@@ -9,24 +9,24 @@ from graspd_core.perception.cloud.free_space import FreeSpace, empty_depth, faci
 from graspd_core.perception.cloud.point_cloud import Points, convex_hull
 from graspd_core.perception.reconstruct.merge_views import Surfels, join, nothing, take, thin
 
-# A piece of outline is where the object ends if a step of this [m] outwards from it is seen to be empty.
+# The object ends at an outline point if the space at this distance outwards [m] is seen to be empty.
 OUTLINE_STEP_M = 0.008
-# How level the surface must be there, and how much it must face a camera [cosines].
+# Least cosines of the surface there: of its normal to the vertical, and of its normal to the direction of a camera.
 MIN_LEVEL_COSINE, MIN_FACING_COSINE = 0.85, 0.3
-# Of the object's lowest points, the share that must be of walls for it to have a base. Their steepness [cosine].
+# Fraction of the lowest points that must belong to walls, and the greatest vertical part of a wall's normal [cosine].
 MIN_WALL_SHARE, MAX_WALL_COSINE = 0.6, 0.25
-# The lowest points seen must be nearer than this to the support [m]: segmentation cuts them off above it.
+# The lowest seen points must be nearer than this to the support [m], because segmentation cuts points off near it.
 MAX_FOOT_HEIGHT_M = 0.015
-# Share of an upright line of a guessed wall that the cameras may contradict.
+# Fraction of a vertical line of a guessed wall that the cameras may contradict.
 MAX_CONTRADICTED_WALL = 0.15
-# Share of the base's outline that walls must stand on.
+# Fraction of the base's outline that must have walls above it.
 MIN_ENCLOSED_SHARE = 0.6
 
 
 def extrude(seen: Surfels, free_space: FreeSpace, step: float) -> Surfels:
-    """Return walls from the outline of what was seen from above, down to the support.
+    """Return vertical walls from the object's outline, seen from above, down to the support.
 
-    An outline counts only if the cameras saw nothing beyond it. Walls that they contradict are left out.
+    A part of the outline counts only if the cameras saw empty space beyond it. Walls that they contradict are left out.
     """
     from scipy.ndimage import binary_closing, binary_erosion, distance_transform_edt, gaussian_filter, maximum_filter
     from scipy.spatial import KDTree
@@ -46,7 +46,7 @@ def extrude(seen: Surfels, free_space: FreeSpace, step: float) -> Surfels:
     height = maximum_filter(top, 3)[rim]
     place = np.column_stack([low + (np.argwhere(rim) + 0.5) * step, height])
     _, nearest = KDTree(seen.points).query(place)
-    # A surface that turns away from the camera at the outline goes on behind it. One that is level there ends.
+    # A surface that turns away from the camera at the outline continues behind it. A horizontal surface ends there.
     level = (seen.normals[nearest, 2] > MIN_LEVEL_COSINE) & (
         facing(free_space, seen.points, seen.normals)[nearest] > MIN_FACING_COSINE
     )
@@ -66,12 +66,12 @@ def _contradicted(
 
 
 def with_foot(surfels: Surfels, free_space: FreeSpace, step: float) -> Surfels:
-    """Return the surfels, with their connection to the support if the object stands."""
+    """Return the surfels, and the surface between them and the support if the object stands."""
     return join(surfels, stand(surfels, free_space, step)) if free_space.standing else surfels
 
 
 def stand(surfels: Surfels, free_space: FreeSpace, step: float) -> Surfels:
-    """Return the walls between the lowest seen points and the support, and the base between them."""
+    """Return the walls between the lowest seen points and the support, and the base between these walls."""
     lowest = float(np.percentile(surfels.points[:, 2], 1))
     band = take(surfels, surfels.points[:, 2] < lowest + 3 * step)
     wall = np.abs(band.normals[:, 2]) < MAX_WALL_COSINE
@@ -80,7 +80,7 @@ def stand(surfels: Surfels, free_space: FreeSpace, step: float) -> Surfels:
     if wall.mean() < MIN_WALL_SHARE or wall.sum() < 10:
         return nothing()
     feet = take(band, wall)
-    # Down along the wall, for each metre of height.
+    # Displacement along the wall for each metre downwards.
     down = feet.normals[:, 2:] * feet.normals - np.array([0.0, 0.0, 1.0])
     down /= -down[:, 2:]
     fall = np.arange(0.5 * step, lowest + 3 * step, step)
@@ -91,7 +91,7 @@ def stand(surfels: Surfels, free_space: FreeSpace, step: float) -> Surfels:
 
 
 def _column(surfels: Surfels, free_space: FreeSpace, step: float) -> Surfels:
-    """Return walls beneath an object seen only high above the support, and beneath parts high above the rest."""
+    """Return walls and base beneath an object seen only high above the support, and walls beneath its higher parts."""
     order = np.argsort(surfels.points[:, 2])
     height = surfels.points[order, 2]
     level = np.cumsum(np.diff(height, prepend=height[:1]) > MAX_FOOT_HEIGHT_M)
@@ -105,7 +105,7 @@ def _column(surfels: Surfels, free_space: FreeSpace, step: float) -> Surfels:
 def _walls(
     surfels: Surfels, bottom: float, free_space: FreeSpace, step: float
 ) -> tuple[Surfels, Float[np.ndarray, "n 2"]]:
-    """Return walls beneath the outline seen from above, down to the height `bottom` [m], and their feet."""
+    """Return walls beneath the outline seen from above, down to the height `bottom` [m], and their lower ends [m]."""
     from scipy.spatial import KDTree
 
     hull = convex_hull(surfels.points[:, :2])
@@ -117,7 +117,7 @@ def _walls(
     edge = np.repeat(np.arange(len(corners)), np.maximum((length / step).astype(int), 1))
     along = np.concatenate([np.arange(n) / n for n in np.bincount(edge)])
     rim = corners[edge] + along[:, None] * edges[edge]
-    # Counter-clockwise corners: outwards is to the right.
+    # The corners run counter-clockwise, so outwards is to the right of an edge.
     outward = np.column_stack([edges[:, 1], -edges[:, 0], np.zeros(len(edges))])[edge] / length[edge, None]
     top = surfels.points[KDTree(surfels.points[:, :2]).query(rim)[1], 2]
     levels = np.arange(bottom + 0.5 * step, max(float(top.max()), bottom + step), step)
@@ -128,7 +128,7 @@ def _walls(
 
 
 def _base(feet: Float[np.ndarray, "n 2"], free_space: FreeSpace, step: float) -> Surfels:
-    """Return the support within the feet's outline, facing down, where it is hidden."""
+    """Return the base: hidden support surface within the hull of the walls' lower ends, facing down."""
     from scipy.spatial import KDTree
 
     hull = convex_hull(feet)

@@ -1,6 +1,6 @@
-"""An object's hidden side: the next best view of it, and its other possible shapes.
+"""The hidden side of an object: the next view that would show most of it, and other shapes that it may have.
 
-Other shapes are guessed by the rules that the reconstruction did not choose.
+The other shapes come from the completion rules that the reconstruction did not choose.
 """
 
 from __future__ import annotations
@@ -22,33 +22,33 @@ from graspd_core.perception.reconstruct.shape_completion import RULES, guess_by
 from graspd_core.se3 import perpendicular
 from graspd_core.types import TriangleMesh
 
-# Heights above the support that a camera may look from, and directions around the object.
+# Elevations above the support [rad], and number of azimuths, of the candidate views.
 _ELEVATIONS, _AZIMUTHS = np.deg2rad([25.0, 50.0, 75.0]), 12
-# Places on a surface that is looked at or compared.
+# Number of points on a surface that is viewed or compared.
 _SAMPLES = 1500
-# Surface that a camera sees flatter than this [cosine] it hardly sees.
+# A surface is visible only if the cosine between its normal and the direction to the camera is above this.
 _FLAT = 0.2
-# A ray meets the sample's own face within this share of its length.
+# A ray that reaches this fraction of the distance to a sample has hit the sample's own face.
 _NEAR = 0.98
-# A trial feels no finer detail: spacing of points, cells along the longest side, faces.
+# Spacing of points [m], cells along the longest side, and faces of other shapes. Trials need no finer detail.
 _STEP_M, _CELLS, _FACES = 0.003, 40, 4000
-# Two shapes nearer to each other than this are one [m].
+# Two shapes count as equal if their mean distance is below this [m].
 _SAME_M = 5e-4
 
 
 def next_view(evidence: Evidence, mesh: TriangleMesh, shift: Vector) -> Float[np.ndarray, "4 4"] | None:
-    """Return `T_views_camera` [m] (z forward, y down) of the further view that shows most of the hidden side.
+    """Return the camera pose that would show most of the hidden side, as `T_views_camera` [m] (z forward, y down).
 
-    Candidates lie around the object, above its support, as far away as the first camera. The surface counts as hidden
+    Candidate poses lie around the object, above its support, as far away as the first camera. Surface counts as hidden
     if it is farther from all seen points than the cameras' precision.
 
     Args:
-        evidence: what was seen.
-        mesh: the object as reconstructed, in the frame of the views [m].
-        shift: added to the camera's position [m].
+        evidence: what the cameras saw.
+        mesh: the reconstructed object, in the frame of the views [m].
+        shift: offset that is added to the camera's position [m].
 
     Returns:
-        None if no candidate shows anything new, or if no camera position is known.
+        The pose. None if no candidate shows any hidden surface, or if no camera position is known.
     """
     from scipy.spatial import KDTree
 
@@ -89,15 +89,15 @@ def _looking(eye: Vector, forward: Vector, up: Vector) -> Float[np.ndarray, "4 4
 
 
 def other_rules(evidence: Evidence) -> tuple[str, ...]:
-    """Return the rules that the reconstruction did not take, the quickest first, none if nothing was hidden."""
-    # The later in `RULES`, the less is looked for in what was seen.
+    """Return the completion rules that the reconstruction did not use, fastest first. Empty if nothing was hidden."""
+    # The later a rule is in `RULES`, the less it searches, and the faster it is.
     return tuple(rule for rule in reversed(RULES) if rule != evidence.chosen) if evidence.hidden else ()
 
 
 def other_shape(evidence: Evidence, rule: str, than: TriangleMesh) -> TriangleMesh | None:
-    """Return the object with its hidden side guessed by a rule, in the frame of the views [m].
+    """Return the object's mesh with its hidden side guessed by `rule`, in the frame of the views [m].
 
-    None if the rule makes no guess, no closed surface fits it, or the surface is that of `than`.
+    Return None if the rule makes no guess, if no closed surface fits, or if the shape equals that of `than`.
     """
     step = max(evidence.step, _STEP_M)
     seen = thin(evidence.seen, step)

@@ -1,10 +1,10 @@
-"""Views become one set of oriented points: several views, or a cloud that shows an object from all round.
+"""Merging of views, or of one cloud that shows an object from all round, into one set of points with normals.
 
-Depth noise runs along the line of sight, so each point is moved along its own to the plane of its neighbours. Its
-normal is turned to the camera that saw it. Both keep thin walls apart, which orientation by neighbours does not.
+Depth noise runs along the line of sight. So each point is moved along its line of sight to the plane of its neighbours,
+and its normal is turned to its camera. Both keep thin walls apart, which orientation by neighbours does not.
 
 Truncated signed distances (Curless and Levoy 1996) wear thin walls and edges away. On 15 rendered views, Open3D's on a
-grid of 2 mm gave surfaces of Chamfer 0.82 mm instead of 0.49 and overlap 0.87 instead of 0.92.
+2 mm grid gave a Chamfer distance of 0.82 mm instead of 0.49 mm and an overlap of 0.87 instead of 0.92.
 """
 
 from __future__ import annotations
@@ -30,39 +30,35 @@ from graspd_core.perception.cloud.point_cloud import (
 )
 from graspd_core.se3 import perpendicular
 
-# Points of a surface seen flatter than this flew off an edge.
+# Points whose normals have a smaller cosine to the line of sight are flying pixels at an edge.
 MIN_VIEW_COSINE = 0.1
-# A surface seen from one side rises by less than this many cells over one cell on most lines of sight. With more than
-# this share of exceptions, the cloud is taken to show the object from all round. Where it is known which way a camera
-# looked it takes more: from above, a third of the lines may run along the sides of a cup.
+# In a view from one side, depth varies by less than this many cells within a cell on most lines of sight. If over this
+# fraction are exceptions, the cloud shows the object from all round. If the camera's direction is known, the limit is
+# higher, because from above a third of the lines may run along the sides of a cup.
 MAX_RISE_CELLS = 4.0
 LAYERED_SHARE, LAYERED_SHARE_OF_CAMERA = 0.15, 0.45
 
-# So many points tell whether they enclose a body. Clouds of shapes from all round have 0 to 0.056 (thin walls, noise
-# of 1 mm), single views of `CHOSEN_ON` (graspd_bench/studies/cameras.py) 0.075 to 0.32. Normals of whole scenes may
-# cancel. But these are flat: thrice their volume over area and size is 0.003 to 0.028, of bodies 0.12 or more.
+# Number of points to check whether they enclose a body, and limits. Openness is 0 to 0.056 for shapes from all round
+# (thin walls, 1 mm noise), 0.075 to 0.32 for single views of `CHOSEN_ON` (studies/cameras.py). Normals of a whole scene
+# may cancel, but it is flat: three volumes over area and size are 0.003 to 0.028, and 0.12 or more for bodies.
 ENCLOSING_POINTS, MOST_OPEN, LEAST_VOLUME = 4000, 0.06, 0.06
-# Of an all-round cloud: neighbours for a normal, the directions that it is looked at from, and how often that is done.
+# For an all-round cloud: neighbours for a normal, directions from which the cloud is viewed, and passes of orientation.
 NORMAL_NEIGHBOURS, UNPOSED_DIRECTIONS, UNPOSED_PASSES = 24, 150, 3
-# It is thinned to this share of the step. Points that face opposite ways count as twice so many steps apart. Points
+# It is thinned to this fraction of the step. Points with opposite normals count as twice this many steps apart. Points
 # this many steps off each other's plane may lie on two sides of a wall.
 UNPOSED_THINNING, UNPOSED_FACING, UNPOSED_DEPTH = 0.6, 4.0, 0.25
 
 
 @dataclass(frozen=True)
 class Surfels:
-    """Points of a surface and its outward unit normals.
-
-    Attributes:
-        points: [m].
-    """
+    """Points of a surface [m] and the outward unit normal at each point."""
 
     points: Points
     normals: Points
 
 
 def join(*parts: Surfels) -> Surfels:
-    """Return the surfels of all parts."""
+    """Return all surfels of the parts in one set."""
     return Surfels(np.concatenate([p.points for p in parts]), np.concatenate([p.normals for p in parts]))
 
 
@@ -77,7 +73,7 @@ def nothing() -> Surfels:
 
 
 def point_step(views: Sequence[PointCloud]) -> float:
-    """Return the spacing that views are thinned to [m]: an eightieth of the object's diagonal, 1 mm at least."""
+    """Return the point spacing [m] to which views are thinned: 1/80 of the object's diagonal, at least 1 mm."""
     points = np.concatenate([view.points for view in views])
     low, high = np.percentile(points, [2, 98], axis=0)
     return max(float(np.linalg.norm(high - low)) / 80, 1e-3)
@@ -86,10 +82,9 @@ def point_step(views: Sequence[PointCloud]) -> float:
 def merge_views(
     views: Sequence[PointCloud], step: float | None = None, settings: ReconstructionConfig | None = None
 ) -> Surfels:
-    """Return the oriented points of all views: strays dropped, noise smoothed, one per cube of side `step` and side of
-    it.
+    """Return the points of all views with normals. Drop flying pixels, smooth noise, and thin the points to `step` [m].
 
-    Raises CloudError: fewer than 50 points are left.
+    Raises CloudError if fewer than 50 points are left.
     """
     step, settings = point_step(views) if step is None else step, settings or ReconstructionConfig()
     together = join(*(orient_view(view, step, settings) for view in views))
@@ -102,7 +97,7 @@ def merge_views(
 
 
 def orient_view(view: PointCloud, step: float, settings: ReconstructionConfig) -> Surfels:
-    """Return one view's surface points, about `step` [m] apart, with normals towards its camera."""
+    """Return the surface points of one view, about `step` [m] apart, with normals towards its camera."""
     from scipy.spatial import KDTree
 
     points = _thin_by_sight(view, step)
@@ -113,7 +108,7 @@ def orient_view(view: PointCloud, step: float, settings: ReconstructionConfig) -
     ray /= np.linalg.norm(ray, axis=1, keepdims=True)
     centre, normals = points[near].mean(1), np.zeros_like(points)
     weights = np.ones(near.shape)
-    # The second pass leaves out what lies across an edge from the first one's plane.
+    # Later passes leave out neighbours that lie across an edge, off the plane of the pass before.
     for _ in range(3):
         total = weights.sum(1, keepdims=True)
         centre = np.einsum("nk,nkd->nd", weights, points[near]) / total
@@ -131,7 +126,7 @@ def orient_view(view: PointCloud, step: float, settings: ReconstructionConfig) -
 
 
 def thin(surfels: Surfels, step: float) -> Surfels:
-    """Return the mean of the points in each cube of side `step` [m] that face the same of six directions."""
+    """Return one mean surfel for each cube of side `step` [m] and each of six directions that normals face."""
     if len(surfels.points) == 0:
         return surfels
     facing = np.abs(surfels.normals).argmax(1)
@@ -145,7 +140,7 @@ def thin(surfels: Surfels, step: float) -> Surfels:
 
 
 def _thin_by_sight(view: PointCloud, step: float) -> Points:
-    """Return one point for each small cone of sight: that of median distance, so that strays do not count."""
+    """Return the point of median distance in each small cone of sight. So flying pixels are seldom chosen."""
     ray = view.points - view.viewpoint
     distance = np.linalg.norm(ray, axis=1)
     width = step / float(np.median(distance))
@@ -160,7 +155,9 @@ def _thin_by_sight(view: PointCloud, step: float) -> Points:
 
 
 def is_unposed(view: PointCloud, axis_known: bool = False) -> bool:
-    """Tell whether a cloud shows surface behind surface on many lines of sight, as no single camera sees it.
+    """Return True if a cloud shows surface behind surface on many lines of sight, as no single camera can see.
+
+    A cloud that encloses a body with the camera's position inside its bounding box counts too.
 
     Args:
         view: the object's points.
@@ -173,7 +170,7 @@ def is_unposed(view: PointCloud, axis_known: bool = False) -> bool:
         return True
     local = (points - view.viewpoint) @ view_frame(PointCloud(points, view.viewpoint))
     distance = float(local[:, 2].mean())
-    # From very near the object, lines of sight are not spread enough to sort points by: any direction will do.
+    # If the viewpoint is very near the object, parallel lines are used instead of lines of sight.
     if distance > np.ptp(points, axis=0).max() and local[:, 2].min() > 0:
         local[:, :2] *= distance / local[:, 2:]
     cell = 1.5 * float(np.median(KDTree(points).query(points, k=5)[0][:, -1]))
@@ -181,15 +178,16 @@ def is_unposed(view: PointCloud, axis_known: bool = False) -> bool:
     near, far = np.full(line.max() + 1, np.inf), np.full(line.max() + 1, -np.inf)
     np.minimum.at(near, line, local[:, 2])
     np.maximum.at(far, line, local[:, 2])
-    # No camera sees what is behind it, whatever axis the name of its frame says.
+    # If points lie behind the camera, the known axis must be wrong.
     most = LAYERED_SHARE_OF_CAMERA if axis_known and local[:, 2].min() > 0 else LAYERED_SHARE
     return bool((far - near > MAX_RISE_CELLS * cell).mean() > most)
 
 
 def is_all_round(view: PointCloud) -> bool:
-    """Tell whether points enclose a body: its normals n and places p have mean n = 0 and mean n pᵀ = volume / area.
+    """Return True if points enclose a body.
 
-    That is the divergence theorem. One side of a body meets the first only by chance, and then not the second.
+    Then normals n and positions p have mean n = 0 and mean n pᵀ = volume / area, by the divergence theorem. One side of
+    a body has mean n = 0 only by chance, and then fails the second test.
     """
     points = view.points[measured(view.points, view.viewpoint)]
     if len(points) < MIN_POINTS:
@@ -204,10 +202,10 @@ def is_all_round(view: PointCloud) -> bool:
 
 
 def orient_unposed(view: PointCloud, step: float) -> Surfels:
-    """Return points of an all-round cloud, about `step` [m] apart, with normals to the outside.
+    """Return points of an all-round cloud, about `step` [m] apart, with outward normals.
 
-    The outside is seen from many directions: the nearest point in each cell of an image faces that direction. This
-    distinguishes both sides of a thin wall, which agreement with neighbours does not.
+    The cloud is viewed from many directions. The nearest point in each cell of an image faces that direction. This
+    distinguishes the two sides of a thin wall, which agreement with neighbours does not.
     """
     from scipy.spatial import KDTree
 
@@ -216,7 +214,7 @@ def orient_unposed(view: PointCloud, step: float) -> Surfels:
     near = np.asarray(place.query(points, k=many)[1])
     normals = _least_axes_of(points[near])
     for _ in range(UNPOSED_PASSES):
-        # What lies as deep in the surface as noise faces the way that its neighbours are seen from.
+        # A point faces the directions from which its neighbours on the same plane, to within noise, are seen.
         deep = np.einsum("nkd,nd->nk", points[near] - points[:, None], normals)
         ways = np.einsum("nk,nkd->nd", np.exp(-np.square(deep / (UNPOSED_DEPTH * step))), seen_from[near])
         normals *= np.where((normals * ways).sum(1) < 0, -1.0, 1.0)[:, None]
@@ -232,7 +230,7 @@ def _least_axes_of(groups: Float[np.ndarray, "n k 3"]) -> Points:
 
 
 def _seen_from(points: Points) -> Points:
-    """Return the sum of the evenly spread directions from which each point is nearest in a cell of an image."""
+    """Return for each point the sum of the directions from which it is the nearest point in its image cell."""
     from scipy.spatial import KDTree
 
     width = 2 * float(np.median(KDTree(points).query(points, k=5)[0][:, -1]))
@@ -251,15 +249,15 @@ def _seen_from(points: Points) -> Points:
 
 @dataclass(frozen=True, eq=False)
 class Evidence:
-    """The seen part of an object, from which other guesses of the hidden part are made.
+    """The seen part of an object, from which other guesses of its hidden part are made.
 
     Attributes:
-        seen, free_space, step: the surface, what speaks against guesses, and the spacing [m], in a frame of its own.
-        rotation, origin: of that frame in the views' [m].
-        chosen: the rule that the reconstruction took, empty for none.
-        settings: of the reconstruction.
-        hidden: whether a good part of the surface was.
-        doubts: why the views may not show what was there, so that no grasp counts as verified.
+        seen, free_space, step: seen surface, space seen to be empty, and point spacing [m], in the local frame.
+        rotation, origin: pose of the local frame in the frame of the views [m].
+        chosen: completion rule that the reconstruction used, empty for none.
+        settings: settings of the reconstruction.
+        hidden: whether a large part of the surface was hidden.
+        doubts: reasons why the views may not show the true scene. With any, no grasp counts as verified.
     """
 
     seen: Surfels

@@ -1,11 +1,11 @@
-"""Oriented points to a closed surface: screened Poisson (Kazhdan and Hoppe 2013), cut by the cameras' free space.
+"""Closed surfaces from oriented points: screened Poisson (Kazhdan and Hoppe 2013), cut by the cameras' free space.
 
-Where points are missing Poisson's surface balloons or runs off. It is sampled on a grid, cut by the space that was seen
-to be empty and by the support, and surfaced again, which closes it.
+Where points are missing, a Poisson surface bulges outwards or stays open. So its distance field is sampled on a grid,
+cut by the space seen to be empty and by the support, and meshed again, which closes the surface.
 
-The field is found on a regular grid by Fourier transforms (Kazhdan 2005), or by Open3D on an adaptive one. On grids of
-few nodes the first takes a sixth of the time. As in screened Poisson, the field is then drawn to zero at the points.
-This fits noise too, so the points are first checked to be of one surface.
+The field is computed on a regular grid by Fourier transforms (Kazhdan 2005), or by Open3D on an adaptive grid. On small
+grids the first takes a sixth of the time. As in screened Poisson, the field is then drawn to zero at the points. This
+would fit noise too, so the points are first checked to lie on one surface.
 """
 
 from __future__ import annotations
@@ -26,47 +26,47 @@ from graspd_core.types import TriangleMesh
 
 # Cells of the grid along the object's longest side.
 GRID_CELLS = 60
-# Cells that a wall is made thick, if it is thinner.
+# Least thickness of walls, in cells. Thinner walls are made thicker.
 MIN_WALL_CELLS = 2.2
-# The sides of a wall face apart by this cosine at least.
+# Two points are on opposite sides of a wall if the cosine between their normals is below minus this.
 OPPOSITE_COSINE = 0.7
-# Beyond so many cells from the Poisson surface a node's side is its region's.
+# Signed distances are computed within this many cells of the surface. Farther nodes get the sign of their region.
 BAND_CELLS = 2
-# A floor looks up by this cosine and is this much higher than the lowest points seen, at most [m].
+# A floor faces up by at least this cosine, and is at most this much above the lowest seen points [m].
 MIN_FLOOR_COSINE, MAX_FLOOR_RISE_M = 0.95, 0.002
-# Nodes whose distances to the facets of a hull are looked at together: these stay in the cache.
+# Number of nodes whose distances to a hull are computed together, so that the arrays stay in the cache.
 _NODES_AT_ONCE = 1000
-# Standard deviations, in cells: of the blur of the field, and of the one that the points' density is read from.
+# Standard deviations [cells] of the blur of the field, and of the blur that measures the density of the points.
 _BLUR, _DENSITY_BLUR = 1.0, 2.0
-# Points count for no more than where they are this much sparser than the median.
+# Sparse points weigh more. The weight stops growing at this fraction of the median density.
 _SPARSEST = 0.2
-# Of the points at least this share lies within a cell of the surface before it is drawn to them: of 120 views of shapes
-# and scans 0.82 and more, of noise 0.48 and less.
+# Least fraction of points within a cell of the surface before it is drawn to them. On 120 views of shapes and scans it
+# is 0.82 or more, on noise 0.48 or less.
 _MIN_NEAR = 0.7
-# Steps that draw the field to zero at the points, and how far each reaches, in cells.
+# Steps that draw the field to zero at the points, and the reach of each step [cells].
 _STEPS, _REACH = 3, 2.0
-# The transforms are of what repeats: so many cells lie between the object and its next image.
+# Fourier transforms treat the grid as periodic. So many cells separate the object from its periodic image.
 _MARGIN = 16
 
 # The nodes of a grid of cubes [m], and values at them.
 Nodes = Float[np.ndarray, "x y z 3"]
 Grid = Float[np.ndarray, "x y z"]
-# Signed distance near a surface through surfels [m], at the nodes of a grid of cubes of that width [m].
+# Function of surfels, grid nodes and cell width [m] that returns the signed distance [m] near a fitted surface.
 Field = Callable[[Surfels, Nodes, float], Grid]
 
 
 def grid_cell(surfels: Surfels, least: float, cells: int = GRID_CELLS) -> float:
-    """Return the width of the cells that a surface through these points is closed on, at least `least` [m]."""
+    """Return the cell width [m] of the grid on which a surface through these points is closed, at least `least`."""
     return max(float(np.ptp(surfels.points, axis=0).max()) / cells, least)
 
 
 def part_walls(surfels: Surfels, cell: float) -> Surfels:
-    """Move the two sides of walls too thin for the grid apart by a millimetre or two, for they would cancel."""
+    """Move apart the two sides of walls too thin for the grid, by a millimetre or two. Otherwise they would cancel."""
     from scipy.spatial import KDTree
 
     points, normals = surfels.points, surfels.normals
     thinnest = MIN_WALL_CELLS * cell
-    # Nearest in place and in opposite normal: the other side of a wall. None is farther away in these six dimensions.
+    # The other side of a wall is nearest in position and opposite normal. In these six dimensions none is farther.
     tree = KDTree(np.hstack([points, thinnest * normals]))
     farthest = np.sqrt(2 + 2 * (1 - OPPOSITE_COSINE)) * thinnest
     _, other = tree.query(np.hstack([points, -thinnest * normals]), distance_upper_bound=farthest, workers=-1)
@@ -80,10 +80,10 @@ def part_walls(surfels: Surfels, cell: float) -> Surfels:
 
 
 def poisson_field(surfels: Surfels, nodes: Nodes, cell: float, finest: float) -> Grid:
-    """Return the signed distance [m] to Open3D's Poisson surface at the nodes of a grid of cubes, `cell` apart [m].
+    """Return the signed distance [m] to Open3D's Poisson surface, at grid nodes that are `cell` [m] apart.
 
-    The surface is open where it leaves the cube of 1.2 times the points' size. Its finest cells are about as wide as
-    `finest` [m]: its grid halves from level to level. Raises CloudError: no surface fits the points.
+    The surface is open where it leaves a cube of 1.2 times the points' size. `finest` [m] is the approximate width of
+    the solver's finest cells, which halve from level to level. Raises CloudError if no surface fits the points.
     """
     import open3d as o3d
 
@@ -100,11 +100,11 @@ def poisson_field(surfels: Surfels, nodes: Nodes, cell: float, finest: float) ->
 
 
 def close_surface(surfels: Surfels, field: Field, free_space: FreeSpace, cell: float) -> TriangleMesh:
-    """Return the closed surface of what a surface fitted to the surfels encloses, without the known empty space.
+    """Fit a surface to the surfels, cut away the space seen to be empty, and return the closed mesh of the rest.
 
     Args:
-        field: signed distance near that surface, at the nodes of a grid.
-        cell: width of that grid's cells [m].
+        field: function that returns the signed distance near the fitted surface, at the nodes of a grid.
+        cell: cell width of this grid [m].
     """
     from scipy.ndimage import gaussian_filter
 
@@ -127,20 +127,20 @@ def close_surface(surfels: Surfels, field: Field, free_space: FreeSpace, cell: f
 
 
 def _beneath_floors(surfels: Surfels, lowest: float) -> Points:
-    """Return points of the support beneath a cup's low floor, where the hull of the seen points would be too thin."""
+    """Return the points of a low floor, as of a cup, moved down to the support. They make the hull thick enough."""
     floor = (surfels.normals[:, 2] > MIN_FLOOR_COSINE) & (surfels.points[:, 2] < lowest + MAX_FLOOR_RISE_M)
     return surfels.points[floor] * np.array([1.0, 1.0, 0.0])
 
 
 def march(value: Grid, axes: Sequence[Float[np.ndarray, "_"]]) -> TriangleMesh:
-    """Return the zero surface of a field on a grid of cubes, facing where the field grows."""
+    """Return the zero surface of a field by marching cubes. Its normals point to where the field grows."""
     import igl
 
     cell = float(axes[0][1] - axes[0][0])
-    # Kept off zero at the nodes, where the surface would pinch to nothing.
+    # Values at the nodes are kept off zero, because zeros would make degenerate faces.
     value = np.where(np.abs(value) < 0.02 * cell, np.where(value < 0, -0.02, 0.02) * cell, value)
     nodes = np.stack(np.meshgrid(*axes, indexing="ij"), -1)
-    # igl counts the first coordinate fastest.
+    # igl expects the first coordinate to vary fastest.
     columns = nodes.transpose(2, 1, 0, 3).reshape(-1, 3)
     marching: Any = igl.marching_cubes
     vertices, faces = marching(value.ravel(order="F"), columns, *value.shape, 0.0)[:2]
@@ -151,10 +151,10 @@ def march(value: Grid, axes: Sequence[Float[np.ndarray, "_"]]) -> TriangleMesh:
 
 
 def _signed(surface: TriangleMesh, nodes: Nodes, cell: float) -> Grid:
-    """Return signed distance at the nodes near the surface, and a signed `BAND_CELLS` of cells elsewhere.
+    """Return the signed distance [m] at the nodes near the surface, and plus or minus `BAND_CELLS` cells elsewhere.
 
-    The surface has no border within the grid, so it parts it into regions. A region away from it takes the side of most
-    of its nodes next to the surface, by the nearest face's normal.
+    The surface has no border within the grid, so it divides the grid into regions. Each region takes the sign of most
+    of its nodes next to the surface, which comes from the normal of the nearest face.
     """
     from scipy.ndimage import label
 
@@ -173,7 +173,7 @@ def _signed(surface: TriangleMesh, nodes: Nodes, cell: float) -> Grid:
 
 
 def _touched(surface: TriangleMesh, nodes: Nodes, cell: float) -> Bool[np.ndarray, "x y z"]:
-    """Return the nodes within some two cells of the surface, whose faces are smaller than a cell or two."""
+    """Return which nodes are within about two cells of the surface. Its faces must be smaller than a cell or two."""
     from scipy.ndimage import binary_dilation
 
     points = np.concatenate([surface.vertices, surface.vertices[surface.faces].mean(1)])
@@ -185,17 +185,17 @@ def _touched(surface: TriangleMesh, nodes: Nodes, cell: float) -> Bool[np.ndarra
 
 
 def _outside_hull(points: Points, nodes: Float[np.ndarray, "m 3"], cell: float) -> Float[np.ndarray, "m"]:
-    """Return how far nodes lie outside the convex hull of points [m], in which any surface through them may close."""
+    """Return how far nodes lie outside the convex hull of points [m]. A surface may close anywhere inside it."""
     hull = convex_hull(np.unique(np.round(points / (3 * cell)), axis=0) * 3 * cell)
     if hull is None:
         return np.zeros(len(nodes))
-    # In parts that stay in the cache: all nodes by all facets would take half a gigabyte, and eight times as long.
+    # Computed in parts that stay in the cache. One array of nodes by facets would take 0.5 GB and eight times as long.
     parts = np.array_split(np.vstack([nodes.T, np.ones(len(nodes))]), 1 + len(nodes) // _NODES_AT_ONCE, axis=1)
     return np.maximum(np.concatenate([(hull.equations @ part).max(0) for part in parts]), 0.0)
 
 
 def _one_solid(value: Grid, cell: float) -> Grid:
-    """Keep the largest part alone, without bubbles, free of the grid's border."""
+    """Keep only the largest solid, fill its inner cavities, and keep it clear of the grid's border."""
     from scipy.ndimage import label
 
     border = np.ones(value.shape, dtype=bool)
@@ -212,26 +212,26 @@ def _one_solid(value: Grid, cell: float) -> Grid:
 
 
 def grid_poisson_field(surfels: Surfels, nodes: Nodes, cell: float) -> Grid:
-    """Return the signed distance near the points' surface [m] at the nodes of a grid of cubes, limited to a band.
+    """Return the signed distance [m] to a surface through the surfels at grid nodes, limited to `BAND_CELLS` cells.
 
     Args:
-        surfels: all within the grid.
-        nodes: of the grid, `cell` apart [m].
+        surfels: points with normals, all within the grid.
+        nodes: positions of the grid nodes, `cell` [m] apart.
 
     Raises:
-        CloudError: the points and normals are not those of one surface.
+        CloudError: the points and normals do not fit one surface.
     """
     import scipy.fft
 
     counts = nodes.shape[:3]
-    fft: Any = scipy.fft  # of which no types are known: SciPy declares these as what they dispatch by
+    fft: Any = scipy.fft  # typed as Any, because SciPy declares only the dispatch types
     shape = tuple(int(fft.next_fast_len(count + _MARGIN, real=True)) for count in counts)
     before = [(most - count) // 2 for most, count in zip(shape, counts, strict=True)]
     at = _trilinear((surfels.points - nodes[0, 0, 0]) / cell + before, shape)
     waves = _waves(shape)
     square = sum(wave**2 for wave in waves)
 
-    # In float32, whose last digit is far less than noise: transforms are most of the time, and take a third of it so.
+    # float32 is far more precise than the noise. The transforms dominate the time, and take a third of it in float32.
     def spread(values: Float[np.ndarray, "points"]) -> np.ndarray:
         return fft.rfftn((at.T @ values).astype(np.float32).reshape(shape))
 
@@ -242,19 +242,19 @@ def grid_poisson_field(surfels: Surfels, nodes: Nodes, cell: float) -> Grid:
     _, density = at_points(spread(np.ones(len(surfels.points))) * np.exp(-0.5 * _DENSITY_BLUR**2 * square))
     weights = 1.0 / np.maximum(density, _SPARSEST * np.median(density))
     blur = np.exp(-0.5 * _BLUR**2 * square)
-    # The gradient of the field is the normals' vector field.
+    # The gradient of the field shall equal the vector field of the normals.
     flow = sum(wave * spread(weights * along) for wave, along in zip(waves, surfels.normals.T, strict=True))
     field, there = at_points(-1j * flow * blur / np.maximum(square, 1e-12))
     slope = _slope(field.reshape(shape), at, surfels.normals)
     if not slope > 0:
-        raise CloudError(f"cloud: the normals of its {len(surfels.points)} points are of no surface")
+        raise CloudError(f"cloud: the normals of its {len(surfels.points)} points fit no surface; add more views")
     field, there = ((values - np.average(there, weights=weights)) / slope for values in (field, there))
     near = float((np.abs(there) < 1.0).mean())
     if near < _MIN_NEAR:
-        raise CloudError(f"cloud: no surface fits its {len(there)} points ({near:.0%} do)")
+        raise CloudError(f"cloud: no surface fits its {len(there)} points ({near:.0%} fit)")
     for _ in range(_STEPS):
         push, pushed = at_points(spread(-weights * there) * blur / (square + _REACH**-2))
-        # As far along it as leaves least at the points.
+        # The step length minimises the squared field at the points.
         share = -(weights * there * pushed).sum() / max((weights * pushed**2).sum(), 1e-300)
         field, there = field + share * push, there + share * pushed
     inner = tuple(slice(low, low + count) for low, count in zip(before, counts, strict=True))
@@ -262,7 +262,7 @@ def grid_poisson_field(surfels: Surfels, nodes: Nodes, cell: float) -> Grid:
 
 
 def _trilinear(place: Float[np.ndarray, "points 3"], shape: tuple[int, ...]) -> Any:
-    """Return the matrix, points by nodes, that reads a field at places given in cells."""
+    """Return the matrix (points × nodes) that interpolates a field at positions given in cells."""
     from scipy.sparse import csr_array
 
     corners = np.array(list(product((0, 1), repeat=3)))

@@ -1,8 +1,8 @@
-"""A closed mesh from one or more views of an object, with its method and the confidence of each part.
+"""Reconstruction of a closed mesh from one or more views of an object, with the confidence of each part.
 
-The seen part is surfaced by screened Poisson with normals towards each camera: on a grid, or by Open3D if that does not
-fit. The hidden part is completed first, by the symmetry, revolution or extrusion that the evidence favours. Space that
-the cameras saw to be empty is cut away.
+The hidden part is guessed first, by the symmetry, revolution or extrusion that fits the views best. Then screened
+Poisson fits a surface to the points, with normals towards each camera. The grid solver comes first, and Open3D's if the
+grid's surface does not fit. Space that the cameras saw to be empty is cut away.
 """
 
 from __future__ import annotations
@@ -46,27 +46,28 @@ from graspd_core.perception.reconstruct.shape_completion import Completion, comp
 from graspd_core.se3 import perpendicular
 from graspd_core.types import Plane, TriangleMesh
 
-# Share of the seen points that must lie on the result.
+# Least fraction of the seen points that must lie on the mesh.
 MIN_FITTED_SHARE = 0.85
-# What is fewer cells across balloons on the grid.
+# An object that is fewer cells across comes out too thick on the grid.
 _LEAST_CELLS = 8
-# Where a cloud shows both sides of walls, and the grid would thicken them at this share of its points, the grid has so
-# many cells, and they may be so much smaller. Walls of 4 mm come out as such, not as 5, in 1.8 s of a core for 1.2.
+# An all-round cloud gets a finer grid if the usual one would thicken its walls at more than this fraction of points.
+# The finer grid has this many cells, of a least width smaller by this factor. Walls of 4 mm then come out as 4 mm, not
+# 5 mm, in 1.8 s of one core instead of 1.2 s.
 _THIN_SHARE, _WALL_CELLS, _WALL_CELL = 0.1, 100, 0.7
-# A face of the foot looks down by this cosine, at least.
+# A face of the foot faces down at least by this cosine.
 _DOWN = 0.7
 
 
 @dataclass(frozen=True)
 class Reconstruction:
-    """A closed surface and how it came about.
+    """A closed mesh, and how it was reconstructed.
 
     Attributes:
-        mesh: closed, in the frame of the views [m].
-        confidence: of each vertex, 1 where the surface was seen, falling to 0 with the distance from it.
-        method: "poisson", and what completed it, e.g. "poisson, revolution".
+        mesh: the closed mesh, in the frame of the views [m].
+        confidence: confidence of each vertex, 1 at seen surface, falling to 0 with the distance from seen surface.
+        method: "poisson" and the completion rule, e.g. "poisson, revolution".
         warnings: what was guessed, one sentence each.
-        evidence: what was seen, for other guesses of the hidden side.
+        evidence: what the cameras saw, for other guesses of the hidden side.
     """
 
     mesh: TriangleMesh
@@ -82,17 +83,17 @@ def reconstruct(
     settings: ReconstructionConfig | None = None,
     whole: Sequence[PointCloud] = (),
 ) -> Reconstruction:
-    """Return the closed surface of the object that the views show.
+    """Reconstruct a closed mesh of the object that the views show.
 
     Args:
-        views: the object's points alone, of each camera, all in one frame. NaN and stray points are dropped. A single
-            cloud that shows the object from all round may stand for many views.
-        support: what the object stands on, in the same frame.
+        views: the object's points as each camera saw them, all in one frame. NaN and stray points are dropped. A single
+            cloud that shows the object from all round may replace several views.
+        support: plane that the object stands on, in the same frame.
         settings: precision of the cameras, and sizes.
-        whole: all that the same cameras saw. What stands before the object hides what is behind it.
+        whole: all points that the same cameras saw. They show what hides parts of the object.
 
     Raises:
-        CloudError: too few points, no closed surface fits them, or it is too small or too large for a hand.
+        CloudError: too few points, no closed surface fits them, or the surface is too small or too large for a hand.
     """
     settings = settings or ReconstructionConfig()
     axis_known = views[0].forward is not None if views else False
@@ -128,7 +129,7 @@ def reconstruct(
 
 
 def _in_frame(view: PointCloud, rotation: Float[np.ndarray, "3 3"], origin: Vector) -> PointCloud:
-    # Some drivers send infinity where they saw nothing: it becomes NaN.
+    # Some drivers send infinity for missing depth. It becomes NaN here.
     with np.errstate(invalid="ignore"):
         return PointCloud((view.points - origin) @ rotation, (view.viewpoint - origin) @ rotation)
 
@@ -146,7 +147,7 @@ def _closed(
     settings: ReconstructionConfig,
     cells: int,
 ) -> TriangleMesh:
-    """Close the surface by Poisson on a grid, or by Open3D's if `settings` ask for it or the grid's does not fit."""
+    """Close the surface by the grid solver, or by Open3D's if `settings` ask for it or the grid's does not fit."""
     adaptive = partial(poisson_field, finest=settings.poisson_cell)
     small = float(np.ptp(seen.points, axis=0).max()) < _LEAST_CELLS * settings.min_cell
     if settings.poisson == "grid" and not small:
@@ -164,14 +165,14 @@ def closed_mesh(
     field: Field,
     cells: int = GRID_CELLS,
 ) -> TriangleMesh:
-    """Return the closed surface through the seen and the guessed surfels, down to the support if there is one.
+    """Return a closed mesh through the seen and the guessed surfels, down to the support if there is one.
 
     Args:
-        field: how a surface is fitted to points.
-        cells: of the grid that it is closed on, along the object's longest side.
+        field: function that fits a surface to points.
+        cells: number of grid cells along the object's longest side.
 
     Raises:
-        CloudError: none fits what was seen.
+        CloudError: no closed surface fits the seen points.
     """
     known = with_foot(join(seen, guess), free_space, step)
     known = part_walls(known, grid_cell(known, settings.min_cell, cells))
@@ -180,14 +181,14 @@ def closed_mesh(
 
 
 def _clean(views: Sequence[PointCloud], settings: ReconstructionConfig) -> list[PointCloud]:
-    """Return the finite points near where most are, of the views that have enough of them for a surface."""
+    """Drop points that are not finite or far from the others, and views with too few points for a surface."""
     from scipy.spatial import KDTree
 
     if len(views) == 0:
         raise CloudError("cloud: no view at all; at least one is needed")
     for view in views:
         if not np.isfinite(view.viewpoint).all():
-            raise CloudError("cloud: the place of a view's camera (viewpoint) is not finite")
+            raise CloudError("cloud: the position of a view's camera (viewpoint) is not finite")
     most = settings.max_points // len(views)
     kept = [_some(view, most) for view in views]
     clean = clean_cloud(np.concatenate(kept), views[0].viewpoint)
@@ -196,7 +197,7 @@ def _clean(views: Sequence[PointCloud], settings: ReconstructionConfig) -> list[
     result = []
     for points, view in zip(kept, views, strict=True):
         points = points[tree.query(points, distance_upper_bound=near)[0] < near] if len(points) else points
-        # Among a thousand: one place sent often is no surface, and its sight would call all else empty.
+        # Checked on some thousand points. One place sent many times is no surface, but would mark other space as empty.
         if len(np.unique(points[:: 1 + len(points) // 1000], axis=0)) > settings.neighbours:
             result.append(PointCloud(points, view.viewpoint.astype(float)))
     if not result:
@@ -213,7 +214,7 @@ def _some(view: PointCloud, most: int) -> Points:
 
 
 def _frame(views: Sequence[PointCloud], support: Plane | None) -> tuple[Float[np.ndarray, "3 3"], Vector]:
-    """Return axes (columns) and origin that move with the views: z up from the support, or towards the first camera."""
+    """Return axes (columns) and origin [m] of a frame: z is the support's normal, or points to the first camera."""
     points = np.concatenate([view.points for view in views])
     centre = points.mean(0)
     view = views[0].viewpoint - centre
@@ -232,7 +233,7 @@ def _frame(views: Sequence[PointCloud], support: Plane | None) -> tuple[Float[np
 
 
 def _finished(mesh: TriangleMesh, seen: Surfels, settings: ReconstructionConfig) -> TriangleMesh:
-    """Simplify and check the mesh. Raises CloudError: it is not closed, or far from the seen points."""
+    """Simplify and check the mesh. Raises CloudError if it is not closed or too far from the seen points."""
     try:
         mesh = _fewer(check_mesh(mesh, "reconstruction")[0], settings.max_faces)
     except MeshError as error:
@@ -240,14 +241,14 @@ def _finished(mesh: TriangleMesh, seen: Surfels, settings: ReconstructionConfig)
     fitted = float((surface_distance(make_surface(mesh), seen.points) < settings.fit_distance).mean())
     if not is_closed(mesh) or fitted < MIN_FITTED_SHARE:
         raise CloudError(
-            f"cloud: no closed surface fits its {len(seen.points)} points ({fitted:.0%} do); more views are needed, "
+            f"cloud: no closed surface fits its {len(seen.points)} points ({fitted:.0%} fit); more views are needed, "
             "or more points where its walls are thin"
         )
     return mesh
 
 
 def _fewer(mesh: TriangleMesh, most: int) -> TriangleMesh:
-    """Reduce a mesh to at most `most` faces. A slower simplifier is used if the quick one tears the surface."""
+    """Reduce a mesh to about `most` faces. Use a slower simplifier if the quick one tears the surface."""
     import open3d as o3d
 
     for aggressiveness in (7, 5, 3):
@@ -279,21 +280,21 @@ def _is_guessed(
     standing: bool,
     settings: ReconstructionConfig,
 ) -> bool:
-    """Tell whether a good part of a surface was not seen. A foot on the support at z = 0 counts as known."""
+    """Return True if much of a surface was not seen. Surface on the support at z = 0 counts as known."""
     if views > 1:
-        # Whatever a rule filled. The normals of the seen part may cancel though much is hidden, as of a bottle's sides.
+        # Whether a rule was used does not matter. Openness is no measure here: the normals of opposite sides cancel.
         return _unseen_share(mesh, seen, standing, settings.seen_distance) > settings.open_share
-    # From above the normals of what is seen and of the foot cancel, and yet no side was seen.
+    # In a view from above, the normals of the top and of the foot cancel although no side was seen.
     area = _open_area(mesh, standing)[0]
     guessed = float((area * (1.0 - confidence[mesh.faces].mean(1))).sum() / max(area.sum(), 1e-12))
     return bool(guess.method) or max(guess.openness, guessed) > settings.open_share
 
 
 def _unseen_share(mesh: TriangleMesh, seen: Surfels, standing: bool, reach: float) -> float:
-    """Return the share of a surface that no seen surface is near to in place and normal.
+    """Return the fraction of a surface that is not near to seen surface in position and normal.
 
     Args:
-        reach: how far is near [m]. A turn of 60° is as far.
+        reach: largest distance that counts as near [m]. A difference of 60° between normals counts as this distance.
     """
     from scipy.spatial import KDTree
 
@@ -304,7 +305,7 @@ def _unseen_share(mesh: TriangleMesh, seen: Surfels, standing: bool, reach: floa
 
 
 def _open_area(mesh: TriangleMesh, standing: bool) -> tuple[Float[np.ndarray, "faces"], Float[np.ndarray, "faces 3"]]:
-    """Return area [m²] and normal of each face. Faces on the support at z = 0 have no area."""
+    """Return area [m²] and unit normal of each face. The area of faces on the support at z = 0 is set to zero."""
     a, b, c = mesh.vertices[mesh.faces].transpose(1, 0, 2)
     across = np.cross(b - a, c - a)
     length = np.linalg.norm(across, axis=1)

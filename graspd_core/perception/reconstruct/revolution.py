@@ -1,9 +1,8 @@
-"""Bodies of revolution: the seen profile turned about its axis, and its closure.
+"""Fitting of bodies of revolution: find the axis, revolve the seen profile about it, and close its ends.
 
-The axis comes first from the normals, which all meet it. With p and n a point and its normal, the axis through c along
-a obeys n·(c × a) + (p × n)·a = 0, which is linear in (a, c × a) (Pottmann and Wallner, Computational Line Geometry,
-2001). Normals are noisy, so the points then settle the axis: turned into one half-plane, points of one place of the
-profile must coincide.
+The normals give a first axis, because they all meet it. For a point p with normal n, the axis through c along a obeys
+n·(c × a) + (p × n)·a = 0, which is linear in (a, c × a) (Pottmann and Wallner, Computational Line Geometry, 2001).
+Normals are noisy, so the points then refine the axis: rotated into one half-plane, they must form a thin profile.
 """
 
 from __future__ import annotations
@@ -20,19 +19,19 @@ from graspd_core.perception.reconstruct.merge_views import Surfels
 from graspd_core.perception.reconstruct.symmetry import CONTRADICTION_WEIGHT, UP
 from graspd_core.se3 import perpendicular
 
-# Normals that pass the axis by more than this share of their direction are of something else: a handle, a spout.
+# A normal whose component around the axis is larger than this belongs to another part, such as a handle or a spout.
 MAX_SKEW = 0.3
-# Gauss-Newton steps to settle an axis, points that it takes, and the share of the identity that holds what they leave
-# free: a ball any direction.
+# Gauss-Newton steps to refine an axis, least number of points, and damping. Damping holds directions that the points
+# leave free, such as every axis of a ball.
 GAUSS_NEWTON_STEPS, MIN_AXIS_POINTS, DAMPING = 6, 30, 1e-3
-# Places around the axis that each ring of the profile is judged at, and the share of them that may contradict it.
+# Points around the axis at which each ring of the profile is checked, and the fraction of them that may contradict it.
 RING_SAMPLES, MAX_CONTRADICTED_SHARE = 24, 0.15
-# Cosine of the tilt below which a body that stands is upright.
+# If the cosine of its tilt is above this, a standing body is taken to be upright.
 UPRIGHT_COSINE = 0.985
-# Without a support the first camera looks down on things: up is towards it.
+# Without a support, z points to the first camera, so this direction lies across the view.
 ACROSS_VIEW = np.array([1.0, 0.0, 0.0])
 
-# Height along the axis and distance from it [m], then the normal's part along and away from it.
+# Height along the axis and distance from it [m], then the normal's components along the axis and away from it.
 Rows = Float[np.ndarray, "_ 4"]
 
 
@@ -45,7 +44,7 @@ class Axis:
 
 
 def fit_axis(surfels: Surfels, direction: Vector) -> Axis:
-    """Return the line of that direction that the normals pass nearest to, by robust weights."""
+    """Return the line along `direction` that the normals pass nearest to, by iteratively reweighted least squares."""
     centre = surfels.points.mean(0)
     points, normals = surfels.points - centre, surfels.normals
     turning = np.cross(points, normals) @ direction
@@ -65,7 +64,7 @@ def fit_axis(surfels: Surfels, direction: Vector) -> Axis:
 
 
 def meeting_direction(surfels: Surfels) -> Vector:
-    """Return the direction of the line that all normals meet best, by iterated weights."""
+    """Return the direction of the line that the normals meet best, by iteratively reweighted least squares."""
     centre = surfels.points.mean(0)
     size = float(np.abs(surfels.points - centre).max())
     points = (surfels.points - centre) / size
@@ -84,10 +83,10 @@ def meeting_direction(surfels: Surfels) -> Vector:
 
 
 def half_plane(surfels: Surfels, axis: Axis) -> tuple[Points, Float[np.ndarray, "n 4"]]:
-    """Turn points about the axis into one half-plane.
+    """Rotate points about the axis into one half-plane.
 
-    Returns the direction of each point from the axis, and rows. Rows hold height along the axis, distance from it [m],
-    and the normal's part along and away from it.
+    Return the unit direction of each point from the axis, and one row per point. A row holds height along the axis and
+    distance from it [m], and the normal's components along the axis and away from it.
     """
     offset = surfels.points - axis.point
     height = offset @ axis.direction
@@ -99,16 +98,15 @@ def half_plane(surfels: Surfels, axis: Axis) -> tuple[Points, Float[np.ndarray, 
 
 
 def turned(rows: Float[np.ndarray, "n 4"], step: float) -> Bool[np.ndarray, "n"]:
-    """Return which rows may be of a body of revolution: their normals meet the axis."""
+    """Return which rows may belong to a body of revolution, because their normals meet the axis."""
     return (rows[:, 2] ** 2 + rows[:, 3] ** 2 > 1 - MAX_SKEW**2) & (rows[:, 1] > 0.5 * step)
 
 
 def settle_axis(surfels: Surfels, axis: Axis, step: float) -> Axis:
-    """Tilt the axis to make the thinnest profile by Gauss-Newton.
+    """Tilt the axis by Gauss-Newton steps until the profile of the points is as thin as possible.
 
-    Its place follows from the normals. Points far from the profile, as of a handle, count less and less. The shifts
-    that go with a tilt are not taken. A half seen from one side does not show its place along the line of sight, but
-    its normals do.
+    Points far from the profile, such as those of a handle, count less and less. Only the tilts of each step are used.
+    The axis position follows from the normals, because points seen from one side do not show it along the view.
     """
     for round_ in range(GAUSS_NEWTON_STEPS):
         right = perpendicular(axis.direction)
@@ -118,7 +116,7 @@ def settle_axis(surfels: Surfels, axis: Axis, step: float) -> Axis:
         if fits.sum() < MIN_AXIS_POINTS:
             break
         offset = surfels.points[fits] - axis.point
-        # How points move, seen from an axis that shifts or tilts.
+        # Velocities of the points, relative to an axis that shifts or tilts.
         shifts = [np.broadcast_to(-right, offset.shape), np.broadcast_to(-up, offset.shape)]
         motions = [*shifts, -np.cross(right, offset), -np.cross(up, offset)]
         rates = np.stack([np.column_stack([m @ axis.direction, (m * outward[fits]).sum(1)]) for m in motions])
@@ -131,10 +129,10 @@ def settle_axis(surfels: Surfels, axis: Axis, step: float) -> Axis:
 def _thinner(
     rows: Float[np.ndarray, "n 4"], rates: Float[np.ndarray, "4 n 2"], step: float, scale: float
 ) -> Float[np.ndarray, "4"]:
-    """Return the step by each motion, given the rates at which points rise and move outwards by it.
+    """Return the Gauss-Newton step of each motion of the axis: two shifts and two tilts.
 
-    A point's residual is its distance from the others of its cell of the profile, along that cell's normal. Its rate is
-    measured in the same way. Residuals beyond `scale` [m] count little.
+    `rates` holds how fast each motion moves the points along and away from the axis. A point's residual is its distance
+    from the mean of its cell of the profile, along the cell's normal. Residuals beyond `scale` [m] count little.
     """
     height, radius, along, across = rows.T
     wall = np.abs(across) > np.abs(along)
@@ -150,7 +148,7 @@ def _thinner(
         moves = np.stack([move - _mean(move, cell, weight) for move in moves])
         weight = 1.0 / (1.0 + np.square(moves[0] / scale)) ** 2
     residual, system = moves[0], moves[1:]
-    # In metres at the object's radius, so that shifts and tilts are held alike.
+    # Tilts are measured in metres at the object's radius, so that shifts and tilts are damped alike.
     lever = np.array([1.0, 1.0, *[float(np.median(radius))] * 2])
     held = np.diag(DAMPING * len(rows) * lever**2)
     return -np.linalg.solve((system * weight) @ system.T + held, system @ (weight * residual))
@@ -165,12 +163,12 @@ def _mean(
 
 @dataclass(frozen=True)
 class Revolution:
-    """The surface of revolution of the seen part about an axis.
+    """The surface made by revolving the seen part about an axis.
 
     Attributes:
-        surfels: of the whole surface.
-        agree, wrong: share of places on it that confirm and that contradict it.
-        share: how much of the seen part it accounts for.
+        surfels: surfels of the whole surface.
+        agree, wrong: fractions of the surface that the cameras confirm and contradict.
+        share: fraction of the seen points that lie on the surface.
     """
 
     axis: Axis
@@ -181,11 +179,11 @@ class Revolution:
 
 
 def find_revolution(surfels: Surfels, free_space: FreeSpace, step: float) -> Revolution | None:
-    """Return the best revolution: about an upright axis, if the object stands, or about one that all normals meet."""
+    """Return the best body of revolution, or None. Its axis is vertical, across the view, or met by all normals."""
     met = meeting_direction(surfels)
-    # A ball has all axes: one across the view shows its back.
+    # Every axis fits a ball. An axis across the view shows its back.
     axes = [fit_axis(surfels, UP if free_space.standing else ACROSS_VIEW)]
-    # What nearly stands upright does: the support is known better than any axis.
+    # A body that is nearly upright is taken as upright, because the support is known more precisely than the axis.
     if not free_space.standing or abs(met @ UP) < UPRIGHT_COSINE:
         axes.append(settle_axis(surfels, fit_axis(surfels, met), step))
     good = [found for axis in axes if (found := revolve(surfels, free_space, axis, step)) is not None]
@@ -194,7 +192,7 @@ def find_revolution(surfels: Surfels, free_space: FreeSpace, step: float) -> Rev
 
 
 def revolve(surfels: Surfels, free_space: FreeSpace, axis: Axis, step: float) -> Revolution | None:
-    """Turn the seen profile about the axis. Rings that the cameras contradict are left out."""
+    """Revolve the seen profile about the axis. Leave out rings that the cameras contradict. None if few are left."""
     from scipy.spatial import KDTree
 
     _, rows = half_plane(surfels, axis)
@@ -219,9 +217,9 @@ def revolve(surfels: Surfels, free_space: FreeSpace, axis: Axis, step: float) ->
 
 
 def _ends(profile: Rows, axis: Axis, right, up, free_space: FreeSpace, step: float) -> list[Rows]:
-    """Return what closes a profile that stops away from the axis: a flat cap, or a curve down to the support.
+    """Return the rows that close a profile which ends away from the axis: a flat cap, or a curve down to the support.
 
-    A cap needs a rim that the cameras saw to be the end. Neither may contradict the cameras.
+    A cap is added only if the cameras saw empty space beyond the rim. Neither may contradict the cameras.
     """
     found = []
     outer = profile[profile[:, 3] > 0.1]
@@ -233,7 +231,7 @@ def _ends(profile: Rows, axis: Axis, right, up, free_space: FreeSpace, step: flo
         if rim[1] < 3 * step or (way * profile[ended, 2] > 0.8).mean() > 0.2:
             continue
         if free_space.standing and way * axis.direction[2] < -0.95:
-            # A ring has nothing near its axis to stand on.
+            # A ring has no surface near its axis, so it has no foot there.
             middle = profile[:, 1].min() < 0.3 * rim[1]
             patch = _foot(rim, way, float(axis.point[2]), step) if middle else np.zeros((0, 4))
         else:
@@ -248,12 +246,12 @@ def _ends(profile: Rows, axis: Axis, right, up, free_space: FreeSpace, step: flo
 
 
 def _foot(rim, way: float, ground: float, step: float) -> Rows:
-    """Return the parabola from an overhanging rim, along its tangent, to where the axis meets the support."""
+    """Return a parabola from an overhanging rim, starting along its tangent, to where the axis meets the support."""
     height, radius = way * -rim[0] + ground, rim[1]
     along, across = way * rim[2], rim[3]
     if along < 0.15 or height < 2 * step:
         return np.zeros((0, 4))
-    # The tangent comes inwards by `along` for every `across` downwards.
+    # The tangent goes inwards by `along` for every `across` downwards.
     corner = float(np.clip(radius - height * along / max(across, 1e-3), 0.0, radius))
     t = np.linspace(0, 0.98, max(int(1.5 * (radius + height) / step), 3))[1:]
     r = (1 - t) ** 2 * radius + 2 * t * (1 - t) * corner
@@ -269,18 +267,18 @@ def _confirmed_and_wrong(rows: Rows, axis: Axis, right, up, free_space: FreeSpac
 
 
 def _profile(rows: Float[np.ndarray, "n 4"], step: float) -> Float[np.ndarray, "m 4"]:
-    """Return the means over cells of height, radius and the side that they face."""
+    """Return the mean row of each cell of height, radius and facing direction."""
     side = np.where(np.abs(rows[:, 2]) > np.abs(rows[:, 3]), 2 + (rows[:, 2] > 0), rows[:, 3] > 0)
     cells = np.column_stack([np.floor(rows[:, :2] / step).astype(int), side.astype(int)])
     _, which, count = np.unique(packed_rows(cells), return_inverse=True, return_counts=True)
     mean = np.column_stack([np.bincount(which, rows[:, k]) for k in range(4)]) / count[:, None]
     mean[:, 2:] /= np.maximum(np.linalg.norm(mean[:, 2:], axis=1, keepdims=True), 1e-9)
-    # Single points are strays.
+    # Cells with a single point are outliers.
     return mean[count > 1] if (count > 1).sum() > 10 else mean
 
 
 def _ring(profile, axis: Axis, right, up, counts) -> Surfels:
-    """Turn each row of the profile to `counts` places."""
+    """Return the surfels made by turning each row of the profile to its number of `counts` positions."""
     rows = np.repeat(np.arange(len(profile)), counts)
     place = np.arange(len(rows)) - np.repeat(np.cumsum(counts) - counts, counts)
     turn = 2 * np.pi * place / np.repeat(counts, counts)

@@ -1,8 +1,8 @@
-"""The unseen side of an object, guessed by the rule that the evidence favours.
+"""Completion of the unseen side of an object, by the rule that fits the views best.
 
-Rules: a body of revolution, one or two mirror planes, a centre of symmetry, and beside each the outline seen from above
-extruded to the support. Guessed points in empty space, in the support, or at seen surface are dropped. A rule is used
-only if the cameras confirm much of it and contradict next to nothing.
+The rules are a body of revolution, one or two mirror planes, a centre of symmetry, and extrusion. Extrusion extends the
+outline seen from above down to the support, alone or together with a symmetry. Guessed points in empty space, in the
+support, or at seen surface are dropped. A rule must be largely confirmed by the views and hardly contradicted.
 """
 
 from __future__ import annotations
@@ -20,24 +20,24 @@ from graspd_core.perception.reconstruct.symmetry import Symmetry, find_centre, f
 
 REVOLUTION, MIRROR, POINT_SYMMETRY, EXTRUSION = "revolution", "mirror", "point symmetry", "extrusion"
 RULES = (REVOLUTION, MIRROR, POINT_SYMMETRY, EXTRUSION, "")
-# Share of a body of revolution's surface that a contradicted share of it takes away.
+# Weight of the contradicted fraction of a body of revolution, against the fraction that it explains.
 FAULT_WEIGHT = 5.0
-# Symmetries of which the cameras contradict more than this share are chance.
+# Symmetries that the cameras contradict at more than this fraction of points are chance.
 MAX_SYMMETRY_FAULTS = 0.02
-# A centre of symmetry must be worth so many times what mirrors are.
+# A centre of symmetry is preferred if its worth is over this many times that of mirror planes.
 TIE = 1.1
-# Two rules' guesses keep this far from each other [m].
+# Least distance between the guessed points of two rules [m].
 RULE_DISTANCE_M = 0.008
 
 
 @dataclass(frozen=True)
 class Completion:
-    """Guessed surface.
+    """The guessed part of a surface.
 
     Attributes:
-        method: the rule, e.g. "mirror and extrusion", empty for none.
-        surfels: without what contradicts or repeats what was seen.
-        openness: share of the surface that was missing before.
+        method: the rule, e.g. "mirror and extrusion". Empty if no rule was used.
+        surfels: the guessed points, without those that contradict or repeat the seen surface.
+        openness: fraction of the surface that was missing before.
     """
 
     method: str
@@ -46,14 +46,14 @@ class Completion:
 
 
 def complete_shape(seen: Surfels, free_space: FreeSpace, step: float, settings: ReconstructionConfig) -> Completion:
-    """Return the guess that the evidence favours: of rules that explain what was seen, the one that adds most."""
+    """Return the best guess of the unseen side: by the rule that explains the seen surface and adds most to it."""
     from scipy.spatial import KDTree
 
     missing = openness(with_foot(seen, free_space, step), step)
     turned = find_revolution(seen, free_space, step)
     if turned is not None and turned.share - FAULT_WEIGHT * turned.wrong > settings.revolution_share:
         guess = plausible(turned.surfels, seen, free_space, step)
-        # What a handle hides of itself, and the like, is left to Poisson.
+        # Small hidden parts, such as the back of a handle, are left to the Poisson surface.
         return Completion(REVOLUTION if _counts(guess, seen) else "", guess, missing)
     methods, guess = [], nothing()
     if missing < settings.open_share:
@@ -66,7 +66,7 @@ def complete_shape(seen: Surfels, free_space: FreeSpace, step: float, settings: 
         name, raw = _symmetric(seen, free_space, settings.symmetry_worth)
         images = plausible(raw, known, free_space, step)
         if len(guess.points):
-            # Where both speak, walls beneath seen outlines are the surer.
+            # Where both rules guess, walls beneath seen outlines are more certain.
             apart = KDTree(guess.points).query(images.points)[0] > RULE_DISTANCE_M
             images = take(images, apart)
         methods += [name] if _counts(images, seen) else []
@@ -75,7 +75,7 @@ def complete_shape(seen: Surfels, free_space: FreeSpace, step: float, settings: 
 
 
 def openness(surfels: Surfels, step: float) -> float:
-    """Return the missing share of a surface: the normals of a closed one, evenly sampled, add up to nothing."""
+    """Return the missing fraction of a surface: the length of its mean normal, zero for a closed surface."""
     return float(np.linalg.norm(thin(surfels, 2 * step).normals.mean(0)))
 
 
@@ -84,7 +84,7 @@ def _counts(guess: Surfels, seen: Surfels) -> bool:
 
 
 def plausible(guess: Surfels, known: Surfels, free_space: FreeSpace, step: float) -> Surfels:
-    """Return the guess, thinned, without points that contradict the cameras or lie at known surface."""
+    """Return the guess, thinned to `step` [m], without points that contradict the cameras or repeat known surface."""
     from scipy.spatial import KDTree
 
     guess = take(guess, empty_depth(free_space, guess.points) < free_space.slack)
@@ -100,7 +100,7 @@ def _symmetric(seen: Surfels, free_space: FreeSpace, least: float) -> tuple[str,
         value[MIRROR] = mirrors[0].worth
     if centre.wrong < MAX_SYMMETRY_FAULTS:
         value[POINT_SYMMETRY] = centre.worth
-    # A tie is not for the last digit to break: the other rule is among the shapes that grasps are tried on.
+    # Rounding must not decide a near tie. Grasps are also tried on the shape by the other rule.
     best = POINT_SYMMETRY if value[POINT_SYMMETRY] > TIE * value[MIRROR] else MIRROR
     if value[best] < least:
         return "", nothing()
@@ -115,9 +115,9 @@ def _mirrored(mirrors: list[Symmetry], seen: Surfels) -> Surfels:
 
 
 def guess_by(rule: str, seen: Surfels, free_space: FreeSpace, step: float) -> Surfels | None:
-    """Return the guess of one of `RULES` for the unseen side, likely or not, None if it makes none.
+    """Return the guess of one of `RULES` for the unseen side, however likely. None if the rule makes no guess.
 
-    "" guesses that nothing is hidden except what the surface closes over.
+    The rule "" guesses no points, so the surface just closes over the seen part.
     """
     if rule == REVOLUTION:
         turned = find_revolution(seen, free_space, step)

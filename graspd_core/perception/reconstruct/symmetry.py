@@ -1,7 +1,7 @@
-"""Symmetries that a partly seen object may have: mirror planes and centres.
+"""Search for symmetries of a partly seen object: mirror planes and centres of symmetry.
 
-Each search moves seen points by many candidates at once. It keeps the candidate whose images fall on seen surface,
-never into space seen to be empty, and show something new.
+Each search moves the seen points by many candidates at once. The images of a good candidate fall on seen surface, not
+into space seen to be empty, and add new surface.
 """
 
 from __future__ import annotations
@@ -18,28 +18,28 @@ from graspd_core.perception.cloud.point_cloud import Points, Vector
 from graspd_core.perception.reconstruct.merge_views import Surfels, take
 from graspd_core.se3 import perpendicular
 
-# Points that a candidate is judged on, closely and at first.
+# Number of points that candidates are scored on, in the fine and in the coarse search.
 FINE_SAMPLES, COARSE_SAMPLES = 240, 90
-# What a contradiction weighs against a confirmation.
+# Weight of a contradiction relative to a confirmation.
 CONTRADICTION_WEIGHT = 3.0
-# Directions of mirror planes that are tried for a standing object and for others, and places of each.
+# Directions of mirror planes to try for a standing object and for other objects, and offsets of each.
 UPRIGHT_DIRECTIONS, SPHERE_DIRECTIONS, PLANE_OFFSETS = 30, 70, 29
 
 UP = np.array([0.0, 0.0, 1.0])
 
 Shares = Float[np.ndarray, "_"]
-# Of shares confirmed, contradicted, met and closed, how good a candidate is.
+# Function that scores candidates by the fractions confirmed, contradicted, met and closed (see `worth`).
 Score = Callable[[Shares, Shares, Shares, Shares], Shares]
 
 
 @dataclass(frozen=True)
 class Symmetry:
-    """A motion, or a reflection, that may take the object onto itself: p ↦ A p + b.
+    """A rotation or reflection p ↦ A p + b that may map the object onto itself.
 
     Attributes:
         linear, shift: A and b [m].
-        agree, wrong: share of judged images that the cameras confirm and contradict.
-        worth: how much it shows, and how surely.
+        agree, wrong: fractions of the moved points that the cameras confirm and contradict.
+        worth: score of how much hidden surface the symmetry shows, and how certainly.
     """
 
     linear: Float[np.ndarray, "3 3"]
@@ -51,7 +51,7 @@ class Symmetry:
 
 @dataclass(frozen=True)
 class _Sample:
-    """Points that candidates are scored on: all over the seen part, and at its rim."""
+    """Points to score candidates on: some all over the seen part, and some at its rim."""
 
     few: Surfels
     rim: Points
@@ -63,23 +63,23 @@ def image(symmetry: Symmetry, surfels: Surfels) -> Surfels:
 
 
 def worth(agree: Shares, wrong: Shares, meets: Shares, closes: Shares) -> Shares:
-    """Return how useful symmetries are. One whose images all fall on seen surface is true and useless.
+    """Return how useful symmetries are. If all images fall on seen surface, a symmetry is true but useless.
 
     Args:
-        agree, wrong: share of judged images that the cameras confirm and contradict.
-        meets: share of the rim of what was seen that the image goes on from.
-        closes: share of the open side that the image turns its own to.
+        agree, wrong: fractions of the moved points that the cameras confirm and contradict.
+        meets: fraction of the rim of the seen part at which the image continues the surface.
+        closes: fraction of the open side that the image closes.
     """
     return (4 * agree * (1 - agree - wrong) + closes) * (0.3 + meets) - CONTRADICTION_WEIGHT * wrong
 
 
 def truth(agree: Shares, wrong: Shares, meets: Shares, closes: Shares) -> Shares:
-    """Return how well symmetries are proven, useful or not."""
+    """Return how well the cameras confirm symmetries, whether they are useful or not."""
     return agree * (0.3 + meets) - CONTRADICTION_WEIGHT * wrong
 
 
 def find_mirrors(surfels: Surfels, free_space: FreeSpace) -> list[Symmetry]:
-    """Return the mirror plane that shows most, and the one normal to it, if that is true as well."""
+    """Return the most useful mirror plane, and the best one perpendicular to it if the cameras confirm it too."""
     sample = _sample(surfels)
     first, normal = _best_plane(_directions(free_space.standing), sample, free_space, worth)
     if free_space.standing:
@@ -94,7 +94,7 @@ def find_mirrors(surfels: Surfels, free_space: FreeSpace) -> list[Symmetry]:
 
 
 def find_centre(surfels: Surfels, free_space: FreeSpace) -> Symmetry:
-    """Return the best centre of symmetry, for a standing object the best upright axis of half a turn."""
+    """Return the best centre of symmetry. For a standing object, return the best vertical axis of 180° symmetry."""
     sample = _sample(surfels)
     low, high = surfels.points.min(0), surfels.points.max(0)
     middle, size = 0.5 * (low + high), float((high - low).max())
@@ -127,7 +127,7 @@ def _best_plane(
         shift = 2 * (place + tried @ pivot)[:, None] * tried
         which, best = _pick(linear, shift, scored, free_space, score)
         normal, at = tried[which], place[which]
-        # Around the best: turned a little, moved a little.
+        # The next candidates are turned and shifted a little from the best.
         turned = _around(normal, 0.1 / finer, free_space.standing)
         moves = np.linspace(-0.02, 0.02, 9) * size / finer
         tried, place = np.repeat(turned, len(moves), 0), at + np.tile(moves, len(turned))
@@ -142,12 +142,12 @@ def _pick(
     free_space: FreeSpace,
     score: Score,
 ) -> tuple[int, Symmetry]:
-    """Return the number of the best candidate, and the candidate."""
+    """Return the index of the best candidate, and the candidate."""
     few = sample.few
     points = np.einsum("kij,nj->kni", linear, few.points) + shift[:, None]
     confirmed, against = weigh(free_space, points, np.einsum("kij,nj->kni", linear, few.normals))
     agree, wrong = confirmed.mean(1), against.mean(1)
-    # These motions are their own inverse: a rim point lies on the image where its image lies on what was seen.
+    # These symmetries are their own inverse. So a rim point meets the image if its own image meets seen surface.
     rim = np.einsum("kij,nj->kni", linear, sample.rim) + shift[:, None]
     meets = on_seen(free_space, rim).mean(1) if len(sample.rim) else np.ones(len(agree))
     closes = _closes(linear, few.normals.mean(0), free_space.standing)
@@ -163,7 +163,7 @@ def _closes(linear: Float[np.ndarray, "k 3 3"], side: Vector, standing: bool) ->
 
 
 def _sample(surfels: Surfels) -> _Sample:
-    """Return a fixed choice of points, and of those with neighbours to one side only."""
+    """Return a random choice (with a fixed seed) of points, and of rim points, whose neighbours lie on one side."""
     from scipy.spatial import KDTree
 
     answer: Any = KDTree(surfels.points).query(surfels.points, k=17)
@@ -183,7 +183,7 @@ def _some(surfels: Surfels, count: int) -> Surfels:
 
 
 def _directions(standing: bool) -> Float[np.ndarray, "k 3"]:
-    """Return level directions over half a turn, or directions over half a sphere (golden spiral)."""
+    """Return horizontal directions over half a turn for a standing object, else directions over half a sphere."""
     if standing:
         turn = np.pi * np.arange(UPRIGHT_DIRECTIONS) / UPRIGHT_DIRECTIONS
         return np.column_stack([np.cos(turn), np.sin(turn), np.zeros(UPRIGHT_DIRECTIONS)])
@@ -194,7 +194,7 @@ def _directions(standing: bool) -> Float[np.ndarray, "k 3"]:
 
 
 def _around(normal: Vector, angle: float, standing: bool) -> Float[np.ndarray, "k 3"]:
-    """Return directions within an angle [rad], level ones about a level one."""
+    """Return directions within `angle` [rad] of a normal, horizontal ones if the object stands."""
     steps = angle * np.array([-1.0, -0.5, 0.0, 0.5, 1.0])[:, None]
     side = np.cross(normal, UP) if standing else perpendicular(normal)
     turned = normal + steps * side

@@ -136,7 +136,7 @@ def test_depth_comes_packed_too(message, off: float):
     [
         (CompressedImage(format="16UC1; compressedDepth rvl", data=bytes(40)), "without a PNG; valid: compressedDepth"),
         (CompressedImage(format="16UC1; compressedDepth png", data=packed(DEPTH).data[:60]), "a broken PNG"),
-        (CompressedImage(format="16UC1; compressedDepth png", data=packed(DEPTH).data[:30]), "no whole PNG"),
+        (CompressedImage(format="16UC1; compressedDepth png", data=packed(DEPTH).data[:30]), "its PNG is cut off"),
         (
             CompressedImage(format="rgb8; png compressed bgr8", data=packed(DEPTH).data),
             "a colour picture: name the depth",
