@@ -151,8 +151,7 @@ def __dir__() -> list[str]:
 
 
 class _MovedModules:
-    """Import finder that names the new path of a module of version 0.1. As the last finder, it sees only failed
-    imports."""
+    """Import finder that names the new path of a module of version 0.1. As the last, it sees only failed imports."""
 
     def find_spec(self, fullname: str, path: Any = None, target: Any = None) -> ModuleSpec | None:
         if not fullname.startswith(f"{__name__}."):

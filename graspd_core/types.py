@@ -23,8 +23,7 @@ class Verdict(StrEnum):
 
 
 class Outcome(Enum):
-    """Outcome of a run, with its message as value. A run that finds no grasp returns one of these and does not
-    raise."""
+    """Outcome of a run, with its message as value. A run that finds no grasp does not raise."""
 
     SUCCEEDED = "as many grasps as asked for were found"
     TOO_FEW = "fewer grasps passed the trial than were asked for"
@@ -244,8 +243,7 @@ class Progress:
 
 @dataclass(frozen=True)
 class Snapshot:
-    """Hand poses that a run is working on, object frame. While optimising they are all starts, in trials the
-    candidates.
+    """Hand poses that a run is working on, object frame: all starts while optimising, the candidates in trials.
 
     Attributes:
         positions: positions of the base links [m].

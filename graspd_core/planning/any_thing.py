@@ -110,7 +110,6 @@ def plan_any_thing(
 
     Args:
         views: point cloud of each camera, in one frame [m].
-        hand: the hand.
         settings: settings for segmentation, reconstruction and obstacles.
         surface: support plane of all objects, if it is known.
         solids: known solids by name, in the frame of the views [m]. They are obstacles and never grasped.

@@ -35,8 +35,8 @@ _DIRECTIONS = 400
 _STEPS = 60
 # Number of failure reasons in a message.
 _REASONS_TOLD = 3
-# The object counts as low if it is at most this high [m], about a finger's thickness, and most contact normals point at
-# least 30° up.
+# An object is low if most contact normals have at least this cosine to the vertical, and if it is at most this high
+# [m].
 _FROM_ABOVE, _LOW = 0.5, 0.03
 
 
@@ -91,10 +91,7 @@ def kind_of(reason: str) -> str:
 # The cache keeps the last few hands. They are hashed by identity.
 @lru_cache(maxsize=8)
 def reach_of(hand: HandModel) -> tuple[float, float]:
-    """Return the span and the opening of the open hand [m].
-
-    The span is the greatest distance between two contact candidates. The opening is the widest gap between fingertips.
-    """
+    """Return the open hand's greatest distance between contact candidates and widest gap between fingertips [m]."""
     poses = forward(make_kinematics(hand, dtype=torch.float64), torch.as_tensor(hand.open_posture)[None])
     links = poses[0, torch.as_tensor(hand.candidate_link)]
     points = (links.rotation @ torch.as_tensor(hand.candidate_points)[..., None]).squeeze(-1) + links.translation

@@ -137,10 +137,7 @@ def plan_grasps(
 def _prepared(
     run: Run, scene: Scene, hand: HandModel, config: PlanConfig, verify: str, bound: BoundRestrictions
 ) -> tuple[Scene, HandModel, str, list[PlanConfig]]:
-    """Return scene and hand for planning, why no grasp is possible, and the settings of the rounds.
-
-    There are no rounds if no grasp is possible or the run is over.
-    """
+    """Return scene and hand for planning, why no grasp is possible (else empty), and the settings of the rounds."""
     if run.over():
         return scene, hand, "", []
     scene, run.origin = planning_scene(scene, config.resolution)

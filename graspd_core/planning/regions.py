@@ -154,10 +154,7 @@ def entered(hand: HandModel, postures: Sequence[Posture], boxes: Sequence[Box]) 
 def _placed_solids(
     hand: HandModel, postures: Sequence[Posture]
 ) -> tuple[Float[np.ndarray, "postures solids corners 3"], Float[np.ndarray, "solids"]]:
-    """Return the extreme points of each primitive [m] and the radius around them [m].
-
-    Shorter lists of points are padded with their first point.
-    """
+    """Return each primitive's extreme points [m], padded with the first to equal numbers, and its radius [m]."""
     solids = extreme_points_of_solids(hand)
     most = max(len(points) for points, _, _ in solids)
     local = np.stack([np.vstack([points, np.repeat(points[:1], most - len(points), 0)]) for points, _, _ in solids])

@@ -177,8 +177,7 @@ class BoundSteering(BoundRestriction):
 
     @property
     def impossible(self) -> str:
-        """Why the approach direction is impossible: the hand would come through the support. Empty if it is
-        possible."""
+        """Why the approach direction is impossible: the hand would come through the support. Else empty."""
         if self.scene.support is None or self.wanted.direction is None:
             return ""
         depth = depth_of_starts(self.scene, self.hand, _PROBES, BoundRestrictions((self,)))
@@ -272,6 +271,5 @@ def _part_of_object(scene: Scene, region: Region, avoid: Sequence[Box]) -> Float
         )
     for number, box in enumerate(avoid):
         if (box.distance(inside) <= 0.0).all():
-            raise ConfigError(f"region: avoid box {number} covers all of it on the object; valid: a part outside the
-            box")
+            raise ConfigError(f"region: avoid box {number} covers all of it on the object; valid: a part outside")
     return inside[:: len(inside) // _MOST_PLACES + 1]

@@ -342,8 +342,7 @@ def displaced(
     offset: Float[np.ndarray, "3"],
     center: Float[np.ndarray, "3"],
 ) -> Grasp:
-    """Return the grasp with its hand postures rotated about `center` [m], then shifted by `offset` [m], object
-    frame."""
+    """Return the grasp with its postures rotated about `center` [m], then shifted by `offset` [m], object frame."""
 
     def move(posture: Posture) -> Posture:
         base = rotation_from_quaternion(torch.as_tensor(posture.quaternion_wxyz, dtype=torch.float64)).numpy()

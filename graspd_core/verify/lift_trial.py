@@ -176,10 +176,7 @@ def _sink(world: World, data: Any, up: Float[np.ndarray, "3"], a: float, setting
 
 
 def reach_through(world: World, data: Any, postures: tuple[Posture, ...], limit: float) -> str:
-    """Return where the hand penetrates an obstacle most on the straight paths between postures.
-
-    The result is empty if the greatest penetration is at most `limit` [m].
-    """
+    """Return the deepest penetration of an obstacle on the straight paths as text, empty if at most `limit` [m]."""
     import mujoco
 
     worst, reason = 0.0, ""

@@ -246,8 +246,8 @@ def intersection_volume(context: MetricsContext, placed: PlacedHand) -> float:
     """Return the volume of the hand inside the object [m³], summed over 2 mm grid cells in the base frame.
 
     An octree of each primitive finds the cells, so even small and thin overlaps are found. In each cell, hand and
-    object are treated as two facing half-spaces, which is exact for flat overlaps of any thickness. Volume that several primitives
-    share is counted once.
+    object are treated as two facing half-spaces, which is exact for flat overlaps of any thickness. Volume that several
+    primitives share is counted once.
     """
     solids = _placed_solids(context.hand, placed)
     cells, which = _root_cells(solids, placed)
@@ -323,10 +323,7 @@ def _root_cells(
 def _solid_distance(
     solids: _PlacedSolids, which: Int[np.ndarray, "n"], points: Float[np.ndarray, "n 3"]
 ) -> Float[np.ndarray, "n"]:
-    """Return the signed distance of each point, object frame, to the primitive `which` [m].
-
-    `which` is ascending. For hulls the distance is a lower bound outside.
-    """
+    """Return each point's signed distance to the primitive `which` (ascending) [m]. For hulls it is a lower bound."""
     local = np.einsum("nji,nj->ni", solids.rotations[which], points - solids.translations[which])
     hulls = int(np.searchsorted(which, len(solids.smooth.link)))
     smooth = local_distance(solids.smooth, torch.as_tensor(local[:hulls]), torch.as_tensor(which[:hulls])).numpy()
@@ -364,8 +361,8 @@ class WrenchHull:
     Attributes:
         epsilon: radius of the largest ball about the origin inside the hull. 0 if the origin is outside.
         volume: volume of the hull.
-        weakest_push: unit disturbance (force, torque over length) that the grasp resists least. It points away from the
-            nearest facet. None if the origin is outside.
+        weakest_push: unit disturbance (force, torque over length) that the grasp resists least: the negative
+            normal of the nearest facet. None if the origin is outside.
     """
 
     epsilon: float = 0.0

@@ -231,11 +231,7 @@ def hypotheses_of(
 
 
 def less_sure(hypotheses: Hypotheses, share: float, most: float) -> Hypotheses:
-    """Return the checks with probabilities scaled by `share`, the probability that the object weighs at most `most`
-    [kg].
-
-    If `share` is too low, no grasp can pass.
-    """
+    """Scale all probabilities by `share`, the probability that the object weighs at most `most` [kg]."""
     if share < LEAST_LIGHT:
         told = f"the hand lifts {most:.2g} kg, and most objects of this volume weigh more"
         return Hypotheses((), share * MASS_KNOWN.likeliest, doubts=(told,))
@@ -344,10 +340,7 @@ def _other_world(scene: Scene, hand: HandModel, protocol: Protocol, rule: str) -
 
 
 def other_scene(evidence: Evidence, rule: str, likeliest: ObjectModel) -> Scene | None:
-    """Return a scene of the object with its hidden side guessed by `rule`. Mass and friction stay the same.
-
-    Return None if the rule gives no valid shape.
-    """
+    """Return a scene with the hidden side guessed by `rule`, equal mass and friction. None without a guess."""
     from graspd_core.perception.reconstruct.hidden_side import other_shape
 
     mesh = other_shape(evidence, rule, likeliest.mesh)

@@ -18,7 +18,6 @@ class TrialContext:
     """Worlds and physics settings for the trials of one scene.
 
     Attributes:
-        hand: the hand.
         protocol: physics settings of the trials.
         alone: world of hand and object only.
         around: world with support and obstacles. None if the scene has neither.

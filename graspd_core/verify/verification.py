@@ -61,10 +61,7 @@ _NOISE = 0x6E6F697365
 
 @dataclass(frozen=True)
 class VerificationContext:
-    """Worlds, metrics and robustness checks of a run.
-
-    `metrics` builds the metrics context on the first call. It is None if metrics are not measured.
-    """
+    """Worlds, metrics and robustness checks of a run. `metrics` builds its context. It is None without metrics."""
 
     trials: TrialContext
     metrics: Callable[[], MetricsContext] | None

@@ -120,10 +120,7 @@ def add_others(spec: Any, others: Sequence[FreeBody], friction: Friction) -> tup
 
 
 def add_support(spec: Any, hand: HandModel, parts: Sequence[TriangleMesh], friction: Friction, support: Plane) -> None:
-    """Add gravity, the plane that the hand collides with, and a plane through the lowest point of `parts`.
-
-    The object rests on the second plane. Without parts it rests on the first one.
-    """
+    """Add gravity, a plane for the hand, and one at the bottom of `parts`. Without parts, both share the plane."""
     spec.option.gravity = -_GRAVITY * support.normal
     add_plane(spec, TABLE, support, friction)
     for link in hand.link_names:
@@ -176,10 +173,7 @@ def add_mesh(spec: Any, name: str, vertices: np.ndarray, faces: np.ndarray) -> N
 
 
 def full_inertia(inertia: Float[np.ndarray, "3 3"], floor: float) -> list[float]:
-    """Return the inertia as xx yy zz xy xz yz [kg·m²].
-
-    Principal moments are raised to `floor` and limited to satisfy the triangle inequality.
-    """
+    """Return xx yy zz xy xz yz of a valid inertia [kg·m²]: moments of at least `floor`, triangle inequality kept."""
     moments, axes = np.linalg.eigh(0.5 * (inertia + inertia.T))
     moments = np.maximum(moments, floor)
     moments[2] = min(moments[2], 0.999 * (moments[0] + moments[1]))
@@ -361,7 +355,6 @@ def build_world(
     """Compile the world of one hand and one object.
 
     Args:
-        hand: the hand.
         target: the object, near the origin (`near_scene`). It gives mass, centre of mass and inertia.
         parts: convex collision parts of the object, object frame [m].
         protocol: physics settings.
