@@ -66,10 +66,7 @@ def add_command(commands: Any) -> None:
 
 
 def run(options: argparse.Namespace) -> int:
-    """Plan on every cloud.
-
-    Return the exit status: 0 if every cloud has enough grasps, else 3. 2 if no cloud is usable, 130 if interrupted.
-    """
+    """Plan on every cloud. Return the exit status: 0 all have enough grasps, 3 fewer, 2 none usable, 130 stopped."""
     from graspd_core.hands.library import load_hand
     from graspd_core.io.grasps_json import check_writable
 

@@ -58,7 +58,7 @@ BAD_OPTIONS: list[tuple[list[str], str]] = [
     (["--region", "sphere", "0", "0", "0", "wide"], "--region: sphere 0 0 0 wide; valid: box"),
     (["--arm", "ur5e_like"], "--arm: base pose missing; give --arm-base X Y Z or X Y Z QW QX QY QZ, in metres"),
     (["--arm", "ur5e_like", "--arm-base", "1", "0", "0", "1"], "--arm-base: 4 numbers; valid"),
-    (["--arm-base", "1", "0", "0"], "--arm-base: there is no arm"),
+    (["--arm-base", "1", "0", "0"], "--arm-base: arm missing; give --arm NAME"),
     (["--frobnicate"], "unrecognized arguments: --frobnicate"),
     (["--preste", "fast"], "unrecognized arguments: --preste fast; did you mean --preset?"),
     (["--hand", "alegro_right"], "unknown hand 'alegro_right'; did you mean 'allegro_right'?"),
@@ -511,7 +511,7 @@ def test_an_object_that_would_go_by_the_name_of_another_is_refused(tmp_path: Pat
     [
         (["build", "shape:sphere"], "--out"),
         (["build", "shape:nothing", "--out", "new.grasps"], "shape"),
-        (["build", "shape:sphere", "--out", "new.grasps", "--verify", "none"], "verify: none"),
+        (["build", "shape:sphere", "--out", "new.grasps", "--verify", "none"], "verify: 'none'; valid for a library"),
         (["build", "shape:sphere", "--out", "other.grasps"], "other.grasps: damaged or not a library"),
         (["list", "none.grasps"], "none.grasps: no such file"),
         (["list", "other.grasps"], "other.grasps: damaged or not a library"),

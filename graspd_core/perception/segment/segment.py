@@ -50,7 +50,7 @@ class Segmentation:
         support: support plane of the object. None if none was seen.
         obstacles: downsampled points of each other object or surface nearby [m].
         warnings: warnings for the user.
-        cut: whether the object reaches the border of an image.
+        cut: whether the object reaches the border of an image or of the workspace.
         beside: why the segment may be larger than the target or another object. Empty without such a reason.
     """
 

@@ -158,7 +158,7 @@ def test_what_cannot_be_met_says_which_wish_refused_the_rest(bottle, hand):
         (partial(Steering, (0, 0, 1), approach_angle=np.nan), "approach_angle: nan"),
         (partial(Steering, (0, 0, 1), roll=np.inf), "roll: inf"),
         (partial(Steering, (0, 0, 1), roll=0, roll_tolerance=-1), "roll_tolerance: -1"),
-        (partial(Steering, (0, 0, 1), approach_angle=2.0, roll=0), "roll: needs .*below pi/2"),
+        (partial(Steering, (0, 0, 1), approach_angle=2.0, roll=0), "roll: it needs .*below pi/2"),
         (partial(Steering, roll=0.0), "roll: it needs approach_direction"),
         (partial(Steering, (0, 0, 1), roll=0.0, roll_zero=(0, 0, 2)), "roll_zero: .*not along"),
         (partial(Box, (0, 0), (1, 1, 1)), "box center: .*3 finite numbers"),
