@@ -86,7 +86,7 @@ def link_points(
 
     Args:
         points: one point per voxel [m].
-        weight: number of full-resolution points in each voxel, normalised for the density that any camera would have.
+        weight: point count of each voxel times its squared distance from the camera [m²] (`VoxelScene.weight`).
         link: distance up to which points are neighbours [m].
         neighbour_share: least number of neighbours of a core point, as a fraction of the median number.
     """
