@@ -1,12 +1,11 @@
-"""Verified grasps for multi-fingered hands: every name that a user of the library needs is here.
+"""Verified grasps for multi-fingered hands. This package exports every name that a user of the library needs.
 
     from graspd_core import load_hand, load_scene, plan_grasps
 
     result = plan_grasps(load_scene("mug.obj"), load_hand("allegro_right"), count=16, seed=0)
 
-A name is loaded on first use: `import graspd_core` takes milliseconds, torch comes with the first name that needs it.
-Lengths are in metres, angles in radians, quaternions wxyz. Bad input raises a `GraspdError`.
-docs/api.md lists the names by purpose.
+Names are loaded on first use, so `import graspd_core` takes milliseconds and does not import torch. Lengths are in
+metres, angles in radians, quaternions wxyz. Bad input raises a `GraspdError`. docs/api.md lists the names by purpose.
 """
 
 from __future__ import annotations
@@ -85,7 +84,7 @@ if TYPE_CHECKING:
     from graspd_core.verify.trial_registry import TrialContext as TrialContext
     from graspd_core.verify.verification import verify_grasps as verify_grasps
 
-# The names of each module.
+# The public names of each module.
 _MODULES = {
     "perception.load_scene": "load_scene",
     "perception.scene_from_views": "scene_from_views",
@@ -121,7 +120,7 @@ _MODULES = {
     "io.grasps_json": "load_grasps save_result",
     "errors": "GraspdError",
 }
-# Names that version 0.1 had here: they are found with a warning until 0.3.
+# Names that version 0.1 exported here. Until version 0.3 they still work, with a warning.
 _MOVED = {
     "io.grasps_json": "grasp_figures grasps_of load_document",
     "hands.kinematics": "link_poses retreat_posture",
@@ -152,7 +151,7 @@ def __dir__() -> list[str]:
 
 
 class _MovedModules:
-    """Refuse the module paths of version 0.1 with their new names. The last finder sees only imports that fail."""
+    """Import finder that names the new path of a module of version 0.1. As the last, it sees only failed imports."""
 
     def find_spec(self, fullname: str, path: Any = None, target: Any = None) -> ModuleSpec | None:
         if not fullname.startswith(f"{__name__}."):
@@ -162,11 +161,11 @@ class _MovedModules:
             raise ImportError(_moved_to(fullname, moved[fullname]), name=fullname)
         if not any(old.startswith(f"{fullname}.") for old in moved):
             return None
-        # A folder that is gone: an empty package, since Python imports a parent before it asks for the module.
+        # The old folder no longer exists. Python imports the parent package first, so return an empty package for it.
         return ModuleSpec(fullname, cast(Any, self), is_package=True)
 
     def create_module(self, spec: ModuleSpec) -> None:
-        """Leave it to Python."""
+        """Return None, so that Python creates the module."""
 
     def exec_module(self, module: ModuleType) -> None:
         def __getattr__(name: str) -> Any:

@@ -1,7 +1,7 @@
-"""`graspd doctor`: what works on this machine, and the remedy for what does not.
+"""`graspd doctor`: check the installation and name the remedy for each failure.
 
-Libraries are tried in processes of their own. One that aborts on import is then reported and does not end the report.
-The ROS probe keeps rclpy out of this process.
+Each library is imported in a subprocess, so that a library that aborts on import does not end the report. The ROS check
+also runs in a subprocess, so that rclpy is never loaded here.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ from graspd_core.cli.output import answer, waiting
 PROBE_TIMEOUT = 60.0  # Seconds. A cold disk takes several for torch or Open3D.
 _SETUP = "run `make setup` in the checkout, or pip install graspd again"
 _CLOUDS = "only clouds need it: pip install 'graspd[clouds]'"
-# Open3D loads these.
+# Shared libraries that Open3D loads, and the packages that provide them.
 _SYSTEM_LIBRARIES = {"libusb-1.0.so.0": "libusb-1.0-0", "libGL.so.1": "libgl1", "libgomp.so.1": "libgomp1"}
 # distribution: module
 _LIBRARIES = {
@@ -65,7 +65,7 @@ found = kernel()
 assert found.library, found.reason
 print(f"{found.name}, {found.library.graspd_lanes()} floats at once")
 """
-# What ROS is, only the ROS package knows.
+# Only the ROS package knows how to check ROS.
 _ROS = "from graspd_ros.node import probe; print(probe())"
 _HANDS = """
 import torch
@@ -77,14 +77,14 @@ print(", ".join(f"{name} ({len(load_hand(name).joint_names)} joints)" for name i
 
 @dataclass(frozen=True)
 class Check:
-    """One thing that was tried.
+    """The result of one check.
 
     Attributes:
-        name: what was tried.
-        ok: whether it works.
-        detail: version or figure when it works, the error in one line when not.
-        hint: what to do, empty when it works.
-        needed: whether graspd is of no use without it.
+        name: name of the checked library or part.
+        ok: whether the check passed.
+        detail: a version or a figure if the check passed, else the error in one line.
+        hint: what to do if the check failed.
+        needed: whether graspd cannot work without it.
     """
 
     name: str
@@ -95,7 +95,7 @@ class Check:
 
 
 def run_checks() -> list[Check]:
-    """Try everything that graspd depends on, in a few seconds."""
+    """Check all dependencies of graspd. This takes a few seconds."""
     probes = [
         ("torch", _TORCH, _SETUP, True),
         ("mujoco", _MUJOCO, _SETUP, True),
@@ -112,7 +112,7 @@ def run_checks() -> list[Check]:
 
 
 def try_code(name: str, code: str, hint: str, needed: bool) -> Check:
-    """Run Python code in a process of its own. Its last line is the detail, its failure that of the check."""
+    """Run Python code in a subprocess. The check fails if the code fails. The last output line is its detail."""
     try:
         done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=PROBE_TIMEOUT)
     except subprocess.TimeoutExpired:
@@ -123,7 +123,7 @@ def try_code(name: str, code: str, hint: str, needed: bool) -> Check:
 
 
 def format_checks(checks: Iterable[Check]) -> str:
-    """Return the report as lines: a verdict, what was tried, the result, and the remedy under a failure."""
+    """Return the report as text. Each line has verdict, name and detail. A hint follows each failure."""
     lines = []
     for check in checks:
         verdict = "ok  " if check.ok else "FAIL" if check.needed else "-   "
@@ -139,7 +139,7 @@ def add_command(commands: Any) -> None:
 
 
 def main() -> int:
-    """Print the report. Returns 0 when all that is needed works, else 1."""
+    """Print the report. Return 0 if all needed checks pass, else 1."""
     checks = run_checks()
     print(format_checks(checks))
     answer(checks)

@@ -1,10 +1,10 @@
-"""Errors of wrong use. Failing to find a grasp is an `Outcome`, never an exception."""
+"""Exceptions for bad input. A run that finds no grasp reports an `Outcome` and raises nothing."""
 
 import difflib
 import reprlib
 from collections.abc import Iterable
 
-# How alike a name and the one that was meant are at least, of 0 to 1.
+# Least similarity, from 0 to 1, at which a valid name is suggested for an unknown one.
 _NEAR = 0.65
 _SHORT = reprlib.Repr()
 _SHORT.maxlevel, _SHORT.maxlist, _SHORT.maxtuple, _SHORT.maxdict, _SHORT.maxset = 3, 6, 6, 6, 6
@@ -12,7 +12,7 @@ _SHORT.maxstring = _SHORT.maxother = 120
 
 
 def shown(value: object) -> str:
-    """Return a value as short text for a message, whatever it holds. One page of YAML can stand for gigabytes."""
+    """Return a short text of any value, for messages. The text of a huge value is cut."""
     try:
         return _SHORT.repr(value)
     # An integer of more than 4300 digits has no decimal form.
@@ -21,7 +21,7 @@ def shown(value: object) -> str:
 
 
 def choices(name: object, valid: Iterable[str], more: str = "") -> str:
-    """Return the end of a message about an unknown name: the valid one that is near, else all, and what `more` is."""
+    """Return the hint for an unknown name: the most similar valid name, else all valid names followed by `more`."""
     names = [*valid]
     # A file may hold any value as a name.
     near = difflib.get_close_matches(name, names, 1, _NEAR) if isinstance(name, str) else ()
@@ -29,11 +29,11 @@ def choices(name: object, valid: Iterable[str], more: str = "") -> str:
 
 
 class GraspdError(Exception):
-    """Base of every error graspd raises on purpose: one line that names the culprit and the valid choices."""
+    """Base class of all graspd errors. The message is one line that names the culprit and the valid values."""
 
 
 class MeshError(GraspdError):
-    """A mesh cannot be read or holds no usable surface."""
+    """A mesh cannot be read or has no usable surface."""
 
 
 class CloudError(GraspdError):
@@ -41,11 +41,11 @@ class CloudError(GraspdError):
 
 
 class NoObjectError(CloudError):
-    """A scene was seen well enough, but does not hold the object asked for."""
+    """The views of a scene are usable, but do not show the requested object."""
 
 
 class BagError(GraspdError):
-    """A bag cannot be read, or lacks what was asked of it."""
+    """A bag cannot be read, or does not contain the requested data."""
 
 
 class HandError(GraspdError):
@@ -57,32 +57,32 @@ class ConfigError(GraspdError):
 
 
 class FormatError(GraspdError):
-    """A grasps file is not in the format or version that this reader knows."""
+    """A grasps file has an unknown format or version."""
 
 
 class TransformError(GraspdError):
-    """Where one frame stands in another is not known, not at that time, or makes no sense."""
+    """A transform between two frames is unknown, not available at the requested time, or not valid."""
 
 
 class ResourceError(GraspdError):
-    """The machine has too little memory for what was asked."""
+    """The machine has too little memory for the request."""
 
 
 class SimulatorError(GraspdError):
-    """A trial needs a simulator that is not installed, or that cannot take the scene."""
+    """A trial needs a simulator that is not installed, or that cannot load the scene."""
 
 
 class Extra:
-    """Report a missing library of an extra in one line: `with Extra("clouds"): import open3d`.
+    """Context that reports a missing optional library: `with Extra("clouds"): import open3d`.
 
-    Raises ConfigError: the library is not installed. The line names the command that installs the extra.
+    Raises ConfigError: the library is not installed. The message names the command that installs the extra.
     """
 
     def __init__(self, name: str) -> None:
         self.name = name
 
     def __enter__(self) -> None:
-        """Begin."""
+        """Enter the context. Nothing is set up."""
 
     def __exit__(self, kind: object, error: object, trace: object) -> None:
         if isinstance(error, ModuleNotFoundError):

@@ -1,4 +1,4 @@
-"""The directories of what graspd ships with, in a checkout and when installed."""
+"""Locations of graspd's configuration files, in a checkout and in an installation."""
 
 from __future__ import annotations
 
@@ -15,9 +15,9 @@ _INSTALLED = Path("share") / "graspd" / "config"
 def config_dir() -> Path:
     """Return the directory that holds `hands/`, `presets/` and the node parameters.
 
-    The order is: the environment variable GRASPD_CONFIG, the checkout of this file, then `share/graspd/config` under
-    the installation's prefix (a virtual environment, `~/.local`, a colcon workspace) and under `sys.prefix`. Raises
-    ConfigError: GRASPD_CONFIG names no directory, or the installation is incomplete.
+    The search order is: the environment variable GRASPD_CONFIG, the checkout of this file, then `share/graspd/config`
+    under the installation's prefix (a virtual environment, `~/.local`, a colcon workspace) and under `sys.prefix`.
+    Raises ConfigError: GRASPD_CONFIG names no directory, or the installation is incomplete.
     """
     named = os.environ.get(ENVIRONMENT_VARIABLE)
     if named:

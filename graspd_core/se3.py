@@ -1,4 +1,4 @@
-"""Rigid transforms on torch tensors: `T_a_b` maps coordinates in frame b to frame a. Quaternions are wxyz.
+"""Rigid transforms on torch tensors. `T_a_b` maps coordinates in frame b to frame a. Quaternions are wxyz.
 
 Gradients are exact everywhere except in `safe_norm`, whose gradient at zero is defined as zero.
 """
@@ -13,18 +13,18 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-# The one epsilon of the project: below it a squared length counts as zero [unit²].
+# Lengths below this count as zero. All of graspd uses this constant.
 EPSILON = 1e-12
 
 
 def perpendicular(direction: Float[np.ndarray, "3"]) -> Float[np.ndarray, "3"]:
-    """Return a unit vector normal to a direction of any length but zero, always the same one."""
+    """Return a unit vector normal to a non-zero direction. Equal directions give equal results."""
     side = np.cross(direction, np.eye(3)[np.abs(direction).argmin()])
     return side / np.linalg.norm(side)
 
 
 def safe_norm(x: Float[Tensor, "*batch n"]) -> Float[Tensor, "*batch"]:
-    """Return the Euclidean norm over the last axis, with gradient zero (not NaN) at the origin."""
+    """Return the Euclidean norm over the last axis. The gradient at zero is zero, not NaN."""
     squared = (x * x).sum(-1)
     is_zero = squared <= EPSILON**2
     return torch.where(
@@ -33,7 +33,7 @@ def safe_norm(x: Float[Tensor, "*batch n"]) -> Float[Tensor, "*batch"]:
 
 
 def normalize(x: Float[Tensor, "*batch n"]) -> Float[Tensor, "*batch n"]:
-    """Return unit vectors along the last axis. Zero stays zero."""
+    """Return the vectors along the last axis scaled to unit length. A zero vector stays zero."""
     return x / safe_norm(x).clamp_min(EPSILON)[..., None]
 
 
@@ -72,13 +72,13 @@ def quaternion_from_rotation(rotation: Float[Tensor, "*batch 3 3"]) -> Float[Ten
 def rotation_from_axis_angle(
     axis: Float[Tensor, "*#batch 3"], angle: Float[Tensor, "*batch"]
 ) -> Float[Tensor, "*batch 3 3"]:
-    """Return rotations about unit axes by angles [rad], through quaternions of half the angle."""
+    """Return the rotation matrices about unit axes by angles [rad]."""
     half = 0.5 * angle[..., None]
     return rotation_from_quaternion(torch.cat([half.cos(), half.sin() * axis], -1))
 
 
 def axis_rotation(axis: Float[np.ndarray, "3"], angle: float) -> Float[np.ndarray, "3 3"]:
-    """Return the rotation about a unit axis by an angle [rad]."""
+    """Return the rotation matrix about a unit axis by an angle [rad]."""
     turn = torch.tensor(angle, dtype=torch.float64)
     return rotation_from_axis_angle(torch.as_tensor(axis, dtype=torch.float64), turn).numpy()
 
@@ -86,7 +86,7 @@ def axis_rotation(axis: Float[np.ndarray, "3"], angle: float) -> Float[np.ndarra
 def quaternion_between(
     source: Float[np.ndarray, "3"], target: Float[np.ndarray, "3"], *, around: Float[np.ndarray, "3"]
 ) -> Float[np.ndarray, "4"]:
-    """Return the shortest turn of one unit vector onto another, wxyz. Opposite ones take half a turn about `around`."""
+    """Return the shortest rotation of one unit vector onto another, wxyz. Opposite vectors turn by π about `around`."""
     quaternion = np.array([1.0 + source @ target, *np.cross(source, target)])
     length = np.linalg.norm(quaternion)
     return quaternion / length if length > EPSILON else np.array([0.0, *around])
@@ -117,7 +117,7 @@ class SE3:
         return (points - self.translation[..., None, :]) @ self.rotation
 
     def compose(self, other: SE3) -> SE3:
-        """Return `T_a_c` of this `T_a_b` and `T_b_c`, whose batch may be larger."""
+        """Return `T_a_c`, the product of this `T_a_b` and `other`, `T_b_c`. The batch of `other` may be larger."""
         turned = (self.rotation @ other.translation[..., None]).squeeze(-1)
         return SE3(self.rotation @ other.rotation, turned + self.translation)
 
@@ -128,8 +128,8 @@ def random_rotations(count: int, generator: torch.Generator, dtype: torch.dtype)
 
 
 def aligning_rotation(source: Float[Tensor, "3"], targets: Float[Tensor, "batch 3"]) -> Float[Tensor, "batch 3 3"]:
-    """Return rotations that turn unit vector `source` onto each unit target (any roll), through a Householder pair."""
-    # Two reflections make a rotation. The first maps source to its mirror, the second maps that to the target.
+    """Return rotations that turn the unit vector `source` onto each unit vector in `targets`. The roll is arbitrary."""
+    # Two Householder reflections make a rotation. One maps `source` to `middle`, the other `middle` to the target.
     helper = torch.eye(3, dtype=targets.dtype)[source.abs().argmin()]
     middle = torch.linalg.cross(source, helper)
     middle = middle / middle.norm()
@@ -139,10 +139,10 @@ def aligning_rotation(source: Float[Tensor, "3"], targets: Float[Tensor, "batch 
 
 
 def reflection_onto(a: Float[Tensor, "batch 3"], b: Float[Tensor, "batch 3"]) -> Float[Tensor, "batch 3 3"]:
-    """Return Householder reflections that swap unit vectors a and b, for equal ones any that keeps them."""
+    """Return Householder reflections that swap the unit vectors a and b. If a equals b, a stays fixed."""
     v = a - b
     same = v.norm(dim=-1, keepdim=True) < 1e-9
-    # Where a = b any mirror plane that contains a will do.
+    # If a equals b, any mirror plane that contains a is valid.
     fallback = torch.linalg.cross(a, torch.eye(3, dtype=a.dtype)[a.abs().argmin(-1)])
     v = torch.where(same, fallback, v)
     v = v / v.norm(dim=-1, keepdim=True)

@@ -1,8 +1,8 @@
-"""Frames over time: the tree of /tf and /tf_static, without any node.
+"""A buffer of time-stamped transforms (/tf and /tf_static) that needs no ROS node.
 
 `T_a_b` maps coordinates in frame b to frame a. Stamps are integer nanoseconds. Between two samples the position is
-interpolated on a line and the rotation on a great circle, as tf2 does. A time before the first or after the last sample
-is an error that names the known span.
+interpolated linearly and the rotation spherically, as in tf2. A lookup before the first or after the last sample raises
+an error that names the known time span.
 """
 
 from __future__ import annotations
@@ -20,13 +20,13 @@ SECOND = 1_000_000_000
 HISTORY = 10 * SECOND
 
 _RIGID = 1e-3
-# No two things on Earth are farther apart [m].
+# Greatest valid translation [m]. No two points on Earth are farther apart.
 _FARTHEST = 1e8
 
 
 @dataclass
 class _Link:
-    """Poses of one frame in its parent over time, stamps ascending. A static one has a single pose."""
+    """Poses of one frame in its parent frame, by ascending stamp. A static frame has a single pose."""
 
     parent: str
     static: bool
@@ -35,10 +35,10 @@ class _Link:
 
 
 class TransformBuffer:
-    """A buffer of transforms that answers for any two connected frames. Safe to use from several threads.
+    """A thread-safe buffer that returns the transform between any two connected frames.
 
     Args:
-        history: how far behind a frame's newest sample older ones are kept [ns]. None keeps all.
+        history: age relative to a frame's newest sample up to which samples are kept [ns]. None keeps all samples.
     """
 
     def __init__(self, history: int | None = HISTORY) -> None:
@@ -49,10 +49,10 @@ class TransformBuffer:
     def add(
         self, parent: str, child: str, T_parent_child: Float[np.ndarray, "4 4"], stamp: int = 0, static: bool = False
     ) -> None:
-        """Add the pose of `child` in `parent` at `stamp` [ns], for a static one at all times.
+        """Add the pose of `child` in `parent` at `stamp` [ns]. A static transform holds at all times.
 
-        A child that gets a new parent, or turns static, loses its earlier poses. Raises TransformError: a frame without
-        a name, a frame under itself, a loop, or no rigid transform.
+        A child that gets a new parent, or becomes static, loses its earlier poses. Raises TransformError: a frame has
+        no valid name, the frames form a loop, or the transform is not rigid.
         """
         parent, child = _name(parent), _name(child)
         pose = _rigid(T_parent_child, parent, child)
@@ -67,9 +67,9 @@ class TransformBuffer:
             self._insert(link, stamp, pose)
 
     def lookup(self, target: str, source: str, stamp: int | None = None) -> Float[np.ndarray, "4 4"]:
-        """Return `T_target_source` at `stamp` [ns], or at the newest time that every link between the two knows.
+        """Return `T_target_source` at `stamp` [ns]. Without a stamp, use the newest time common to all frames between.
 
-        Raises TransformError: an unknown frame, frames that no chain connects, or a time outside what is known.
+        Raises TransformError: a frame is unknown, the frames are not connected, or the time is outside the known span.
         """
         target, source = _name(target), _name(source)
         with self._lock:
@@ -93,12 +93,12 @@ class TransformBuffer:
             return _inverse(self._down(below_target, stamp, asked)) @ self._down(below_source, stamp, asked)
 
     def frames(self) -> tuple[str, ...]:
-        """Return every known frame, in alphabetical order."""
+        """Return the names of all known frames, in alphabetical order."""
         with self._lock:
             return tuple(sorted({*self._links, *(link.parent for link in self._links.values())}))
 
     def clear(self) -> None:
-        """Forget everything, as when time has jumped back."""
+        """Remove all transforms, for example after a jump back in time."""
         with self._lock:
             self._links.clear()
 
@@ -160,11 +160,11 @@ def _inverse(T_a_b: np.ndarray) -> Float[np.ndarray, "4 4"]:
 
 def _rigid(pose: np.ndarray, parent: str, child: str) -> Float[np.ndarray, "4 4"]:
     turn = pose[:3, :3]
-    # Compared first: products of numbers that are not finite, or too large, would be warned of.
+    # This is checked first, because products of NaN, infinite or huge numbers cause NumPy warnings.
     fits = (np.abs(turn) < 2).all() and (np.abs(pose[:3, 3]) <= _FARTHEST).all()
     square = fits and np.abs(turn @ turn.T - np.eye(3)).max() < _RIGID and np.linalg.det(turn) > 0
     if not square:
-        raise TransformError(f"transform {parent} -> {child}: not a rotation and a position in finite numbers")
+        raise TransformError(f"transform {parent} -> {child}: not rigid; valid: a rotation and a finite position")
     return np.array(pose, dtype=float)
 
 

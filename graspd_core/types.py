@@ -1,7 +1,7 @@
-"""The frozen values that folders pass to each other.
+"""Immutable value types that the packages exchange.
 
-Metres, radians, newtons, kilograms throughout. A transform `T_a_b` maps coordinates in frame b to frame a. Quaternions
-are wxyz. The object frame is the frame of the mesh as loaded (after scaling).
+Units are metres, radians, newtons and kilograms. A transform `T_a_b` maps coordinates in frame b to frame a.
+Quaternions are wxyz. The object frame is the frame of the mesh as loaded (after scaling).
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ from jaxtyping import Float, Int
 
 
 class Verdict(StrEnum):
-    """What is known of one grasp."""
+    """Result of all trials of one grasp."""
 
     VERIFIED = "verified"
     UNVERIFIED = "unverified"
@@ -23,7 +23,7 @@ class Verdict(StrEnum):
 
 
 class Outcome(Enum):
-    """How a run ended, as a sentence. Numerical failure is one of these, not an exception."""
+    """Outcome of a run, with its message as value. A run that finds no grasp does not raise."""
 
     SUCCEEDED = "as many grasps as asked for were found"
     TOO_FEW = "fewer grasps passed the trial than were asked for"
@@ -33,7 +33,7 @@ class Outcome(Enum):
 
 
 class Stage(StrEnum):
-    """The stage of a run, as in progress reports."""
+    """Stage of a run, for progress reports."""
 
     LOAD = "load"
     OPTIMISE = "optimise"
@@ -43,11 +43,11 @@ class Stage(StrEnum):
 
 @dataclass(frozen=True)
 class TriangleMesh:
-    """A triangle soup. Immutable: functions return new meshes.
+    """An immutable triangle mesh. Functions that change a mesh return a new one.
 
     Attributes:
         vertices: corner positions [m].
-        faces: rows of three vertex indices, counter-clockwise seen from outside.
+        faces: three vertex indices per face, counter-clockwise as seen from outside.
     """
 
     vertices: Float[np.ndarray, "vertices 3"]
@@ -55,7 +55,7 @@ class TriangleMesh:
 
 
 def joined(*meshes: TriangleMesh) -> TriangleMesh:
-    """Return meshes as one, their vertices and faces in order."""
+    """Return one mesh with the vertices and faces of all meshes, in order."""
     offsets = np.cumsum([0, *(len(mesh.vertices) for mesh in meshes[:-1])])
     faces = [mesh.faces + offset for mesh, offset in zip(meshes, offsets, strict=True)]
     return TriangleMesh(np.vstack([mesh.vertices for mesh in meshes]), np.vstack(faces))
@@ -63,11 +63,11 @@ def joined(*meshes: TriangleMesh) -> TriangleMesh:
 
 @dataclass(frozen=True)
 class Plane:
-    """A flat support that fills the half-space n·x < offset.
+    """A flat support surface. The half-space n·x < offset below it is solid.
 
     Attributes:
-        normal: unit normal, into the free side.
-        offset: n·x of its points [m].
+        normal: unit normal n, pointing away from the solid side.
+        offset: n·x of every point x on the plane [m].
     """
 
     normal: Float[np.ndarray, "3"]
@@ -76,12 +76,12 @@ class Plane:
 
 @dataclass(frozen=True)
 class Contact:
-    """One place where a link touches the object.
+    """One contact between a hand link and the object.
 
     Attributes:
-        link: the hand link's name.
-        position: the point on the object's surface, object frame [m].
-        normal: outward unit normal of the object there, object frame.
+        link: name of the hand link.
+        position: contact point on the object's surface, object frame [m].
+        normal: outward unit normal of the object at the contact, object frame.
     """
 
     link: str
@@ -89,21 +89,21 @@ class Contact:
     normal: tuple[float, float, float]
 
 
-# Name of the trial under what else may be true of the scene: who fails it alone is neither verified nor failed.
+# Name of the trial that runs the robustness checks. A grasp that fails only this trial is unverified, not failed.
 HYPOTHESES = "hypotheses"
 
 
 @dataclass(frozen=True)
 class TrialResult:
-    """What one trial of one grasp measured. `graspd_core.verify.trial_registry` lists the trials that planning runs.
+    """The result of one trial of one grasp. `graspd_core.verify.trial_registry` lists the trials that planning runs.
 
     Attributes:
-        name: of the trial.
+        name: name of the trial.
         passed: whether the object stayed within the limits.
-        displacement: greatest travel of the object's centre of mass from where the hand should have had it [m], until
-            the trial ended: it ends when the answer is known, unless the full length was asked for.
-        rotation: greatest turn of the object from its start [rad], likewise.
-        reason: why the trial failed, empty when it passed.
+        displacement: greatest distance of the object's centre of mass from its expected position [m]. It is measured
+            until the trial ends, which may be before the full length (`early_stop`).
+        rotation: greatest rotation of the object from its start [rad], measured until the trial ends.
+        reason: why the trial failed. Empty if it passed.
     """
 
     name: str
@@ -115,9 +115,9 @@ class TrialResult:
 
 @dataclass(frozen=True)
 class GraspMetrics(Mapping[str, float | None]):
-    """Static quality of one grasp by metric name, in SI units. None: the metric was not measured.
+    """Static quality metrics of one grasp by name, in SI units. A value is None if the metric was not measured.
 
-    `graspd_core.verify.metrics` lists the metrics, docs/metrics.md defines them.
+    `graspd_core.verify.metrics` lists the metrics. docs/metrics.md defines them.
     """
 
     values_si: Mapping[str, float | None]
@@ -139,7 +139,7 @@ class Posture:
     Attributes:
         position: origin of the hand's base link [m].
         quaternion_wxyz: unit quaternion of the base link.
-        joint_positions: in the order of the hand's joint names [rad].
+        joint_positions: values in the order of the hand's joint names [rad] or [m].
     """
 
     position: Float[np.ndarray, "3"]
@@ -147,18 +147,18 @@ class Posture:
     joint_positions: Float[np.ndarray, "joints"]
 
 
-# Where an arm is on its way through a grasp, in this order.
+# Named waypoints of an arm path, in this order.
 ARM_STAGES = ("retreat", "pregrasp", "grasp", "lift")
 
 
 @dataclass(frozen=True)
 class ArmPath:
-    """How an arm brings a hand to a grasp and lifts it: joint values of closely spaced waypoints.
+    """Arm path that brings the hand to a grasp and lifts it, as joint values of closely spaced waypoints.
 
     Attributes:
-        joint_names: of the arm, base first.
-        positions: joint values, a row a waypoint [rad] or [m].
-        stages: the rows at which the hand is at the retreat, the pregrasp, the grasp and the lift (`ARM_STAGES`).
+        joint_names: names of the arm's joints, base first.
+        positions: joint values, one row per waypoint [rad] or [m].
+        stages: row indices of the retreat, the pregrasp, the grasp and the lift (`ARM_STAGES`).
     """
 
     joint_names: tuple[str, ...]
@@ -166,25 +166,26 @@ class ArmPath:
     stages: tuple[int, int, int, int]
 
     def at(self, stage: str) -> Float[np.ndarray, "joints"]:
-        """Return the joint values at one of `ARM_STAGES`."""
+        """Return the arm's joint values at `stage`, one of `ARM_STAGES`."""
         return self.positions[self.stages[ARM_STAGES.index(stage)]]
 
 
 @dataclass(frozen=True)
 class Grasp:
-    """One grasp: three postures, where it touches, how good it is, and what the trials measured.
+    """One grasp: its hand postures, contacts, quality and trial results.
 
     Attributes:
-        pregrasp: open and clear of the object.
-        grasp: the fingers just touch.
-        squeeze: the position targets that press with balanced forces.
-        contacts: one per touching link.
-        score: the optimiser's own measure, larger is better. It ranks grasps before any trial.
-        metrics: static quality, None until measured.
-        trials: in the order that they were run. The first failure ends them.
-        probability: of holding on the true object, if cameras saw it (docs/clouds.md), else None.
-        arm: how the arm gets there, if one was given (docs/arms.md), else None.
-        arrival: posture of a hand that closes only after it has arrived, open and clear. None: not looked for.
+        pregrasp: open posture, clear of the object.
+        grasp: posture in which the fingers just touch the object.
+        squeeze: position targets that press the fingers on the object with balanced forces.
+        contacts: one contact per touching link.
+        score: the optimiser's score, larger is better. It ranks grasps before any trial.
+        metrics: static quality metrics. None until they are measured.
+        trials: trial results in the order of the trials. The first failure ends the trials.
+        probability: probability that the grasp holds on the true object (docs/clouds.md). None without camera data.
+        arm: arm path to the grasp (docs/arms.md). None without an arm.
+        arrival: collision-free open posture at the grasp, for planners that close the fingers only after arriving. None
+            if it was not computed or none was found.
     """
 
     pregrasp: Posture
@@ -200,7 +201,7 @@ class Grasp:
 
     @property
     def verdict(self) -> Verdict:
-        """Verified if all trials passed, failed if one did not on the likeliest scene, otherwise unverified."""
+        """Verified if all trials passed. Failed if a trial on the likeliest scene failed. Otherwise unverified."""
         failed = {trial.name for trial in self.trials if not trial.passed}
         if self.trials and not failed:
             return Verdict.VERIFIED
@@ -208,12 +209,12 @@ class Grasp:
 
     @property
     def usable(self) -> bool:
-        """Whether it is as sure as was asked for: verified, or with a contact where no trial was asked for."""
+        """Whether the grasp is verified. If no trial was requested, whether it has a contact."""
         return self.verdict is Verdict.VERIFIED or bool(not self.trials and self.contacts)
 
     @property
     def reason(self) -> str:
-        """Why the first failed trial failed, empty without one."""
+        """Reason of the first failed trial. Empty if none failed."""
         return next((trial.reason for trial in self.trials if not trial.passed), "")
 
 
@@ -222,13 +223,13 @@ class Progress:
     """One progress report of a run.
 
     Attributes:
-        stage: what is being done.
+        stage: current stage.
         step: steps done in this stage.
         of: steps planned in this stage.
-        best: lowest loss so far while optimising, 0 otherwise.
-        verified: grasps that passed the trial so far.
-        elapsed: seconds since the run began.
-        found: the grasp that has just passed, without metrics yet, None in all other reports.
+        best: lowest loss so far while optimising, otherwise 0.
+        verified: number of grasps verified so far.
+        elapsed: time since the run began [s].
+        found: grasp that was just verified, still without metrics. None in all other reports.
     """
 
     stage: Stage
@@ -242,13 +243,13 @@ class Progress:
 
 @dataclass(frozen=True)
 class Snapshot:
-    """The hands that a run works on at one moment, object frame: starts on their way, or candidates on trial.
+    """Hand poses that a run is working on, object frame: all starts while optimising, the candidates in trials.
 
     Attributes:
-        positions: of their base links [m].
-        quaternions_wxyz: of their base links, any non-zero length.
-        joint_positions: [rad] or [m].
-        verdicts: of candidates, in their order, unverified if not tried yet. Empty while optimising.
+        positions: positions of the base links [m].
+        quaternions_wxyz: orientations of the base links, quaternions of any non-zero length.
+        joint_positions: joint values [rad] or [m].
+        verdicts: verdict of each candidate, unverified before its trial. Empty while optimising.
     """
 
     positions: Float[np.ndarray, "hands 3"]
@@ -264,9 +265,9 @@ StopHook = Callable[[], bool]
 
 @dataclass(frozen=True)
 class Timing:
-    """Wall-clock seconds of a run's stages. `first_verified` is None without a verified grasp.
+    """Wall-clock times of a run's stages [s]. `first_verified` is None without a verified grasp.
 
-    `load` and `sdf` are the times of building the scene. `total` counts them too.
+    `load` and `sdf` are the times for building the scene. `total` includes them.
     """
 
     load: float = 0.0
@@ -280,7 +281,7 @@ class Timing:
 
 @dataclass(frozen=True)
 class AuditCount:
-    """Zero, kept for readers of version 0.1 until 0.3. `graspd bench early` tries both lengths."""
+    """Deprecated counts, always zero. Version 0.3 removes them. `graspd bench early` compares both trial lengths."""
 
     audited: int = 0
     disagreed: int = 0
@@ -288,14 +289,14 @@ class AuditCount:
 
 @dataclass(frozen=True)
 class GraspResult:
-    """The result of a run: always an outcome with its `message`, and what was tried in rank order, verified ones first.
+    """The result of a run: its outcome, a `message` and all tried grasps.
 
-    `grasps` has those that did not fail, at most the `count` that were asked for, and `failed` those that did. `tried`
-    has both, and what was found beyond `count`. `support` is what the object stood on, None for a floating one.
-    `audits` is always zero, and goes with 0.3. `next_view` is `T_object_camera` [m] of a further view of the hidden
-    side. It is set if grasps hold on the likeliest shape and none is sure enough. `refused` counts by reason the
-    candidates that a restriction did not admit. `mass` is the object's mass in the trials [kg] if the hand could not
-    hold the assumed one, else None. `tried_mass` is its mass in all trials [kg].
+    `tried` holds every tried grasp in rank order, verified ones first. `support` is the plane that the object stands
+    on, None for a floating object. `audits` is always zero, and version 0.3 removes it. `next_view` is
+    `T_object_camera` [m] of a camera pose that shows more of the hidden side. It is set if grasps hold on the likeliest
+    shape but none is verified. `refused` counts the candidates that a restriction refused, by reason. `mass` is the
+    reduced object mass of the trials [kg] if the hand could not hold the assumed mass, else None. `tried_mass` is the
+    object's mass in the trials [kg]. `count` is the requested number of grasps.
     """
 
     outcome: Outcome
@@ -315,10 +316,10 @@ class GraspResult:
 
     @property
     def grasps(self) -> tuple[Grasp, ...]:
-        """The grasps that did not fail, verified ones first, at most as many as were asked for."""
+        """The grasps that did not fail, verified ones first, at most `count`."""
         return tuple(grasp for grasp in self.tried if grasp.verdict is not Verdict.FAILED)[: self.count]
 
     @property
     def failed(self) -> tuple[Grasp, ...]:
-        """The candidates that failed a trial, in rank order. Each has a `reason`."""
+        """The grasps that failed a trial, in rank order. Each has a `reason`."""
         return tuple(grasp for grasp in self.tried if grasp.verdict is Verdict.FAILED)

@@ -131,10 +131,10 @@ def test_loops_are_refused_and_leave_the_tree_as_it_was():
 @pytest.mark.parametrize(
     ("T", "parent", "culprit"),
     [
-        (np.full((4, 4), np.nan), "map", "not a rotation and a position"),
-        (np.diag([1.0, 1.0, -1.0, 1.0]), "map", "not a rotation"),
-        (np.diag([2.0, 2.0, 2.0, 1.0]), "map", "not a rotation"),
-        (pose((np.inf, 0, 0)), "map", "in finite numbers"),
+        (np.full((4, 4), np.nan), "map", "not rigid; valid: a rotation and a finite position"),
+        (np.diag([1.0, 1.0, -1.0, 1.0]), "map", "not rigid"),
+        (np.diag([2.0, 2.0, 2.0, 1.0]), "map", "not rigid"),
+        (pose((np.inf, 0, 0)), "map", "not rigid"),
         (np.eye(4), "", "a frame without a name"),
     ],
 )

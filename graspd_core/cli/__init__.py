@@ -1,7 +1,7 @@
-"""The command line, one file a command. Each command imports heavy libraries when it runs.
+"""The command line. Each command has its own module and imports heavy libraries only when it runs.
 
-graspd synthesize | replay | reconstruct | library | hands | doctor | completion are graspd_core's own. Other packages
-add commands by entry points of the group `graspd.commands`: view, bench, dataset, import and cell.
+graspd_core provides synthesize, replay, reconstruct, library, hands, doctor and completion. Other packages add commands
+by entry points of the group `graspd.commands`: view, bench, dataset, import and cell.
 """
 
 from __future__ import annotations
@@ -20,14 +20,14 @@ from graspd_core.cli.output import add_output_options, output_of, print_error
 from graspd_core.cli.running import EXIT_BAD_INPUT, EXIT_INTERRUPTED, SIBLINGS, process_began
 from graspd_core.errors import ConfigError, GraspdError, choices
 
-# New objects between two looks for garbage, by default 700. What libraries make when they are imported stays, and
-# looking through it takes a tenth of the time.
+# Number of new objects that starts a garbage collection. Python's default is 700. Collections at import free nothing
+# and take a tenth of the start-up time.
 _YOUNG = 20_000
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run the command line. Return the exit status: 0 enough grasps, 3 fewer, 2 bad input, 130 interrupted."""
-    # With arguments of its own this is a call within a process that began long ago.
+    # A call with arguments comes from a process that may have started long ago.
     own_process = arguments is None
     began = process_began() if own_process else time.perf_counter()
     if own_process:
@@ -46,15 +46,15 @@ def main(arguments: Sequence[str] | None = None) -> int:
         return EXIT_INTERRUPTED
     finally:
         if own_process:
-            # The interpreter's end would look through all of it once more.
+            # Without this, the interpreter would collect garbage once more at exit.
             gc.freeze()
 
 
 class _Parser(argparse.ArgumentParser):
-    """A parser whose errors are a ConfigError like any other: one line, no usage text before it."""
+    """Argument parser that raises a one-line ConfigError instead of printing its usage."""
 
     def error(self, message: str) -> NoReturn:
-        # The parser that meets words which none of its commands took knows those commands.
+        # Unknown options are reported by the top parser, so search the options of all its commands.
         if (words := message.removeprefix("unrecognized arguments: ")) != message and words.startswith("--"):
             known = [option for below in runnable(self) for option in below._option_string_actions]
             if near := difflib.get_close_matches(words.split()[0].split("=")[0], known, 1):
@@ -63,7 +63,7 @@ class _Parser(argparse.ArgumentParser):
 
 
 class _Commands(argparse._SubParsersAction):
-    """Commands with their summaries, without which they are hidden from completion."""
+    """Subparsers with a summary for each command. Shell completion hides commands without a summary."""
 
     def add_parser(self, name: str, **settings: Any) -> argparse.ArgumentParser:
         return super().add_parser(name, help=_SUMMARIES.get(name, ""), **settings)
@@ -79,7 +79,7 @@ _COMMANDS = {
     "doctor": "graspd_core.doctor",
     "completion": "graspd_core.cli.completion_command",
 }
-# What `graspd --help` says, which imports no command. Commands of other packages are listed by name.
+# Summaries for `graspd --help`, which imports no command.
 _SUMMARIES = {
     "synthesize": "plan grasps on a mesh, a cloud or a boxed shape",
     "replay": "plan grasps on the clouds or depth images of a rosbag2 recording",
@@ -97,7 +97,7 @@ _SUMMARIES = {
 
 
 def _overview() -> argparse.ArgumentParser:
-    """Build a parser that knows the commands by name only, for `--help` and `--version`."""
+    """Build a parser for `--help` and `--version`, which knows only the names and summaries of commands."""
     parser = _parser()
     parser.add_argument("--version", action="version", version=f"graspd {version('graspd')}")
     commands = parser.add_subparsers(metavar="COMMAND", dest="command")
@@ -107,9 +107,9 @@ def _overview() -> argparse.ArgumentParser:
 
 
 def build_parser(command: str = "") -> argparse.ArgumentParser:
-    """Build the parser of `command`, or of all commands if there is no name.
+    """Build the parser of `command`, or of all commands if `command` is empty.
 
-    Raises ConfigError: the command is unknown, or the parser meets options that it does not know.
+    Raises ConfigError: the command is unknown or its package is not installed.
     """
     parser, modules = _parser(), _COMMANDS if command in _COMMANDS else _modules()
     if command and command not in modules:
@@ -125,7 +125,7 @@ def build_parser(command: str = "") -> argparse.ArgumentParser:
 
 
 def runnable(parser: argparse.ArgumentParser) -> Iterator[argparse.ArgumentParser]:
-    """Yield the parsers below one, and that itself, that something is run by."""
+    """Yield all subparsers of a parser, and the parser itself, that run a command."""
     for action in parser._actions:
         for below in action.choices.values() if isinstance(action, argparse._SubParsersAction) else ():
             yield from runnable(below)

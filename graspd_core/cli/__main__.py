@@ -1,4 +1,4 @@
-"""`python -m graspd_core.cli`."""
+"""Entry point of `python -m graspd_core.cli`."""
 
 import sys
 

@@ -1,9 +1,9 @@
-"""`graspd completion`: a script by which a shell completes graspd's commands, options, hands and presets.
+"""`graspd completion`: print a shell script that completes graspd's commands, options, hands and presets.
 
     source <(graspd completion bash)          # in ~/.bashrc
     graspd completion zsh > ~/.zfunc/_graspd  # a folder of zsh's fpath
 
-The script is written once and knows what is installed then: completing asks no Python.
+The script lists what is installed when it is printed. Completion itself does not run Python.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ def add_command(commands: Any) -> None:
 
 
 def run(options: argparse.Namespace) -> int:
-    """Print the script. Raises ConfigError: shtab is not installed."""
+    """Print the completion script. Raises ConfigError: shtab is not installed."""
     try:
         import shtab
     except ImportError:
@@ -38,7 +38,7 @@ def run(options: argparse.Namespace) -> int:
         if action.dest in names:
             action.choices = names[action.dest]()
         elif action.nargs != 0 and action.choices is None and action.type not in (int, float):
-            # shtab reads this of an action.
+            # shtab reads this attribute of an action.
             vars(action)["complete"] = shtab.FILE
     print(shtab.complete(parser, shell=options.shell))
     return EXIT_OK

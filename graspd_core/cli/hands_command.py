@@ -1,4 +1,4 @@
-"""`graspd hands`: the built-in hands. `graspd hands inspect`: one hand as text, picture and description."""
+"""`graspd hands`: list the built-in hands. `graspd hands inspect`: show one hand as text, picture or description."""
 
 from __future__ import annotations
 
@@ -53,7 +53,7 @@ def run(options: argparse.Namespace) -> int:
 
 
 def run_inspect(options: argparse.Namespace) -> int:
-    """Print, draw or describe one hand."""
+    """Print one hand. Draw it or write its description if requested."""
     import torch
 
     from graspd_core.hands.library import load_hand
@@ -64,9 +64,9 @@ def run_inspect(options: argparse.Namespace) -> int:
         if path is not None:
             check_writable(path)
     if options.picture is not None and options.picture.suffix.lower() != ".png":
-        raise ConfigError(f"--picture {options.picture}: a .png file is written")
+        raise ConfigError(f"--picture {options.picture}; valid: a file name that ends in .png")
     if options.yaml is not None and Path(options.hand).suffix == ".pkl":
-        raise ConfigError(f"--yaml {options.yaml}: a description names a URDF or MJCF file, not a MANO file")
+        raise ConfigError(f"--yaml: {options.hand} is a MANO file; valid: a hand read from a URDF or MJCF file")
     hand = load_hand(options.hand, candidates=options.candidates)
     print(as_text(hand))
     answer(_document(hand))
@@ -82,7 +82,7 @@ def run_inspect(options: argparse.Namespace) -> int:
 
 
 def _document(hand: HandModel) -> dict[str, Any]:
-    """Return a hand as JSON-ready values, in rad, m and N."""
+    """Return a hand as JSON-ready values, in rad, m, N and N·m."""
     joints = [
         {"name": name, "lower": lower, "upper": upper, "effort": effort, "open": at_open, "closed": at_closed}
         for name, lower, upper, effort, at_open, at_closed in zip(
@@ -97,10 +97,7 @@ def _document(hand: HandModel) -> dict[str, Any]:
 
 
 def as_text(hand: HandModel) -> str:
-    """Return a hand as lines for a terminal: tree, joints, palm and warnings, in rad and m.
-
-    The pairs of links that are checked against each other are counted.
-    """
+    """Return a hand as text: link tree, joints, palm, number of self-collision pairs and warnings, in rad and m."""
     couplings = {mimic.name: mimic for mimic in hand.mimics}
     lines = [
         f"{hand.name}: {hand.num_links} links, {hand.num_joints} actuated joints, {len(couplings)} coupled",
@@ -140,7 +137,7 @@ def as_text(hand: HandModel) -> str:
 
 
 def as_yaml(hand: HandModel, urdf: str) -> str:
-    """Return a hand description to edit, with `urdf` as the path in it."""
+    """Return an editable hand description in YAML. `urdf` is the path of the hand's file in it."""
     lines = [f"urdf: {_quoted(urdf)}", "", "palm:", f"  link: {_quoted(hand.base_link)}"]
     lines += [f"  center: {_list(hand.palm_center)}", f"  normal: {_list(hand.palm_normal)}"]
     lines += ["", f"approach: {_list(hand.approach)}"]
@@ -148,9 +145,9 @@ def as_yaml(hand: HandModel, urdf: str) -> str:
         lines += ["", f"{key}:"]
         for name in (name for name in all_joint_names(hand) if name in hand.joint_names):
             i = hand.joint_names.index(name)
-            # Rounded towards the inside, or a posture at a limit would be beyond it.
+            # Clip the rounded value, because rounding may move a posture beyond a joint limit.
             value = float(np.clip(round(float(posture[i]), 3), hand.lower[i], hand.upper[i]))
-            # Written out: YAML reads 1e-05 as text.
+            # Write without an exponent, because YAML reads 1e-05 as text.
             lines.append(f"  {_quoted(name)}: {np.format_float_positional(value, trim='0')}")
     return "\n".join(lines) + "\n"
 

@@ -1,4 +1,4 @@
-"""`graspd library`: build and list files of verified grasps of known objects."""
+"""`graspd library`: build and list libraries, which are files of verified grasps of known objects."""
 
 from __future__ import annotations
 
@@ -31,14 +31,14 @@ def add_command(commands: Any) -> None:
 
 
 def _build(options: argparse.Namespace) -> int:
-    """Plan for all objects. Return the exit status: 0, 3 if an object got too few grasps, 130 if interrupted."""
+    """Add grasps of all objects. Return the exit status: 0, 3 if an object has too few grasps, 130 if interrupted."""
     from graspd_core.hands.library import load_hand
     from graspd_core.library.grasp_library import GraspLibrary
     from graspd_core.mesh.shapes import object_sources
 
     config, request = planning_options(options)
     if options.verify == "none":
-        raise ConfigError("verify: none; a library holds verified grasps: standard, full, hard or hard_full")
+        raise ConfigError("verify: 'none'; valid for a library: standard, full, hard, hard_full")
     sources, hand = object_sources(options.meshes), load_hand(options.hand)
     library = GraspLibrary(options.out)
     library.create()
@@ -60,7 +60,7 @@ def _build(options: argparse.Namespace) -> int:
 
 
 def _add_object(options: argparse.Namespace, library: GraspLibrary, source: str, scale: float, *rest: Any) -> int:
-    """Plan what an object lacks and add it. Return the number of its grasps then."""
+    """Plan the missing grasps of an object and add them. Return the object's new number of grasps."""
     from graspd_core.library.grasp_library import entry_of
     from graspd_core.library.known_grasps import add_planned
     from graspd_core.perception.load_scene import load_scene

@@ -1,4 +1,4 @@
-"""Options that commands share: planning, clouds out of files or bags, restrictions of grasps. Their summaries."""
+"""Options that several commands share: planning, clouds from files or bags, restrictions. Also prints summaries."""
 
 from __future__ import annotations
 
@@ -30,12 +30,12 @@ if TYPE_CHECKING:
 
 # Metrics in the summary of a run.
 _SHOWN = ("payload", "least_friction", "penetration", "contact_area", "epsilon", "robustness")
-# Grasps that it lists. It counts the others.
+# Number of grasps that a summary lists.
 _FIRST = 3
 
 
 def add_plugin_option(parser: argparse._ActionsContainer) -> None:
-    """Add `--plugin`: the file is run while the options are read, so that they may name its methods."""
+    """Add `--plugin`. The file runs while the options are parsed, so that other options may name its methods."""
     parser.add_argument(
         "--plugin", type=load_plugin, action="append", metavar="FILE.py",
         help="run a file that registers methods, metrics or trials (repeatable)",
@@ -43,7 +43,7 @@ def add_plugin_option(parser: argparse._ActionsContainer) -> None:
 
 
 def add_planning_options(parser: argparse.ArgumentParser) -> None:
-    """Add hand, number, method and trial of the grasps, and the object's mass and friction."""
+    """Add the options for hand, grasps, method, trials, and the object's mass and friction."""
     parser.add_argument("--hand", default="allegro_right", metavar="NAME|PATH", help="graspd hands lists the names")
     parser.add_argument("-n", "--count", type=int, default=16, help="verified grasps wanted (default 16)")
     parser.add_argument("--method", default=None, metavar="NAME", help="instead of the preset's, at its defaults")
@@ -66,9 +66,9 @@ def add_planning_options(parser: argparse.ArgumentParser) -> None:
 
 
 def planning_options(options: argparse.Namespace) -> tuple[PlanConfig, dict[str, Any]]:
-    """Return the settings and the arguments of `plan_grasps` except the deadline.
+    """Return the settings and the other arguments of `plan_grasps`, except the deadline. Set torch's threads.
 
-    Sets torch's threads. Raises ConfigError: an option is out of range, or the preset is unknown or malformed.
+    Raises ConfigError: an option is out of range, or the preset is unknown or malformed.
     """
     import torch
 
@@ -89,18 +89,18 @@ def planning_options(options: argparse.Namespace) -> tuple[PlanConfig, dict[str,
 
 
 def not_loaded(options: argparse.Namespace, config: PlanConfig, began: float) -> GraspResult:
-    """Return the result of a run whose deadline passed while its object was loaded, from `began` on."""
+    """Return the result if the deadline passed while loading, which began at `began` (`time.perf_counter()`)."""
     taken = time.perf_counter() - began
     return GraspResult(Outcome.DEADLINE, (), Timing(load=taken, total=taken), options.seed, config.method)
 
 
 def not_loaded_document(result: GraspResult) -> dict[str, Any]:
-    """Return what there is of a grasps.json without an object."""
+    """Return the JSON document of a run whose object was not loaded: its outcome and no grasps."""
     return {"outcome": {"name": result.outcome.name, "message": result.outcome.value}, "grasps": []}
 
 
 def summary(result: GraspResult, wanted: int, different: int) -> str:
-    """Return a few lines for a person. `different` counts the good grasps that are not copies."""
+    """Return a short text about a result. `different` is the number of usable grasps without near-duplicates."""
     from graspd_core.verify.metrics import METRICS
 
     good = good_grasps(result)
@@ -126,23 +126,23 @@ def summary(result: GraspResult, wanted: int, different: int) -> str:
 
 
 def good_grasps(result: GraspResult) -> int:
-    """Return the number of grasps that are as sure as was asked for. They come first."""
+    """Return the number of usable grasps (`Grasp.usable`). They come first in the result."""
     return sum(grasp.usable for grasp in result.grasps)
 
 
 def exit_status(result: GraspResult) -> int:
-    """Return the status for enough grasps, fewer, or an interruption."""
+    """Return the exit status of a result: enough grasps, too few, or interrupted."""
     if result.outcome is Outcome.CANCELLED:
         return EXIT_INTERRUPTED
     return EXIT_OK if result.outcome is Outcome.SUCCEEDED else EXIT_TOO_FEW
 
 
-# Views that are fused unasked: all are held in memory at once.
+# Greatest number of views to fuse without --limit, because all are in memory at once.
 MOST_VIEWS = 100
 
 
 def add_bag_options(parser: argparse.ArgumentParser) -> None:
-    """Add which messages of a bag to take, and the frame to have them in."""
+    """Add the options that choose the messages of a bag and the frame of their clouds."""
     parser.add_argument("--topic", default=None, help="of clouds or depth images, where a bag has several")
     parser.add_argument("--camera-info", default=None, metavar="TOPIC", help="of the depth images' camera")
     parser.add_argument("--frame", default=None, help="put clouds into this frame by the bag's /tf and /tf_static")
@@ -152,7 +152,7 @@ def add_bag_options(parser: argparse.ArgumentParser) -> None:
 
 
 def add_object_options(parser: argparse.ArgumentParser) -> None:
-    """Add which object of a cloud is meant, and how clouds become scenes."""
+    """Add the options that choose the object in a cloud, the viewpoint and the scene settings."""
     which = parser.add_mutually_exclusive_group()
     which.add_argument(
         "--target", type=float, nargs=3, default=None, metavar=("X", "Y", "Z"),
@@ -170,7 +170,7 @@ def add_object_options(parser: argparse.ArgumentParser) -> None:
 
 
 def add_camera_option(parser: argparse.ArgumentParser) -> None:
-    """Add the camera of a depth image."""
+    """Add `--camera`, the camera of a depth image."""
     parser.add_argument(
         "--camera", type=Path, default=None, metavar="camera.json",
         help="that took the depth image (png, tiff, npy, npz): width, height, K (docs/clouds.md)",
@@ -178,19 +178,19 @@ def add_camera_option(parser: argparse.ArgumentParser) -> None:
 
 
 def target_of(options: argparse.Namespace):
-    """Return the `Target` that the options name, if any."""
+    """Return the `Target` of the option `--target`, or None."""
     from graspd_core.perception.segment.target_selection import Target
 
     return Target(point=np.array(options.target)) if options.target else None
 
 
 def scene_config_of(options: argparse.Namespace) -> SceneConfig:
-    """Return the settings in the file that the options name, else the defaults. Raises ConfigError."""
+    """Return the settings from the file of `--scene`, or the defaults. Raises ConfigError: the file is not valid."""
     return load_scene_config(options.scene) if options.scene else SceneConfig()
 
 
 def check_bag_options(options: argparse.Namespace) -> None:
-    """Refuse what `bag_views` could not use. Raises ConfigError."""
+    """Check the options that `bag_views` uses. Raises ConfigError: --every or --limit is below 1."""
     for name in ("every", "limit"):
         value = getattr(options, name)
         if value is not None and value < 1:
@@ -198,9 +198,9 @@ def check_bag_options(options: argparse.Namespace) -> None:
 
 
 def bag_views(path: Path, options: argparse.Namespace) -> Iterator[tuple[BagFrame, PointCloud | str]]:
-    """Yield the clouds that the options choose, each with its cloud or the reason why it cannot be used.
+    """Yield the recorded frames that the options choose, each with its cloud or the reason why it is unusable.
 
-    Raises BagError: nothing can be read, or the frame wanted is not in the bag.
+    Raises BagError: nothing can be read, or the requested frame is not in the bag.
     """
     said = options.view_point and tuple(options.view_point)
     transforms, place = None, CameraPlace(said, options.sensor_frame)
@@ -227,10 +227,10 @@ def bag_views(path: Path, options: argparse.Namespace) -> Iterator[tuple[BagFram
 
 
 def merged_views(path: Path, options: argparse.Namespace) -> tuple[PointCloud, ...]:
-    """Return the chosen clouds as views of one scene.
+    """Return the chosen clouds as views of one scene. Print the number of unusable clouds on stderr.
 
-    Unusable ones are counted on stderr. Raises BagError: nothing can be read, none can be used, they are not in one
-    frame, or they are too many without a limit.
+    Raises BagError: nothing can be read, no cloud is usable, the clouds are in several frames, or there are too many
+    clouds without --limit.
     """
     views, names, refusals = [], set(), []
     for frame, seen in bag_views(path, options):
@@ -252,7 +252,7 @@ def merged_views(path: Path, options: argparse.Namespace) -> tuple[PointCloud, .
 
 
 def load_views(path: Path, options: argparse.Namespace) -> tuple[PointCloud, ...]:
-    """Return the views of a cloud file, or those that the options choose from a bag, by default the first."""
+    """Return the views of a cloud file, or the chosen views of a bag. Without --limit, take a bag's first view."""
     from graspd_core.perception.cloud import cloud_files
 
     if not is_bag(path):
@@ -295,9 +295,9 @@ def add_restriction_options(parser: argparse.ArgumentParser) -> None:
 
 
 def restrictions_of(options: argparse.Namespace) -> tuple[Restriction, ...]:
-    """Return the restrictions that the options ask for.
+    """Return the restrictions that the options request: steering and reach of an arm.
 
-    Raises ConfigError: a value is out of its range, an option lacks another, or there is no such arm.
+    Raises ConfigError: a value is out of range, an option needs another one, or the arm is unknown.
     """
     return (*_steering(options), *_reach(options))
 
@@ -322,7 +322,7 @@ def _steering(options: argparse.Namespace) -> tuple[Steering, ...]:
 
 def _refuse_alone(name: str, value: float | None, other: str) -> None:
     if value is not None:
-        raise ConfigError(f"--{name}: it needs --{other}")
+        raise ConfigError(f"--{name}: it needs --{other}; give both or neither")
 
 
 def _region(words: list[str]) -> Region:
@@ -350,13 +350,16 @@ def _reach(options: argparse.Namespace) -> tuple[Reach, ...]:
     if options.arm is None and options.arm_base is None:
         return ()
     if options.arm is None:
-        raise ConfigError("--arm-base: there is no arm; give --arm NAME or FILE")
+        raise ConfigError("--arm-base: arm missing; give --arm NAME or --arm FILE")
     from graspd_core.arms.arm import load_arm
     from graspd_core.arms.reach import Reach
 
     arm, base = load_arm(options.arm), options.arm_base
     if base is None:
-        raise ConfigError("--arm: say where it stands, --arm-base X Y Z or X Y Z QW QX QY QZ")
+        raise ConfigError(
+            "--arm: base pose missing; give --arm-base X Y Z or X Y Z QW QX QY QZ, in metres, "
+            "in the object's or cloud's frame"
+        )
     if len(base) not in (3, 7):
         raise ConfigError(f"--arm-base: {len(base)} numbers; valid: X Y Z, or X Y Z QW QX QY QZ")
     x, y, z, *turn = base
@@ -365,6 +368,6 @@ def _reach(options: argparse.Namespace) -> tuple[Reach, ...]:
 
 
 def add_address(parser: argparse.ArgumentParser) -> None:
-    """Add the address of a served page."""
+    """Add `--host` and `--port`, the address of a served page."""
     parser.add_argument("--host", default="127.0.0.1", help="who may come: by default this machine alone")
     parser.add_argument("--port", type=int, default=8080, help="or the next that is free (default 8080)")

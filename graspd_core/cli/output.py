@@ -1,6 +1,6 @@
-"""What a command says: its result on stdout, errors, notes and progress on stderr. `--quiet` and `--json` of them all.
+"""Output of commands: results on stdout, errors, notes and progress on stderr. Also the options `--quiet` and `--json`.
 
-Nothing here writes a colour. Bars are drawn on a terminal only.
+Output has no colours. Progress bars appear only on a terminal.
 """
 
 from __future__ import annotations
@@ -22,13 +22,13 @@ from graspd_core.types import Progress, Stage
 
 T = TypeVar("T")
 _END = object()
-# Seconds until a wait is shown, and then from one look of it to the next.
+# Time until a progress bar of `busy` appears, and interval between its updates [s].
 _PATIENCE = 1.0
 
 
 @dataclass(frozen=True)
 class _Asked:
-    """What the running command was asked for: no notes, and where its JSON document goes, None for text."""
+    """Output settings of the running command: whether notes are hidden, and the stream for JSON, None for text."""
 
     quiet: bool = False
     document_to: Any = None
@@ -38,8 +38,8 @@ _asked = _Asked()
 
 
 def add_output_options(parser: argparse.ArgumentParser) -> None:
-    """Add `--quiet`, and `--json` unless the default of the parser's `json` is False."""
-    # No default: an action of a command would set back what was given before it.
+    """Add `--quiet`, and `--json` unless the parser's default for `json` is False."""
+    # There is no default, because a subcommand's default would overwrite the option given before it.
     parser.add_argument("--quiet", action="store_true", default=argparse.SUPPRESS, help="errors and the result only")
     if parser.get_default("json") is None:
         told = "the result as one JSON document on stdout"
@@ -48,7 +48,7 @@ def add_output_options(parser: argparse.ArgumentParser) -> None:
 
 @contextmanager
 def output_of(options: argparse.Namespace) -> Iterator[None]:
-    """Say what the options ask for. With `--json`, stdout gets the document alone, and stderr what is printed."""
+    """Apply `--quiet` and `--json` inside the context. With `--json`, stdout gets only JSON, stderr all other text."""
     global _asked
     quiet, as_json = getattr(options, "quiet", False), getattr(options, "json", False)
     before, _asked = _asked, _Asked(quiet, sys.stdout if as_json else None)
@@ -61,7 +61,7 @@ def output_of(options: argparse.Namespace) -> Iterator[None]:
 
 
 def answer(document: Any) -> None:
-    """Write the result of the command if it was asked for as JSON."""
+    """Print the command's result as JSON if `--json` was given."""
     if _asked.document_to is not None:
         # NaN is not JSON.
         text = json.dumps(document, indent=1, allow_nan=False, default=_plain)
@@ -69,7 +69,7 @@ def answer(document: Any) -> None:
 
 
 def _plain(value: Any) -> Any:
-    """Return the JSON-ready form of a dataclass, a mapping, an array or a set, and of another value its text."""
+    """Return the JSON-ready form of a dataclass, mapping, array or set. Return any other value as text."""
     if is_dataclass(value):
         return vars(value)
     if isinstance(value, Mapping):
@@ -78,18 +78,18 @@ def _plain(value: Any) -> Any:
 
 
 def print_note(text: object) -> None:
-    """Say on stderr what `--quiet` leaves out."""
+    """Print a note on stderr, unless `--quiet` was given."""
     if not _asked.quiet:
         print_error(text)
 
 
 def print_error(text: object) -> None:
-    """Say on stderr what went wrong."""
+    """Print an error on stderr."""
     print(f"graspd: {text}", file=sys.stderr, flush=True)
 
 
 def bar(what: str, total: int | None, done: int = 0, **settings: Any) -> Any:
-    """Return a bar of tqdm on a terminal, None elsewhere and with `--quiet`."""
+    """Return a tqdm progress bar on a terminal. Return None elsewhere and with `--quiet`."""
     if not _draws():
         return None
     from tqdm import tqdm
@@ -103,7 +103,7 @@ def _draws() -> bool:
 
 @contextmanager
 def busy(what: str) -> Iterator[None]:
-    """Show on a terminal for how many seconds something has been going on, from the first second on."""
+    """Show on a terminal how long the work inside the context has taken, if it takes longer than 1 s."""
     began, ended = time.time(), threading.Event()
     if not _draws():
         yield
@@ -128,7 +128,7 @@ def busy(what: str) -> Iterator[None]:
 
 
 def waiting(items: Iterable[T], what: str, total: int | None = None) -> Iterator[T]:
-    """Yield the items. On a terminal, what is waited for is shown, and its number."""
+    """Yield the items. While an item is awaited, a terminal shows `what` and the item's number."""
     rest, of = iter(items), f"/{total}" if total else ""
     for number in itertools.count(1):
         with busy(f"{what} {number}{of}"):
@@ -139,7 +139,7 @@ def waiting(items: Iterable[T], what: str, total: int | None = None) -> Iterator
 
 
 class Reporter:
-    """Progress of a run: a bar on a terminal, elsewhere plain lines, one a stage."""
+    """Progress display of a run: a bar on a terminal, elsewhere one line per stage."""
 
     def __enter__(self) -> Reporter:
         self._bar: Any = None

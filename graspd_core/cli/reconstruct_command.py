@@ -1,4 +1,4 @@
-"""`graspd reconstruct`: clouds in, a closed mesh out."""
+"""`graspd reconstruct`: reconstruct a closed mesh from point clouds."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ def add_command(commands: Any) -> None:
 
 
 def run(options: argparse.Namespace) -> int:
-    """Reconstruct a mesh and write it. Return the exit status."""
+    """Reconstruct a mesh and write it to `--out`. Return the exit status."""
     from graspd_core.io.grasps_json import check_writable
     from graspd_core.mesh.mesh_files import save_mesh
     from graspd_core.perception.cloud.depth_files import is_depth_image

@@ -1,4 +1,4 @@
-"""`graspd replay`: the clouds of a recording in, grasps for each of them out, as the node would give them."""
+"""`graspd replay`: plan grasps for each cloud of a recording, as the ROS node would."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ from graspd_core.types import GraspResult
 
 @dataclass(frozen=True)
 class _Job:
-    """Views to plan on together, or why there are none."""
+    """Views to plan on together. If the cloud is unusable, `refusal` says why and there are no views."""
 
     name: str
     label: str
@@ -66,7 +66,7 @@ def add_command(commands: Any) -> None:
 
 
 def run(options: argparse.Namespace) -> int:
-    """Plan on every cloud. Return the exit status: 0 enough grasps on every cloud, 3 fewer on some, 2 no usable one."""
+    """Plan on every cloud. Return the exit status: 0 all have enough grasps, 3 fewer, 2 none usable, 130 stopped."""
     from graspd_core.hands.library import load_hand
     from graspd_core.io.grasps_json import check_writable
 
@@ -75,7 +75,7 @@ def run(options: argparse.Namespace) -> int:
     settings = scene_config_of(options)
     single = options.out is not None and options.out.suffix == ".json"
     if single and not (options.fuse or options.limit == 1):
-        raise ConfigError(f"{options.out}: one file for many clouds; give a directory, or --limit 1, or --fuse")
+        raise ConfigError(f"--out {options.out}: one file for many clouds; give a directory, or --limit 1, or --fuse")
     if options.out:
         check_writable(options.out if single else options.out / "probe")
     hand = load_hand(options.hand)
@@ -85,7 +85,7 @@ def run(options: argparse.Namespace) -> int:
     scenes: list[dict[str, Any]] = []
     with Interrupt() as interrupt:
         for job in waiting(_jobs(options), "read cloud"):
-            # Here, so that it ends a recording of which every cloud is refused, too.
+            # Check here, so that an interrupt also ends a recording in which every cloud is refused.
             if interrupted := interrupt.came():
                 break
             try:
@@ -95,7 +95,7 @@ def run(options: argparse.Namespace) -> int:
             except GraspdError as error:
                 print(f"{job.label}: refused: {error}", flush=True)
                 scenes.append({"label": job.label, "refused": str(error)})
-                # An empty table is an answer. A cloud that cannot be used is bad input.
+                # An empty table counts as too few grasps. An unusable cloud is bad input.
                 statuses.append(EXIT_TOO_FEW if isinstance(error, NoObjectError) else EXIT_BAD_INPUT)
                 continue
             print(_outcome_line(job, result, options.count), flush=True)
@@ -124,9 +124,9 @@ def _outcome_line(job: _Job, result: GraspResult, count: int) -> str:
 def _planned(
     job: _Job, options: argparse.Namespace, hand: HandModel, config: PlanConfig, request: dict[str, Any]
 ) -> tuple[GraspResult, dict[str, Any]]:
-    """Plan on a job's views and write the result if asked for. Return it, and its document too.
+    """Plan on a job's views and, with `--out`, write the result file. Return the result and its JSON document.
 
-    Raises a GraspdError: the views show no usable object.
+    Raises GraspdError: the views are unusable or show no usable object.
     """
     from graspd_core.io.grasps_json import result_document, save_result
     from graspd_core.planning.plan_grasps import plan_grasps
@@ -150,7 +150,7 @@ def _planned(
 
 
 def _jobs(options: argparse.Namespace) -> Iterator[_Job]:
-    """Yield one cloud after the other, or all of them together."""
+    """Yield one job per cloud. With `--fuse`, yield one job with all clouds."""
     if options.fuse:
         views = merged_views(options.bag, options)
         yield _Job("fused", f"{len(views)} clouds fused", views)
@@ -165,7 +165,7 @@ def _jobs(options: argparse.Namespace) -> Iterator[_Job]:
 
 
 def _scene_of(job: _Job, options: argparse.Namespace, settings: SceneConfig):
-    """Return the scene of a job's views. Raises a GraspdError: they show no usable object."""
+    """Return the scene of a job's views. Raises GraspdError: the views show no usable object."""
     from graspd_core.perception.scene_from_views import scene_from_views
 
     if job.refusal:

@@ -1,4 +1,4 @@
-"""A running command: its exit status and deadline, and its response to Ctrl-C."""
+"""Exit status, deadline and Ctrl-C handling of a running command."""
 
 from __future__ import annotations
 
@@ -21,18 +21,18 @@ from graspd_core.types import GraspResult, ProgressHook, WatchHook
 EXIT_OK, EXIT_BAD_INPUT, EXIT_TOO_FEW, EXIT_INTERRUPTED = 0, 2, 3, 130
 
 
-# Signals that end a run: what a terminal sends, and what a service or a batch system does.
+# Signals that end a run. Terminals send SIGINT, services and batch systems send SIGTERM.
 _ENDS = (signal.SIGINT, signal.SIGTERM)
 
 
 class Interrupt:
-    """A context in which the first Ctrl-C or SIGTERM ends a run with its result so far, the second the process."""
+    """Context for Ctrl-C and SIGTERM. The first signal ends the run with its result so far, the second the process."""
 
     def __init__(self) -> None:
         self._event = threading.Event()
 
     def __enter__(self) -> Interrupt:
-        # Signals belong to the main thread. In another thread, the caller keeps them.
+        # Only the main thread can handle signals. In other threads this context does nothing.
         self._mine = threading.current_thread() is threading.main_thread()
         if self._mine:
             self._before = {number: signal.signal(number, self._handle) for number in _ENDS}
@@ -52,30 +52,30 @@ class Interrupt:
         self._event.set()
 
 
-# Seconds from one interruption of the same work to the next.
+# Interval between two interruptions of the same work [s].
 _AGAIN = 0.5
 
 
 class DeadlinePassed(BaseException):
-    """The end of work by a deadline. It is no Exception, because readers of files catch all of those as their own."""
+    """Raised when a deadline passes. It is not an Exception, because file readers catch every Exception."""
 
 
 class Deadline:
-    """A time `seconds` after `began`, a `time.perf_counter()` value. None: never."""
+    """Deadline `seconds` after `began`, a `time.perf_counter()` value. It never passes if `seconds` is None."""
 
     def __init__(self, seconds: float | None, began: float) -> None:
         self._end = None if seconds is None else began + seconds
 
     def left(self) -> float | None:
-        """Return the seconds left, more than zero, None without a deadline."""
+        """Return the remaining time [s], always above 0. None without a deadline."""
         return None if self._end is None else max(self._end - time.perf_counter(), 1e-9)
 
     @contextmanager
     def cuts_short(self) -> Iterator[None]:
-        """Raise DeadlinePassed in the work inside once the deadline has passed.
+        """Raise DeadlinePassed inside the context as soon as the deadline has passed.
 
-        A library's long call ends first. Signals belong to the main thread. In another one, DeadlinePassed waits for
-        the work's end.
+        A long call into a library ends first. Outside the main thread, DeadlinePassed is raised only after the work,
+        because only the main thread can handle signals.
         """
         if self._end is None:
             yield
@@ -84,7 +84,7 @@ class Deadline:
             try:
                 yield
             except Exception:
-                # What a library that was interrupted makes of that.
+                # An interrupted library may raise its own error. After the deadline it is ignored.
                 if time.perf_counter() < self._end:
                     raise
         if time.perf_counter() >= self._end:
@@ -93,7 +93,7 @@ class Deadline:
 
 @contextmanager
 def _alarm(end: float) -> Iterator[None]:
-    """Raise DeadlinePassed in the main thread at `end`, and again while a library catches that as its own error."""
+    """Raise DeadlinePassed in the main thread at `end`. Raise it again if a library catches it."""
     armed = True
 
     def passed(number: int, frame: FrameType | None) -> None:
@@ -116,10 +116,10 @@ def _alarm(end: float) -> Iterator[None]:
 
 
 def process_began() -> float:
-    """Return the start of this process, a `time.perf_counter()` value. If the system does not say it, now."""
+    """Return the start time of this process, a `time.perf_counter()` value. If it is unknown, return the time now."""
     now = time.perf_counter()
     try:
-        # The 22nd field. The second, the program's name in brackets, may hold blanks.
+        # The start time is field 22. Field 2, the program's name in brackets, may contain blanks.
         ticks = int(Path("/proc/self/stat").read_text().rpartition(")")[2].split()[19])
         age = time.clock_gettime(time.CLOCK_BOOTTIME) - ticks / os.sysconf("SC_CLK_TCK")
     except (OSError, AttributeError, ValueError, IndexError):
@@ -129,12 +129,12 @@ def process_began() -> float:
 
 @dataclass(frozen=True)
 class Watched:
-    """How a run is followed in a browser, by default not at all.
+    """Hooks that show a run in a browser. By default they do nothing.
 
     Attributes:
-        watch: hook of `plan_grasps`.
-        told: as its progress hook.
-        show: shows what was found until Ctrl-C.
+        watch: watch hook for `plan_grasps`.
+        told: additional progress hook for `plan_grasps`.
+        show: function that shows the result until Ctrl-C.
     """
 
     watch: WatchHook | None = None
@@ -142,20 +142,20 @@ class Watched:
     show: Callable[[GraspResult], None] = lambda result: None
 
     def progress(self, reporter: ProgressHook) -> ProgressHook:
-        """Return the progress hook of a run that `reporter` follows too."""
+        """Return a progress hook that calls both `reporter` and the browser's hook."""
         told = self.told
         if told is None:
             return reporter
         return lambda progress: (reporter(progress), told(progress))[0]
 
 
-# Packages beside graspd_core by the command, or the option, that needs them.
+# Package that each command outside graspd_core needs.
 SIBLINGS = {"view": "graspd_viewer", "bench": "graspd_bench", "dataset": "graspd_dataset", "import": "graspd_dataset"}
 SIBLINGS |= {"cell": "graspd_cell"}
 
 
 def sibling(module: str) -> Any:
-    """Import a module of a package beside graspd_core. Raises ConfigError: the package is not installed."""
+    """Import a module of another graspd package. Raises ConfigError: the package is not installed."""
     package = module.partition(".")[0]
     if find_spec(package) is None:
         raise ConfigError(f"{package} is not installed; run: pip install graspd")

@@ -1,4 +1,4 @@
-"""`graspd synthesize`: one object in, grasps out."""
+"""`graspd synthesize`: plan grasps for one object."""
 
 from __future__ import annotations
 
@@ -57,7 +57,7 @@ def add_command(commands: Any) -> None:
 
 
 def run(options: argparse.Namespace) -> int:
-    """Plan on one object. Return the exit status."""
+    """Plan grasps for one object, print a summary and write the requested files. Return the exit status."""
     from graspd_core.hands.library import load_hand
     from graspd_core.io.grasps_json import check_writable
     from graspd_core.perception.load_scene import load_scene
@@ -66,9 +66,9 @@ def run(options: argparse.Namespace) -> int:
     config, request = planning_options(options)
     request["restrictions"] = restrictions_of(options)
     deadline = Deadline(options.deadline, options.began)
-    # A run whose result could not be written would be lost.
+    # Check the output paths first. Otherwise a long run's result could be lost.
     if options.picture and options.picture.suffix.lower() != ".png":
-        raise ConfigError(f"--picture {options.picture}: a .png file is written")
+        raise ConfigError(f"--picture {options.picture}; valid: a file name that ends in .png")
     for path in (options.out, options.html, options.picture):
         if path:
             check_writable(path)
@@ -87,7 +87,7 @@ def run(options: argparse.Namespace) -> int:
             )
             hand = load_hand(options.hand)
     except DeadlinePassed:
-        # Nothing is written: results are of an object.
+        # No file is written, because a result file needs an object.
         result = not_loaded(options, config, options.began)
         print(summary(result, options.count, 0))
         answer(not_loaded_document(result))
@@ -109,7 +109,7 @@ def run(options: argparse.Namespace) -> int:
 def _report(
     options: argparse.Namespace, result: GraspResult, scene: Scene, hand: HandModel, config: PlanConfig
 ) -> None:
-    """Write the result to the files asked for, and print a summary."""
+    """Write the result to the requested files and print a summary."""
     from graspd_core.io.grasps_json import result_document, save_result
     from graspd_core.verify.metrics import distinct
 

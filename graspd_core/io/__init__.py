@@ -1,1 +1,1 @@
-"""Files of grasps, and recordings."""
+"""Readers and writers of grasps files and recordings."""

@@ -1,6 +1,6 @@
-"""Read rosbag2 recordings (mcap and sqlite3) by the rosbags library: no ROS installation, no DDS.
+"""Reader of rosbag2 recordings (mcap and sqlite3). It uses the rosbags library and needs no ROS installation.
 
-The order is the recording's, so that the same bag gives the same clouds every time.
+Messages keep the order of the recording, so that a bag gives the same clouds every time.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ TRANSFORMS = "tf2_msgs/msg/TFMessage"
 
 @dataclass(frozen=True)
 class BagTopic:
-    """One topic of a recording: its name, the type of its messages, and how many there are."""
+    """One topic of a recording: name, message type and number of messages."""
 
     name: str
     type: str
@@ -40,12 +40,12 @@ class BagFrame:
     """One recorded cloud or depth image, not yet decoded.
 
     Attributes:
-        index: its place among the topic's messages.
-        stamp: time in its header [ns].
-        frame: the frame in which it is recorded.
-        topic: the topic it was recorded on.
-        message: a PointCloud2, a depth Image, or a CompressedImage of depth.
-        info: CameraInfo of a depth image.
+        index: index among the topic's messages.
+        stamp: time stamp of the header [ns].
+        frame: frame id of the header.
+        topic: topic of the message.
+        message: a PointCloud2, a depth Image, or a CompressedImage with depth.
+        info: CameraInfo of a depth image. None for a cloud.
     """
 
     index: int
@@ -58,18 +58,18 @@ class BagFrame:
     def view(
         self, transforms: TransformBuffer | None = None, target: str | None = None, place: CameraPlace = ORIGIN
     ) -> PointCloud:
-        """Return what the camera saw, in its own frame or in `target`. The camera of a cloud stood at `place`.
+        """Return the point cloud, in the message's frame or in `target`. `place` is the camera's position for a cloud.
 
         Raises:
-            CloudError: the message is broken or shows nothing.
-            TransformError: the pose of the frame in `target` is not known for that time.
+            CloudError: the message is broken or has no usable point.
+            TransformError: the transform from the message's frame to `target` is not known at the stamp.
         """
-        # A driver that does not stamp its messages leaves zero: then the newest transform has to do.
+        # Some drivers leave the stamp at zero. Then the newest transform is used.
         lookup = no_lookup if transforms is None else lambda to, of: transforms.lookup(to, of, self.stamp or None)
         if self.info is None:
             cloud = place.cloud(self.message, lookup)
         else:
-            # REP 118 and image_pipeline: rectified images say so in the last part of their name.
+            # By REP 118 and image_pipeline, the last part of a rectified image's topic contains "rect".
             rectified = re.search(r"(^|_)rect(_|$)", _image_name(self.topic).rsplit("/", 1)[-1]) is not None
             cloud = cloud_from_depth_message(self.message, self.info, rectified=rectified)
         if target is None or target.removeprefix("/") == self.frame.removeprefix("/"):
@@ -78,7 +78,7 @@ class BagFrame:
 
 
 def is_bag(path: str | Path) -> bool:
-    """Tell whether a path looks like a recording: a storage file, or a directory with one or its metadata."""
+    """Return True if a path is a storage file by its ending, or a directory with a storage file or metadata.yaml."""
     path = Path(path)
     if path.is_dir():
         return (path / "metadata.yaml").exists() or bool(_storage_files(path))
@@ -86,7 +86,7 @@ def is_bag(path: str | Path) -> bool:
 
 
 def bag_topics(path: str | Path) -> tuple[BagTopic, ...]:
-    """Return the topics of a recording, by name. Raises BagError: not a bag, or a broken one."""
+    """Return the topics of a recording, sorted by name. Raises BagError: it is not a bag, or it is broken."""
     with _opened(path) as reader:
         return _topics(reader)
 
@@ -94,7 +94,7 @@ def bag_topics(path: str | Path) -> tuple[BagTopic, ...]:
 def read_transforms(path: str | Path) -> TransformBuffer:
     """Read all transforms of a recording (/tf and /tf_static).
 
-    Raises BagError: not a bag, a broken one, or one without transforms.
+    Raises BagError: it is not a bag, it is broken, or it has no transforms.
     """
     buffer = TransformBuffer(history=None)
     with _opened(path) as reader:
@@ -115,17 +115,17 @@ def read_frames(
     every: int = 1,
     limit: int | None = None,
 ) -> Iterator[BagFrame]:
-    """Yield the clouds of a recording, or its depth images with their camera, in the order of recording.
+    """Yield the clouds of a recording, or its depth images with their CameraInfo, in recorded order.
 
     Args:
         path: a rosbag2 directory, or one of its storage files (.mcap, .db3).
-        topic: of PointCloud2 or of depth images. None takes the only one there is, clouds before depth images.
-        info_topic: CameraInfo of the depth images. None takes `camera_info` beside them, or the only one there is.
-        every: take one of so many.
-        limit: end after so many taken.
+        topic: topic of clouds or depth images. None takes the only cloud topic, else the only depth topic.
+        info_topic: CameraInfo topic of the depth images. None takes `camera_info` next to them, or the only one.
+        every: yield only every n-th message.
+        limit: greatest number of messages to yield. None for no limit.
 
     Raises:
-        BagError: not a bag, a broken one, or the topic is missing, ambiguous, empty or of another type.
+        BagError: it is not a bag, it is broken, or the topic is missing, ambiguous, empty or of another type.
     """
     with _opened(path) as reader:
         chosen = _choose(path, reader, topic)
@@ -135,7 +135,7 @@ def read_frames(
             info_name = _info_topic(path, reader, chosen.name, info_topic)
             infos = [c for c in reader.connections if c.topic == info_name]
             connections += infos
-            # The calibration may be recorded a moment after the first image.
+            # The first CameraInfo may be recorded after the first image.
             info = _first(path, reader, info_name)
         index = taken = 0
         for connection, _, raw in _messages(path, reader, connections):
@@ -152,9 +152,9 @@ def read_frames(
 
 
 def read_raw(path: str | Path, topics: tuple[str, ...] = ()) -> Iterator[tuple[BagTopic, int, bytes]]:
-    """Yield recorded messages as stored (CDR) with their time of recording [ns], of all topics or those named.
+    """Yield raw messages (CDR) of the given topics, or of all, each with its topic and receive time [ns].
 
-    Raises BagError: not a bag, a broken one, or a topic that is not in it.
+    Raises BagError: it is not a bag, it is broken, or a topic is not in it.
     """
     with _opened(path) as reader:
         known = {topic.name: topic for topic in _topics(reader)}
@@ -168,7 +168,7 @@ def read_raw(path: str | Path, topics: tuple[str, ...] = ()) -> Iterator[tuple[B
 
 @cache
 def jazzy_types() -> Any:
-    """Return the message types of ROS 2 Jazzy, for bags that do not carry their own definitions."""
+    """Return the message types of ROS 2 Jazzy, for bags without message definitions."""
     from rosbags.typesys import Stores, get_typestore
 
     return get_typestore(Stores.ROS2_JAZZY)
@@ -187,7 +187,7 @@ def _opened(path: str | Path) -> Iterator[Any]:
         kinds = "a directory of rosbag2, or a file ending in " + " or ".join(f".{e}" for e in BAG_ENDINGS)
         raise BagError(f"{path}: not a bag; a bag is {kinds}")
     if path.is_dir() and not (path / "metadata.yaml").exists():
-        # The recorder was killed before it wrote the metadata: its storage may still be whole.
+        # The recorder was killed before it wrote the metadata. Its storage file may still be complete.
         files = _storage_files(path)
         if len(files) > 1:
             raise BagError(f"{path}: no metadata.yaml and {len(files)} storage files; give one of them")
@@ -196,7 +196,7 @@ def _opened(path: str | Path) -> Iterator[Any]:
     try:
         reader = AnyReader([path], default_typestore=jazzy_types())
         reader.open()
-    # The library lets through whatever a spoilt file brings about in it: struct, sqlite3, yaml, assertion errors.
+    # For a broken file the library raises many kinds of errors, such as struct, sqlite3, yaml and assertion errors.
     except Exception as error:
         raise BagError(f"{path}: not a readable bag, or cut short ({_first_line(error)})") from error
     try:
@@ -206,7 +206,7 @@ def _opened(path: str | Path) -> Iterator[Any]:
 
 
 def _messages(path: str | Path, reader: Any, connections: list[Any]) -> Iterator[tuple[Any, int, Any]]:
-    """Yield messages by time of recording, those of one time in the order of the file."""
+    """Yield messages by receive time. Messages with equal times keep the order of the file."""
     if not connections:
         return
     messages = reader.messages(connections=connections)
@@ -221,7 +221,7 @@ def _messages(path: str | Path, reader: Any, connections: list[Any]) -> Iterator
 
 
 def _decode(path: str | Path, reader: Any, connection: Any, raw: Any) -> Any:
-    """Return the message, its type as Jazzy defines it, since fields of a bag's own definition could not be read."""
+    """Decode a message with Jazzy's definition of its type. If there is none, use the bag's own definition."""
     kind, known = connection.msgtype, jazzy_types()
     types = known if kind in known.fielddefs else reader.typestore
     try:
@@ -250,13 +250,13 @@ def _choose(path: str | Path, reader: Any, name: str | None) -> BagTopic:
         if found is None:
             raise BagError(f"{path}: no clouds or depth images on {name!r}; topics with some: {offered}")
         return found
-    # Beside an image its packed form is the same one again.
+    # A compressed image next to a raw one shows the same. The raw one is preferred.
     candidates = clouds or images or packed
     if not candidates:
         have = ", ".join(f"{t.name} ({t.type.rsplit('/', 1)[-1]})" for t in topics) or "none"
         raise BagError(f"{path}: no topic with clouds or depth images; it has: {have}")
     if len(candidates) > 1:
-        raise BagError(f"{path}: several topics could be meant, name one: {offered}")
+        raise BagError(f"{path}: several topics fit; name one of: {offered}")
     return candidates[0]
 
 

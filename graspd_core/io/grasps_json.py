@@ -1,4 +1,4 @@
-"""The file format `graspd/grasps` (docs/format.md): write a result in version 2, read versions 1 and 2."""
+"""Files of the format `graspd/grasps` (docs/format.md). Writes version 2, reads versions 1 and 2."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ _LIBRARIES = ("graspd", "torch", "mujoco", "open3d", "numpy")
 
 
 def result_document(result: GraspResult, target: ObjectModel, hand: HandModel, config: PlanConfig) -> dict[str, Any]:
-    """Return a result as JSON-ready values: metres, radians and newtons unless a key names another unit."""
+    """Return a result as JSON-ready values, in m, rad and N unless a key names another unit."""
     return {
         "format": FORMAT,
         "version": VERSION,
@@ -61,7 +61,7 @@ def result_document(result: GraspResult, target: ObjectModel, hand: HandModel, c
 
 
 def _hand(hand: HandModel) -> dict[str, Any]:
-    """Return the hand's joints, their couplings, and its mount on an arm."""
+    """Return the hand's names, joints, joint couplings and mount on an arm as JSON-ready values."""
     return {
         "name": hand.name,
         "urdf": hand.urdf,
@@ -76,10 +76,9 @@ def _hand(hand: HandModel) -> dict[str, Any]:
 
 
 def check_writable(path: Path) -> None:
-    """Refuse a path that cannot be written before the work that would be lost.
+    """Check before long work that a file can be written. Make missing directories.
 
-    Makes missing directories. Raises ConfigError: the path is a directory, or its directory cannot be made or written
-    to.
+    Raises ConfigError: the path is a directory, or its directory cannot be made or written to.
     """
     if path.is_dir():
         raise ConfigError(f"{path}: is a directory; give the name of a file to write")
@@ -101,16 +100,16 @@ def save_result(
     frame: str = "",
     stamp: float | None = None,
 ) -> None:
-    """Write a result, whole or not at all. `frame` and `stamp` [s] name the frame and time of its poses."""
+    """Write a result to a file atomically. `frame` and `stamp` [s] are the frame and time of its poses."""
     document = result_document(result, target, hand, config)
     document |= {"frame": frame} if frame else {}
     document |= {"stamp": stamp} if stamp is not None else {}
-    # NaN is not JSON: a document that held one must never be written.
+    # NaN is not valid JSON, so a document with NaN must not be written.
     save_text(Path(path), json.dumps(document, indent=1, allow_nan=False) + "\n")
 
 
 def save_text(path: Path, text: str) -> None:
-    """Write a file that appears whole or not at all. Makes missing directories."""
+    """Write a text file atomically. Make missing directories."""
     save_bytes(path, text.encode())
 
 
@@ -143,9 +142,10 @@ def _arm(path: ArmPath) -> dict[str, Any]:
 
 
 def grasp_figures(grasp: Grasp) -> dict[str, Any]:
-    """Return metrics and trials of a grasp as JSON-ready values, null for what is not measured or not finite.
+    """Return metrics and trials of a grasp as JSON-ready values.
 
-    Every metric of the registry has a key, which names its unit. Trials are in [m] and [rad].
+    Values that were not measured or are not finite are None. Every metric of the registry has a key that names its
+    unit. Trials are in [m] and [rad].
     """
     metrics = grasp.metrics or {}
     return {
@@ -179,13 +179,13 @@ def load_grasps(path: str | Path) -> tuple[Grasp, ...]:
     """Read the grasps of a file that `save_result` wrote, in rank order.
 
     Raises:
-        FormatError: missing, not of this format or version, or a grasp in it is malformed.
+        FormatError: the file is missing, has another format or version, or a grasp in it is malformed.
     """
     return grasps_of(load_document(path))
 
 
 def load_document(path: str | Path) -> dict[str, Any]:
-    """Read a grasps file. Raises FormatError: missing, not JSON, of another format or of an unknown version."""
+    """Read a grasps file. Raises FormatError: it is missing, not JSON, of another format or of an unknown version."""
     path = Path(path)
     try:
         document = json.loads(path.read_text(encoding="utf-8"), parse_constant=_refuse_constant)
@@ -204,19 +204,19 @@ def load_document(path: str | Path) -> dict[str, Any]:
 def grasps_of(document: dict[str, Any]) -> tuple[Grasp, ...]:
     """Return the grasps of a document that `load_document` read, in rank order.
 
-    The squeeze has the grasp's base pose. Joint positions are those of the actuated joints. Metrics that this version
-    does not know are left out. Raises FormatError: a grasp lacks a key, or a value is of the wrong kind or not finite.
+    The squeeze gets the grasp's base pose. Postures hold actuated joints only. Metrics that this version does not know
+    are ignored. Raises FormatError: a grasp lacks a key, or a value has the wrong type or is not finite.
     """
     try:
         hand = document["hand"]
-        # Files written before joints could be coupled have no such key.
+        # Older files, from before coupled joints, do not have this key.
         coupled = {mimic["joint"] for mimic in hand.get("mimic", ())}
         actuated = np.array([name not in coupled for name in hand["joint_names"]], dtype=bool)
         upgrade = _from_version_1 if document.get("version") == 1 else dict
         return tuple(_grasp_of(upgrade(values), actuated) for values in document["grasps"])
     except KeyError as error:
         raise FormatError(f"grasps: a grasp lacks the key {shown(error.args[0])}") from None
-    # A number of JSON may be larger than any float.
+    # A JSON number may be too large for a float.
     except (AttributeError, TypeError, ValueError, OverflowError) as error:
         raise FormatError(f"grasps: {' '.join(str(error).split())[:300]}") from None
 
@@ -224,11 +224,11 @@ def grasps_of(document: dict[str, Any]) -> tuple[Grasp, ...]:
 def _grasp_of(values: dict[str, Any], actuated: Bool[np.ndarray, "movable"]) -> Grasp:
     def posture(*keys: str) -> Posture:
         if len(values[keys[2]]) != actuated.size:
-            raise ValueError(f"{keys[2]} has {len(values[keys[2]])} values for {actuated.size} joints")
+            raise ValueError(f"{keys[2]}: {len(values[keys[2]])} values; expected {actuated.size}")
         sizes = (3, 4, actuated.size)
         position, quaternion, joints = (_numbers_of(values, key, n) for key, n in zip(keys, sizes, strict=True))
         if abs(np.linalg.norm(quaternion.clip(-2, 2)) - 1) > 0.01:
-            raise ValueError(f"{keys[1]} is no unit quaternion: {quaternion.tolist()}")
+            raise ValueError(f"{keys[1]}: {quaternion.tolist()}; expected a unit quaternion")
         return Posture(position, quaternion, joints[actuated])
 
     grasp = Grasp(
@@ -239,9 +239,9 @@ def _grasp_of(values: dict[str, Any], actuated: Bool[np.ndarray, "movable"]) -> 
         score=float(_numbers_of(values, "score")),
         metrics=_metrics_of(values["metrics"]),
         trials=tuple(_trial_of(trial) for trial in values["trials"]),
-        # Files written before clouds were doubted have no such key.
+        # Older files, from before probabilities, do not have this key.
         probability=_scaled({"probability": None, **values}, "probability", 1.0),
-        # Nor those written before an arm could be given.
+        # Older files, from before arms, do not have this key.
         arm=_arm_of(values["arm"]) if values.get("arm") is not None else None,
     )
     if values["verdict"] != grasp.verdict:
@@ -250,8 +250,8 @@ def _grasp_of(values: dict[str, Any], actuated: Bool[np.ndarray, "movable"]) -> 
 
 
 def _from_version_1(values: dict[str, Any]) -> dict[str, Any]:
-    """Return a grasp of version 1 with its trials in the form of version 2. The reason belongs to the last trial."""
-    # Files written before there was a lift trial have no such key.
+    """Convert a grasp from version 1 to version 2. Its `reason` belongs to the last trial."""
+    # Older files, from before the lift trial, do not have this key.
     tried = {name: values["metrics"].get(name) for name in ("hold", "lift")}
     tried = {name: trial for name, trial in tried.items() if trial is not None}
     trials = [
@@ -276,7 +276,7 @@ def _metrics_of(values: dict[str, Any]) -> GraspMetrics | None:
 def _trial_of(values: dict[str, Any]) -> TrialResult:
     if not isinstance(values["passed"], bool):
         raise ValueError(f"passed: {shown(values['passed'])}; expected true or false")
-    # What was not finite was written as null.
+    # Values that are not finite were written as null.
     moved = [_scaled(values, key, 1.0) for key in ("displacement", "rotation")]
     displacement, rotation = (math.inf if value is None else value for value in moved)
     return TrialResult(str(values["name"]), values["passed"], displacement, rotation, str(values["reason"]))
@@ -291,7 +291,7 @@ def _arm_of(values: dict[str, Any]) -> ArmPath:
     positions = _numbers_of(values, "positions", rows, len(names))
     first, second, third, fourth = (int(values["stages"][stage]) for stage in ARM_STAGES)
     if not 0 <= first <= second <= third <= fourth < rows:
-        raise ValueError(f"arm.stages: {shown(values['stages'])}; expected rows of its {rows} waypoints in order")
+        raise ValueError(f"arm.stages: {shown(values['stages'])}; expected ascending row indices below {rows}")
     return ArmPath(names, positions, (first, second, third, fourth))
 
 

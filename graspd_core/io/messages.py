@@ -1,4 +1,4 @@
-"""Sensor messages as arrays: live ones, recorded ones, and all objects with the attributes of ROS."""
+"""Conversion of ROS messages to arrays: for live and recorded messages and all objects with the same attributes."""
 
 from __future__ import annotations
 
@@ -29,26 +29,26 @@ from graspd_core.perception.cloud.point_cloud import (
 from graspd_core.perception.cloud.viewpoint_check import seen_from
 from graspd_core.transforms import SECOND, TransformBuffer
 
-# Mean share of a direction in those from the camera to its points, where it is the one that the camera looks along.
+# Least mean cosine between an axis and the directions to the points, if the camera looks along this axis.
 _AHEAD = 0.8
 
 
 def stamp_of(message: Any) -> int:
-    """Return the time of a stamped message's header [ns]."""
+    """Return the time stamp of a message's header [ns]."""
     stamp = message.header.stamp
     return stamp.sec * SECOND + stamp.nanosec
 
 
 def points_from_message(message: Any) -> Float[np.ndarray, "n 3"]:
-    """Return the finite points of a sensor_msgs/PointCloud2, in row order, in the cloud's own frame and unit.
+    """Return the finite points of a sensor_msgs/PointCloud2, in row order, in the message's frame and unit.
 
-    Raises CloudError: no points, x, y or z missing or not a float, sizes that contradict each other, or nothing finite.
+    Raises CloudError: no point is finite, x, y or z is missing or not a float, or the sizes contradict each other.
     """
     return points_from_layout(_layout(message))
 
 
 def pixels_from_message(message: Any) -> Float[np.ndarray, "height width 3"]:
-    """Return all points of a PointCloud2 in their places, NaN and infinite too. Raises CloudError as above."""
+    """Return all points of a PointCloud2 as an image, including NaN and infinite ones. Raises CloudError as above."""
     return organised_points(_layout(message))
 
 
@@ -67,20 +67,20 @@ def _layout(message: Any) -> CloudLayout:
 
 @dataclass(frozen=True)
 class CameraPlace:
-    """The position of a cloud's camera, the origin of the cloud's frame by default.
+    """Position of a cloud's camera. The default is the origin of the cloud's frame.
 
-    `view_point`, in the cloud's frame [m], goes before `sensor_frame`, the frame at whose origin the camera stood. The
-    camera looked along z if the name of its frame ends in optical_frame (REP 103).
+    `view_point` is the position in the cloud's frame [m]. Without it, the camera is at the origin of `sensor_frame`.
+    The camera looks along z if the name of this frame ends in optical_frame (REP 103).
     """
 
     view_point: tuple[float, float, float] | None = None
     sensor_frame: str = ""
 
     def cloud(self, message: Any, lookup: Callable[[str, str], Float[np.ndarray, "4 4"]]) -> PointCloud:
-        """Return a sensor_msgs/PointCloud2 as its camera saw it. `lookup` gives `T_target_source` of two frames.
+        """Return the cloud of a sensor_msgs/PointCloud2 with its viewpoint. `lookup` returns `T_target_source` [m].
 
         Raises:
-            CloudError: as `points_from_message`, or the pixels show that the camera stood at another place.
+            CloudError: see `points_from_message`, or the pixels show that the camera was at another position.
             TransformError: the pose of the camera's frame is not known.
         """
         T, frame = np.eye(4), message.header.frame_id
@@ -99,14 +99,14 @@ ORIGIN = CameraPlace()
 
 
 def no_lookup(target: str, source: str) -> Float[np.ndarray, "4 4"]:
-    """Look a frame up where no transforms are known. Raises TransformError."""
+    """Raise TransformError. This is the lookup function if there are no transforms."""
     raise TransformError(f"transform {source} -> {target}: no transforms are given")
 
 
 def frame_doubt(frame: str, points: Float[np.ndarray, "n 3"]) -> str:
-    """Return a warning if points, seen from the frame's origin, contradict its name, else an empty text.
+    """Return a warning if the camera's viewing direction contradicts the frame's name, else an empty text.
 
-    By REP 103 cameras look along z in optical frames, along x in body frames.
+    The camera is at the frame's origin. By REP 103 it looks along z in optical frames and along x in body frames.
     """
     named = "z" if "optical" in frame else "x" if frame.endswith(("_link", "_frame")) else ""
     reach = np.linalg.norm(points, axis=1)
@@ -119,36 +119,36 @@ def frame_doubt(frame: str, points: Float[np.ndarray, "n 3"]) -> str:
         return ""
     meant = "body" if other == "x" else "optical"
     return (
-        f"the points lie along {other} of {frame!r}, which by its name looks along {named} (REP 103): if so, every "
-        f"grasp is turned by 90 degrees; name the camera's {meant} frame in header.frame_id"
+        f"frame {frame!r}: by its name the camera looks along {named} (REP 103), but the points lie along {other}, so "
+        f"every grasp may be turned by 90 degrees; name the camera's {meant} frame in header.frame_id"
     )
 
 
 def camera_from_message(info: Any, *, rectified: bool = False) -> PinholeCamera:
-    """Return the camera of a sensor_msgs/CameraInfo: K and distortion for a raw image, P alone for a rectified one.
+    """Return the camera of a sensor_msgs/CameraInfo: K and distortion for a raw image, P for a rectified image.
 
-    Binning and region of interest count: the camera is that of the image as sent. Raises CloudError: it is not
-    calibrated, or of an unknown distortion model.
+    The camera includes binning and region of interest, so it fits the image as sent. Raises CloudError: the camera is
+    not calibrated, or the distortion model is unknown.
     """
     # Drivers of cameras without distortion often leave P empty.
     by_projection = rectified and info.p[0] > 0
     matrix = np.array(info.p).reshape(3, 4)[:, :3] if by_projection else np.array(info.k, dtype=float).reshape(3, 3)
     if not np.isfinite(matrix).all():
-        raise CloudError(f"camera: its {'P' if by_projection else 'K'} has numbers that are not finite")
+        raise CloudError(f"camera_info: {'P' if by_projection else 'K'} is {matrix.tolist()}; valid: finite numbers")
     roi, bins = info.roi, np.array([max(info.binning_x, 1), max(info.binning_y, 1)])
     shown = matrix.copy()
     shown[:2, 2] -= roi.x_offset, roi.y_offset
     shown[:2] /= bins[:, None]
     width, height = image_size(info)
-    # Once it is taken out, its model does not matter: that of a fisheye lens is not known here.
+    # A rectified image needs no distortion model, so an unknown model, such as that of a fisheye lens, is ignored.
     distortion, model = ([], "") if rectified else (list(info.d), info.distortion_model)
     return camera_from_calibration(int(width), int(height), shown.ravel().tolist(), distortion, model)
 
 
 def image_size(message: Any) -> tuple[int, int]:
-    """Return width and height [pixels] of a depth image, packed or not, or of the images of a CameraInfo.
+    """Return width and height [pixels] of a raw or compressed depth image, or of the images of a CameraInfo.
 
-    Raises CloudError: a packed image does not say it.
+    Raises CloudError: a compressed image does not contain its size.
     """
     if hasattr(message, "roi"):
         bins = max(message.binning_x, 1), max(message.binning_y, 1)
@@ -159,7 +159,7 @@ def image_size(message: Any) -> tuple[int, int]:
 
 
 def depth_from_message(image: Any) -> DepthImage:
-    """Return the depth [m] of a sensor_msgs/Image or CompressedImage, 0 for none. Raises CloudError: no depth."""
+    """Return the depth [m] of an Image or CompressedImage, 0 for no depth. Raises CloudError: no depth image."""
     if hasattr(image, "format"):
         return depth_from_compressed(memoryview(image.data), image.format)
     return depth_from_bytes(
@@ -173,27 +173,27 @@ def depth_from_message(image: Any) -> DepthImage:
 
 
 def depth_and_camera(image: Any, info: Any, *, rectified: bool = False) -> tuple[DepthImage, PinholeCamera]:
-    """Return a depth image [m], 0 where there is none, and its camera from its sensor_msgs/CameraInfo.
+    """Return the depth image [m], 0 for no depth, and its camera from a sensor_msgs/CameraInfo.
 
     Args:
-        image: a sensor_msgs/Image of an encoding for depth, or a CompressedImage of `compressedDepth`.
-        info: the camera's calibration, for an image of the same size.
-        rectified: whether distortion has been taken out of the image.
+        image: a sensor_msgs/Image with a depth encoding, or a CompressedImage of `compressedDepth`.
+        info: calibration of the camera, for an image of the same size.
+        rectified: whether the image is rectified, that is, without distortion.
 
     Raises:
-        CloudError: the image is no depth, is broken, or is of another frame than the calibration.
+        CloudError: the image is no depth image, is broken, or has another frame than the calibration.
     """
     theirs, own = info.header.frame_id, image.header.frame_id
     if theirs and theirs.removeprefix("/") != own.removeprefix("/"):
-        raise CloudError(f"depth image in {own!r}, but its camera_info in {theirs!r}")
+        raise CloudError(f"depth image: frame {own!r}, but its camera_info has {theirs!r}")
     camera = camera_from_message(info, rectified=rectified)
     return depth_from_message(image), camera
 
 
 def cloud_from_depth_message(image: Any, info: Any, *, rectified: bool = False) -> PointCloud:
-    """Return what a depth image shows, in the camera's optical frame. The arguments are those of `depth_and_camera`.
+    """Return the point cloud of a depth image, in the camera's optical frame. See `depth_and_camera` for arguments.
 
-    Raises CloudError: as `depth_and_camera`, or the image shows nothing or does not fit the calibration.
+    Raises CloudError: see `depth_and_camera`, or the image has no depth or does not fit the calibration.
     """
     depth, camera = depth_and_camera(image, info, rectified=rectified)
     cloud = cloud_from_depth(depth, camera)
@@ -203,7 +203,7 @@ def cloud_from_depth_message(image: Any, info: Any, *, rectified: bool = False) 
 
 
 def add_transforms(buffer: TransformBuffer, message: Any, *, static: bool) -> tuple[str, ...]:
-    """Put a tf2_msgs/TFMessage into a buffer. Return a line for each invalid transform, which is left out."""
+    """Add the transforms of a tf2_msgs/TFMessage to a buffer. Skip invalid ones and return an error line for each."""
     refused = []
     for item in message.transforms:
         try:
@@ -215,14 +215,13 @@ def add_transforms(buffer: TransformBuffer, message: Any, *, static: bool) -> tu
 
 
 def _pose(transform: Any) -> Float[np.ndarray, "4 4"]:
-    """Return the matrix of a geometry_msgs/Transform, NaN if its quaternion is no rotation."""
+    """Return the matrix of a geometry_msgs/Transform. Its rotation is NaN if the quaternion has not unit length."""
     from scipy.spatial.transform import Rotation
 
     turn, move = transform.rotation, transform.translation
     quaternion = np.array([turn.x, turn.y, turn.z, turn.w])
     pose = np.eye(4)
     pose[:3, 3] = move.x, move.y, move.z
-    # A driver that leaves the quaternion at zero, or far from unit length, says nothing that could be trusted.
     usable = np.isfinite(quaternion).all() and abs(np.linalg.norm(quaternion.clip(-2, 2)) - 1) < 1e-2
     pose[:3, :3] = Rotation.from_quat(quaternion).as_matrix() if usable else np.nan
     return pose

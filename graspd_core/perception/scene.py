@@ -1,10 +1,9 @@
-"""The frozen scene: the object's mesh, its mass and its signed distance, and what stands around it.
+"""The immutable scene: the object with its mesh, mass and signed distance grid, its support and its obstacles.
 
-A scene keeps the coordinates of its file. Float32 would round an object far from the origin, as in the coordinates of a
-map: `near_scene` moves a whole scene about its object, and `moved_grasp` brings grasps back.
+A scene keeps the coordinates of its file. Float32 would round an object far from the origin, for example in map
+coordinates. `near_scene` moves such a scene near the origin, and `moved_grasp` moves grasps back.
 
-Confidence says how far the object's surface is known, as a grid beside its signed distance: 1 where it was seen, 0
-where it was guessed.
+The confidence grid has the nodes of the signed distance grid. It is 1 where the surface was seen, 0 where guessed.
 """
 
 from __future__ import annotations
@@ -62,20 +61,20 @@ def moved_grasp(grasp: Grasp, offset: Float[np.ndarray, "3"]) -> Grasp:
     return replace(grasp, **postures, contacts=tuple(map(contact, grasp.contacts)))
 
 
-# Cells from the surface within which a node looks for its vertex; every surface has nodes this near.
+# Nodes within this many cells of the surface take the confidence of their nearest vertex. Every surface has such nodes.
 _NEAR_SURFACE_CELLS = 2.0
 
 
 def confidence_grid(
     vertices: Float[np.ndarray, "vertices 3"], confidence: Float[np.ndarray, "vertices"], sdf: GridSDF
 ) -> Float[Tensor, "x y z"]:
-    """Return the confidence in the vertex nearest to each node by the surface, elsewhere of the nearest such node."""
+    """Return the confidence of the nearest vertex at nodes near the surface. Other nodes copy the nearest such node."""
     spacing = float(sdf.spacing)
     near = sdf.field[0].abs().cpu().numpy() < _NEAR_SURFACE_CELLS * spacing
     nodes = sdf.origin.cpu().numpy() + spacing * np.argwhere(near)
     grid = np.zeros(near.shape)
     grid[near] = confidence[KDTree(vertices).query(nodes)[1]]
-    # Far from the vertices a search among them costs a second; a step on the grid costs nothing.
+    # For nodes far from the surface, a search among the vertices would take a second. The distance transform is fast.
     source: Any = distance_transform_edt(~near, return_distances=False, return_indices=True)
     return torch.as_tensor(grid[tuple(source)]).to(sdf.field)
 
@@ -83,7 +82,7 @@ def confidence_grid(
 def sample_confidence(
     grid: Float[Tensor, "x y z"], sdf: GridSDF, points: Float[Tensor, "batch points 3"]
 ) -> Float[Tensor, "batch points"]:
-    """Interpolate linearly, beyond the grid from its border. Differentiable in the points."""
+    """Interpolate the confidence linearly, differentiably, at points [m]. Outside the grid, use its border value."""
     unit = points / sdf.half - (sdf.origin / sdf.half + 1)
     # grid_sample takes x for the last axis of its input.
     field = grid.permute(2, 1, 0)[None, None]
@@ -91,38 +90,38 @@ def sample_confidence(
     return sampled.reshape(points.shape[:-1])
 
 
-# Faces beyond this are smaller than the cells of a 48³ grid: nothing that it or a hand could feel, and slow to build.
+# Meshes are simplified to this number of faces. More faces would be smaller than the cells of a 48³ grid, and slow.
 MAX_FACES = 25_000
 
-# What a household thing of one litre may weigh [kg], and how that grows with its volume. The line is water's density at
-# 1.8 l, and that of solid steel at 0.03 l: large things are hollow or light inside, and small ones may be metal. Of the
-# ten YCB scans that it was fitted on, none is heavier. The heaviest, drill and hammer, reach 0.87 and 0.97 of it.
+# Assumed mass of a household object of one litre [kg], and exponent of its volume. The curve has water's density at 1.8
+# l and solid steel's at 0.03 l, because large objects are hollow or light and small ones may be metal. None of the ten
+# YCB scans of the fit is heavier. The heaviest, drill and hammer, reach 0.87 and 0.97 of the curve.
 HEAVY_LITRE, HEAVY_GROWTH = 1.35, 0.5
 
-# How a surface is cut into convex parts that is known to millimetres only, from cameras or by guess.
+# Settings for cutting reconstructed or guessed surfaces into convex parts. They are accurate to millimetres only.
 COARSE_CUTS: dict[str, Any] = {"tolerance": 0.003, "max_parts": 32, "surface_points": 2000}
-# How many places of it are looked at for sharp ones.
+# Number of surface points of a reconstructed object that are searched for sharp points.
 _COARSE_POOL = 2000
 
 
 @dataclass(frozen=True)
 class ObjectModel:
-    """The thing to grasp, in its own frame (that of its mesh as loaded, after scaling).
+    """The object to grasp, in the object frame (the frame of its mesh as loaded, after scaling).
 
     Attributes:
-        source: where it came from, for messages.
+        source: origin of the object, such as its file, for messages.
         sha256: hash of the cleaned mesh's content.
-        mesh: the cleaned surface [m].
+        mesh: the cleaned mesh [m].
         volume: enclosed volume [m³].
-        mass: [kg].
-        mass_assumed: whether nobody gave the mass, so that it is the heavy end of what the volume allows.
-        center_of_mass: [m].
-        inertia: about the centre of mass, mesh axes [kg·m²].
-        friction: Coulomb coefficient against the hand.
-        scale: factor that the file's coordinates were multiplied by.
+        mass: mass [kg].
+        mass_assumed: whether no mass was given, so that the mass is `heavy_mass` of the volume.
+        center_of_mass: centre of mass [m].
+        inertia: inertia about the centre of mass, along the mesh axes [kg·m²].
+        friction: Coulomb friction coefficient between object and hand.
+        scale: factor by which the file's coordinates were multiplied.
         radius: distance from the centre of mass to the farthest vertex [m].
-        warnings: what was found wrong with the input, one sentence each.
-        reconstructed: whether the mesh was made of what cameras saw.
+        warnings: problems found in the input, one sentence each.
+        reconstructed: whether the mesh was reconstructed from camera data.
     """
 
     source: str
@@ -140,17 +139,17 @@ class ObjectModel:
     mass_assumed: bool = False
 
     def at_mass(self, mass: float) -> ObjectModel:
-        """Return the same object of another mass [kg], spread as before."""
+        """Return the object with another mass [kg] and proportional inertia."""
         return replace(self, mass=float(mass), inertia=self.inertia * (mass / self.mass))
 
 
 @dataclass(frozen=True)
 class Obstacle:
-    """A thing that the hand must not touch.
+    """A body that the hand must not touch.
 
     Attributes:
-        mesh: its closed surface, in the object's frame [m].
-        sdf: its signed distance.
+        mesh: closed surface, object frame [m].
+        sdf: signed distance grid of the body.
     """
 
     mesh: TriangleMesh
@@ -159,16 +158,16 @@ class Obstacle:
 
 @dataclass(frozen=True, eq=False)
 class Scene:
-    """What a grasp is planned against, all in the object's frame.
+    """The scene to plan grasps in, in the object frame.
 
     Attributes:
-        object: the thing to grasp.
-        sdf: its signed distance.
-        timing: seconds taken by loading and by the distance field.
-        support: what the object stands on, if anything. Gravity points against its normal.
-        obstacles: other things, only those that the hand could reach.
-        confidence: how far the surface nearest to each node of `sdf` was seen, 1, or guessed, 0. None: all of it known.
-        evidence: of what else may be true of an object that cameras saw. None for a mesh.
+        object: the object to grasp.
+        sdf: signed distance grid of the object.
+        timing: time for loading and time for building the distance grid [s].
+        support: plane that the object stands on, or None. Gravity points against its normal.
+        obstacles: other bodies that the hand could reach.
+        confidence: at each node of `sdf`, 1 if the nearest surface was seen, 0 if guessed. None if all is known.
+        evidence: camera evidence for other possible shapes of the object. None for a mesh.
     """
 
     object: ObjectModel
@@ -196,19 +195,19 @@ def build_scene(
     confidence: Float[np.ndarray, "vertices"] | None = None,
     ahead: Callable[[ObjectModel], None] | None = None,
 ) -> Scene:
-    """Build the scene of a mesh already in metres.
-
-    Its callers check the numbers (`refuse_numbers`). `scale` is what its file was multiplied by, for record and advice.
+    """Build the scene of a mesh in metres. Callers must check the numbers (`refuse_numbers`).
 
     Args:
-        mass: [kg]. None assumes the most that a thing of its volume may weigh (`heavy_mass`), and warns of it.
-        support: what the object stands on.
-        obstacles: other things near it.
-        confidence: how far each of the mesh's vertices was seen, 1, or guessed, 0. None where all of it is known.
-        ahead: called with the object before its distance grid is built, to begin what does without.
+        mesh: surface of the object [m].
+        mass: mass of the object [kg]. None assumes `heavy_mass` of its volume and adds a warning.
+        scale: factor by which the file's coordinates were multiplied, for the record and for messages.
+        support: plane that the object stands on, or None.
+        obstacles: other bodies near the object.
+        confidence: confidence at each vertex, 1 if seen, 0 if guessed. None if all of the surface is known.
+        ahead: called with the object before its distance grid is built, to start work that does not need the grid.
 
     Raises:
-        MeshError: see `load_scene`, or there is not one confidence for every vertex.
+        MeshError: see `load_scene`, or the number of confidences differs from the number of vertices.
     """
     if confidence is not None and len(confidence) != len(mesh.vertices):
         raise MeshError(
@@ -237,9 +236,9 @@ def build_scene(
 
 
 def object_sdf(model: ObjectModel, resolution: int = 48) -> GridSDF:
-    """Return the signed distance of an object near the origin (float32, CPU) on at most `resolution`³ nodes.
+    """Return the signed distance grid (float32, CPU) of an object near the origin, with at most `resolution`³ nodes.
 
-    Remembered by content.
+    The grid is cached by the mesh's content.
     """
 
     def build() -> cache.Arrays:
@@ -260,7 +259,7 @@ def object_sdf(model: ObjectModel, resolution: int = 48) -> GridSDF:
 
 
 def object_sharp_points(model: ObjectModel, count: int) -> tuple[Float[np.ndarray, "points 3"], float]:
-    """Return the object's sharp points [m] and its share of thin surface (`sharp_points`), remembered by content."""
+    """Return the object's sharp points [m] and its fraction of thin surface (`sharp_points`), cached by content."""
     coarse = {"pool": _COARSE_POOL} if model.reconstructed else {}
 
     def build() -> cache.Arrays:
@@ -275,14 +274,14 @@ def object_sharp_points(model: ObjectModel, count: int) -> tuple[Float[np.ndarra
 
 
 def object_parts(model: ObjectModel) -> tuple[TriangleMesh, ...]:
-    """Convex parts that together fill the object and leave its hollows hollow, remembered by content.
+    """Return a convex decomposition of the object that keeps its hollows, cached by content.
 
-    Those of a reconstructed object are coarser: cameras do not see it finer than that.
+    For a reconstructed object the parts are coarser, like the camera data.
     """
     cuts = COARSE_CUTS if model.reconstructed else {}
 
     def build() -> cache.Arrays:
-        # Some tenths of a second of Python's own work, beside the optimiser.
+        # This takes some tenths of a second. It runs in a child process, in parallel with the optimiser.
         parts = run_isolated(convex_parts, model.mesh, object_sdf(model), **cuts)
         return {f"{kind}{i}": getattr(part, kind) for i, part in enumerate(parts) for kind in ("vertices", "faces")}
 
@@ -295,10 +294,10 @@ def object_parts(model: ObjectModel) -> tuple[TriangleMesh, ...]:
 
 
 def near_scene(scene: Scene) -> tuple[Scene, Float[np.ndarray, "3"]]:
-    """Return a scene about its object, and where its origin lies in the scene given [m].
+    """Return the scene moved near the origin, and the new origin in the given scene's frame [m].
 
-    The origin moves for an object farther from it than a hundred times its size: float32 could not tell a contact there
-    from a gap, and MuJoCo finds none. Otherwise this is the scene itself, and zero.
+    The scene moves only if the object is farther from the origin than a hundred times its size. There float32 could not
+    distinguish contacts from gaps, and MuJoCo finds no contacts. Otherwise return the scene itself and zero.
     """
     far = far_centre(scene.object.mesh.vertices)
     if not far.any():
@@ -352,7 +351,7 @@ def _object_model(mesh, source, mass, friction, scale, warnings, reconstructed) 
 
 
 def heavy_mass(volume: float) -> float:
-    """Return the most that a household thing of a volume [m³] may weigh [kg], full or hollow, metal or not."""
+    """Return the greatest mass [kg] that a household object of this volume [m³] may have, of any material."""
     return HEAVY_LITRE * (1e3 * volume) ** HEAVY_GROWTH
 
 

@@ -1,4 +1,4 @@
-"""From what depth cameras saw to a scene: the object cut out and made whole, and what stands in the hand's way."""
+"""Scenes from depth camera views: segment the object, reconstruct its surface, and build the obstacles around it."""
 
 from __future__ import annotations
 
@@ -22,9 +22,9 @@ from graspd_core.perception.segment.target_selection import Target
 from graspd_core.runtime.worker_process import run_isolated
 from graspd_core.types import Plane, TriangleMesh
 
-# From here on numbers of 32 bits are coarser than a camera [m].
+# From this distance to the origin on, float32 coordinates are coarser than a camera [m].
 _FAR = 100.0
-# Depth cameras see nothing nearer [m]. Where more than this share of a scene is too far, it is not one on a table.
+# Least range of depth cameras [m], and fraction of points out of range above which the unit of a scene is doubtful.
 _NEAREST, _CUT_OFF = 0.1, 0.3
 
 
@@ -41,27 +41,27 @@ def scene_from_views(
     device: torch.device | str = "cpu",
     ahead: Callable[[ObjectModel, Evidence], None] | None = None,
 ) -> Scene:
-    """Build the scene that one or several views show, in their common frame. Its warnings tell what was guessed.
+    """Build a scene from one or several views, in their common frame. Its warnings name what was guessed.
 
     Args:
-        views: what each camera saw [m]. Points may be NaN.
-        target: which of the things seen is meant. Without it, the one nearest the first view's axis.
-        alone: the views show the object and nothing else, so that all they show is taken.
-        settings: of segmentation, reconstruction and obstacles.
-        mass: [kg]. None assumes the heavy end of what the volume allows, and warns of it.
-        friction: Coulomb coefficient between hand and object.
+        views: point cloud of each camera [m]. Points may be NaN.
+        target: selects the object. Without a target, take the object nearest the first view's optical axis.
+        alone: whether the views show only the object, so that all points belong to it.
+        settings: settings for segmentation, reconstruction and obstacles.
+        mass: mass of the object [kg]. None assumes `heavy_mass` of its volume and adds a warning.
+        friction: Coulomb friction coefficient between hand and object.
         source: name of the views, for messages.
-        resolution: the distance grid has at most the cube of it in nodes.
-        ahead: called as soon as the object is known, before its distance grid is built, to begin what does without.
+        resolution: the distance grid has at most `resolution`³ nodes.
+        ahead: called with object and evidence before the distance grid is built, to start work that does not need it.
 
     Raises:
-        CloudError: the views show no usable object. It is a NoObjectError where what was asked for is not in them.
-        MeshError: the object they show is too small or too large, or a number is out of range.
+        CloudError: the views show no usable object. If they do not show the target, it is a NoObjectError.
+        MeshError: the object is too small or too large, or a number is out of range.
     """
     started = time.perf_counter()
     refuse_numbers(source, mass=mass, friction=friction, resolution=resolution)
     settings = settings or SceneConfig()
-    # The child, where there is one, is free for other work while the distance grid is built here.
+    # The distance grid is built in this process, so that the child process is free for other work.
     whole, support, obstacles, warnings = run_isolated(reconstruct_object, views, target, alone, settings)
     scene = build_scene(
         whole.mesh,
@@ -83,12 +83,12 @@ def scene_from_views(
 def reconstruct_object(
     views: Sequence[PointCloud], target: Target | None, alone: bool, settings: SceneConfig
 ) -> tuple[Reconstruction, Plane | None, tuple[Obstacle, ...], tuple[str, ...]]:
-    """Return the surface of the object, what it stands on, what stands about it, and how surely it was cut out.
+    """Return the object's reconstructed surface, its support, its obstacles and the warnings.
 
     Raises:
-        CloudError: as `segment` and `reconstruct`, or a camera cannot have stood where it is said to.
+        CloudError: see `segment` and `reconstruct`, or a camera cannot have been at its stated position.
     """
-    # The same cloud in numbers of 32 and of 64 bits is the same scene.
+    # Round to float32, so that a cloud gives the same scene in float32 and float64.
     views = [replace(view, points=_single(view.points)) for view in views]
     alone = alone or _is_whole_object(views)
     if alone:
@@ -103,13 +103,12 @@ def reconstruct_object(
 
 
 def _single(points: Points) -> Points:
-    """Points rounded to 32 bits [m], unless they are too far from the origin for those."""
     near = np.abs(points[np.isfinite(points)]).max(initial=0.0) < _FAR
     return points.astype(np.float32).astype(float) if near else points
 
 
 def _doubts(seen: Segmentation, views: Sequence[PointCloud], farthest: float) -> tuple[str, ...]:
-    """Why what is seen may not be what was there: nothing that is planned on it counts as verified."""
+    """Return reasons to doubt unit, cameras or segmentation. If there is a reason, no grasp counts as verified."""
     return (*_unit_doubts(seen, views, farthest), *_camera_doubts(seen, views), *filter(None, (seen.beside,)))
 
 
@@ -136,12 +135,12 @@ def _camera_doubts(seen: Segmentation, views: Sequence[PointCloud]) -> tuple[str
         if _needs_no_camera(seen.views):
             return ()
         raise
-    # Views of several sides explain each other.
+    # Views from several sides confirm each other.
     return tuple(told) if len(told) == 1 and told[0] and not _needs_no_camera(seen.views) else ()
 
 
 def _is_whole_object(views: Sequence[PointCloud]) -> bool:
-    """Check the cameras of a scene. Tell whether the one that fails shows an object from all round instead."""
+    """Check the camera positions. Return True if the check fails because the only cloud shows all sides."""
     try:
         check_scene(views)
     except CloudError:
@@ -152,7 +151,7 @@ def _is_whole_object(views: Sequence[PointCloud]) -> bool:
 
 
 def _needs_no_camera(views: Sequence[PointCloud]) -> bool:
-    """Tell whether one cloud shows its object from all round."""
+    """Return True if the only view has no camera pose and shows its object from all sides."""
     first = views[0]
     all_round = len(views) == 1 and is_unposed(first, first.forward is not None)
     return all_round and (fits_nowhere(first) or is_all_round(first))

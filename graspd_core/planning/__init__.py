@@ -1,1 +1,1 @@
-"""A run: its rounds, its restrictions, and the reasons why an object cannot be held."""
+"""Planning of a run: its rounds, its restrictions, and the reasons why an object cannot be held."""

@@ -1,8 +1,8 @@
-"""The next object of a scene: of all objects seen, one with a sure grasp, else the surest ones.
+"""Planning for any object of a scene: find one object with a verified grasp, else rank the objects by probability.
 
-Objects without failures come first, then the highest, since nothing lies on them. An object without failures gets one
-round of the planner. The first verified grasp ends the search. Else it ends after `enough` objects if one
-of them has a likely grasp, so that a request for any of many objects mostly costs no more than one for two of them.
+Objects with fewer earlier failures come first. Among equals, higher objects come first, because nothing lies on them.
+An object without failures gets one round of the planner. The first verified grasp ends the search. After `enough`
+objects, a likely grasp also ends the search, to limit its time.
 """
 
 from __future__ import annotations
@@ -29,25 +29,25 @@ from graspd_core.perception.segment.target_selection import Target
 from graspd_core.planning.plan_grasps import plan_grasps
 from graspd_core.types import Grasp, GraspResult, Plane, Posture, TriangleMesh, Verdict
 
-# A grasp is like one that was lost where its base is this near to it and turned by less [m], [rad].
+# Two grasps are alike if their bases differ by less than this distance [m] and this angle [rad].
 LIKE_DISTANCE, LIKE_TURN = 0.015, 0.26
-# Why a thing is not looked at any more.
+# Why an object is skipped.
 OUT_OF_TRIES = "tried in vain too often"
-# What is seen within this of a place where something failed is that thing [m].
+# An object within this distance of an earlier failure's place is the same object [m].
 _SAME_PLACE = 0.04
-# Of a likely grasp.
+# Least probability of a likely grasp.
 _LIKELY = 0.5
-# Nearly all points of a known solid that stray off it are within this of its surface [m], also at edges.
+# Points are of a known solid if this fraction of them is within this distance of its surface [m].
 _STRAY, _NEARLY_ALL = 0.016, 0.9
 
 
 @dataclass(frozen=True, eq=False)
 class Failure:
-    """A grasp that failed, or an object without one.
+    """An earlier failed try: a grasp that failed, or an object for which no grasp was found.
 
     Attributes:
-        place: the middle of the object's points [m].
-        grasp: its posture at the grasp, None if none was tried.
+        place: mean of the object's points [m].
+        grasp: hand posture at the failed grasp. None if no grasp was tried.
     """
 
     place: Float[np.ndarray, "3"]
@@ -59,12 +59,12 @@ class ThingPlan:
     """The plan for one object of a scene.
 
     Attributes:
-        points: that show it [m].
-        scene: the object among the others, None if none could be made.
-        result: of planning, None without a scene.
-        grasp: the best one, verified or not, None for none.
-        reason: why there is no verified grasp, empty if there is one.
-        looked_at: whether a grasp was looked for in this request.
+        points: points of the object [m].
+        scene: scene of the object with its obstacles. None if it could not be built.
+        result: result of planning. None without a scene.
+        grasp: the best grasp, verified or not. None if there is none.
+        reason: why there is no verified grasp. Empty if there is one.
+        looked_at: whether this request tried to find a grasp for the object.
     """
 
     points: Float[np.ndarray, "_ 3"]
@@ -76,17 +76,17 @@ class ThingPlan:
 
     @property
     def place(self) -> Float[np.ndarray, "3"]:
-        """The middle of its points [m]."""
+        """Mean of the object's points [m]."""
         return self.points.mean(0)
 
     @property
     def is_likely(self) -> bool:
-        """Whether its grasp holds likelier than not, as far as anybody weighed that."""
+        """Whether the grasp's probability is at least 0.5 or unknown. False without a grasp."""
         return self.grasp is not None and (self.grasp.probability is None or self.grasp.probability >= _LIKELY)
 
     @property
     def surety(self) -> float:
-        """Probability that its grasp holds, more than one for a verified grasp, less than zero for none."""
+        """Probability that the grasp holds, plus 1 if it is verified. -1 without a grasp."""
         if self.grasp is None:
             return -1.0
         return (self.grasp.probability or 0.0) + float(self.grasp.verdict is Verdict.VERIFIED)
@@ -106,23 +106,22 @@ def plan_any_thing(
     on_thing: Callable[[ThingPlan], None] | None = None,
     **plan: Any,
 ) -> tuple[ThingPlan, ...]:
-    """Plan for the objects seen until one has a verified grasp, and return all of them, the surest first.
+    """Plan for one object after the other until one has a verified grasp. Return all objects, by descending `surety`.
 
     Args:
-        views: what each camera saw [m].
-        hand: that grasps.
-        settings: of the way from clouds to scenes.
-        surface: what all objects stand on, if it is known.
-        solids: what else is known to stand there, by name, frame of the views [m]. It is not an object.
-        failures: of before. An object is skipped after `tries` of them, and grasps like them are left out.
-        tries: the most tries for an object.
-        seconds: after which no further object is begun.
-        enough: after so many objects, none with a verified grasp, the surest grasp is taken if it is likely.
-        on_thing: called with each object that was looked at.
-        plan: of `plan_grasps`. Its `seed` is advanced with every failure of an object.
+        views: point cloud of each camera, in one frame [m].
+        settings: settings for segmentation, reconstruction and obstacles.
+        surface: support plane of all objects, if it is known.
+        solids: known solids by name, in the frame of the views [m]. They are obstacles and never grasped.
+        failures: failures of earlier requests. Grasps like the failed ones are left out.
+        tries: an object with this many failures is skipped.
+        seconds: time after which no further object is planned for [s].
+        enough: number of objects after which a likely grasp ends the search.
+        on_thing: called with each object that was planned for.
+        plan: keyword arguments of `plan_grasps`. `seed` is increased by the object's number of failures.
 
     Raises:
-        CloudError: empty, all NaN, or too few points.
+        CloudError: a cloud is empty, all NaN, or has too few points.
         ConfigError: see `plan_grasps`.
     """
     began, things, over = time.perf_counter(), list[ThingPlan](), False
@@ -143,7 +142,7 @@ def plan_any_thing(
 
 
 def _is_solid(points: Float[np.ndarray, "_ 3"], solids: Mapping[str, Sequence[TriangleMesh]]) -> bool:
-    """Whether some points are strays of a known solid."""
+    """Return True if nearly all points lie on the surface of a known solid."""
     meshes = [mesh for solid in solids.values() for mesh in solid]
     away = (surface_distance(make_surface(mesh), points) for mesh in meshes)
     return any(float(np.quantile(one, _NEARLY_ALL)) < _STRAY for one in away)
@@ -165,8 +164,8 @@ def _scene_among(
     surface: Plane | None,
     solids: Mapping[str, Sequence[TriangleMesh]] | None,
 ) -> Scene | str:
-    """Return the scene of the object that some points show, or the error."""
-    # A point of the thing itself: the middle of a ring is empty.
+    """Return the scene of the object with these points, or the message of the error."""
+    # The target is a point on the object, because the middle of a ring is empty.
     middle = points[np.linalg.norm(points - points.mean(0), axis=1).argmin()]
     try:
         scene = scene_from_views(views, target=Target(point=middle), settings=settings)
@@ -199,7 +198,7 @@ def _thing_plan(
 
 
 def unlike(grasps: Sequence[Grasp], lost: Sequence[Posture]) -> list[Grasp]:
-    """Return the grasps that are not like any of those that were lost."""
+    """Return the grasps that are not like any posture in `lost` (within 15 mm and 0.26 rad)."""
     return [grasp for grasp in grasps if not any(_alike(grasp.grasp, posture) for posture in lost)]
 
 

@@ -1,9 +1,9 @@
-"""Why an object cannot be held, in words that a user can act on: before any search, and after failed trials.
+"""Reasons why an object cannot be held, as advice for users: before any search, and after failed trials.
 
-A necessary condition of every grasp, from statics alone: contact forces that cancel cannot all point into one open
-half-space. All contacts of a hand lie within its span of each other. Nothing can be held if in every such patch of the
-object no force of the friction cones opposes the others. Rims, handles, walls and thin plates have opposing normals
-next to each other and pass.
+The check before the search is a necessary condition from statics. Balanced contact forces cannot all point into one
+open half-space. The distance between any two contacts is at most the hand's span. The object cannot be held if, in
+every patch of this size, all friction-cone forces lie in one half-space. Rims, handles, walls and thin plates have
+opposing normals next to each other and pass.
 """
 
 from __future__ import annotations
@@ -25,26 +25,26 @@ from graspd_core.mesh.topology import packed_rows, scaled_normals
 from graspd_core.perception.scene import Scene
 from graspd_core.types import Grasp, Verdict
 
-# The roughest surface that a trial believes in. See `verify.world.at_friction`.
+# Greatest friction that trials use. See `verify.world.at_friction`.
 _MOST_FRICTION = 0.6
-# Points of the surface. Beside them go the middles of all faces, so that no small handle is missed.
+# Number of surface samples. All face centres are added, so that no small handle is missed.
 _SAMPLES = 4000
-# Directions that the object's width is looked at along.
+# Number of directions in which the object's width is measured.
 _DIRECTIONS = 400
-# Steps of the search for a direction that all forces of a patch point away from.
+# Greatest number of steps in the search for a separating direction.
 _STEPS = 60
-# Reasons of failed trials that are told.
+# Number of failure reasons in a message.
 _REASONS_TOLD = 3
-# An object is low on its support where most contacts press on it from above, 30° and more, and it is no higher than
-# fingers are thick [m].
+# An object is low if most contact normals have at least this cosine to the vertical, and if it is at most this high
+# [m].
 _FROM_ABOVE, _LOW = 0.5, 0.03
 
 
 def out_of_reach(scene: Scene, hand: HandModel) -> str:
-    """Return why the hand can hold the object nowhere, as a sentence, empty if it may."""
+    """Return a sentence that says why the hand cannot hold the object anywhere. Empty if it may be able to."""
     span, opening = reach_of(hand)
     vertices = scene.object.mesh.vertices
-    # What fits along an axis, as most things do, needs no closer look.
+    # Most objects fit into the hand along an axis and need no further check.
     if float(np.ptp(vertices, axis=0).min()) <= span:
         return ""
     points, normals = _surface(scene)
@@ -62,7 +62,7 @@ def out_of_reach(scene: Scene, hand: HandModel) -> str:
 
 
 def why_trials_failed(scene: Scene, grasps: Sequence[Grasp]) -> str:
-    """Return the reasons of failed trials, most frequent first, and a remedy, empty without failures."""
+    """Return the reasons of failed trials, most frequent first, and advice. Empty without failures."""
     failed = [grasp for grasp in grasps if grasp.verdict is Verdict.FAILED and grasp.reason]
     if not failed:
         return ""
@@ -82,16 +82,16 @@ def why_trials_failed(scene: Scene, grasps: Sequence[Grasp]) -> str:
 
 
 def kind_of(reason: str) -> str:
-    """Return a reason without its figures and directions, so that like ones can be counted."""
+    """Return a failure reason without its numbers and directions, so that equal kinds can be counted."""
     for figures in (r"\([^()]*\d[^()]*\)", r"(by )?[-+]?\d+(\.\d+)?(e[-+]?\d+)?( ?°| ?[cm]?m\b)?", r"along [-+][xyz]"):
         reason = re.sub(figures, " ", reason)
     return re.sub(r" (?=[;,.:])", "", " ".join(reason.split()))
 
 
-# Kept for the last few hands, which are hashed by identity.
+# The cache keeps the last few hands. They are hashed by identity.
 @lru_cache(maxsize=8)
 def reach_of(hand: HandModel) -> tuple[float, float]:
-    """Return the greatest distance of two points of the open hand, and the widest gap between two fingertips [m]."""
+    """Return the open hand's greatest distance between contact candidates and widest gap between fingertips [m]."""
     poses = forward(make_kinematics(hand, dtype=torch.float64), torch.as_tensor(hand.open_posture)[None])
     links = poses[0, torch.as_tensor(hand.candidate_link)]
     points = (links.rotation @ torch.as_tensor(hand.candidate_points)[..., None]).squeeze(-1) + links.translation
@@ -102,12 +102,12 @@ def reach_of(hand: HandModel) -> tuple[float, float]:
 
 
 def _surface(scene: Scene) -> tuple[Float[np.ndarray, "n 3"], Float[np.ndarray, "n 3"]]:
-    """Return points of the object's surface and their outward unit normals."""
+    """Return points on the object's surface [m] and their outward unit normals."""
     mesh = scene.object.mesh
     points, normals = surface_samples(mesh, _SAMPLES, seed=0)
     across = scaled_normals(mesh.vertices, mesh.faces)
     doubled = np.linalg.norm(across, axis=-1)
-    # A face without area has no normal.
+    # A face with zero area has no normal.
     real = doubled > 1e-12
     middles, across = mesh.vertices[mesh.faces[real]].mean(1), across[real] / doubled[real, None]
     return np.concatenate([points, middles]), np.concatenate([normals, across])
@@ -116,17 +116,17 @@ def _surface(scene: Scene) -> tuple[Float[np.ndarray, "n 3"], Float[np.ndarray, 
 def _one_sided(
     points: Float[np.ndarray, "n 3"], normals: Float[np.ndarray, "n 3"], radius: float, least: float
 ) -> bool:
-    """Tell whether in every patch of `radius` [m] one direction separates all forces from their opposites."""
+    """Return True if in every patch of `radius` [m] all friction-cone forces lie in one half-space (`_separated`)."""
     tree = KDTree(points)
     _, first = np.unique(packed_rows(np.round(points / (radius / 4)).astype(np.int64)), return_index=True)
     return all(_separated(normals[tree.query_ball_point(points[k], radius)], least) for k in first)
 
 
 def _separated(normals: Float[np.ndarray, "n 3"], least: float) -> bool:
-    """Tell whether one direction a has n·a > `least`, the sine of the friction angle, for all normals n.
+    """Return True if a unit direction a has n·a > `least`, the sine of the friction angle, for all normals n.
 
-    The best one is along the point of their convex hull that is nearest to the origin. Gilbert's steps go there (SIAM
-    J. Control 1966), and end where its distance is too small for any direction.
+    The best direction points to the point of the normals' convex hull that is nearest to the origin. Gilbert's
+    algorithm (SIAM J. Control 1966) finds it. The search ends early once the distance is too small for any direction.
     """
     nearest = normals.mean(0)
     for _ in range(_STEPS):

@@ -1,4 +1,4 @@
-"""Plan grasps: a scene and a hand in, ranked and verified grasps out."""
+"""Grasp planning: find, verify and rank grasps of a scene's object by a hand."""
 
 from __future__ import annotations
 
@@ -43,15 +43,15 @@ from graspd_core.verify.limits import LEAST_PAYLOAD
 from graspd_core.verify.run_clock import Run, result_of
 from graspd_core.verify.verification import payloads, rank_by_robustness, trials_ahead
 
-# Grasps that are weighed where none of them is verified.
+# Number of grasps whose payload is measured if none is verified.
 _WEIGHED = 8
 
 
 def planning_scene(scene: Scene, resolution: int) -> tuple[Scene, Float[np.ndarray, "3"]]:
-    """Return the scene as it is planned on (`near_scene`), and its origin in the given scene [m].
+    """Return the scene for planning, moved near the origin (`near_scene`), and its origin in the given scene [m].
 
-    A distance grid of another resolution, or of a far object, whose nodes float32 rounded, is built anew. Raises
-    ConfigError: no such resolution.
+    The distance grid is rebuilt if its resolution differs, or if the scene was moved, because float32 rounded its
+    nodes. Raises ConfigError: the resolution is out of range.
     """
     if not 8 <= resolution <= 256:
         raise ConfigError(f"resolution: {resolution} nodes; valid: 8 to 256")
@@ -91,23 +91,23 @@ def plan_grasps(
     """Plan grasps and try them in rank order until `count` pass all trials of the scene.
 
     Args:
-        scene: from `load_scene` or `scene_from_views`. Another grid is built if the preset asks for it.
-        hand: from `load_hand`. It gets as many contact candidates as the preset asks for.
-        count: verified grasps wanted.
-        seed: same seed, same machine, same grasps.
-        preset: a preset's name, a preset file, or the settings themselves.
-        verify: "standard" or "hard" trials, which "full" and "hard_full" run to the end, or "none".
-        deadline: seconds from now after which the run ends with what it has.
-        device: of the optimiser's tensors.
-        restrictions: further conditions on grasps. Refused candidates are counted in `refused`.
-        measure: whether grasps get their metrics, except failed ones. Measuring takes longer than a trial.
+        scene: scene from `load_scene` or `scene_from_views`. Its distance grid is rebuilt if the preset needs another.
+        hand: hand from `load_hand`. It gets the number of contact candidates that the preset asks for.
+        count: number of verified grasps to find.
+        seed: random seed. The same seed on the same machine gives the same grasps.
+        preset: name of a preset, a preset file, or the settings.
+        verify: "standard" or "hard" trials, "full" or "hard_full" for the same without early stop, or "none".
+        deadline: time after which the run ends with the grasps found so far [s]. None for no limit.
+        device: torch device of the optimiser.
+        restrictions: further conditions on grasps. The result's `refused` counts the refused candidates.
+        measure: whether to measure the metrics of grasps that did not fail. Measuring takes longer than a trial.
         progress: called from this thread with `Progress` values.
-        watch: called from this thread with the hands that the run works on.
-        stop: polled, true ends the run within one optimiser step or a tenth of a simulated second.
+        watch: called from this thread with `Snapshot` values, the hands that the run is working on.
+        stop: polled hook. If it returns true, the run ends within one optimiser step or 0.1 s of simulated time.
 
     Raises:
         ConfigError: count, seed, verify, deadline, device, preset or a restriction is not valid.
-        ResourceError: the machine has too little memory for so many grasps.
+        ResourceError: the machine has too little memory for this number of grasps.
     """
     config = load_preset(preset) if isinstance(preset, str) else preset
     request: dict[str, Any] = {"count": count, "seed": seed, "device": device}
@@ -137,7 +137,7 @@ def plan_grasps(
 def _prepared(
     run: Run, scene: Scene, hand: HandModel, config: PlanConfig, verify: str, bound: BoundRestrictions
 ) -> tuple[Scene, HandModel, str, list[PlanConfig]]:
-    """Return scene and hand as planned on, why nothing can be held, and the rounds, none for a run that is over."""
+    """Return scene and hand for planning, why no grasp is possible (else empty), and the settings of the rounds."""
     if run.over():
         return scene, hand, "", []
     scene, run.origin = planning_scene(scene, config.resolution)
@@ -153,7 +153,7 @@ def _ranked(run: Run, found: RoundsResult, config: PlanConfig, seed: int) -> tup
 
 
 def on_surface(scene: Scene, grasps: Sequence[Grasp]) -> tuple[Grasp, ...]:
-    """Return the grasps with contacts and normals on the object's mesh. A search has those of its grid."""
+    """Return the grasps with contacts and normals moved from the distance grid to the object's mesh."""
     contacts = [contact for grasp in grasps for contact in grasp.contacts]
     if not contacts:
         return tuple(grasps)
@@ -184,7 +184,7 @@ def _why_few(run: Run, scene: Scene, bound: BoundRestrictions, found: RoundsResu
 
 
 def _less_sure(scene: Scene, far: Float[np.ndarray, "3"], result: GraspResult) -> GraspResult:
-    """Return a result without a sure grasp, with the next best view of the hidden side."""
+    """Return the result of a run without a verified grasp, with a message and, if possible, the next best view."""
     held = sum(grasp.verdict is Verdict.UNVERIFIED for grasp in result.tried)
     if scene.evidence is None or not held:
         return result
@@ -202,7 +202,7 @@ def _less_sure(scene: Scene, far: Float[np.ndarray, "3"], result: GraspResult) -
 
 
 def _timing(run: Run, scene: Scene, found: RoundsResult) -> Timing:
-    """Return the seconds of each stage. Loading took place before the run began."""
+    """Return the time of each stage [s]. Loading took place before the run began."""
     elapsed, (load, sdf) = time.perf_counter() - run.began, scene.timing
     optimise = found.began - run.began + found.optimise_time
     return Timing(
@@ -216,7 +216,7 @@ def _timing(run: Run, scene: Scene, found: RoundsResult) -> Timing:
 
 
 def check_request(*, count: int, seed: int, verify: str, deadline: float | None, device: str) -> None:
-    """Refuse what `plan_grasps` would refuse, without a scene. Raises ConfigError: names the valid values."""
+    """Check arguments of `plan_grasps` without a scene. Raises ConfigError: a value is not valid."""
     if not 1 <= count <= 1024:
         raise ConfigError(f"count: {count} grasps; valid: 1 to 1024")
     if not 0 <= seed < 2**63:
@@ -224,7 +224,7 @@ def check_request(*, count: int, seed: int, verify: str, deadline: float | None,
     if verify not in VERIFICATIONS:
         raise ConfigError(f"verify: {verify!r}; valid: {', '.join(VERIFICATIONS)}")
     if deadline is not None and not deadline > 0:
-        raise ConfigError(f"deadline: {deadline} s; it must be positive")
+        raise ConfigError(f"deadline: {deadline} s; valid: above 0")
     devices = ["cpu", *(["cuda"] if torch.cuda.is_available() else [])]
     devices += [f"cuda:{index}" for index in range(torch.cuda.device_count())]
     if device not in devices:
@@ -232,10 +232,10 @@ def check_request(*, count: int, seed: int, verify: str, deadline: float | None,
 
 
 def warm_up(hand: HandModel, stop: StopHook | None = None) -> None:
-    """Do the first-use work of all libraries on a small sphere, so that the first request is as fast as others.
+    """Plan once on a small sphere, so that all libraries are loaded and the first request is as fast as later ones.
 
-    For a process that serves. It starts the child process for `run_isolated` and for cutting objects into convex parts,
-    so that other threads go on.
+    Servers call this at start. It also starts the child process that `run_isolated` uses, for example to cut objects
+    into convex parts while other threads go on.
     """
     from graspd_core.perception.scene_from_views import scene_from_views
 

@@ -1,4 +1,4 @@
-"""Regions of space: boxes, balls and neighbourhoods of points. Also checks whether a link enters a box."""
+"""Regions of space: boxes, spheres and neighbourhoods of points. Also checks whether a link enters a box."""
 
 from __future__ import annotations
 
@@ -21,12 +21,12 @@ from graspd_core.perception.scene import Obstacle, Scene
 from graspd_core.se3 import SE3, rotation_from_quaternion
 from graspd_core.types import Posture, TriangleMesh
 
-# A few numbers, as a caller may write them.
+# A short sequence of numbers, in any form that callers may use.
 Numbers = Sequence[float | int] | np.ndarray
 
 
 def numbers(name: str, given: Any, count: int) -> tuple[float, ...]:
-    """Return `count` finite numbers. Raises ConfigError otherwise, with the name of what was given."""
+    """Return `given` as `count` finite numbers. Raises ConfigError, which names the value `name`: it is not that."""
     try:
         values = np.asarray(given, dtype=float)
     except (TypeError, ValueError):
@@ -38,15 +38,15 @@ def numbers(name: str, given: Any, count: int) -> tuple[float, ...]:
 
 @dataclass(frozen=True)
 class Box:
-    """A box.
+    """An oriented box.
 
     Attributes:
-        center: its middle, object frame [m].
-        size: its edges' lengths [m].
-        quaternion_wxyz: rotation of its edges, of any length, by default none.
+        center: centre of the box, object frame [m].
+        size: edge lengths along the box axes [m].
+        quaternion_wxyz: rotation of the box in the object frame, a quaternion of any non-zero length.
 
     Raises:
-        ConfigError: a number is not finite, an edge not longer than 0, the quaternion 0.
+        ConfigError: a number is not finite, an edge length is not above 0, or the quaternion is 0.
     """
 
     center: Numbers
@@ -67,7 +67,7 @@ class Box:
         return rotation_from_quaternion(torch.tensor(tuple(self.quaternion_wxyz), dtype=torch.float64)).numpy()
 
     def local(self, points: Float[np.ndarray, "*n 3"]) -> Float[np.ndarray, "*n 3"]:
-        """Return points of the object frame in the box's own [m]."""
+        """Map points from the object frame to the box frame [m]."""
         return (points - np.asarray(self.center)) @ self.rotation
 
     def distance(self, points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n"]:
@@ -78,14 +78,14 @@ class Box:
 
 @dataclass(frozen=True)
 class Sphere:
-    """A ball.
+    """A sphere.
 
     Attributes:
-        center: its middle, object frame [m].
-        radius: [m].
+        center: centre of the sphere, object frame [m].
+        radius: radius [m].
 
     Raises:
-        ConfigError: a number is not finite, or the radius not above 0.
+        ConfigError: a number is not finite, or the radius is not above 0.
     """
 
     center: Numbers
@@ -103,14 +103,14 @@ class Sphere:
 
 @dataclass(frozen=True, eq=False)
 class NearPoints:
-    """The neighbourhood of points, as those of a mask of an image.
+    """The region within a distance of given points, for example the points of an image mask.
 
     Attributes:
-        points: object frame [m].
-        radius: how near [m].
+        points: points, object frame [m]. Points that are not finite are ignored.
+        radius: greatest distance from the nearest point [m].
 
     Raises:
-        ConfigError: there is no finite point, or the radius is not above 0.
+        ConfigError: no point is finite, or the radius is not above 0.
     """
 
     points: Float[np.ndarray, "points 3"]
@@ -121,13 +121,13 @@ class NearPoints:
         points = np.asarray(self.points, dtype=float)
         points = points[np.isfinite(points).all(-1)] if points.ndim == 2 and points.shape[-1] == 3 else points[:0]
         if len(points) == 0:
-            raise ConfigError("region points: none is finite; valid: rows of x, y, z in metres")
+            raise ConfigError("region points: no finite row x, y, z; valid: rows of x, y, z in metres")
         if not np.isfinite(self.radius) or self.radius <= 0:
             raise ConfigError(f"region radius: {self.radius} m; valid: above 0")
         object.__setattr__(self, "_tree", KDTree(points))
 
     def distance(self, points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n"]:
-        """Return the distance of points from the nearest point, less the radius [m], negative inside."""
+        """Return the distance to the nearest point of the region minus the radius [m], negative inside."""
         return self._tree.query(points)[0] - self.radius
 
 
@@ -135,15 +135,15 @@ Region = Box | Sphere | NearPoints
 
 
 _STEPS = 60
-# A gap narrower than this is none [m].
+# A gap narrower than this counts as contact [m].
 _TOUCH = 1e-5
 _GRID_RESOLUTION = 32
-# The search keeps so far off a box [m]: it allows a little depth in obstacles, and a squeeze closes the fingers more.
+# Boxes are padded by this for the search [m], which allows slight penetration. A squeeze also closes the fingers more.
 _PAD = 0.004
 
 
 def entered(hand: HandModel, postures: Sequence[Posture], boxes: Sequence[Box]) -> Bool[np.ndarray, "postures"]:
-    """Return in which postures a link reaches into one of the boxes. Positions are in the boxes' frame."""
+    """Return in which postures a link enters one of the boxes. Postures and boxes are in the same frame."""
     if not boxes or not postures:
         return np.zeros(len(postures), dtype=bool)
     points, radii = _placed_solids(hand, postures)
@@ -154,7 +154,7 @@ def entered(hand: HandModel, postures: Sequence[Posture], boxes: Sequence[Box]) 
 def _placed_solids(
     hand: HandModel, postures: Sequence[Posture]
 ) -> tuple[Float[np.ndarray, "postures solids corners 3"], Float[np.ndarray, "solids"]]:
-    """Return the extreme points of each solid [m], padded with the first, and the radius about them."""
+    """Return each primitive's extreme points [m], padded with the first to equal numbers, and its radius [m]."""
     solids = extreme_points_of_solids(hand)
     most = max(len(points) for points, _, _ in solids)
     local = np.stack([np.vstack([points, np.repeat(points[:1], most - len(points), 0)]) for points, _, _ in solids])
@@ -172,10 +172,9 @@ def _enter(
     radii: Float[np.ndarray, "solids"],
     half: Float[np.ndarray, "3"],
 ) -> Bool[np.ndarray, "postures"]:
-    """Return which hands have a solid less than its radius from the box |x| ≤ `half`."""
+    """Return in which postures a primitive is nearer than its radius to the box |x| ≤ `half`."""
     flat = points.reshape(-1, *points.shape[2:])
     radius = np.tile(radii, len(points))
-    # What lies beyond one of the box's faces is clear of it.
     clear = ((flat.min(1) - radius[:, None] > half) | (flat.max(1) + radius[:, None] < -half)).any(-1)
     rows = np.flatnonzero(~clear)
     x = flat[rows].mean(1)
@@ -199,7 +198,7 @@ def _enter(
 
 
 def boxes_in_reach(scene: Scene, hand: HandModel, boxes: Sequence[Box]) -> tuple[Obstacle, ...]:
-    """Return what the hand could meet of each box on its way to the object, as an obstacle of the search."""
+    """Return the part of each box that the hand could reach while approaching the object, as obstacles."""
     reach = scene.object.radius + hand_reach(hand) + RETREAT
     found = []
     for box in boxes:

@@ -1,7 +1,4 @@
-"""Rounds of optimiser and trials: their effort and their results.
-
-Too little memory is a named failure in all libraries.
-"""
+"""Rounds of optimiser and trials: their effort and their results."""
 
 from __future__ import annotations
 
@@ -34,13 +31,13 @@ from graspd_core.verify.verification import (
     surest_first,
 )
 
-# What torch says where it finds no memory, on the processor and on CUDA. It raises a RuntimeError for both.
+# Parts of torch's messages when memory runs out, on the CPU and on CUDA. It raises a RuntimeError for both.
 _TORCH_SAYS = ("can't allocate memory", "not enough memory", "out of memory")
 
 
 @contextmanager
 def enough_memory(asked: str) -> Iterator[None]:
-    """Raise ResourceError for `asked` if the work inside runs out of memory."""
+    """Raise ResourceError, naming `asked`, if the work inside the context runs out of memory."""
     try:
         yield
     except (MemoryError, RuntimeError) as error:
@@ -52,10 +49,10 @@ def enough_memory(asked: str) -> Iterator[None]:
 
 
 def rounds_of(scene: Scene, config: PlanConfig, verify: str) -> list[PlanConfig]:
-    """Return the settings of every round, each with more effort than the last.
+    """Return the settings of all rounds, with increasing effort.
 
-    A cheap first round pays if failures are found at little cost: by a hold trial, on an object of known shape that
-    stands alone.
+    The first round is cheap only if failures are cheap to find: by a hold trial, on an object of known shape without
+    support or obstacles.
     """
     rounds = config.rounds
     cheap = verify != "none" and scene.support is None and not scene.obstacles and scene.confidence is None
@@ -65,15 +62,15 @@ def rounds_of(scene: Scene, config: PlanConfig, verify: str) -> list[PlanConfig]
     return [config.at_budget(effort) for effort in efforts]
 
 
-# How far apart the seeds of two rounds are.
+# Difference between the seeds of two rounds.
 _SEED_STEP = 1_000_003
-# Where so many grasps are asked for, so few are sought first: an answer need not wait until all are found. Where the
-# first round finds none at all, as many are sought, however few are asked for.
+# From `_MANY` requested grasps on, the first batch seeks only `_FIRST_BATCH`, so that the first answer comes early. If
+# a round finds no grasp, the next one seeks at least `_MANY`.
 _MANY, _FIRST_BATCH = 8, 2
 
 
-# Grasps that are weighed where none holds the mass assumed, the share of the greatest payload that is tried then, and
-# the share of the assumed mass that this is at most.
+# If no grasp holds the assumed mass: number of grasps whose payload is measured, tried mass as a fraction of the
+# greatest payload, and upper limit of the tried mass as a fraction of the assumed mass.
 _WEIGHED, _LIFTED, _HALF = 60, 0.8, 0.5
 
 
@@ -82,13 +79,13 @@ class RoundsResult:
     """The results of the rounds of a run.
 
     Attributes:
-        began: when the first round began, a `time.perf_counter()` value.
-        grasps: verified (or untried) ones first, then those that failed.
-        context: what grasps are tried with, None if none was tried.
-        optimise_time: spent in the method [s].
-        first: when the first grasp was verified, a `time.perf_counter()` value.
-        refused: candidates that restrictions did not admit to any trial, by reason.
-        mass: that of the trials [kg], if it is less than the one assumed.
+        began: start of the first round, a `time.perf_counter()` value.
+        grasps: verified (or untried) grasps first, then failed ones.
+        context: context of the trials. None if no grasp was tried.
+        optimise_time: time spent in the optimiser [s].
+        first: time of the first verified grasp, a `time.perf_counter()` value. None without one.
+        refused: number of candidates that restrictions refused, by reason.
+        mass: object mass of the trials [kg] if it is lower than the assumed mass, else None.
     """
 
     began: float
@@ -101,19 +98,19 @@ class RoundsResult:
 
     @property
     def good(self) -> int:
-        """Number of grasps as sure as was asked for: verified, or found if no trial was asked for."""
+        """Number of verified grasps. If no trial was requested, number of grasps with a contact."""
         return sum(grasp.usable for grasp in self.grasps)
 
 
 def poses_seen(poses: Poses) -> Snapshot:
-    """Return the hands of an optimiser."""
+    """Return a snapshot of an optimiser's poses."""
     return Snapshot(*(rows.detach().double().cpu().numpy() for rows in vars(poses).values()))
 
 
 def _hooks(run: Run, good: int) -> Hooks:
     return Hooks(
         report=lambda step, of, loss: run.report(Stage.OPTIMISE, step, of, loss, good),
-        # An iterate half-way is no grasp, and could not be verified any more: no time is spent on its stages.
+        # When the run is over, stop at once. An unfinished iterate is not a grasp.
         stop=run.over,
         watch=None if run.watch is None else lambda poses: run.show(poses_seen(poses)),
     )
@@ -132,11 +129,11 @@ def run_rounds(
     device: str,
     measure: bool = True,
 ) -> RoundsResult:
-    """Find candidates and try them, round by round, until `count` of them are good.
+    """Find and try candidates, round by round, until `count` grasps are good.
 
-    The first round begins with a small batch for a first answer. If too few grasps held, the next round starts from
-    other initial poses. Candidates that a restriction refuses are not tried. Without `ahead`, the worlds of the trials,
-    none is.
+    If many grasps are requested, a small batch comes first, for an early answer. If too few grasps hold, the next round
+    starts from other initial poses. Candidates that a restriction refuses are not tried. `ahead` holds the worlds of
+    the trials. Without it, no candidate is tried.
     """
     state = RoundsResult(time.perf_counter())
     rounds = rounds[:1] if scene.evidence is not None and scene.evidence.doubts else rounds
@@ -147,7 +144,7 @@ def run_rounds(
         seek = enough - good if good or not attempt else max(enough, _MANY)
         with enough_memory(f"{seek} grasps at once"):
             candidates = find_candidates(PlannerInput(scene, hand, seek, seed + _SEED_STEP * attempt, **asked)).grasps
-        # Here, since a search that was interrupted leaves none to go through.
+        # The time is counted here, because the loop below does not run after an interrupted search.
         state, began = _searched_since(state, began), time.perf_counter()
         for some in _in_rank_order(candidates, enough - good, restrictions):
             admitted, refused = restrictions.admit(some)
@@ -171,7 +168,7 @@ def run_rounds(
                 break
         if state.good >= count or run.over():
             break
-        # A second round seeks stronger grasps, unless not even the likeliest shape was held in the first.
+        # Lower the mass only after a second round for stronger grasps. Without an unverified grasp, lower it at once.
         doubted = any(grasp.verdict is Verdict.UNVERIFIED for grasp in state.grasps)
         too_heavy = attempt >= len(early) + doubted and not state.good and scene.object.mass_assumed
         if too_heavy and ahead is not None and state.mass is None:
@@ -188,7 +185,7 @@ def _searched_since(state: RoundsResult, began: float) -> RoundsResult:
 def _tried_lighter(
     run: Run, scene: Scene, ahead: TrialsAhead, state: RoundsResult, certainty: CertaintyConfig, count: int
 ) -> RoundsResult:
-    """Try the best grasps again, the strongest first, at a mass that they lift, if the assumed one is too heavy."""
+    """Try the best grasps again with a lower mass that the strongest of them can lift. Try the strongest first."""
     if state.context is None:
         return state
     best, others = state.grasps[:_WEIGHED], state.grasps[_WEIGHED:]

@@ -1,9 +1,8 @@
-"""Steering: the hand's approach direction, its roll, its contacts and what it avoids.
+"""Steering constraints on grasps: approach direction, roll, contact region and boxes to avoid.
 
-The part of an object outside a wanted region is an obstacle of the search. The search then puts all contacts into the
-region by its loss for obstacles. The obstacle's distance is the greater of the distances to the object and to the
-outside of the region. It is exact if one of them is the nearer one's, else too small. Its gradient jumps where the two
-are equal.
+The part of the object outside the wanted region is an obstacle of the search. The obstacle loss then moves all contacts
+into the region. The obstacle's signed distance is the maximum of the distances to the object and to the outside of the
+region. It is a lower bound of the true distance. Its gradient jumps where the two are equal.
 """
 
 from __future__ import annotations
@@ -38,12 +37,12 @@ from graspd_core.planning.regions import Box, NearPoints, Numbers, Region, Spher
 from graspd_core.se3 import rotation_from_quaternion
 from graspd_core.types import Grasp
 
-# The untouched part begins so far outside the region, and links keep so far off its surface [m].
+# Distance outside the region at which the untouched part begins, and distance that links keep from its surface [m].
 _BEGINS, _SKIN = 0.003, 0.004
 
 
 def untouched_part(scene: Scene, region: Region) -> Obstacle:
-    """Return the object outside `region`, on the nodes of the object's own grid."""
+    """Return the part of the object outside `region` as an obstacle, on the nodes of the object's distance grid."""
     sdf = scene.sdf
     field, spacing = sdf.field.double().cpu().numpy(), float(sdf.spacing)
     axes = [float(x) + spacing * np.arange(n) for x, n in zip(sdf.origin, field.shape[1:], strict=True)]
@@ -58,40 +57,40 @@ def untouched_part(scene: Scene, region: Region) -> Obstacle:
     )
 
 
-# A contact may lie so far outside the region [m]. Angles are rounded by this [rad].
+# Distance by which a contact may lie outside the region [m], and tolerance of angles [rad].
 CONTACT_TOLERANCE = 0.005
 _ROUNDING = 1e-6
-# Points of the surface that tell what part of the object lies in a region, and how many of those are aimed at.
+# Number of surface samples that show which part of the object lies in a region, and greatest number of aim points.
 _SURFACE, _MOST_PLACES = 20_000, 400
-# Fingers that point so nearly along the approach have no side of their own: sine of the angle.
+# If the angle between fingers and approach has a lower sine, the fingers define no side of the hand.
 _ALONG = 0.3
-# From so near to the vertical a roll is measured from x: cosine of the angle.
+# If the angle between approach and vertical has a higher cosine, the roll is measured from x.
 _VERTICAL = 0.95
-# Directions with a lesser angle's sine are along each other.
+# Directions are parallel if the sine of their angle is lower.
 _PARALLEL = 1e-3
-# Starts that are looked at, and how deep the best of them is in the support where none can come from there [m].
+# Number of sampled starts, and their least penetration of the support above which the direction is impossible [m].
 _PROBES, _TOO_DEEP = 8, 0.06
 
 
 @dataclass(frozen=True)
 class Steering:
-    """What is asked of a grasp's place and direction, in the object frame. None: not asked for.
+    """Steering constraints on grasps, in the object frame. A constraint that is None does not apply.
 
-    A hand's approach is the direction in which it moves from the retreat over the pregrasp to the grasp:
+    A hand's approach is the direction in which it moves from the retreat over the pregrasp to the grasp. It is
     `HandModel.approach`, by default the palm's normal.
 
-    The roll is measured at the hand's side: the direction from the palm to the fingertips, made normal to the approach.
-    For a hand whose open fingers point along the approach, as a gripper's, it is the direction in which they close.
+    The roll is measured at the hand's side: the direction from the palm to the fingertips, projected normal to the
+    approach. If the open fingers point along the approach, as in a gripper, the side is the closing direction.
 
     Attributes:
-        approach_direction: wanted direction of approach, of any length but 0. (0, 0, -1) is from above.
-        approach_angle: greatest angle between it and a grasp's approach, above 0, at most π [rad].
-        region: a `Box`, a `Sphere` or points (`NearPoints`). Every contact lies in it, or at most 5 mm outside.
+        approach_direction: wanted approach direction, a vector of any non-zero length. (0, 0, -1) is from above.
+        approach_angle: greatest angle between `approach_direction` and a grasp's approach, above 0, at most π [rad].
+        region: a `Box`, a `Sphere` or `NearPoints`. Every contact lies in the region, or at most 5 mm outside.
         avoid: boxes that no link enters at pregrasp, grasp and squeeze.
-        roll: turn of the hand's side about the approach, right-handed [rad]. At 0 it points along z, or along x if the
-            wanted approach is within 18° of vertical. It needs an approach direction, and an angle below π/2.
-        roll_zero: direction of the hand's side at a roll of 0, made normal to the approach. None: as `roll` says.
-        roll_tolerance: greatest difference from `roll` either way, above 0, at most π [rad].
+        roll: right-handed rotation of the hand's side about the approach [rad]. It needs `approach_direction`, and
+            `approach_angle` below π/2. At 0 the side points along z, or along x for an approach within 18° of vertical.
+        roll_zero: direction of the hand's side at roll 0, projected normal to the approach. None for the default above.
+        roll_tolerance: greatest deviation from `roll` in either direction, above 0, at most π [rad].
 
     Raises:
         ConfigError: a value is out of its range, not finite, or contradicts another.
@@ -116,13 +115,13 @@ class Steering:
         if self.region is not None and not isinstance(self.region, Box | Sphere | NearPoints):
             raise ConfigError(f"region: {type(self.region).__name__}; valid: Box, Sphere, NearPoints")
         if any(not isinstance(box, Box) for box in self.avoid):
-            raise ConfigError("avoid: not all are a Box")
+            raise ConfigError(f"avoid: {shown(self.avoid)}; valid: a sequence of Box")
         if self.roll is None:
             return
         if not np.isfinite(self.roll):
             raise ConfigError(f"roll: {self.roll} rad; valid: a finite number")
         if self.approach_direction is None or self.approach_angle >= np.pi / 2:
-            raise ConfigError("roll: needs approach_direction, and approach_angle below pi/2 (90 degrees)")
+            raise ConfigError("roll: it needs approach_direction, and approach_angle below pi/2 (90 degrees)")
         if self.roll_zero is not None:
             zero, along = numbers("roll_zero", self.roll_zero, 3), np.array(self.approach_direction, dtype=float)
             if not np.linalg.norm(np.cross(zero, along)) > _PARALLEL * np.linalg.norm(zero) * np.linalg.norm(along):
@@ -132,7 +131,7 @@ class Steering:
         """Bind the steering to this hand in this scene.
 
         Raises:
-            ConfigError: no part of the object lies in the region, or that part lies in an avoided box.
+            ConfigError: no part of the object lies in the region, or an avoided box covers that part.
         """
         direction = None if self.approach_direction is None else np.array(self.approach_direction, dtype=float)
         if direction is not None:
@@ -149,7 +148,7 @@ class Steering:
 
 @dataclass(frozen=True, eq=False)
 class BoundSteering(BoundRestriction):
-    """`Steering` of one hand in one scene. `wanted` is where starts are drawn."""
+    """`Steering` bound to one hand in one scene. `wanted` tells the optimiser where to draw initial poses."""
 
     steering: Steering
     scene: Scene
@@ -158,39 +157,39 @@ class BoundSteering(BoundRestriction):
 
     @property
     def asked(self) -> str:
-        """The names of the given conditions."""
+        """Names of the given constraints."""
         given = {name: getattr(self.steering, name) is not None for name in ("approach_direction", "region", "roll")}
         given["avoid"] = len(self.steering.avoid) > 0
         return ", ".join(name for name, there in given.items() if there)
 
     @property
     def aim(self) -> Aim | None:
-        """The aim of starts, if a place, a direction or a roll is asked for."""
+        """Aim of the initial poses. None without a constraint on region or approach direction."""
         asked = self.wanted.direction is not None or self.wanted.places is not None
         return self.wanted if asked else None
 
     @cached_property
     def obstacles(self) -> tuple[Obstacle, ...]:
-        """The avoided boxes, where the hand could meet them, and the part of the object that must not be touched."""
+        """The reachable parts of the avoided boxes, and the part of the object outside the region."""
         region = self.steering.region
         rest = () if region is None else (untouched_part(self.scene, region),)
         return (*boxes_in_reach(self.scene, self.hand, self.steering.avoid), *rest)
 
     @property
     def impossible(self) -> str:
-        """Why the hand cannot come from the wanted direction: it would come out of the support."""
+        """Why the approach direction is impossible: the hand would come through the support. Else empty."""
         if self.scene.support is None or self.wanted.direction is None:
             return ""
         depth = depth_of_starts(self.scene, self.hand, _PROBES, BoundRestrictions((self,)))
         if depth <= _TOO_DEEP:
             return ""
         return (
-            f"approach_direction: nothing is left of it, since on its way the hand would reach {depth * 100:.0f} cm "
-            "into what the object stands on; ask for a direction from the free side, or a wider approach_angle"
+            f"approach_direction: impossible, because the hand would reach {depth * 100:.0f} cm into the support on "
+            "its approach; give a direction from the free side, or a wider approach_angle"
         )
 
     def starts(self, positions: Places, quaternions: Turns, joints: JointRows) -> Allowed:
-        """Return which hands have their palm in no avoided box, there and at the retreat."""
+        """Return which initial poses have their palm outside all avoided boxes, at the pose and at the retreat."""
         if not self.steering.avoid:
             return np.ones(len(positions), dtype=bool)
         turns = rotation_from_quaternion(torch.as_tensor(quaternions)).numpy()
@@ -198,7 +197,7 @@ class BoundSteering(BoundRestriction):
         return np.all([box.distance(palm) > 0.0 for box in self.steering.avoid for palm in palms], axis=0)
 
     def admit(self, grasps: Sequence[Grasp]) -> Sequence[Grasp | Refusal]:
-        """Return the candidates that meet all conditions. A refusal names the first condition that is missed."""
+        """Return each candidate that meets all constraints, else a refusal that names the first violated one."""
         if not grasps:
             return grasps
         asked, wanted, missed = self.steering, self.wanted, dict[str, Bool[np.ndarray, "grasps"]]()
@@ -229,13 +228,13 @@ def angle_of_approach(hand: HandModel, grasp: Grasp, direction: Float[np.ndarray
 
 
 def outside_region(region: Region, grasp: Grasp) -> float:
-    """Return how far the farthest contact of a grasp lies outside a region [m], infinite without a contact."""
+    """Return the greatest signed distance of a grasp's contacts to a region [m]. Infinite without a contact."""
     points = np.array([contact.position for contact in grasp.contacts], dtype=float)
     return float(region.distance(points).max()) if len(points) else np.inf
 
 
 def hand_side(hand: HandModel) -> Float[np.ndarray, "3"]:
-    """Return the unit direction by which rolls are measured, normal to the approach, base frame (see `Steering`)."""
+    """Return the hand's side (see `Steering`): a unit vector normal to the approach, base frame."""
     links = hand.candidate_link
     points = in_base(link_poses(hand, hand.open_posture), hand.candidate_points, links)
     tips = [points[hand.link_group[links] == group].mean(0) for group in hand.fingertip_groups]
@@ -244,22 +243,22 @@ def hand_side(hand: HandModel) -> Float[np.ndarray, "3"]:
     if np.linalg.norm(side) < _ALONG * np.linalg.norm(ahead):
         side = closing_axis(hand)
         side = side - (side @ hand.approach) * hand.approach
-        # The axis has no sign of its own.
+        # The axis has no sign, so make its largest component positive.
         side = side * np.sign(side[np.abs(side).argmax()])
     return side / np.linalg.norm(side)
 
 
 def zero_of_roll(direction: Float[np.ndarray, "3"]) -> Float[np.ndarray, "3"]:
-    """Return the default direction of a hand's side at a roll of 0: unit, normal to the wanted unit approach."""
+    """Return the default direction of the hand's side at roll 0: a unit vector normal to the unit approach."""
     up = np.eye(3)[0 if abs(direction[2]) > _VERTICAL else 2]
     square = up - (up @ direction) * direction
     return square / np.linalg.norm(square)
 
 
 def _part_of_object(scene: Scene, region: Region, avoid: Sequence[Box]) -> Float[np.ndarray, "places 3"]:
-    """Return points of the object's surface in a region [m].
+    """Return points on the object's surface in a region [m].
 
-    Raises ConfigError: there is none, or all of them lie in an avoided box.
+    Raises ConfigError: there is no such point, or all of them lie in an avoided box.
     """
     mesh = scene.object.mesh
     points = np.vstack([surface_samples(mesh, _SURFACE, seed=0)[0], mesh.vertices])
@@ -272,5 +271,5 @@ def _part_of_object(scene: Scene, region: Region, avoid: Sequence[Box]) -> Float
         )
     for number, box in enumerate(avoid):
         if (box.distance(inside) <= 0.0).all():
-            raise ConfigError(f"region: all of it that is on the object lies in avoid box {number}; valid: one outside")
+            raise ConfigError(f"region: avoid box {number} covers all of it on the object; valid: a part outside")
     return inside[:: len(inside) // _MOST_PLACES + 1]

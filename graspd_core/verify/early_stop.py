@@ -1,10 +1,11 @@
-"""The end of a hold whose answer is known: the object's drift cannot carry it to a limit in the time that is left.
+"""Early stop of a hold: end it once the object's drift cannot reach a limit in the remaining time.
 
-A trial that stops early goes through the same states as one of full length. It can verify what a full one would not,
-never the reverse. A slowly sliding object may come to an edge and snap away, hence the safety factor. Jitter on the
-contacts hides the drift within a few steps, so the drift is taken over several spans, and one of them suffices. At low
-friction or with few fingers, the object has to be at rest as well. The numbers come from trajectories of pulls of four
-hands on eleven shapes and ten scans. `graspd bench early` measures their effect.
+Up to the stop, a trial has the same states as a full one. It can pass where a full trial would fail, but it never fails
+where a full trial would pass. A slowly sliding object may reach an edge and slip suddenly, so the drift is multiplied
+by a safety factor. Contact jitter hides the drift within a few steps. The drift is therefore measured over several
+windows, and one small drift is enough. At low friction or with few fingers, the object must also be at rest. The
+numbers come from pull trajectories of four hands on eleven shapes and ten scans. `graspd bench early` measures their
+effect.
 """
 
 from __future__ import annotations
@@ -15,22 +16,22 @@ from dataclasses import dataclass
 
 from graspd_core.verify.world import Protocol
 
-# Steps from one look at a hold to the next. This divides `CHECK_EVERY` and every number of steps in a rule.
+# Steps between two checks for an early stop. This divides `CHECK_EVERY` and every number of steps in a rule.
 LOOK_EVERY = 5
-# Steps from one check of the limits to the next.
+# Steps between two checks of the limits.
 CHECK_EVERY = 25
 
 
 @dataclass(frozen=True)
 class StopRule:
-    """How a hold is checked.
+    """Rule for the early stop of a hold.
 
     Attributes:
-        first: steps before the first look.
-        windows: steps that the drift is taken over. One of them is enough.
-        safety: how many times that drift the object is supposed to keep until the end.
-        speed: a slower object is at rest [m/s], infinite if rest is not asked for.
-        spin: an object that turns slower is at rest [rad/s], likewise.
+        first: number of steps before the first check.
+        windows: window lengths for the drift, in steps. A hold stops if the drift of one window is small enough.
+        safety: factor by which the measured drift is multiplied when it is extrapolated to the end.
+        speed: speed below which the object is at rest [m/s]. Infinite if it need not be at rest.
+        spin: angular speed below which the object is at rest [rad/s]. Infinite if it need not be at rest.
     """
 
     first: int
@@ -42,23 +43,23 @@ class StopRule:
 
 FIRM = StopRule(first=10, windows=(5, 10, 20, 40), safety=8.0)
 SLIPPERY = StopRule(first=10, windows=(5, 10, 20, 40), safety=16.0)
-# Objects begin to slip as late as 1.9 s. What moves at 1 mm/s until then may let go at once.
+# Objects may begin to slip after 1.9 s. An object that creeps at 1 mm/s until then may slip suddenly.
 CREEPING = StopRule(first=100, windows=(50,), safety=16.0, speed=0.0005, spin=math.radians(0.5))
-# Between fewer ends of fingers an object turns about the line that joins them, as late as it slips.
+# Between fewer fingertips, an object may begin to turn about the line that joins them, just as late.
 _FEWEST_FINGERS = 3
-# The least impedance ratio and sliding friction of each, CREEPING below them all. Measured at 0.6 and 0.3.
+# Rule, least impedance ratio and least sliding friction. Below all of them CREEPING applies. Measured at 0.6 and 0.3.
 _RULES = ((FIRM, 10.0, 0.6), (SLIPPERY, 10.0, 0.3))
 
 
 @dataclass(frozen=True)
 class ObjectState:
-    """Pose and speed of the object in the world of a trial.
+    """Pose and speed of the object during a trial, world frame.
 
     Attributes:
-        center: of mass [m].
-        quaternion_wxyz: of its body.
-        speed: of its origin [m/s].
-        spin: [rad/s].
+        center: centre of mass [m].
+        quaternion_wxyz: orientation of the object's body.
+        speed: speed of the body's origin [m/s].
+        spin: angular speed [rad/s].
     """
 
     center: tuple[float, ...]
@@ -68,7 +69,7 @@ class ObjectState:
 
 
 def stop_rule(protocol: Protocol, fingers: int) -> StopRule | None:
-    """Return the rule of a protocol, by its friction, and of a hand, None if trials run to their end."""
+    """Return the stop rule for a protocol and a number of fingers. None if the protocol asks for full length."""
     if protocol.full_length:
         return None
     if fingers < _FEWEST_FINGERS:
@@ -80,14 +81,14 @@ def stop_rule(protocol: Protocol, fingers: int) -> StopRule | None:
 def answer_known(
     rule: StopRule, protocol: Protocol, states: Sequence[ObjectState], moved: tuple[float, float], left: int
 ) -> bool:
-    """Tell whether a hold need not go on. False if anything is not finite.
+    """Return True if a hold can stop, because it will stay within its limits. Return False if a value is not finite.
 
     Args:
-        rule: of the hold.
-        protocol: has the limits.
-        states: of the last checks, oldest first. Windows that reach back further are left out.
-        moved: travel [m] and turn [rad] so far.
-        left: steps that are left.
+        rule: stop rule of the hold.
+        protocol: protocol with the limits.
+        states: object states at the last checks, oldest first. Longer windows are skipped.
+        moved: travel [m] and rotation [rad] so far.
+        left: number of remaining steps.
     """
     spans = ((window, states[-(window // LOOK_EVERY + 1) :]) for window in rule.windows)
     return any(
@@ -104,6 +105,6 @@ def _stays(protocol: Protocol, moved: tuple[float, float], drift: tuple[float, f
 
 
 def drifted(before: ObjectState, now: ObjectState) -> tuple[float, float]:
-    """Return travel [m] and turn [rad] from one state to another."""
+    """Return travel [m] and rotation [rad] from one state to another."""
     cosine = abs(sum(a * b for a, b in zip(before.quaternion_wxyz, now.quaternion_wxyz, strict=True)))
     return math.dist(before.center, now.center), 2 * math.acos(min(1.0, cosine))

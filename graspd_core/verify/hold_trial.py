@@ -1,10 +1,10 @@
-"""The hold trial: close on a free object, pull it along ±x, ±y, ±z in turn, and check that it stays.
+"""The hold trial: close the hand on a free object, pull the object along ±x, ±y, ±z in turn, and check that it stays.
 
-After DexGraspBench's floating protocol, re-implemented from its parameters. Travel and turn of the object are measured
-from its pose at the start of the trial, so that the closing counts too. A pull ends when its answer is known
+The trial re-implements DexGraspBench's floating protocol from its parameters. Travel and rotation of the object are
+measured from its pose at the start of the trial, so they include motion while the hand closes. A pull may stop early
 (`early_stop`), unless the protocol asks for the full length.
 
-The noisy hold trial repeats the hold trial with the hand out of place, as by a wrong estimate of the object's pose.
+The noisy hold trial repeats the hold trial with the hand displaced, as by a wrong estimate of the object's pose.
 """
 
 from __future__ import annotations
@@ -29,19 +29,19 @@ from graspd_core.verify.world import Protocol, World, advance, trial_data
 
 
 DIRECTIONS = np.concatenate([np.eye(3), -np.eye(3)])
-# Why a trial failed that its caller ended.
+# Reason of a trial that its stop hook ended.
 STOPPED = "stopped before the trial ended"
 
 
 def hold_trial(
     world: World, grasp: Grasp, protocol: Protocol, *, stop: Callable[[], bool] = lambda: False
 ) -> TrialResult:
-    """Run one hold trial of `protocol`, which ends at the first breach.
+    """Run one hold trial. It ends as soon as the object exceeds a limit.
 
     Returns:
-        Worst displacement [m] of the object's centre of mass and worst rotation [rad] until the pulls ended. A slowly
-        moving object would go farther in a pull of full length. A simulation that diverges, or has more contacts than
-        memory, is a failure with that reason.
+        The result, with the greatest displacement [m] of the object's centre of mass and the greatest rotation [rad]
+        until the trial ended. If the simulation diverges or runs out of contact memory, the trial fails with this
+        reason.
     """
     import mujoco
 
@@ -54,12 +54,12 @@ def hold_trial(
 
 
 def gave_up(error: Exception) -> str:
-    """Return the reason of a trial that MuJoCo has broken off."""
+    """Return the reason of a trial that a MuJoCo error ended."""
     return f"the simulation gave up: {str(error).splitlines()[0]}"
 
 
 def _hold(world: World, grasp: Grasp, protocol: Protocol, worst: np.ndarray, stop: Callable[[], bool]) -> str:
-    """Return why the grasp does not hold, empty if it does. `worst` travel [m] and turn [rad] are updated."""
+    """Return why the grasp fails, empty if it holds. Update `worst`, the greatest travel [m] and rotation [rad]."""
     import mujoco
 
     with trial_data(world) as data:
@@ -83,11 +83,10 @@ def _hold(world: World, grasp: Grasp, protocol: Protocol, worst: np.ndarray, sto
 def step_until_known(
     world: World, data: Any, protocol: Protocol, worst: np.ndarray, steps: int, *, stop: Callable[[], bool]
 ) -> str:
-    """Simulate `steps` steps, or until it is known that the object stays within the limits.
+    """Simulate `steps` steps, or fewer if the stop rule knows that the object stays within the limits.
 
-    Returns why the trial is over, empty if it is not. `worst` travel [m] and turn [rad] are updated.
+    Return why the trial failed, empty if it did not. Update `worst`, the greatest travel [m] and rotation [rad].
     """
-
     rule, done = stop_rule(protocol, world.fingers), 0
     recent = deque[ObjectState](maxlen=1 + max(rule.windows) // LOOK_EVERY if rule else 0)
     while done < steps:
@@ -109,7 +108,7 @@ def step_until_known(
 
 
 def object_state(world: World, data: Any) -> ObjectState:
-    """Return the pose and speed of the object."""
+    """Return the current pose and speed of the object."""
     turn = world.object_address + 3
     x, y, z, *spin = data.qvel[world.object_velocity : world.object_velocity + 6].tolist()
     return ObjectState(
@@ -121,7 +120,7 @@ def object_state(world: World, data: Any) -> ObjectState:
 
 
 def moved(world: World, state: ObjectState) -> tuple[float, float]:
-    """Return travel [m] of the object's centre of mass, and the object's turn [rad], from the start of the trial."""
+    """Return travel of the object's centre of mass [m] and rotation of the object [rad] since the trial began."""
     w, x, y, z = state.quaternion_wxyz
     return math.dist(state.center, world.center_of_mass), 2 * math.atan2(math.hypot(x, y, z), abs(w))
 
@@ -135,9 +134,9 @@ def close_hand(
     *,
     stop: Callable[[], bool] = lambda: False,
 ) -> str:
-    """Move the hand from pregrasp to squeeze.
+    """Move the hand from the pregrasp over the grasp to the squeeze.
 
-    Return why the trial is over, if it is. Updates travel and turn `worst`.
+    Return why the trial failed, empty if it did not. Update `worst`, the greatest travel [m] and rotation [rad].
     """
     import mujoco
 
@@ -159,7 +158,7 @@ def close_hand(
 
 
 def posture_fault(world: World, data: Any, grasp: Grasp, protocol: Protocol) -> str:
-    """Return why a grasp is refused before the hand moves: deep in the object, or in itself. Empty if it is not."""
+    """Return why pregrasp or grasp is invalid: the hand penetrates the object or itself. Empty if both are valid."""
     deepest = {"pregrasp": protocol.max_start_penetration, "grasp": protocol.max_grasp_penetration}
     for name, limit in deepest.items():
         place_hand(world, data, getattr(grasp, name))
@@ -171,7 +170,7 @@ def posture_fault(world: World, data: Any, grasp: Grasp, protocol: Protocol) -> 
 
 
 def start_penetration(world: World, data: Any) -> float:
-    """Return the deepest overlap of hand and object in the current state [m]."""
+    """Return the greatest penetration of hand and object in the current state [m]."""
     bodies = world.model.geom_bodyid
     contact = data.contact
     on_object = (bodies[contact.geom1] == world.object_body) != (bodies[contact.geom2] == world.object_body)
@@ -179,7 +178,7 @@ def start_penetration(world: World, data: Any) -> float:
 
 
 def self_fault(world: World, data: Any, protocol: Protocol) -> str:
-    """Return which non-adjacent links are too deep in each other in the current state, empty for none."""
+    """Return a description of the deepest forbidden self-penetration in the current state, empty if there is none."""
     first, second, distance = data.contact.geom1, data.contact.geom2, data.contact.dist
     deep = np.flatnonzero(distance < -protocol.max_self_penetration)
     own = deep[np.isin(first[deep], world.hand_geoms) & np.isin(second[deep], world.hand_geoms)]
@@ -196,7 +195,7 @@ def axis_name(direction: np.ndarray) -> str:
 
 
 def set_hand_pose(world: World, data: Any, posture: Posture) -> None:
-    """Put base, joints and targets where a posture says. The caller runs `mj_forward`."""
+    """Set base pose, joint values and joint targets to a posture. The caller must run `mj_forward`."""
     set_joints(world, data, posture.joint_positions)
     data.mocap_pos[0] = posture.position
     data.mocap_quat[0] = posture.quaternion_wxyz
@@ -204,7 +203,7 @@ def set_hand_pose(world: World, data: Any, posture: Posture) -> None:
 
 
 def place_hand(world: World, data: Any, posture: Posture) -> None:
-    """Put the hand where a posture says, and find its contacts there."""
+    """Set the hand to a posture and compute its contacts."""
     import mujoco
 
     set_hand_pose(world, data, posture)
@@ -213,15 +212,14 @@ def place_hand(world: World, data: Any, posture: Posture) -> None:
 
 
 def set_joints(world: World, data: Any, values: np.ndarray) -> None:
-    """Put the actuated joints at `values` [rad] or [m], and those coupled to them where they belong."""
+    """Set the actuated joints to `values` [rad] or [m], and the coupled joints accordingly."""
     data.qpos[world.joint_addresses] = values
     for address, mimic in zip(world.coupled_addresses, world.mimics, strict=True):
         data.qpos[address] = mimic.multiplier * values[mimic.joint] + mimic.offset
 
 
 def _move(world: World, data: Any, start: Posture, end: Posture, protocol: Protocol, worst: np.ndarray) -> str:
-    """Move the targets linearly from start to end. Return why the trial is over, empty if it is not."""
-
+    """Move the targets linearly from start to end. Return why the trial failed, empty if it did not."""
     steps = round(protocol.stage_time / protocol.timestep)
     way = straight_way(start, end, np.arange(1, steps + 1) / steps)
     for step in range(1, steps + 1):
@@ -236,7 +234,7 @@ def _move(world: World, data: Any, start: Posture, end: Posture, protocol: Proto
 
 @dataclass(frozen=True, eq=False)
 class Way:
-    """Base poses (wxyz, [m]) and joint targets [rad] or [m] on the path from one posture to another."""
+    """Base poses (wxyz, [m]) and joint targets [rad] or [m] along the path between two postures."""
 
     positions: Float[np.ndarray, "n 3"]
     quaternions: Float[np.ndarray, "n 4"]
@@ -244,9 +242,9 @@ class Way:
 
 
 def straight_way(start: Posture, end: Posture, shares: Float[np.ndarray, "n"]) -> Way:
-    """Return the postures at shares of the straight path from start to end, all at once."""
+    """Return the postures at the fractions `shares` of the straight path from start to end."""
     a = shares[:, None]
-    # The shorter way round for the base: wxyz and its negative are the same rotation.
+    # Take the shorter rotation of the base. A quaternion and its negative are the same rotation.
     sign = 1.0 if start.quaternion_wxyz @ end.quaternion_wxyz >= 0 else -1.0
     quaternions = (1 - a) * start.quaternion_wxyz + a * sign * end.quaternion_wxyz
     return Way(
@@ -257,14 +255,14 @@ def straight_way(start: Posture, end: Posture, shares: Float[np.ndarray, "n"]) -
 
 
 def set_targets(data: Any, way: Way, index: int) -> None:
-    """Set base pose and joint targets to a point of the path."""
+    """Set base pose and joint targets to point `index` of the path."""
     data.mocap_pos[0] = way.positions[index]
     data.mocap_quat[0] = way.quaternions[index]
     data.ctrl[:] = way.joints[index]
 
 
 def diverged(data: Any) -> bool:
-    """Tell whether MuJoCo met a bad state. Its other warnings, such as a full contact buffer, leave the state sound."""
+    """Return True if MuJoCo warned of a bad state. Its other warnings, such as a full contact buffer, are harmless."""
     import mujoco
 
     bad = (mujoco.mjtWarning.mjWARN_BADQPOS, mujoco.mjtWarning.mjWARN_BADQVEL, mujoco.mjtWarning.mjWARN_BADQACC)
@@ -272,7 +270,7 @@ def diverged(data: Any) -> bool:
 
 
 def breach(world: World, data: Any, protocol: Protocol, worst: np.ndarray) -> str:
-    """Update the worst travel and turn. Return the broken limit, if any."""
+    """Update `worst`, the greatest travel [m] and rotation [rad]. Return which limit is exceeded, empty if none is."""
     travel, turn = moved(world, object_state(world, data))
     if diverged(data) or not np.isfinite(data.qpos[world.object_address : world.object_address + 7]).all():
         worst[:] = np.inf
@@ -282,7 +280,7 @@ def breach(world: World, data: Any, protocol: Protocol, worst: np.ndarray) -> st
 
 
 def broken_limit(protocol: Protocol, travel: float, turn: float) -> str:
-    """Return which limit a travel [m] and a turn [rad] break, as a sentence, empty for none."""
+    """Return as text which limit a travel [m] or a rotation [rad] exceeds, empty if none."""
     if travel > protocol.max_displacement:
         return f"the object moved {travel * 100:.1f} cm"
     if turn > protocol.max_rotation:
@@ -291,15 +289,15 @@ def broken_limit(protocol: Protocol, travel: float, turn: float) -> str:
 
 
 def out_of_place(protocol: Protocol) -> Protocol:
-    """Return the trial for an object that is not as planned: the depth of the grasp posture is no fault there."""
+    """Return the protocol for a displaced or altered object, without a limit on penetration at the grasp."""
     return replace(protocol, max_grasp_penetration=math.inf)
 
 
-# Errors of a noisy trial.
+# Number of pose errors per noisy trial.
 TRIALS = 8
-# A turn and an offset [m] of the hand.
+# Rotation and offset [m] of the hand.
 PoseError = tuple[Float[np.ndarray, "3 3"], Float[np.ndarray, "3"]]
-# Errors are uniform up to these: along each axis [m], and about a random axis through the centre of mass [rad].
+# Greatest pose errors, drawn uniformly: along each axis [m], and about a random axis through the centre of mass [rad].
 OFFSET, TURN = 0.005, float(np.deg2rad(5.0))
 
 
@@ -311,10 +309,10 @@ def noisy_share(
     *,
     stop: Callable[[], bool] = lambda: False,
 ) -> float | None:
-    """Return the share of hold trials that the grasp passes, one for each error, with the hand out of place by it.
+    """Return the fraction of hold trials that the grasp passes, with one trial per pose error.
 
-    The error moves pregrasp, grasp and squeeze alike, as a wrong estimate of the object's pose would. A start that the
-    error pushes too deep into the object counts as not held. None where `stop` ended one of them, or there is none.
+    Each error displaces pregrasp, grasp and squeeze alike, as a wrong estimate of the object's pose would. A pregrasp
+    that penetrates the object too deeply counts as not held. Return None if `stop` ended a trial or `errors` is empty.
     """
     held, protocol = 0, out_of_place(protocol)
     for error in errors:
@@ -325,13 +323,13 @@ def noisy_share(
 
 
 def pose_errors(seed: int | Sequence[int], count: int) -> list[PoseError]:
-    """Draw seeded errors, one for each trial."""
+    """Return `count` random pose errors, the same for the same seed."""
     rng = np.random.default_rng(seed)
     return [pose_error(rng) for _ in range(count)]
 
 
 def pose_error(rng: np.random.Generator) -> PoseError:
-    """Draw a random turn and a random offset [m]."""
+    """Draw a random rotation and a random offset [m]."""
     axis = rng.normal(size=3)
     angle = torch.tensor(rng.uniform(-TURN, TURN), dtype=torch.float64)
     rotation = rotation_from_axis_angle(torch.as_tensor(axis / np.linalg.norm(axis)), angle).numpy()
@@ -344,7 +342,7 @@ def displaced(
     offset: Float[np.ndarray, "3"],
     center: Float[np.ndarray, "3"],
 ) -> Grasp:
-    """Return the grasp with all its hand postures turned about `center` and shifted by `offset` [m], object frame."""
+    """Return the grasp with its postures rotated about `center` [m], then shifted by `offset` [m], object frame."""
 
     def move(posture: Posture) -> Posture:
         base = rotation_from_quaternion(torch.as_tensor(posture.quaternion_wxyz, dtype=torch.float64)).numpy()

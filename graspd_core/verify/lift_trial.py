@@ -1,11 +1,11 @@
-"""The lift trial: come from a retreat, close on an object that stands on its support, lift it, and hold it.
+"""The lift trial: approach an object on its support, close the hand, lift the object, and hold it.
 
-Two questions, in this order. Do the commanded postures, from the retreat over the pregrasp to the grasp, reach into the
-support or a neighbour? MuJoCo's distances answer this, because a base that follows its commands passes through fixed
-bodies. Then, in the simulation under gravity: does the object rise with the hand and stay with it?
+The trial first checks whether the commanded postures, from the retreat over the pregrasp to the grasp, penetrate the
+support or a neighbour. It uses MuJoCo's distances, because a mocap base passes through fixed bodies. Then it simulates
+under gravity and checks whether the object rises with the hand and stays in it.
 
-The lift is seen from the hand: the base stands still, all others sink, and the object feels the acceleration as weight.
-MuJoCo gives bodies that follow commands no velocity, so a rising base would not carry by friction.
+The lift is simulated in the hand's frame. The base stands still, support and neighbours move down, and inertial forces
+act on the free bodies. MuJoCo gives mocap bodies no velocity, so a rising base would not carry the object by friction.
 """
 
 from __future__ import annotations
@@ -41,21 +41,21 @@ from graspd_core.verify.world import Protocol, World, advance, trial_data
 
 
 _COMING, _CLOSING, _SQUEEZING, _LIFTING = "while the hand came", "while closing", "while squeezing", "while lifting"
-# Shares of each way at which the hand's commanded postures are held against the obstacles.
+# Fractions of each path at which the hand's commanded postures are checked against the obstacles.
 _SHARES = (0.0, 0.25, 0.5, 0.75)
 
 
 @dataclass(frozen=True)
 class LiftSettings:
-    """The course of a lift trial, beside the physics and limits of `world.Protocol`.
+    """Settings of a lift trial, in addition to the physics and limits of `world.Protocol`.
 
     Attributes:
-        retreat: how far back along the hand's approach the trial begins [m].
-        approach_time: from the retreat to the pregrasp [s].
-        lift_height: [m].
-        lift_time: [s].
-        hold_time: [s].
-        max_reach_through: deepest that a commanded posture may lie in the support or a neighbour [m].
+        retreat: distance from the retreat to the pregrasp, along the hand's approach [m].
+        approach_time: duration from the retreat to the pregrasp [s].
+        lift_height: height of the lift [m].
+        lift_time: duration of the lift [s].
+        hold_time: duration of the hold after the lift [s].
+        max_reach_through: greatest allowed penetration of the support or a neighbour by a commanded posture [m].
     """
 
     retreat: float = RETREAT
@@ -75,13 +75,11 @@ def lift_trial(
     settings: LiftSettings = LiftSettings(),
     stop: Callable[[], bool] = lambda: False,
 ) -> TrialResult:
-    """Run one lift trial in a world built with a support or neighbours.
+    """Run one lift trial in a world built with a support or neighbours. It ends as soon as the object exceeds a limit.
 
-    It ends at the first breach. Until the hand first touches the object, the object rests as it was seen, because a
-    reconstructed bottom may not stand. From then on it is free.
-
-    The object has to stay within the protocol's limits (5 cm, 15°) of its start, as carried along by the lift, at all
-    times. Without a support there is no gravity, and the hand takes the object back the way it came.
+    Until the hand first touches the object, the object is held fixed, because a reconstructed bottom may not stand.
+    Then it is free. Relative to the hand's lift, the object must always stay within the protocol's limits (5 cm, 15°)
+    of its start. Without a support there is no gravity, and the hand moves the object back along the approach.
     """
     import mujoco
 
@@ -120,8 +118,7 @@ def _raise(
     worst: np.ndarray,
     stop: Callable[[], bool],
 ) -> str:
-    """Come, close, squeeze and raise the hand. Return why the trial is over, empty if it is not. Updates `worst`."""
-
+    """Approach, close, squeeze and lift. Return why the trial failed, empty if it did not. Update `worst`."""
     away, touched = (begin.position - grasp.pregrasp.position) / settings.retreat, False
     for name, start, end, duration in _stages(begin, grasp, protocol, settings):
         steps = round(duration / protocol.timestep)
@@ -150,7 +147,7 @@ def _said(reason: str, stage: str) -> str:
 def _stages(
     begin: Posture, grasp: Grasp, protocol: Protocol, settings: LiftSettings
 ) -> tuple[tuple[str, Posture, Posture, float], ...]:
-    """Return name, ends and duration [s] of every stage but the last, the hold, in order."""
+    """Return name, start, end and duration [s] of each stage before the final hold."""
     return (
         (_COMING, begin, grasp.pregrasp, settings.approach_time),
         (_CLOSING, grasp.pregrasp, grasp.grasp, protocol.stage_time),
@@ -179,7 +176,7 @@ def _sink(world: World, data: Any, up: Float[np.ndarray, "3"], a: float, setting
 
 
 def reach_through(world: World, data: Any, postures: tuple[Posture, ...], limit: float) -> str:
-    """Return where the hand is deepest in an obstacle on the straight paths between postures, empty to `limit` [m]."""
+    """Return the deepest penetration of an obstacle on the straight paths as text, empty if at most `limit` [m]."""
     import mujoco
 
     worst, reason = 0.0, ""

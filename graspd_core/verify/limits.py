@@ -1,6 +1,6 @@
-"""How much a grasp holds: the greatest mass at its friction, and the least friction at its mass.
+"""Limits of a grasp: the greatest mass at its friction, and the least friction at its mass.
 
-Both are found by bisection over trials whose pulls end when their answer is known (`early_stop`).
+Both are found by bisection over hold trials with early stop (`early_stop`).
 """
 
 from __future__ import annotations
@@ -17,11 +17,11 @@ from graspd_core.verify.world import Protocol, World, altered, at_friction, tria
 # mujoco is a compiled module without stubs.
 # pyright: reportAttributeAccessIssue=false
 
-# The least and the greatest mass that are asked about [kg].
+# Range of the payload search [kg].
 LEAST_PAYLOAD, MOST_PAYLOAD = 0.01, 16.0
-# The least share of its friction that is asked about.
+# Smallest tried friction, as a fraction of the protocol's.
 _LEAST_SHARE = 0.02
-# Limits are found to this factor.
+# The bisections end when the bounds differ by less than this factor.
 FINENESS = 1.1
 
 
@@ -34,11 +34,11 @@ def payload(
     held: bool = False,
     stop: StopHook = lambda: False,
 ) -> float:
-    """Return the greatest mass [kg] whose pulls the grasp holds, zero where it does not hold the `least`.
+    """Return the payload [kg]: the greatest mass at which the grasp withstands every pull of the protocol.
 
-    The hand closes once on the object's own mass, unless a hold trial has just closed it. Each direction is then pulled
-    as hard as the trial pulls the mass that is asked about, from the same state. `held` says that a hold trial has
-    shown that the grasp holds the `least`.
+    The result is 0 if the grasp does not hold the mass `least` [kg]. The hand closes once, with the object's own mass.
+    If a hold trial has already closed it, that state is reused. Each pull starts from this state, with the force for
+    the tried mass. Set `held` if a hold trial has already passed at `least`.
     """
     import mujoco
 
@@ -53,7 +53,7 @@ def payload(
                     return 0.0
                 closed = np.empty(mujoco.mj_stateSize(world.model, kind))
                 mujoco.mj_getState(world.model, data, closed, kind)
-            # Hands are weakest against what pulls the object out of them, the way they came.
+            # Hands are weakest against pulls along the approach, out of the hand. These directions come first.
             way = grasp.grasp.position - grasp.pregrasp.position
             directions = DIRECTIONS[list(protocol.pulls)]
             for direction in directions[np.argsort(-directions @ way, kind="stable")]:
@@ -70,7 +70,7 @@ def payload(
                     while high < MOST_PAYLOAD and holds(high := min(2 * low, MOST_PAYLOAD)):
                         low = high
                     most = _greatest(holds, low, high) if low < high else high
-                # Only a direction that is weaker than those before it is looked at closely.
+                # Bisect again only in a direction that is weaker than all earlier ones.
                 elif not holds(most):
                     most = _greatest(holds, least, most)
     except mujoco.FatalError:
@@ -79,7 +79,7 @@ def payload(
 
 
 def least_friction(world: World, grasp: Grasp, protocol: Protocol, *, stop: StopHook = lambda: False) -> float:
-    """Return the least sliding friction at which the grasp passes the hold trial, that of the protocol at most."""
+    """Return the least sliding friction, at most the protocol's, at which the grasp passes the hold trial."""
 
     def holds(fraction: float) -> bool:
         slippery = at_friction(protocol, Protocol.friction[0] / fraction)
@@ -89,7 +89,7 @@ def least_friction(world: World, grasp: Grasp, protocol: Protocol, *, stop: Stop
 
 
 def _greatest(holds: Callable[[float], bool], low: float, high: float) -> float:
-    """Return the greatest value known to hold, between `low` that does and `high` that does not."""
+    """Return by bisection the greatest value that holds. `low` must hold and `high` must not."""
     while high > FINENESS * low:
         middle = math.sqrt(low * high)
         low, high = (middle, high) if holds(middle) else (low, middle)

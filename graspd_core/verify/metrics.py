@@ -1,7 +1,7 @@
-"""The metrics of a grasp, one row each: `measure`, files, messages and tables follow these rows.
+"""Registry of grasp metrics. `measure`, files, messages and tables use its rows.
 
-They are static, independent of the frame, and defined in docs/metrics.md, which a test compares with the rows.
-`distinct` drops copies of a grasp from a run.
+The metrics are static and independent of the frame. docs/metrics.md defines them, and a test compares it with the rows.
+`distinct` removes near-duplicate grasps.
 """
 
 from __future__ import annotations
@@ -30,15 +30,15 @@ from graspd_core.verify.prepared_grasp import (
 
 @dataclass(frozen=True)
 class Metric:
-    """How one metric is measured and shown.
+    """Definition of one metric.
 
     Attributes:
         name: key of `GraspMetrics`.
-        unit: that files and tables show, empty without one.
-        scale: value in that unit over value in SI units.
-        measure: gives the value in SI units. None where another step of planning fills it in.
-        description: definition, for docs/metrics.md.
-        digits: decimals in tables.
+        unit: unit in files and tables. Empty if the metric has no unit.
+        scale: factor from SI units to `unit`.
+        measure: function that returns the value in SI units. None if another step of planning measures it.
+        description: definition for docs/metrics.md.
+        digits: number of decimals in tables.
     """
 
     name: str
@@ -50,17 +50,17 @@ class Metric:
 
     @property
     def key(self) -> str:
-        """Key in files: the name, and the unit in ASCII."""
+        """Key in files: the name followed by the unit in ASCII."""
         unit = self.unit.replace("1/", "per_").translate(str.maketrans("²³", "23"))
         return f"{self.name}_{unit}" if unit else self.name
 
     @property
     def title(self) -> str:
-        """Heading in tables."""
+        """Column heading in tables."""
         return f"{self.name.replace('_', ' ')} {self.unit}".rstrip()
 
     def text(self, value: float) -> str:
-        """Write a value in SI units for people."""
+        """Return a value, given in SI units, as text with name and unit."""
         return f"{self.name.replace('_', ' ')} {value * self.scale:.{self.digits}f} {self.unit}".rstrip()
 
 
@@ -134,25 +134,25 @@ METRICS: dict[str, Metric] = {row.name: row for row in _ROWS}
 
 
 def measure(context: MetricsContext, posture: Posture, *, max_contacts: int = MAX_CONTACTS) -> GraspMetrics:
-    """Every metric of the registry, of the context's hand at `posture` on the context's object.
+    """Measure all metrics of the context's hand at `posture` on the context's object.
 
-    ε and volume are those of at most `max_contacts` contacts. None where another step measures the metric.
+    ε and volume use at most `max_contacts` contacts. A metric that another step measures is None.
     """
     grasp = prepare_grasp(context, posture, max_contacts)
     values = {name: row.measure(grasp) if row.measure else None for name, row in METRICS.items()}
     return GraspMetrics({name: None if value is None else float(value) for name, value in values.items()})
 
 
-# Grasps are two where their palms are this far apart [m], or look or roll this far apart [rad].
+# Two grasps are different if their palms are this far apart [m] or their base rotations differ by this angle [rad].
 APART, TURNED = 0.02, float(np.deg2rad(20.0))
 
 
 def distinct(grasps: Sequence[Grasp], hand: HandModel) -> tuple[Grasp, ...]:
-    """Return the grasps, in their order, without those that are copies of one kept before.
+    """Return the grasps in order, without near-duplicates of an earlier grasp.
 
-    A copy has the middle of its palm within 20 mm and its base turned by less than 20° of the other's, in the object's
-    frame. What the object looks like plays no part: to grasp a ball from the left and from the right is two grasps,
-    because a robot that cannot come from one side may come from the other.
+    A near-duplicate has its palm centre within 20 mm and its base rotation within 20° of the other grasp's, in the
+    object frame. Symmetry of the object is ignored. Grasping a ball from the left and from the right counts as two
+    grasps, because a robot may reach only one side.
     """
     kept: list[Grasp] = []
     palms, turns = np.zeros((0, 3)), np.zeros((0, 3, 3))
@@ -160,7 +160,7 @@ def distinct(grasps: Sequence[Grasp], hand: HandModel) -> tuple[Grasp, ...]:
         posture = grasp.grasp
         turn = rotation_from_quaternion(torch.as_tensor(posture.quaternion_wxyz, dtype=torch.float64)).numpy()
         palm = posture.position + turn @ hand.palm_center
-        # The angle between two rotations, from the trace of one undone by the other.
+        # The trace of the relative rotation gives the cosine of its angle.
         cosine = (np.einsum("nij,ij->n", turns, turn) - 1.0) / 2.0
         near = np.linalg.norm(palms - palm, axis=1) < APART
         if not (near & (cosine > np.cos(TURNED))).any():

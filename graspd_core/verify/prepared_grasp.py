@@ -1,8 +1,8 @@
-"""One grasp ready to be measured: what several metrics need is computed once.
+"""Measurements of one grasp. Quantities that several metrics need are computed once.
 
-Dense samples of the hand, which no optimiser ever sees, tell where it touches the object, and how far it reaches into
-the object or into itself. The wrench space of unit contact forces gives the quality figures of Ferrari and Canny (ICRA
-1992).
+Dense samples of the hand's surface give its contacts, its penetration of the object and its self-penetration. The
+optimiser never sees these samples. The wrench space of unit contact forces gives the quality measures of Ferrari and
+Canny (ICRA 1992).
 """
 
 from __future__ import annotations
@@ -43,22 +43,22 @@ from graspd_core.types import Grasp, Plane, Posture
 from graspd_core.verify.hold_trial import place_hand, start_penetration
 from graspd_core.verify.world import World, trial_data
 
-# Where a hand may wait that closes only after it has arrived: how far it is closed, and how far it is drawn back to the
-# pregrasp [m]. Where it sinks in by more than `_SUNK` [m], there or at these shares of the way back, it may not.
+# Candidate arrival postures: fraction of the closing motion, and distance back towards the pregrasp [m]. A candidate is
+# invalid if it penetrates by more than `_SUNK` [m], there or at the fractions `_WAY_BACK` of the path to the pregrasp.
 _CLOSED, _DRAWN_BACK, _SUNK, _WAY_BACK = (0.0, 0.25, 0.5, 0.75), (0.0, 0.001, 0.002, 0.003), 1e-5, (0.5, 1.0)
-# Samples and a seed that the optimiser's candidates never see.
+# Number of samples, and a seed that the optimiser does not use.
 _SAMPLES, _SEED = 4000, 20_000
 
 
 @dataclass(frozen=True, eq=False)
 class HandSurface:
-    """Dense samples of a hand's collision surface, link frames.
+    """Dense samples of a hand's collision surface, in link frames.
 
     Attributes:
-        points: [m].
-        links: link of each sample.
-        areas: surface that each sample stands for [m²].
-        kinematics: float64.
+        points: sample positions in the frame of their link [m].
+        links: link index of each sample.
+        areas: surface area that each sample represents [m²].
+        kinematics: the hand's kinematics in float64.
     """
 
     points: Float[np.ndarray, "samples 3"]
@@ -69,12 +69,12 @@ class HandSurface:
 
 @dataclass(frozen=True, eq=False)
 class MetricsContext:
-    """An object and a hand, ready to measure grasps: build with `make_metrics_context`, ask with `metrics.measure`.
+    """Precomputed data for measuring grasps of one object by one hand (`make_metrics_context`, `metrics.measure`).
 
     Attributes:
-        points: of the object's surface and edges [m].
-        tree: of these points, a `scipy.spatial.KDTree`.
-        world: of the hold trial. None where there is none, and then no contact depth is measured.
+        points: points on the object's surface and edges [m].
+        tree: `scipy.spatial.KDTree` of `points`.
+        world: world of the hold trial. If it is None, the contact depth is not measured.
     """
 
     target: ObjectModel
@@ -87,7 +87,7 @@ class MetricsContext:
 
 
 def make_metrics_context(target: ObjectModel, hand: HandModel) -> MetricsContext:
-    """Sample the hand and prepare the object's distance, once for all grasps of that object by that hand."""
+    """Sample hand and object and prepare distance queries, once for all grasps of this object by this hand."""
     from scipy.spatial import KDTree
 
     creases = crease_points(target.mesh, _SAMPLES // 4, _SEED)
@@ -98,14 +98,14 @@ def make_metrics_context(target: ObjectModel, hand: HandModel) -> MetricsContext
 
 @lru_cache(maxsize=8)
 def hand_surface(hand: HandModel) -> HandSurface:
-    """Dense samples of a hand."""
+    """Return dense samples of the hand's collision surface."""
     points, links, areas = kept_dense_samples(hand, count=_SAMPLES, seed=_SEED)
     return HandSurface(points, links, areas, make_kinematics(hand, "cpu", torch.float64))
 
 
-# Hand surface nearer than this to the object's is in contact [m].
+# A hand sample nearer than this to the object's surface is in contact [m].
 CONTACT_DISTANCE = 0.002
-# Samples farther than this from the object's bounding box have no exact distance [m]; the widest contact is 10 mm.
+# Samples farther than this from the object's bounding box have no exact distance [m]. The widest contact is 10 mm.
 _REACH = 0.015
 
 
@@ -114,12 +114,12 @@ class PlacedHand:
     """Dense surface samples of a hand in the object frame.
 
     Attributes:
-        points: [m].
-        links: link of each sample.
-        areas: surface that each sample stands for [m²].
-        distance: signed distance of each sample to the object [m], a lower bound beyond 15 mm.
+        points: sample positions [m].
+        links: link index of each sample.
+        areas: surface area that each sample represents [m²].
+        distance: signed distance of each sample to the object [m]. Beyond 15 mm it is a lower bound.
         rotations: `R_object_link`.
-        translations: link origins in the object frame [m].
+        translations: link origins, object frame [m].
     """
 
     points: Float[np.ndarray, "samples 3"]
@@ -131,7 +131,7 @@ class PlacedHand:
 
 
 def placed_hand(context: MetricsContext, posture: Posture) -> PlacedHand:
-    """Put the hand's samples where a posture puts them, and measure every sample's distance to the object."""
+    """Return the hand's samples at a posture, with each sample's distance to the object."""
     surface = context.surface
     joints = torch.as_tensor(posture.joint_positions, dtype=torch.float64)[None]
     links = forward(surface.kinematics, joints)[0]
@@ -144,28 +144,28 @@ def placed_hand(context: MetricsContext, posture: Posture) -> PlacedHand:
 
 
 def contact_area(placed: PlacedHand, within: float = CONTACT_DISTANCE) -> float:
-    """Measure the hand's surface within a distance of the object's, of at most 15 mm, on either side of it [m²]."""
+    """Return the area of the hand within `within` [m], at most 15 mm, of the object's surface, on either side [m²]."""
     return float(placed.areas[np.abs(placed.distance) <= within].sum())
 
 
 def contact_links(placed: PlacedHand, within: float = CONTACT_DISTANCE) -> int:
-    """Count the links that come within a distance of the object, penetrating ones included."""
+    """Count the links that come within `within` [m] of the object or penetrate it."""
     return len(np.unique(placed.links[touching(placed, within)]))
 
 
 def touching(placed: PlacedHand, within: float = CONTACT_DISTANCE) -> Bool[np.ndarray, "samples"]:
-    """Tell which samples count as contacts."""
+    """Return which samples lie within `within` [m] of the object or inside it."""
     return placed.distance <= within
 
 
-# Cells are halved until they are 2 mm wide: 16 mm, 8, 4, 2. Lengths of cells are counted in the smallest.
+# Cells are halved until they are 2 mm wide: 16, 8, 4, 2 mm. Cell sizes and positions are integers, in units of 2 mm.
 _CELL, _HALVINGS = 0.002, 3
-# Half the diagonal of a cube of side 1, with room for rounding.
+# Half the diagonal of a unit cube, with a margin for rounding.
 _HALF_DIAGONAL = 0.5 * np.sqrt(3.0) * 1.001
 
 
 def penetration(context: MetricsContext, placed: PlacedHand) -> float:
-    """Return the greatest depth of a hand sample inside the object, or of a point of the object inside a link [m]."""
+    """Return the greatest depth of a hand sample inside the object, or of an object point inside a link [m]."""
     worst = float(max(0.0, -placed.distance.min()))
     centers, radii = _link_balls(context.hand)
     centers = np.einsum("nij,nj->ni", placed.rotations, centers) + placed.translations
@@ -177,7 +177,7 @@ def penetration(context: MetricsContext, placed: PlacedHand) -> float:
 
 @lru_cache(maxsize=8)
 def _link_balls(hand: HandModel) -> tuple[Float[np.ndarray, "links 3"], Float[np.ndarray, "links"]]:
-    """Return centers, in link frames, and radii of balls about the solids of each link [m]. A bare link's are zero."""
+    """Return centers, in link frames, and radii of each link's bounding sphere [m]. Both are 0 without primitives."""
     centers, radii = np.zeros((hand.num_links, 3)), np.zeros(hand.num_links)
     for link, primitives in enumerate(hand.primitives_of):
         if primitives:
@@ -188,11 +188,11 @@ def _link_balls(hand: HandModel) -> tuple[Float[np.ndarray, "links 3"], Float[np
 
 
 def arrival(context: MetricsContext, grasp: Grasp, support: Plane | None) -> Posture | None:
-    """Return an open posture at the grasp whose straight way from the pregrasp is clear of object and support.
+    """Return an open posture at the grasp that the hand reaches from the pregrasp on a straight, collision-free path.
 
-    graspd's trial closes the fingers on the way. Some planners do so only after the hand has arrived, where fingers as
-    open as the pregrasp's may be in the object. The hand is closed in part, else drawn back by at most 3 mm. None:
-    neither helps.
+    graspd's own trial closes the fingers while the hand approaches. Some planners close them only after arriving, when
+    the open fingers may penetrate the object. This function therefore closes the fingers in part or moves the hand back
+    by at most 3 mm. Return None if no such posture is free of collisions with object and support.
     """
     open_joints, closing = grasp.pregrasp.joint_positions, grasp.grasp.joint_positions - grasp.pregrasp.joint_positions
     back = grasp.pregrasp.position - grasp.grasp.position
@@ -218,7 +218,7 @@ def arrival(context: MetricsContext, grasp: Grasp, support: Plane | None) -> Pos
 
 
 def contact_depth(context: MetricsContext, posture: Posture) -> float | None:
-    """MuJoCo's deepest contact of hand and object at a posture [m], or None without a world."""
+    """Return the depth of MuJoCo's deepest contact of hand and object at a posture [m]. None without a world."""
     if context.world is None:
         return None
     with trial_data(context.world) as data:
@@ -227,12 +227,12 @@ def contact_depth(context: MetricsContext, posture: Posture) -> float | None:
 
 
 def self_penetration(context: MetricsContext, placed: PlacedHand) -> float:
-    """Return the greatest depth of a hand sample inside a link that is not adjacent to its own [m]."""
+    """Return the greatest depth of a hand sample inside a link that is not adjacent to the sample's link [m]."""
     hand, worst = context.hand, 0.0
     centers, radii = _link_balls(hand)
     centers = np.einsum("nij,nj->ni", placed.rotations, centers) + placed.translations
     apart = np.linalg.norm(centers[:, None] - centers, axis=-1) - radii[:, None] - radii
-    # Samples of a link lie on its solids, so that links whose balls are apart cannot meet.
+    # Links whose bounding spheres are apart cannot collide.
     meet = (apart < 0) & ~hand.adjacent
     for link in np.flatnonzero(meet.any(1)).tolist():
         others = placed.points[meet[link][placed.links]]
@@ -243,11 +243,11 @@ def self_penetration(context: MetricsContext, placed: PlacedHand) -> float:
 
 
 def intersection_volume(context: MetricsContext, placed: PlacedHand) -> float:
-    """Return the volume of the hand inside the object [m³], summed over 2 mm cells of a lattice in the base frame.
+    """Return the volume of the hand inside the object [m³], summed over 2 mm grid cells in the base frame.
 
-    An octree of each solid finds the cells, so no overlap is too small or too thin to be visited. A cell counts by the
-    thickness of what hand and object share in it, as of two flat faces that meet: exact for a flat overlap of any
-    thickness. What solids share is counted once.
+    An octree of each primitive finds the cells, so even small and thin overlaps are found. In each cell, hand and
+    object are treated as two facing half-spaces, which is exact for flat overlaps of any thickness. Volume that several
+    primitives share is counted once.
     """
     solids = _placed_solids(context.hand, placed)
     cells, which = _root_cells(solids, placed)
@@ -260,7 +260,7 @@ def intersection_volume(context: MetricsContext, placed: PlacedHand) -> float:
         depth = -_solid_distance(solids, which, centers)
         kept = depth > -half_diagonal
         cells, which, centers, depth = cells[kept], which[kept], centers[kept], depth[kept]
-        # Solids overlap, and share cells.
+        # Overlapping primitives share cells.
         _, first, same = np.unique(packed_rows(cells), return_index=True, return_inverse=True)
         if size == 1:
             deepest = np.full(len(first), -np.inf)
@@ -285,10 +285,10 @@ class _PlacedSolids:
     """The collision primitives of a hand at its grasp, hulls last.
 
     Attributes:
-        primitives: those of the hand.
+        primitives: the hand's primitives.
         rotations: `R_object_primitive`.
-        translations: primitive origins in the object frame [m].
-        smooth: those that are no hulls, for distances.
+        translations: primitive origins, object frame [m].
+        smooth: the primitives that are not hulls, for distance queries.
     """
 
     primitives: tuple[Primitive, ...]
@@ -308,7 +308,7 @@ def _placed_solids(hand: HandModel, placed: PlacedHand) -> _PlacedSolids:
 def _root_cells(
     solids: _PlacedSolids, placed: PlacedHand
 ) -> tuple[Int[np.ndarray, "cells 3"], Int[np.ndarray, "cells"]]:
-    """Return the coarsest cells over the boxes of all solids, base frame, and the solid of each, rising."""
+    """Return the coarsest octree cells of all primitives, base frame, and each cell's primitive index, ascending."""
     size, base, cells = 2**_HALVINGS, placed.rotations[0], [np.zeros((0, 3), dtype=np.int64)]
     for primitive in solids.primitives:
         low, high = bounds(primitive)
@@ -323,7 +323,7 @@ def _root_cells(
 def _solid_distance(
     solids: _PlacedSolids, which: Int[np.ndarray, "n"], points: Float[np.ndarray, "n 3"]
 ) -> Float[np.ndarray, "n"]:
-    """Measure how far each point of the object frame is from one solid [m], `which` rising. At least that of hulls."""
+    """Return each point's signed distance to the primitive `which` (ascending) [m]. For hulls it is a lower bound."""
     local = np.einsum("nji,nj->ni", solids.rotations[which], points - solids.translations[which])
     hulls = int(np.searchsorted(which, len(solids.smooth.link)))
     smooth = local_distance(solids.smooth, torch.as_tensor(local[:hulls]), torch.as_tensor(which[:hulls])).numpy()
@@ -343,26 +343,26 @@ def _lattice(low: Int[np.ndarray, "3"], high: Int[np.ndarray, "3"]) -> Int[np.nd
 
 
 CONE_EDGES = 8
-# A set of wrenches whose smallest extent is below this share of its largest spans no volume.
+# Wrenches span no volume if their smallest extent is below this fraction of their largest.
 _FLAT = 1e-9
 
 
-# Wrenches are moved by up to this, so that no more than six lie on a facet. A compiled hull whose planes are farther
-# off than the second number is built again by Qhull.
+# Wrenches are perturbed by up to the first number, so that at most six lie on a facet. If the plane error of a compiled
+# hull exceeds the second number, Qhull builds the hull again.
 _JOGGLE, _PLANE_ERROR = 1e-9, 1e-9
-# The compiled hull numbers wrenches by bytes.
+# The compiled hull stores wrench indices as bytes.
 _MOST_WRENCHES = 256
 
 
 @dataclass(frozen=True, eq=False)
 class WrenchHull:
-    """The convex hull of unit-force friction-cone wrenches, quality figures of Ferrari and Canny.
+    """Grasp quality of Ferrari and Canny, from the convex hull of the wrenches of unit contact forces.
 
     Attributes:
-        epsilon: radius of the largest ball about the origin in the hull, 0 where the origin is outside.
-        volume: of the hull.
-        weakest_push: the unit disturbance (force, torque over length) that is resisted least, against the nearest
-            facet. None where the origin is outside.
+        epsilon: radius of the largest ball about the origin inside the hull. 0 if the origin is outside.
+        volume: volume of the hull.
+        weakest_push: unit disturbance (force, torque over length) that the grasp resists least: the negative
+            normal of the nearest facet. None if the origin is outside.
     """
 
     epsilon: float = 0.0
@@ -373,13 +373,13 @@ class WrenchHull:
 def wrench_hull(
     arms: Float[np.ndarray, "n 3"], normals: Float[np.ndarray, "n 3"], friction: float, length: float
 ) -> WrenchHull:
-    """Return the hull of the wrenches of contacts.
+    """Return the grasp quality of a set of contacts.
 
     Args:
-        arms: contact points about the centre of mass [m].
+        arms: contact points relative to the centre of mass [m].
         normals: outward unit normals of the object.
         friction: Coulomb coefficient.
-        length: torque scale, the object's largest radius [m].
+        length: length that torques are divided by, the object's largest radius [m].
     """
     if len(arms) < 2:
         return WrenchHull()
@@ -391,12 +391,12 @@ def wrench_hull(
     return WrenchHull(offset, volume, -normal) if offset > 0 else WrenchHull(volume=volume)
 
 
-# Distance from the origin and outward normal of the nearest facet, and volume.
+# Distance from the origin to the nearest facet, outward normal of that facet, and volume of the hull.
 Hull = tuple[float, Float[np.ndarray, "6"], float]
 
 
 def compiled_hull(wrenches: Float[np.ndarray, "n 6"]) -> Hull | None:
-    """Return the hull by the compiled kernel, or None where there is no kernel or it fails."""
+    """Build the hull with the compiled kernel. Return None if there is no kernel or it fails."""
     library = kernel().library
     if library is None or len(wrenches) > _MOST_WRENCHES:
         return None
@@ -407,10 +407,10 @@ def compiled_hull(wrenches: Float[np.ndarray, "n 6"]) -> Hull | None:
 
 
 def qhull(wrenches: Float[np.ndarray, "n 6"]) -> Hull:
-    """Return the hull by Qhull."""
+    """Build the hull with Qhull."""
     from scipy.spatial import ConvexHull
 
-    # Joggled: takes half the time of merging facets, and is the same every time.
+    # QJ perturbs the input. It takes half the time of merging facets and is deterministic.
     hull = ConvexHull(wrenches, qhull_options="QJ")
     nearest = hull.equations[:, -1].argmax()
     return -float(hull.equations[nearest, -1]), hull.equations[nearest, :-1], float(hull.volume)
@@ -419,7 +419,7 @@ def qhull(wrenches: Float[np.ndarray, "n 6"]) -> Hull:
 def cone_wrenches(
     arms: Float[np.ndarray, "n 3"], normals: Float[np.ndarray, "n 3"], friction: float, length: float
 ) -> Float[np.ndarray, "wrenches 6"]:
-    """Wrenches (force, torque over length) of unit forces along the edges of each contact's friction cone."""
+    """Return the wrenches (force, torque over length) of unit forces along each contact's friction cone edges."""
     reference = np.eye(3)[np.abs(normals).argmin(-1)]
     first = np.cross(normals, reference)
     first /= np.maximum(np.linalg.norm(first, axis=-1, keepdims=True), 1e-12)
@@ -431,8 +431,8 @@ def cone_wrenches(
     return np.concatenate([forces, torques], -1).reshape(-1, 6)
 
 
-# Contacts that the wrench hull is made of. The protocol allows 32, whose hull in six dimensions has some 22,000 facets
-# and takes five times as long; that raises ε by a tenth (docs/metrics.md). Benchmarks ask for 32, planning does not.
+# Greatest number of contacts in the wrench hull, in planning and in benchmarks. A hull of 32 contacts has some 22,000
+# facets, takes five times as long and raises ε by a tenth (docs/metrics.md).
 MAX_CONTACTS, PROTOCOL_CONTACTS = 16, 32
 # Half the distance of a central difference [m].
 _STEP = 2e-4
@@ -440,13 +440,13 @@ _STEP = 2e-4
 
 @dataclass(frozen=True, eq=False)
 class PreparedGrasp:
-    """A hand at its grasp, about to be measured.
+    """A hand at a grasp, with the quantities that metrics share.
 
     Attributes:
         context: the object and the hand.
-        posture: of the hand.
-        placed: the hand's samples in the object frame.
-        max_contacts: contacts that the wrench hull is made of at most.
+        posture: posture of the hand.
+        placed: the hand's samples, object frame.
+        max_contacts: greatest number of contacts in the wrench hull.
     """
 
     context: MetricsContext
@@ -456,7 +456,7 @@ class PreparedGrasp:
 
     @cached_property
     def wrench_hull(self) -> WrenchHull:
-        """Hull of the wrenches of at most `max_contacts` contacts, torques over the object's radius."""
+        """Grasp quality of at most `max_contacts` contacts. Torques are divided by the object's radius."""
         target, points = self.context.target, self.placed.points[touching(self.placed)]
         chosen = points[farthest_points(points, self.max_contacts)]
         normals = surface_normals(self.context.query, chosen)
@@ -469,12 +469,12 @@ class PreparedGrasp:
 
 
 def prepare_grasp(context: MetricsContext, posture: Posture, max_contacts: int = MAX_CONTACTS) -> PreparedGrasp:
-    """Put the hand at a posture."""
+    """Place the hand at a posture and compute its samples' distances."""
     return PreparedGrasp(context, posture, placed_hand(context, posture), max_contacts)
 
 
 def surface_normals(query: DistanceQuery, points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 3"]:
-    """Outward unit normals of the object's surface next to points, by central differences of the exact distance."""
+    """Return outward unit normals of the object's surface near points, by central differences of the distance."""
     probes = points[:, None, None] + _STEP * np.stack([np.eye(3), -np.eye(3)])
     distance = signed_distance(query, probes.reshape(-1, 3)).reshape(len(points), 2, 3)
     gradient = distance[:, 0] - distance[:, 1]

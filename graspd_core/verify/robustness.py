@@ -1,9 +1,9 @@
-"""Robustness checks of an object that cameras saw: another place, less friction, other shapes of its hidden side.
+"""Robustness checks for objects seen by cameras: other poses, less friction, other shapes of the hidden side.
 
-A grasp that holds on the likeliest scene is tried on these too, until it is as sure as asked for or cannot be. Two of
-the other shapes must hold it, which finds objects whose hidden side was guessed wrong. How often such grasps hold on
-the true object was measured (docs/clouds.md). Trials run on several threads. `results_in_order` gives their results in
-order, the same for any number of threads.
+A grasp that holds on the likeliest scene runs these checks until it passes or fails. It must hold on two of the other
+shapes, because the hidden side may be guessed wrong. docs/clouds.md reports how often such grasps hold on the true
+object. Trials run on several threads. `results_in_order` yields the same results in the same order for any number of
+threads.
 """
 
 from __future__ import annotations
@@ -34,12 +34,12 @@ from graspd_core.verify.world import Protocol, World, altered, at_friction, buil
 Item = TypeVar("Item")
 Result = TypeVar("Result")
 
-# How often the stop hook is asked while waiting for a result [s].
+# Interval at which the stop hook is polled while waiting for a result [s].
 _POLL_RESULTS = 0.02
 
 
 def begin_in_thread(name: str, work: Callable[[], Result]) -> Future[Result]:
-    """Begin work in a thread of its own. Only a request for its result, and the process's end, wait for it."""
+    """Start `work` in a new thread and return its future. The process waits for the thread before it exits."""
     pool = ThreadPoolExecutor(max_workers=1, thread_name_prefix=name)
     begun = pool.submit(work)
     pool.shutdown(wait=False)
@@ -55,17 +55,17 @@ def results_in_order(
     *,
     known_over: StopHook = lambda: False,
 ) -> Generator[Result]:
-    """Yield the result of each item, in their order, until it is over.
+    """Yield the result of each item in order, until `over` returns true.
 
-    Work that was begun ahead ends by its stop hook when the iterator is closed.
+    When the iterator is closed, the stop hook ends work that was started ahead.
 
     Args:
-        over: ends it all. Only the calling thread asks it.
-        work: done by the calling thread if there is one thread, else by `threads` others.
-        items: what is worked on.
-        threads: at least 1.
-        needed: how many more results will be asked for at least, so that none of these is begun too early.
-        known_over: ends work too. All threads ask it, also while nobody asks for a result.
+        over: ends the iteration. Only the calling thread calls it.
+        work: function of an item and a stop hook. With one thread, the calling thread runs it. Otherwise a pool does.
+        items: the items to work on.
+        threads: number of threads, at least 1.
+        needed: returns how many more results the caller needs at least. So many items are started ahead.
+        known_over: also ends running work. All threads call it.
     """
     if min(threads, len(items)) <= 1:
         for item in items:
@@ -78,7 +78,7 @@ def results_in_order(
     waiting, left = deque[Future[Result]](), iter(items)
     try:
         while not over():
-            # As many again as are worked on, and all that are needed: no thread waits for the first in line.
+            # Queue twice as many items as threads, and all that are needed, so that no thread is idle.
             for item in islice(left, max(2 * threads, needed()) - len(waiting)):
                 waiting.append(pool.submit(work, item, lambda: closed.is_set() or known_over()))
             if not waiting:
@@ -92,31 +92,31 @@ def results_in_order(
         pool.shutdown(cancel_futures=True)
 
 
-# Of the friction that the scene says.
+# Factor on the friction in the check with less friction.
 _LESS_FRICTION = 2 / 3
-# Places that the object may be at instead, the same for all grasps. No benchmark tries them.
+# Number and seed of the displaced object poses, the same for all grasps. No benchmark uses them.
 _PLACES, _PLACES_SEED = 3, 0x706C616365
-# How many places must hold a grasp whose trials ask for more than most things weigh, and how many other shapes.
+# Least number of displaced poses on which a grasp must hold if the mass is assumed, and of other shapes.
 _LEAST_PLACES, LEAST_SHAPES = 2, 2
-# A guessed shape is not worth a finer distance grid: nodes along an axis.
+# Nodes of a guessed shape's distance grid along an axis. A finer grid would not help.
 _RESOLUTION = 24
-# How often the stop hook is asked while waiting for a world [s].
+# Interval at which the stop hook is polled while waiting for a world [s].
 _POLL = 0.02
-# Name of the threads that make other shapes.
+# Name of the threads that build other shapes.
 _SHAPES = "graspd-shapes"
 
-# Results of some checks in order, None for an impossible one. And a function that tries a grasp under a stage.
+# Results of some checks in order, None for an impossible check. `HoldUnder` runs the checks of a stage on a grasp.
 Results = Generator[TrialResult | None]
 HoldUnder = Callable[["HypothesisStage", Grasp, StopHook], Results]
 
 
 @dataclass(frozen=True)
 class Hypothesis:
-    """One robustness check: another possible state of the scene.
+    """One robustness check: a variant of the scene that may be the true one.
 
     Attributes:
-        name: what it is, for people.
-        hold: the hold trial of a grasp in that state, None if it is impossible or the hook says to stop.
+        name: name of the variant, for messages.
+        hold: runs the hold trial of a grasp in the variant. It returns None if the variant is impossible or if stopped.
     """
 
     name: str
@@ -128,9 +128,9 @@ class HypothesisStage:
     """Robustness checks of one kind.
 
     Attributes:
-        items: in the order in which they are tried.
-        least: how many of them must hold a grasp, all of them if there are fewer.
-        though_failed: probability that a grasp which fails here holds on the true object.
+        items: the checks, in the order in which they run.
+        least: number of checks that a grasp must pass. If there are fewer possible checks, it must pass all.
+        though_failed: probability that a grasp that fails this stage still holds on the true object.
     """
 
     items: tuple[Hypothesis, ...]
@@ -139,19 +139,19 @@ class HypothesisStage:
 
 
 class LaterWorld:
-    """A world that a thread makes on the first request and that is then kept. None if there is no such world."""
+    """A world that a thread builds on the first request. The result is kept. It is None if there is no such world."""
 
     def __init__(self, make: Callable[[], World | None]):
         self._make, self._begun, self._asked = make, None, threading.Lock()
 
     def begin(self) -> Future[World | None]:
-        """Begin to make it, if that is not begun."""
+        """Start to build the world, if that has not started yet. Return its future."""
         with self._asked:
             self._begun = self._begun or begin_in_thread(_SHAPES, self._make)
             return self._begun
 
     def altered(self, mass: float) -> LaterWorld:
-        """Return the world with an object of another mass [kg]."""
+        """Return the world with another object mass [kg], also built on the first request."""
         return LaterWorld(lambda: (world := self.begin().result()) and altered(world, mass=mass))
 
 
@@ -160,10 +160,10 @@ class Hypotheses:
     """The robustness checks that a grasp must pass.
 
     Attributes:
-        stages: places, which are cheap to try, then other shapes.
-        probability: that a grasp which holds under all of them holds on the true object.
-        waited_for: set once a trial waits for its world: there is time for other work.
-        doubts: what speaks against the scene or its mass. No grasp is tried under anything else then, and none passes.
+        stages: displaced poses and less friction, which are cheap to try, then other shapes.
+        probability: probability that a grasp that passes all stages holds on the true object.
+        waited_for: set once a trial waits for its world, so that other trials may start.
+        doubts: reasons to doubt the scene or its mass. If there are any, no check runs and no grasp passes.
     """
 
     stages: tuple[HypothesisStage, ...]
@@ -175,10 +175,10 @@ class Hypotheses:
 def begin_other_worlds(
     run: Run, scene: Scene, hand: HandModel, protocol: Protocol, probability: float
 ) -> tuple[LaterWorld, ...]:
-    """Return the worlds of other shapes of the object, none if grasps need not be tried in one.
+    """Return the worlds of other possible shapes of the object. Empty if grasps need not be tried on them.
 
-    Those that every grasp is tried in are begun, one at a time. A world is None if there is no such shape, or if the
-    run was over before.
+    The first two worlds, in which every grasp is tried, are built at once, one after the other. The others are built
+    when needed. A world is None if there is no such shape or if the run ended first.
     """
     making = threading.Lock()
 
@@ -196,10 +196,10 @@ def begin_other_worlds(
 def hypotheses_of(
     scene: Scene, others: Sequence[LaterWorld], trials: TrialContext, probability: float
 ) -> Hypotheses | None:
-    """Return the checks that a grasp must pass to be as sure as asked for, None for none.
+    """Return the checks that a grasp must pass to reach the requested `probability`. None if there are none.
 
-    `others` comes from `begin_other_worlds`. With a known mass, a grasp must hold in all places, and with less
-    friction.
+    `others` comes from `begin_other_worlds`. If the mass is known, a grasp must hold on all displaced poses and with
+    less friction.
     """
     shares = held_shares(scene.object)
     if scene.evidence is not None and scene.evidence.doubts:
@@ -218,7 +218,7 @@ def hypotheses_of(
         places.append(Hypothesis(f"friction {slippery.friction[0]:.2g}", work))
         least = len(places)
     stages = [HypothesisStage(tuple(places), least, shares.fails_places)]
-    # Where nothing was hidden no more can be doubted.
+    # If no side was hidden, there are no other shapes to check.
     surest = shares.shapes if others or not scene.evidence.hidden else shares.places
     waited_for = threading.Event()
     if others:
@@ -231,7 +231,7 @@ def hypotheses_of(
 
 
 def less_sure(hypotheses: Hypotheses, share: float, most: float) -> Hypotheses:
-    """Return the checks of an object that weighs at most the payload `most` [kg] with the probability `share`."""
+    """Scale all probabilities by `share`, the probability that the object weighs at most `most` [kg]."""
     if share < LEAST_LIGHT:
         told = f"the hand lifts {most:.2g} kg, and most objects of this volume weigh more"
         return Hypotheses((), share * MASS_KNOWN.likeliest, doubts=(told,))
@@ -240,7 +240,7 @@ def less_sure(hypotheses: Hypotheses, share: float, most: float) -> Hypotheses:
 
 
 def one_by_one(stage: HypothesisStage, grasp: Grasp, stop: StopHook) -> Results:
-    """Yield the trials of a grasp under each check, none begun before its result is asked for."""
+    """Yield the trial result of each check in turn. A trial starts only when its result is requested."""
     for item in stage.items:
         yield item.hold(grasp, stop)
 
@@ -251,10 +251,10 @@ def try_hypotheses(
     stop: StopHook,
     hold_under: HoldUnder = one_by_one,
 ) -> tuple[TrialResult, float]:
-    """Try a grasp under each check in turn, until enough hold or too many fail.
+    """Run the robustness checks of a grasp, stage by stage. A stage ends when enough checks pass or too many fail.
 
-    Returns result and probability. The result holds the greatest travel and turn of the passed trials. `hold_under` is
-    given a stage at a time.
+    Return the combined result and the probability that the grasp holds on the true object. The result has the greatest
+    travel and rotation of the passed trials. `hold_under` runs the checks of one stage.
     """
     travel = turn = 0.0
     if hypotheses.doubts:
@@ -280,7 +280,7 @@ def try_hypotheses(
 
 
 def held_shares(target: ObjectModel) -> HeldShares:
-    """Return the probabilities of grasps of an object that hold under robustness checks."""
+    """Return the measured probabilities that grasps hold, for an object of assumed or of known mass."""
     return MASS_ASSUMED if target.mass_assumed else MASS_KNOWN
 
 
@@ -316,9 +316,9 @@ def _begun(evidence: Evidence) -> dict[str, Future[Scene | None]]:
 
 
 def begin_other_shapes(probability: float, likeliest: ObjectModel, evidence: Evidence) -> None:
-    """Begin the other shapes that all grasps of a scene to come will be tried on, if any, in other threads.
+    """Start to build, in background threads, the other shapes on which every grasp will be tried, if there are any.
 
-    `scene_from_views` calls this, so that they are made while the distance grid of the likeliest shape is built.
+    `scene_from_views` calls this, so that they are built in parallel with the distance grid of the likeliest shape.
     """
     for rule in _rules_needed(evidence, probability, held_shares(likeliest))[:LEAST_SHAPES]:
         work = partial(run_isolated, other_scene, evidence, rule, likeliest)
@@ -327,20 +327,20 @@ def begin_other_shapes(probability: float, likeliest: ObjectModel, evidence: Evi
 
 @lru_cache(maxsize=16)
 def _other_world(scene: Scene, hand: HandModel, protocol: Protocol, rule: str) -> World | None:
-    """Return the world of another shape of the object's own mass and friction, None if there is no such shape."""
+    """Return the world of another shape with the object's mass and friction. None if there is no such shape."""
     assert scene.evidence is not None
-    # Taken out: if making it failed, as where memory was short, it is made again the next time.
+    # The future is removed. If building the shape failed, for example for lack of memory, it is built again next time.
     begun = _begun(scene.evidence).pop(rule, None)
     other = run_isolated(other_scene, scene.evidence, rule, scene.object) if begun is None else begun.result()
     if other is None:
         return None
-    # A call of its own: the likeliest shape, which every grasp is tried on first, may be cut before.
+    # This is a separate call, so that the likeliest shape, which every grasp needs first, may be cut before it.
     parts = run_isolated(convex_parts, other.object.mesh, other.sdf, **COARSE_CUTS)
     return build_world(hand, other.object, parts, protocol)
 
 
 def other_scene(evidence: Evidence, rule: str, likeliest: ObjectModel) -> Scene | None:
-    """Return an object of the same mass and friction whose hidden side is guessed by a rule, None for no guess."""
+    """Return a scene with the hidden side guessed by `rule`, equal mass and friction. None without a guess."""
     from graspd_core.perception.reconstruct.hidden_side import other_shape
 
     mesh = other_shape(evidence, rule, likeliest.mesh)

@@ -1,4 +1,4 @@
-"""The clock, the hooks and the result of one run."""
+"""Clock, hooks and result of one run."""
 
 from __future__ import annotations
 
@@ -24,13 +24,13 @@ from graspd_core.types import (
 
 
 class Run:
-    """The clock of a run, its hooks, and whether it was cancelled.
+    """Clock and hooks of a run.
 
     Attributes:
-        began: `time.perf_counter()` value.
+        began: start of the run, a `time.perf_counter()` value.
         cancelled: whether the stop hook has returned true.
-        watch: called with the hands that the run works on, if given.
-        origin: of what the run works on, in the frame of the scene that it was given [m].
+        watch: hook that gets snapshots of the hands, or None.
+        origin: origin of the planning frame, in the frame of the given scene [m].
     """
 
     def __init__(
@@ -49,32 +49,32 @@ class Run:
         self._progress, self._stop = progress, stop
 
     def over(self) -> bool:
-        """Tell whether to end. Only the run's own thread may ask, because this calls the stop hook."""
+        """Return True if the run must end. This calls the stop hook, so only the run's own thread may call it."""
         self.cancelled = self.cancelled or (self._stop is not None and self._stop())
         return self.known_over()
 
     def known_over(self) -> bool:
-        """Tell whether to end, without a call of the stop hook, for other threads."""
+        """Return True if the run must end. This does not call the stop hook, so any thread may call it."""
         return self.cancelled or self.late()
 
     def late(self) -> bool:
-        """Tell whether the deadline has passed."""
+        """Return True if the deadline has passed."""
         return time.perf_counter() >= self._end
 
     def report(self, stage: Stage, step: int, of: int, best: float, verified: int, found: Grasp | None = None) -> None:
-        """Call the progress hook."""
+        """Call the progress hook, if there is one, with the elapsed time and `found` in the given scene's frame."""
         if self._progress is not None:
             found = None if found is None else moved_grasp(found, self.origin)
             self._progress(Progress(stage, step, of, best, verified, time.perf_counter() - self.began, found))
 
     def show(self, seen: Snapshot) -> None:
-        """Call the watch hook."""
+        """Call the watch hook, if there is one, with positions in the given scene's frame."""
         if self.watch is not None:
             self.watch(replace(seen, positions=seen.positions + self.origin))
 
     @property
     def ended_early(self) -> Outcome | None:
-        """Why the run ended before its work was done, None if it did not."""
+        """`CANCELLED` or `DEADLINE` if one of them ended the run, else None."""
         return Outcome.CANCELLED if self.cancelled else Outcome.DEADLINE if self.late() else None
 
 
@@ -90,9 +90,9 @@ def result_of(
     warnings: tuple[str, ...] = (),
     refused: Mapping[str, int] | None = None,
 ) -> GraspResult:
-    """Return the result of a run for `count` grasps, whose outcome follows from how many of them are usable.
+    """Return the result of a run. Its outcome is success if at least `count` grasps are usable.
 
-    `ended_early` is the outcome of a run that has too few since it was ended.
+    `ended_early` is the outcome if there are too few usable grasps because the run was ended.
     """
     few = Outcome.TOO_FEW if grasps else Outcome.NO_CANDIDATES
     enough = sum(grasp.usable for grasp in grasps) >= count

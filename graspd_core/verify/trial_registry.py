@@ -1,4 +1,4 @@
-"""The trials that planning runs, one row each, in this order. `types.Grasp.verdict` says what passing them means."""
+"""Registry of the trials that planning runs, in order. `types.Grasp.verdict` says what passing them means."""
 
 from __future__ import annotations
 
@@ -15,13 +15,12 @@ from graspd_core.verify.world import Protocol, World, build_world
 
 @dataclass(frozen=True)
 class TrialContext:
-    """The worlds and the physics of the trials of one scene.
+    """Worlds and physics settings for the trials of one scene.
 
     Attributes:
-        hand: the hand that grasps.
-        protocol: physics of the trials.
-        alone: world of the object and the hand.
-        around: world with support and obstacles too, None without them.
+        protocol: physics settings of the trials.
+        alone: world of hand and object only.
+        around: world with support and obstacles. None if the scene has neither.
     """
 
     hand: HandModel
@@ -32,12 +31,12 @@ class TrialContext:
 
 @dataclass(frozen=True)
 class Trial:
-    """One trial.
+    """Definition of one trial.
 
     Attributes:
-        name: of its results.
-        applies: whether the trial runs in a context.
-        run: tries one grasp. It polls the hook, and fails if that ends the trial.
+        name: name in the trial results.
+        applies: returns whether the trial runs in a context.
+        run: tries one grasp. It polls the stop hook, and the trial fails if the hook stops it.
     """
 
     name: str
@@ -60,7 +59,7 @@ TRIALS: dict[str, Trial] = {row.name: row for row in _ROWS}
 
 
 def build_worlds(scene: Scene, hand: HandModel, parts: Sequence[TriangleMesh], protocol: Protocol) -> TrialContext:
-    """Build the worlds. `parts` are the object's convex parts, object frame [m]."""
+    """Build the worlds of a scene's trials. `parts` are the object's convex parts, object frame [m]."""
     around = None
     if scene.support is not None or scene.obstacles:
         around = build_world(hand, scene.object, parts, protocol, scene.support, scene.obstacles)
@@ -68,7 +67,7 @@ def build_worlds(scene: Scene, hand: HandModel, parts: Sequence[TriangleMesh], p
 
 
 def grasp_trials(context: TrialContext, grasp: Grasp, stop: StopHook = lambda: False) -> tuple[TrialResult, ...]:
-    """Run the trials that apply, in order, up to the first that the grasp fails."""
+    """Run the trials that apply, in order. Stop after the first failed trial."""
     results: list[TrialResult] = []
     for trial in TRIALS.values():
         if trial.applies(context):

@@ -1,4 +1,4 @@
-"""The trials of a run: worlds built once, candidates tried in rank order, held grasps put in order.
+"""The trials of a run: build the worlds once, try candidates in rank order, sort the verified grasps.
 
 `verify_grasps` tries and measures grasps of another planner or of a file in the same worlds.
 """
@@ -46,22 +46,22 @@ from graspd_core.verify.run_clock import Run
 from graspd_core.verify.trial_registry import TrialContext, build_worlds, grasp_trials
 from graspd_core.verify.world import PROTOCOLS, altered, at_friction
 
-# How often stop and deadline are looked at while waiting for the collision parts [s].
+# Interval at which stop hook and deadline are polled while waiting for the worlds [s].
 _POLL = 0.02
 
-# Objects are cut into convex parts, and their worlds built, one at a time.
+# Only one object at a time is cut into convex parts.
 _CUTTING = threading.Lock()
 
-# Where verified grasps stand whose robustness nobody had the time to measure.
+# Robustness by which verified grasps without a measured robustness are sorted.
 _UNKNOWN = 0.5
 
-# Keeps the errors that grasps are ranked by apart from all others of the same seed.
+# Added to the seed of the pose errors for ranking, so that they differ from all others.
 _NOISE = 0x6E6F697365
 
 
 @dataclass(frozen=True)
 class VerificationContext:
-    """The worlds, metrics and robustness checks of a run. Metrics are made on the first request, None: not measured."""
+    """Worlds, metrics and robustness checks of a run. `metrics` builds its context. It is None without metrics."""
 
     trials: TrialContext
     metrics: Callable[[], MetricsContext] | None
@@ -70,17 +70,17 @@ class VerificationContext:
 
     @property
     def mass(self) -> float:
-        """Mass of the object in the trials [kg]."""
+        """Object mass in the trials [kg]."""
         return float(self.trials.alone.model.body_mass[self.trials.alone.object_body])
 
 
 @dataclass(frozen=True)
 class TrialsAhead:
-    """The slow parts of a run's trials, made by threads beside the search.
+    """Worlds of the trials, which background threads build during the search.
 
     Attributes:
-        worlds: of the likeliest scene, None if the run was over before.
-        others: the worlds of other shapes of the object, if grasps are tried in them.
+        worlds: worlds of the likeliest scene. The result is None if the run ended before they were built.
+        others: worlds of other possible shapes of the object. Empty if grasps are not tried on them.
     """
 
     worlds: Future[TrialContext | None]
@@ -88,10 +88,10 @@ class TrialsAhead:
 
 
 def trials_ahead(run: Run, scene: Scene, hand: HandModel, verify: str, certainty: CertaintyConfig) -> TrialsAhead:
-    """Begin the worlds of the trials in other threads (`begin_in_thread`), which takes about as long as the optimiser.
+    """Start to build the trial worlds in background threads, which takes about as long as the optimiser.
 
-    One object is cut at a time, and none whose run is over before its turn. Runs that are cancelled faster than objects
-    are cut would otherwise pile up work.
+    Only one object is cut at a time. An object is skipped if its run has ended. Otherwise work would pile up if runs
+    were cancelled quickly.
     """
 
     def build() -> TrialContext | None:
@@ -113,7 +113,7 @@ def make_trial_context(
     measure: bool,
     friction: bool = False,
 ) -> VerificationContext | None:
-    """Return the context, as soon as the worlds are there, None if the run ended first."""
+    """Wait for the worlds and return the context of the trials. Return None if the run ends first."""
     while not run.over() and not wait([ahead.worlds], timeout=_POLL).done:
         pass
     if run.over() or (worlds := ahead.worlds.result()) is None:
@@ -126,9 +126,10 @@ def make_trial_context(
 def lighter(
     scene: Scene, ahead: TrialsAhead, context: VerificationContext, certainty: CertaintyConfig, mass: float, most: float
 ) -> VerificationContext:
-    """Return the context with an object of less `mass` [kg] than was assumed. Its grasps are less sure.
+    """Return the context with a lower object `mass` [kg] than the assumed one.
 
-    If most objects of its volume weigh more than the greatest payload `most` [kg], none of its grasps can be verified.
+    Grasps then have a lower probability. `most` is the greatest payload of any grasp [kg]. If most objects of this
+    volume weigh more, no grasp can be verified.
     """
     trials, others = context.trials, [world.altered(mass) for world in ahead.others]
     around = trials.around and altered(trials.around, mass=mass)
@@ -141,7 +142,7 @@ def lighter(
 
 
 def payloads(context: VerificationContext, grasps: Sequence[Grasp], stop: StopHook) -> list[float]:
-    """Return the greatest payload of each grasp [kg], zero for one that is no stronger than all before."""
+    """Return the payload of each grasp [kg], or 0 if an earlier grasp has about the same payload or more."""
     trials, found = context.trials, list[float]()
     for grasp in grasps:
         least = FINENESS * max(found, default=LEAST_PAYLOAD)
@@ -149,10 +150,10 @@ def payloads(context: VerificationContext, grasps: Sequence[Grasp], stop: StopHo
     return found
 
 
-# Kept for the last few scenes and hands, which are hashed by identity.
+# The cache keeps the last few scenes and hands. They are hashed by identity.
 @lru_cache(maxsize=4)
 def trial_context(scene: Scene, hand: HandModel, verify: str) -> TrialContext:
-    """Build the worlds of `verify` trials in a scene near the origin (`near_scene`), at its object's friction."""
+    """Build the worlds of the `verify` trials at the object's friction. The scene is near the origin (`near_scene`)."""
     protocol = at_friction(PROTOCOLS[verify], scene.object.friction)
     return build_worlds(scene, hand, object_parts(scene.object), protocol)
 
@@ -163,7 +164,7 @@ def _metrics_context(scene: Scene, hand: HandModel) -> MetricsContext:
 
 
 def measured(scene: Scene, hand: HandModel, candidates: tuple[Grasp, ...]) -> tuple[Grasp, ...]:
-    """Return candidates with their metrics, none of them tried."""
+    """Return the candidates with their metrics, without trials."""
     postures = [grasp.grasp for grasp in candidates]
     with ThreadPoolExecutor(torch.get_num_threads(), thread_name_prefix="graspd-metrics") as pool:
         metrics = list(pool.map(partial(measure, _metrics_context(scene, hand)), postures))
@@ -171,7 +172,7 @@ def measured(scene: Scene, hand: HandModel, candidates: tuple[Grasp, ...]) -> tu
 
 
 def _measured(trials: TrialContext, context: MetricsContext, friction: bool, grasp: Grasp) -> GraspMetrics:
-    """Metrics of a grasp that passed its trials, and how much it holds."""
+    """Measure a grasp that passed its trials: metrics, payload and, if `friction` is set, least friction."""
     world = trials.alone
     mass = float(world.model.body_mass[world.object_body])
     most = payload(world, grasp, trials.protocol, least=mass, held=True)
@@ -183,11 +184,11 @@ def _measured(trials: TrialContext, context: MetricsContext, friction: bool, gra
 
 @dataclass(frozen=True)
 class TriedGrasps:
-    """The results of the trials of some candidates.
+    """Candidates with their trial results.
 
     Attributes:
-        grasps: those that were tried, verified ones first.
-        first: when the first of them had passed, a `time.perf_counter()` value.
+        grasps: the tried grasps, verified ones first.
+        first: time at which the first grasp was verified, a `time.perf_counter()` value. None without one.
     """
 
     grasps: tuple[Grasp, ...] = ()
@@ -195,7 +196,7 @@ class TriedGrasps:
 
 
 def candidates_seen(candidates: tuple[Grasp, ...]) -> Snapshot:
-    """Return the hands of candidates, none of them tried."""
+    """Return a snapshot of the candidates, all of them unverified."""
     hands = [(g.grasp.position, g.grasp.quaternion_wxyz, g.grasp.joint_positions) for g in candidates]
     return Snapshot(*map(np.stack, zip(*hands, strict=True)), verdicts=(Verdict.UNVERIFIED,) * len(candidates))
 
@@ -203,20 +204,20 @@ def candidates_seen(candidates: tuple[Grasp, ...]) -> Snapshot:
 def run_trials(
     run: Run, context: VerificationContext, candidates: tuple[Grasp, ...], count: int, before: int
 ) -> TriedGrasps:
-    """Try candidates in rank order until `count` are verified.
+    """Try candidates in rank order until `count` are verified, and measure each verified grasp.
 
-    `before` are already. It uses as many threads as torch may use in the calling one. Verdicts and order do not depend
-    on their number. Verified grasps are measured beside the trials of the next.
+    `before` is the number of grasps that were verified earlier. The trials use torch's number of threads. Verdicts and
+    order do not depend on it. Grasps are measured in parallel with the next trials.
     """
     verified: list[Grasp] = []
     others: list[Grasp] = []
     metrics: list[Future[GraspMetrics]] = []
     threads, doubted = torch.get_num_threads(), 0
-    # Where the scene itself is doubted, none is verified: so many that hold on it are as good an answer.
+    # If the scene itself is doubtful, no grasp can be verified. Then `count` unverified grasps are enough.
     hopeless = context.hypotheses is not None and bool(context.hypotheses.doubts)
     first = None
     seen = None if run.watch is None else candidates_seen(candidates)
-    # The first answer comes sooner where the best candidate is tried under several hypotheses at a time.
+    # The first answer comes sooner if the best candidate runs several robustness checks in parallel.
     alone = context.hypotheses is not None and not before
     # No trial gives more than one verified grasp.
     trials = _tried(run, context, candidates, alone, lambda: count - len(verified))
@@ -224,7 +225,7 @@ def run_trials(
         for index, tried in enumerate(trials):
             passed = tried.verdict is Verdict.VERIFIED
             if run.over() and not passed:
-                # A trial that was cut short says nothing of the grasp.
+                # An interrupted trial says nothing about the grasp.
                 break
             first = first or (time.perf_counter() if passed else None)
             found = tried if passed else None
@@ -235,12 +236,12 @@ def run_trials(
             doubted += tried.verdict is Verdict.UNVERIFIED
             enough = len(verified) + passed + (doubted if hopeless else 0) == count
             if enough:
-                # What is tried ahead takes no more time from measuring.
+                # Stop the trials that were started ahead, so that they do not slow down measuring.
                 trials.close()
-            # Behind the report: measuring takes longer than a trial. What failed is not measured.
+            # Measure after the report, because measuring takes longer than a trial. Failed grasps are not measured.
             if passed and context.metrics is not None:
                 metrics.append(pool.submit(_measured, context.trials, context.metrics(), context.friction, tried))
-                # A run that ends now still measures what it found: that is never more than there are threads.
+                # A run that ends now still measures its grasps. This limits them to the number of threads.
                 wait(metrics[: 1 - threads or None])
             (verified if passed else others).append(tried)
             if enough:
@@ -253,10 +254,10 @@ def run_trials(
 def _tried(
     run: Run, context: VerificationContext, candidates: tuple[Grasp, ...], alone: bool, needed: Callable[[], int]
 ) -> Generator[Grasp]:
-    """Yield candidates with their trials, in their order.
+    """Yield the candidates with their trial results, in order.
 
-    `alone`: the first is tried under several checks at a time. The others wait until it waits for a world, or has
-    ended.
+    If `alone` is set, the first candidate runs several robustness checks in parallel. The others wait until it waits
+    for a world or is done.
     """
     threads, hypotheses = torch.get_num_threads(), context.hypotheses
     work = partial(_all_trials, context, one_by_one)
@@ -268,7 +269,7 @@ def _tried(
 def _best_first(
     context: VerificationContext, hypotheses: Hypotheses, best: Grasp, threads: int, grasp: Grasp, stop: StopHook
 ) -> Grasp:
-    """Try a candidate. All but the best wait until there is time for them."""
+    """Try a candidate. All but the best wait until the best one waits for a world or is done."""
     if grasp is not best:
         while not hypotheses.waited_for.wait(_POLL) and not stop():
             pass
@@ -280,7 +281,7 @@ def _best_first(
 
 
 def _at_once(threads: int, stage: HypothesisStage, grasp: Grasp, stop: StopHook) -> Results:
-    """Try as many checks at a time as must hold in any case, the others one by one."""
+    """Run the checks that are needed in any case in parallel, then the others one by one."""
     first, others = stage.items[: stage.least], stage.items[stage.least :]
     yield from results_in_order(stop, lambda item, ended: item.hold(grasp, ended), first, threads, lambda: len(first))
     yield from one_by_one(replace(stage, items=others), grasp, stop)
@@ -295,7 +296,7 @@ def _all_trials(context: VerificationContext, hold_under: HoldUnder, grasp: Gras
 
 
 def surest_first(grasps: Sequence[Grasp]) -> tuple[Grasp, ...]:
-    """Return verified grasps, then unverified, then failed ones, each by probability, then by score."""
+    """Return verified, then unverified, then failed grasps. Each group is sorted by probability, then by score."""
     place = {Verdict.VERIFIED: 0, Verdict.UNVERIFIED: 1, Verdict.FAILED: 2}
     return tuple(sorted(grasps, key=lambda g: (place[g.verdict], -(g.probability or 0.0), -g.score)))
 
@@ -303,14 +304,14 @@ def surest_first(grasps: Sequence[Grasp]) -> tuple[Grasp, ...]:
 def rank_by_robustness(
     run: Run, context: VerificationContext, grasps: tuple[Grasp, ...], config: RobustConfig, seed: int
 ) -> tuple[Grasp, ...]:
-    """Return the grasps, first those that still hold with the object slightly out of place.
+    """Sort the verified grasps by robustness: the fraction of noisy trials that a grasp holds.
 
-    The share of noisy trials that a verified grasp held is written into its metrics. If the run ends before all were
-    tried, untried ones stand between the good and the bad.
+    The fraction is added to each verified grasp's metrics. If the run ends early, a grasp without noisy trials is
+    sorted like one with robustness 0.5. Unverified and failed grasps follow unchanged.
     """
     verified = [grasp for grasp in grasps if grasp.verdict is Verdict.VERIFIED]
     measured: list[Grasp] = []
-    # The same errors for all, so that none is ranked by its luck. No benchmark uses them.
+    # All grasps get the same errors, so that luck does not rank them. No benchmark uses these errors.
     errors = pose_errors((_NOISE, seed), config.trials)
     protocol = replace(context.trials.protocol, hold_time=config.hold_time)
 
@@ -320,7 +321,7 @@ def rank_by_robustness(
     threads, needed = torch.get_num_threads(), lambda: len(verified)
     shares = results_in_order(run.over, share_held, verified, threads, needed, known_over=run.known_over)
     with closing(shares):
-        # None for those that the end of the run leaves over.
+        # Grasps that are left when the run ends get None.
         for index, (grasp, share) in enumerate(zip(verified, chain(shares, repeat(None)), strict=False)):
             metrics = GraspMetrics({**(grasp.metrics or {}), "robustness": share})
             measured.append(replace(grasp, metrics=metrics))
@@ -329,7 +330,7 @@ def rank_by_robustness(
 
 
 def most_robust_first(verified: Sequence[Grasp]) -> list[Grasp]:
-    """Return grasps by the share of noisy trials that they held. Equal and unmeasured ones keep their order."""
+    """Return the grasps by descending robustness. Equal ones keep their order. An unmeasured one counts as 0.5."""
 
     def share(grasp: Grasp) -> float:
         known = grasp.metrics.get("robustness") if grasp.metrics else None
@@ -338,21 +339,21 @@ def most_robust_first(verified: Sequence[Grasp]) -> list[Grasp]:
     return sorted(verified, key=share, reverse=True)
 
 
-# Farther from one than this, the length of a quaternion is no rounding error.
+# Greatest deviation of a quaternion's length from 1.
 _UNIT_TOLERANCE = 0.01
 
 
 def verify_grasps(
     scene: Scene, hand: HandModel, grasps: Sequence[Grasp], *, verify: str = "standard", measure: bool = True
 ) -> tuple[Grasp, ...]:
-    """Try and measure given grasps, in their order. None is dropped.
+    """Try and measure the given grasps. Return all of them in order.
 
     Args:
-        scene: what is grasped. With a support or obstacles the lift trial runs too.
-        hand: whose joints the postures name, in the order of `hand.joint_names`.
-        grasps: `pregrasp`, `grasp` and `squeeze` count. Earlier metrics and trials are replaced.
-        verify: "standard" or "hard" trials, which "full" and "hard_full" run to the end, or "none".
-        measure: whether metrics are measured, of failed grasps too.
+        scene: scene with the object. With a support or obstacles, the lift trial runs too.
+        hand: hand of the postures. Their joint values are in the order of `hand.joint_names`.
+        grasps: grasps with `pregrasp`, `grasp` and `squeeze`. Earlier metrics and trials are replaced.
+        verify: "standard" or "hard" trials, "full" or "hard_full" for the same without early stop, or "none".
+        measure: whether to measure metrics, also of failed grasps.
 
     Raises:
         ConfigError: `verify` is unknown, or a posture does not fit the hand or is not finite.

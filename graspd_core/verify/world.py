@@ -1,10 +1,10 @@
-"""The world of a trial in MuJoCo: a hand of primitives on a position-controlled base, a free object of convex parts.
+"""The MuJoCo world of a trial: a hand of primitives on a position-controlled base, and a free object of convex parts.
 
-A support adds gravity and a table, neighbours add obstacles. They are mocap bodies after the hand's own, so that a
-trial can lower them all away from the hand.
+A support adds gravity and a table. Neighbours add obstacles. Table and obstacles are mocap bodies, so that a trial can
+lower them away from the hand. Their mocap indices follow the hand's.
 
-Contact and solver settings follow the floating protocol of DexGraspBench (Chen et al., BODex, ICRA 2025), from its
-published parameters. Nothing here is differentiable and nothing is shared with the optimiser.
+Contact and solver settings use the published parameters of DexGraspBench's floating protocol (Chen et al., BODex, ICRA
+2025). Nothing here is differentiable, and the optimiser uses nothing of it.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ from graspd_core.types import Plane, Posture, TriangleMesh
 
 
 OBJECT = "graspd_object"
-# What the hand meets of the support, and what the object rests on.
+# Names of the plane that the hand collides with, and of the plane that the object rests on.
 TABLE, _REST = "the support", "graspd_rest"
 _GRAVITY = 9.81
 
@@ -42,12 +42,12 @@ Friction = tuple[float, float, float]
 
 @dataclass(frozen=True, eq=False)
 class FreeBody:
-    """A body of the scene that is free to move.
+    """A free body of the scene.
 
     Attributes:
-        model: the object, in its own frame.
-        parts: its convex parts, likewise [m].
-        pose: of its frame in the world [m].
+        model: the body's object model, in the body's own frame.
+        parts: the body's convex parts, in the body's own frame [m].
+        pose: `T_world_body` [m].
     """
 
     model: ObjectModel
@@ -56,7 +56,7 @@ class FreeBody:
 
 
 def add_primitive(spec: Any, body: Any, primitive: Primitive, name: str, friction: Friction) -> None:
-    """Add a collision solid of the hand. `name` is that of its mesh, if it needs one."""
+    """Add a collision primitive of the hand. `name` is the name of the mesh that a hull needs."""
     import mujoco
 
     geom = body.add_geom(
@@ -64,7 +64,7 @@ def add_primitive(spec: Any, body: Any, primitive: Primitive, name: str, frictio
         quat=quaternion_from_rotation(torch.as_tensor(primitive.rotation, dtype=torch.float64)).numpy(),
         condim=4,
         friction=friction,
-        # The hand's contact softness rules in every contact it takes part in.
+        # In each contact of the hand, MuJoCo uses the hand's contact softness.
         priority=1,
         solref=[0.005, 1.0],
         solimp=[0.5, 0.99, 1e-4, 0.5, 2.0],
@@ -112,7 +112,7 @@ def add_object(
 
 
 def add_others(spec: Any, others: Sequence[FreeBody], friction: Friction) -> tuple[str, ...]:
-    """Add free bodies about the object. Return the names of their bodies."""
+    """Add free bodies around the object. Return their body names."""
     names = tuple(f"other {index + 1}" for index in range(len(others)))
     for name, other in zip(names, others, strict=True):
         add_object(spec, other.model, other.parts, friction, name=name, pose=other.pose)
@@ -120,7 +120,7 @@ def add_others(spec: Any, others: Sequence[FreeBody], friction: Friction) -> tup
 
 
 def add_support(spec: Any, hand: HandModel, parts: Sequence[TriangleMesh], friction: Friction, support: Plane) -> None:
-    """Add the plane that the hand meets, and one below `parts` on which they rest. Without parts there is one plane."""
+    """Add gravity, a plane for the hand, and one at the bottom of `parts`. Without parts, both share the plane."""
     spec.option.gravity = -_GRAVITY * support.normal
     add_plane(spec, TABLE, support, friction)
     for link in hand.link_names:
@@ -158,7 +158,7 @@ def add_obstacle(spec: Any, name: str, neighbour: Obstacle, target: ObjectModel,
     body.add_geom(name=name, type=mujoco.mjtGeom.mjGEOM_MESH, meshname=name, condim=4, friction=friction)
     surface = torch.as_tensor(surface_samples(target.mesh, 1000, 0)[0]).to(neighbour.sdf.field)
     if bool((sample_sdf(neighbour.sdf, surface)[0] < 0).any()):
-        # A grown hull that overlaps the object would throw it away.
+        # A padded hull that overlaps the object would push the object away.
         spec.add_exclude(bodyname1=name, bodyname2=OBJECT)
 
 
@@ -168,12 +168,12 @@ def add_mesh(spec: Any, name: str, vertices: np.ndarray, faces: np.ndarray) -> N
     mesh = spec.add_mesh(name=name)
     mesh.uservert = np.asarray(vertices, dtype=float).ravel()
     mesh.userface = np.asarray(faces, dtype=np.int32).ravel()
-    # Masses are given explicitly, so a part may be as thin as it likes.
+    # Masses are given explicitly, so a part may have any thickness.
     mesh.inertia = mujoco.mjtMeshInertia.mjMESH_INERTIA_SHELL
 
 
 def full_inertia(inertia: Float[np.ndarray, "3 3"], floor: float) -> list[float]:
-    """Return xx yy zz xy xz yz, with principal moments raised to `floor` and the triangle inequality kept."""
+    """Return xx yy zz xy xz yz of a valid inertia [kg·m²]: moments of at least `floor`, triangle inequality kept."""
     moments, axes = np.linalg.eigh(0.5 * (inertia + inertia.T))
     moments = np.maximum(moments, floor)
     moments[2] = min(moments[2], 0.999 * (moments[0] + moments[1]))
@@ -181,34 +181,34 @@ def full_inertia(inertia: Float[np.ndarray, "3 3"], floor: float) -> list[float]
     return [m[0, 0], m[1, 1], m[2, 2], m[0, 1], m[0, 2], m[1, 2]]
 
 
-# A hand of more solids than this has thousands of contacts with itself and the object, more than MuJoCo's 14 MB hold.
+# A hand with more primitives than this has thousands of contacts. They exceed MuJoCo's default memory of 14 MB.
 _CROWD, _MEMORY = 100, 2**28
 
 
 @dataclass(frozen=True)
 class Protocol:
-    """Physics of a trial. Defaults are the `standard` hold trial.
+    """Physics settings of a trial. The defaults are those of the `standard` hold trial.
 
     Attributes:
         friction: sliding, torsional and rolling coefficients.
-        noslip_iterations: iterations of MuJoCo's slip suppression.
-        impratio: frictional-to-normal impedance.
-        timestep: [s].
+        noslip_iterations: iterations of MuJoCo's noslip solver.
+        impratio: ratio of frictional to normal impedance.
+        timestep: simulation time step [s].
         stiffness: position gain of every revolute joint [N·m/rad].
-        damping: of every revolute joint [N·m·s/rad].
-        slide_stiffness: of every prismatic joint [N/m]: what `stiffness` comes to at the end of a 5 cm link.
-        slide_damping: of every prismatic joint, likewise [N·s/m].
+        damping: damping of every revolute joint [N·m·s/rad].
+        slide_stiffness: position gain of every prismatic joint [N/m]. It equals `stiffness` at the end of a 5 cm link.
+        slide_damping: damping of every prismatic joint [N·s/m]. It equals `damping` at the end of a 5 cm link.
         armature: rotor inertia of every joint [kg·m²] or [kg].
         stage_time: duration of pregrasp → grasp and of grasp → squeeze [s].
         hold_time: duration of each pull [s].
-        pulls: directions of the pulls, one after another, each from the squeeze on: rows of `hold_trial.DIRECTIONS`.
-        pull: force per object mass [N/kg].
-        max_displacement: allowed travel of the object's centre of mass [m].
-        max_rotation: allowed turn of the object [rad].
-        max_start_penetration: deeper starts are refused [m].
-        max_grasp_penetration: a grasp posture deeper in the object is refused [m].
-        max_self_penetration: a hand deeper in itself is refused, at pregrasp and grasp, and as it was squeezed [m].
-        full_length: whether every hold lasts to its end, not only until the answer is known (`early_stop`).
+        pulls: row indices of `hold_trial.DIRECTIONS`. Each pull in turn starts from the squeezed state.
+        pull: pull force per object mass [N/kg].
+        max_displacement: greatest allowed travel of the object's centre of mass [m].
+        max_rotation: greatest allowed rotation of the object [rad].
+        max_start_penetration: greatest allowed penetration of the object at the pregrasp [m].
+        max_grasp_penetration: greatest allowed penetration of the object at the grasp [m].
+        max_self_penetration: greatest allowed self-penetration of the hand at pregrasp, grasp and after squeezing [m].
+        full_length: whether every pull runs to its end instead of stopping early (`early_stop`).
     """
 
     friction: tuple[float, float, float] = (0.6, 0.02, 1e-4)
@@ -242,41 +242,41 @@ PROTOCOLS: dict[str, Protocol] = {
 
 
 def at_friction(protocol: Protocol, friction: float) -> Protocol:
-    """Return the trial of an object more slippery than the 0.6 of the protocols, with coefficients in proportion.
+    """Return the protocol for an object of this friction, with all three coefficients scaled by friction / 0.6.
 
-    A rougher object is tried as the protocol says, so that no grasp passes by friction that nobody measured.
+    The scale is at most 1, so that no grasp passes because of high friction that nobody measured.
     """
     share = min(friction / Protocol.friction[0], 1.0)
     sliding, torsional, rolling = protocol.friction
     return replace(protocol, friction=(sliding * share, torsional * share, rolling * share))
 
 
-# Squeeze and protocol of a grasp that held, and MuJoCo's state with the hand closed. So many are kept.
+# Squeeze posture and protocol of a grasp that held, and MuJoCo's state with the hand closed. A world keeps the last 32.
 ClosedState = tuple[Posture, Protocol, Float[np.ndarray, "state"]]
 _MOST_CLOSED = 32
 
 
 @dataclass(frozen=True)
 class World:
-    """A compiled model and where things are in it. The model is never written to after compilation.
+    """A compiled MuJoCo model and the indices that trials need. Trials never write to the model.
 
     Attributes:
         model: the `mujoco.MjModel`.
         joint_addresses: index into `qpos` of each actuated hand joint, in the hand's order.
         object_address: index into `qpos` of the object's free joint (position, then wxyz).
-        object_velocity: index into `qvel` of its free joint.
+        object_velocity: index into `qvel` of the object's free joint.
         object_body: body id of the object.
-        center_of_mass: of the object [m].
+        center_of_mass: the object's centre of mass [m].
         hand_geoms: ids of the hand's geoms.
-        obstacles: id and name of the geom of every obstacle to the hand.
+        obstacles: geom id and name of every obstacle, the support included.
         up: unit direction against gravity, None without gravity.
         coupled_addresses: index into `qpos` of each coupled joint, in the order of `mimics`.
         mimics: the coupled joints.
         fingers: number of the hand's fingertips.
-        others: body ids of the free things about the object.
-        spare: the `mujoco.MjData` of trials that ended, for `trial_data`.
-        closed: of the last grasps that held: squeeze, protocol and MuJoCo's state with the hand closed, for `payload`.
-        watch: called with the `mujoco.MjData` after every step of a trial. None, as in planning, costs nothing.
+        others: body ids of the other free bodies.
+        spare: `mujoco.MjData` of ended trials, which `trial_data` reuses.
+        closed: squeeze, protocol and closed-hand state of the last grasps that held, which `payload` reuses.
+        watch: called with the `mujoco.MjData` after every step of a trial. None in planning.
     """
 
     model: Any
@@ -298,7 +298,7 @@ class World:
 
 
 def altered(world: World, *, mass: float | None = None, friction: Friction | None = None) -> World:
-    """Return the world with an object of another mass [kg], or with another friction of everything."""
+    """Return a copy of the world with another object mass [kg], or with another friction of all geoms."""
     import mujoco
 
     model, body = copy(world.model), world.object_body
@@ -307,17 +307,17 @@ def altered(world: World, *, mass: float | None = None, friction: Friction | Non
     if mass is not None:
         model.body_inertia[body] *= mass / model.body_mass[body]
         model.body_mass[body] = mass
-        # What MuJoCo derives of the masses softens its contacts.
+        # MuJoCo's contact softness depends on constants that it derives from the masses.
         mujoco.mj_setConst(model, mujoco.MjData(model))
     return replace(world, model=model, spare=deque(), closed=deque(maxlen=_MOST_CLOSED))
 
 
 @contextmanager
 def trial_data(world: World) -> Iterator[Any]:
-    """Give the `mujoco.MjData` of one trial, at the model's initial state.
+    """Provide the `mujoco.MjData` of one trial, reset to the model's initial state.
 
-    Safe from any thread: each trial has its own. Data of an ended trial is used again, since it takes about a
-    millisecond to make. Data that MuJoCo broke off in is not: its memory may be half in use.
+    This is thread-safe, because each trial has its own data. Data of an ended trial is reused, because making new data
+    takes about a millisecond. Data is not reused after a MuJoCo error, which may leave its memory in use.
     """
     import mujoco
 
@@ -331,7 +331,7 @@ def trial_data(world: World) -> Iterator[Any]:
 
 
 def advance(world: World, data: Any, steps: int = 1) -> None:
-    """Simulate `steps` steps, and call the watch hook after each."""
+    """Simulate `steps` steps and call the watch hook after each step."""
     import mujoco
 
     if world.watch is None:
@@ -355,18 +355,18 @@ def build_world(
     """Compile the world of one hand and one object.
 
     Args:
-        hand: any loaded hand.
-        target: gives mass, centre of mass and inertia. It lies near the origin (`near_scene`).
+        target: the object, near the origin (`near_scene`). It gives mass, centre of mass and inertia.
         parts: convex collision parts of the object, object frame [m].
         protocol: physics settings.
-        support: a table, with gravity onto it. The hand meets it where it is. The object rests on a plane of its own
-            through its lowest point, because a reconstructed bottom hovers or sinks by millimetres.
-        obstacles: fixed, as their convex hulls. Those that the object touches already let it pass.
-        others: free bodies. If given, even none, the object rests on the support itself.
+        support: a table, with gravity along its negative normal. The hand collides with this plane. The object rests on
+            its own plane through its lowest point, because a reconstructed bottom may be millimetres too high or too
+            low.
+        obstacles: fixed bodies, as their convex hulls. An obstacle that overlaps the object does not collide with it.
+        others: other free bodies. If given, even empty, the object rests on the support plane.
     """
     import mujoco
 
-    # Otherwise MuJoCo writes a log file into the working directory. The trial reads the counts of warnings itself.
+    # Without this handler MuJoCo writes a log file into the working directory. Trials read the warning counters.
     mujoco.set_mju_user_warning(lambda message: None)
     spec = mujoco.MjSpec()
     spec.compiler.degree = False
@@ -393,7 +393,7 @@ def _world_of(
     fixed: Sequence[str],
     up: Float[np.ndarray, "3"] | None,
 ) -> World:
-    """Return a compiled model with the addresses that trials need. `fixed` names the geoms of the obstacles."""
+    """Return the world of a compiled model. `fixed` holds the geom names of the obstacles."""
     return World(
         model=model,
         joint_addresses=_joint_addresses(model, hand.joint_names),
@@ -426,7 +426,7 @@ def _joint_addresses(model: Any, names: Sequence[str]) -> np.ndarray:
 
 
 def add_hand(spec: Any, hand: HandModel, protocol: Protocol) -> None:
-    """Add a hand's links, joints, motors and solids. Its base is a mocap body."""
+    """Add the hand's links, joints, actuators and collision primitives. The hand's base is a mocap body."""
     quaternions = quaternion_from_rotation(torch.as_tensor(hand.link_offset_rotation, dtype=torch.float64)).numpy()
     bodies: list[Any] = []
     coupled = {mimic.link: mimic for mimic in hand.mimics}
@@ -464,7 +464,7 @@ def _add_joint(spec: Any, body: Any, hand: HandModel, link: int, protocol: Proto
         **_joint_physics(hand, link, protocol),
         range=[hand.lower[joint], hand.upper[joint]],
         limited=True,
-        # A joint's stop is as hard as the time step allows (two steps), not MuJoCo's soft default of five.
+        # Joint limits are as stiff as the time step allows (two steps). MuJoCo's default is softer (five steps).
         solref_limit=[2 * protocol.timestep, 1.0],
     )
     effort = float(hand.effort[joint])
@@ -475,7 +475,7 @@ def _add_joint(spec: Any, body: Any, hand: HandModel, link: int, protocol: Proto
 
 
 def _add_coupled_joint(spec: Any, body: Any, hand: HandModel, mimic: Mimic, protocol: Protocol) -> None:
-    """Add a joint without motor or stops, held to its leader by an equality: loads on it reach the motor."""
+    """Add a coupled joint, without actuator or limits. An equality constraint ties it to its leader joint."""
     import mujoco
 
     name = f"joint:{mimic.name}"
@@ -485,7 +485,7 @@ def _add_coupled_joint(spec: Any, body: Any, hand: HandModel, mimic: Mimic, prot
         objtype=mujoco.mjtObj.mjOBJ_JOINT,
         name1=name,
         name2=f"joint:{hand.joint_names[mimic.joint]}",
-        # As stiff as gears: two time steps and hardly any softness, or a loaded finger would lag behind its leader.
+        # The constraint is as stiff as gears. If it were softer, a loaded finger would lag behind its leader.
         solref=[2 * protocol.timestep, 1.0],
         solimp=[0.9999, 0.9999, 1e-3, 0.5, 2.0],
     )
@@ -493,7 +493,7 @@ def _add_coupled_joint(spec: Any, body: Any, hand: HandModel, mimic: Mimic, prot
 
 
 def _joint_physics(hand: HandModel, link: int, protocol: Protocol) -> dict[str, Any]:
-    """Return what joints with and without a motor share."""
+    """Return the MuJoCo joint settings that actuated and coupled joints share."""
     import mujoco
 
     slides = hand.joint_kind[link] == "prismatic"

@@ -159,7 +159,7 @@ def test_a_calibration_of_another_frame_is_refused_in_a_recording_as_in_the_node
     ]
     write_bag(tmp_path / "bag", records)
     (frame,) = read_frames(tmp_path / "bag")
-    with pytest.raises(CloudError, match="'camera_optical_frame', but its camera_info in 'colour_optical_frame'"):
+    with pytest.raises(CloudError, match="'camera_optical_frame', but its camera_info has 'colour_optical_frame'"):
         frame.view()
 
 
@@ -174,7 +174,7 @@ def test_depth_in_a_frame_whose_name_says_another_direction_is_told(tmp_path, ca
         )
         assert len(list(bag_views(tmp_path / frame, options))) == 2
         told = capsys.readouterr().err
-        assert told.count("the points lie along z of 'camera_link'") == (frame == "camera_link")
+        assert told.count("frame 'camera_link': by its name the camera looks along x") == (frame == "camera_link")
 
 
 @pytest.mark.parametrize("lost", ["depth", "camera_info"])
@@ -261,8 +261,8 @@ def test_the_topic_is_the_one_that_is_meant(tmp_path, topics, options, chosen):
 @pytest.mark.parametrize(
     ("topics", "options", "culprit"),
     [
-        (("/points_1", "/points_2"), {}, "several topics could be meant, name one: /points_1, /points_2"),
-        (("/a/depth", "/b/depth", "/a/camera_info"), {}, "several topics could be meant, name one: /a/depth, /b/depth"),
+        (("/points_1", "/points_2"), {}, "several topics fit; name one of: /points_1, /points_2"),
+        (("/a/depth", "/b/depth", "/a/camera_info"), {}, "several topics fit; name one of: /a/depth, /b/depth"),
         (("/points",), {"topic": "/cloud"}, "no clouds or depth images on '/cloud'; topics with some: /points"),
         (("/color/image",), {}, "no topic with clouds or depth images; it has: /color/image (Image)"),
         (("/a/depth",), {}, "no camera info on '/a/camera_info' for /a/depth; topics with some: none"),

@@ -256,7 +256,7 @@ def test_a_file_from_before_joints_could_be_coupled_is_read(document, result):
 
 def test_too_few_joint_values_are_refused(document):
     document["grasps"][0]["squeeze_joint_positions"].pop()
-    with pytest.raises(FormatError, match="squeeze_joint_positions has 15 values for 16 joints"):
+    with pytest.raises(FormatError, match="squeeze_joint_positions: 15 values; expected 16"):
         grasps_of(document)
 
 

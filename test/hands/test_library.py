@@ -237,8 +237,8 @@ def test_the_command_inspects_a_file(tmp_path: Path, capsys: pytest.CaptureFixtu
     ("arguments", "message"),
     [
         (["nowhere.urdf"], "nowhere.urdf: no such file"),
-        (["allegro_right", "--picture", "hand.jpg"], "hand.jpg: a .png file is written"),
-        (["MANO_RIGHT.pkl", "--yaml", "hand.yaml"], "hand.yaml: a description names a URDF or MJCF file, not a MANO"),
+        (["allegro_right", "--picture", "hand.jpg"], "hand.jpg; valid: a file name that ends in .png"),
+        (["MANO_RIGHT.pkl", "--yaml", "hand.yaml"], "--yaml: MANO_RIGHT.pkl is a MANO file; valid: a hand"),
     ],
 )
 def test_the_command_refuses_in_one_line(arguments, message, capsys, tmp_path, monkeypatch):

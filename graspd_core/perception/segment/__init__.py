@@ -1,1 +1,1 @@
-"""One object cut out of what cameras saw."""
+"""Segmentation of one object from camera data."""

@@ -1,14 +1,14 @@
-"""Things in a scene: points linked to their neighbours, and which of these clusters are one thing, or two.
+"""Objects in a scene: cluster points, join clusters of one object, and find clusters that may be several objects.
 
-Pieces of one thing that occlusion set apart, as the far wall of a cup behind the near one or a rim over its bottom, are
-joined. Two pieces are one thing only if they touch in some camera's image, for the edge between them is then an
-occlusion, and if they are near enough, or one stands within the other's outline on the support. A piece that ends above
-the support hangs on the nearest that stands, unless it may be a thing that stands behind what hides its foot.
+Occlusion splits one object into several clusters: the far wall of a cup lies behind the near wall, a rim above the
+bottom. Two clusters are joined only if they touch in some camera's image, because the edge between them is then an
+occlusion. They must also be near each other, or one must lie within the other's outline on the support. A cluster that
+ends above the support belongs to the nearest standing cluster, unless it may be an object whose foot is hidden.
 
-Things that touch are one cluster of points, and a seam or a narrow waist in it parts two which both stand. A surface
-that turns towards itself over a finger's breadth is a seam. Things of one height that touch along a line are joined by
-a bridge of points across their tops, far narrower than either. One thing may have such places as well, where a leg
-meets a body. So this is a doubt, never a cut. Two boxes that stand flush are one to a camera.
+Touching objects form one cluster. A concave seam or a narrow waist between two standing parts suggests two objects.
+Objects of equal height that touch along a line are connected by a narrow bridge of points across their tops. One object
+may also have seams and waists, for example where a leg meets a body. Therefore a seam only causes a warning. Two boxes
+that stand flush look like one object to a camera.
 """
 
 from __future__ import annotations
@@ -25,49 +25,50 @@ from graspd_core.config import SegmentationConfig
 from graspd_core.perception.cloud.point_cloud import Eyes, Points, Vector, convex_hull, least_axes, longest_side
 from graspd_core.perception.segment.planes import FlatPart
 
-# Flying pixels, which are spread along their lines of sight between two surfaces, have less than this share of the
-# weight around a usual point: it tells them where many views have filled the space around an edge with them.
+# Flying pixels lie along lines of sight between two surfaces. The weight around them is below this fraction of the
+# usual weight, even where many views fill the space around an edge with them.
 MIN_WEIGHT_SHARE = 0.04
-# Points are linked over this share of the gap between things; noise takes the rest.
+# Points are linked over this fraction of the gap between objects. The rest is for noise.
 LINK_SHARE_OF_GAP = 0.75
-# Points are dense if their fourth neighbours are so many times nearer than that.
+# Points are dense if the link length is at least this many times the distance to the fourth neighbour.
 DENSE_SPACING_RATIO = 1.6
-# Sparse ones are linked over this many times the distance to the fourth neighbour: surfaces seen at a small angle have
-# their points far apart along the line of sight.
+# Sparse points are linked over this many times the distance to the fourth neighbour. On surfaces seen at a grazing
+# angle, points are far apart along the line of sight.
 SPARSE_LINK_RATIO = 2.5
 SPACING_SAMPLES = 2000
-# Points so far apart tell how a surface bends [m], and how much bend inwards is a seam [1/m]: a bowl's inside, of a
-# radius over 5 cm, is none, nor is a camera's noise.
+# Greatest distance of point pairs for measuring curvature [m], and concave curvature from which a surface is a seam
+# [1/m]. The inside of a bowl with a radius over 5 cm is not a seam, nor is camera noise.
 _REACH_M, _SEAM_BEND = 0.013, 20.0
 # Points on one side of a seam are linked over this many spacings.
 _LINK_SPACINGS = 1.7
-# A waist is no wider than this share of what is on either side of it; half the widths that are looked for [m].
+# Greatest width of a waist as a fraction of the parts on either side, and half of the tried widths [m].
 _WAIST, _WAISTS_M = 0.3, (0.0, 0.003, 0.005, 0.007, 0.009, 0.012)
-# Each of two things has this share of the points at least, and some of its seen surface so near to the support [m];
-# the inside of a bowl is none, which is hollow.
+# Each of two touching objects has at least this fraction of the points, and visible surface within this height of the
+# support [m]. The inside of a bowl is no object of its own, because it is concave.
 _MIN_SHARE, _FOOT_M = 0.12, 0.03
 _NEIGHBOURS = 24
-# A point is on the outline of what is seen if, of as many neighbours as lie within so many spacings, none is in a
-# sector of this angle about it.
+# A point is on the outline of the visible surface if a sector of this angle around it has no neighbour: of this many
+# neighbours within this many spacings.
 _OUTLINE_NEIGHBOURS, _OUTLINE_SPACINGS, _OUTLINE_ANGLE = 16, 2.2, np.deg2rad(110.0)
-# Beyond so many pieces the rest is noise.
+# Only the largest clusters up to this number are joined. The rest is noise.
 MAX_PIECES = 40
-# What ends so many link lengths above the support does not stand on it, unless it hides this share of the place below.
+# A cluster that ends this many link lengths above the support does not stand on it, unless it hides this fraction of
+# the place below it from a camera.
 FLOATING_LINKS, HIDDEN_FOOT_SHARE = 0.5, 0.5
-# What ends above the support may stand there by itself, its foot hidden, if it has this share of the other's surface,
-# and if it is seen over this share of its height or ends at another height than the other [m]. Handles fall short of
-# the first, walls of cups of both others.
+# A cluster that ends above the support may be an object with a hidden foot. Then it has at least this fraction of the
+# other cluster's points. It is also visible over this fraction of its height, or its top differs from the other's by
+# this height [m]. Handles fail the first condition, walls of cups the other two.
 OWN_SURFACE_SHARE, SEEN_HEIGHT_SHARE, LEVEL_TOPS_M = 0.12, 0.5, 0.01
-# It is part of the other nevertheless if it is so many link lengths from it.
+# Even then, it is part of the other cluster if it is within this many link lengths of it.
 NEAR_LINKS = 1.5
-# Outlines this many link lengths apart touch in an image: pixels at edges are lost.
+# Outlines within this many link lengths touch in an image, because pixels at edges are lost.
 IMAGE_GAP_LINKS = 1.5
-# Share of a piece that lies within another's outline.
+# Least fraction of a cluster that lies within another cluster's outline.
 OUTLINE_SHARE = 0.6
 
 
 def link_length(points: Points, settings: SegmentationConfig) -> float:
-    """Points this near belong together [m]: less than the gap, unless the points are too sparse."""
+    """Return the distance up to which points are linked [m]. It is less than the gap unless the points are sparse."""
     if len(points) < 5:
         return settings.gap
     some = points[:: max(1, len(points) // SPACING_SAMPLES)]
@@ -79,15 +80,15 @@ def link_length(points: Points, settings: SegmentationConfig) -> float:
 def link_points(
     points: Points, weight: Float[np.ndarray, "n"], link: float, neighbour_share: float
 ) -> Int[np.ndarray, "n"]:
-    """Link evenly dense points to clusters, numbered from the largest. A stray is -1.
+    """Cluster evenly dense points. Return cluster numbers, from the largest, and -1 for noise.
 
-    As in DBSCAN, only points with enough neighbours carry a cluster on. The others join the nearest that does.
+    As in DBSCAN, only core points, which have enough neighbours, extend a cluster. Others join the nearest core point.
 
     Args:
-        points: one a voxel [m].
-        weight: how well each was seen: full points in its voxel, those that any camera would see taken as equal.
-        link: points this near are neighbours [m].
-        neighbour_share: points with a smaller share of the median number of neighbours are strays.
+        points: one point per voxel [m].
+        weight: point count of each voxel times its squared distance from the camera [m²] (`VoxelScene.weight`).
+        link: distance up to which points are neighbours [m].
+        neighbour_share: least number of neighbours of a core point, as a fraction of the median number.
     """
     label = np.full(len(points), -1)
     if len(points) == 0:
@@ -113,14 +114,14 @@ def link_points(
 
 
 def extent(points: Points) -> float:
-    """Length along the longest principal axis [m], however the points are turned."""
+    """Return the length along the longest principal axis [m]. It does not depend on rotation."""
     centred = points - points.mean(0)
     _, axes = np.linalg.eigh(centred.T @ centred)
     return longest_side(centred @ axes)
 
 
 def renumber(label: Int[np.ndarray, "n"]) -> Int[np.ndarray, "n"]:
-    """Give clusters their numbers from the largest, without gaps. Strays (-1) stay."""
+    """Renumber clusters from the largest, without gaps. Noise stays -1."""
     answer = np.full(len(label), -1)
     known = label >= 0
     count = np.bincount(label[known])
@@ -131,13 +132,13 @@ def renumber(label: Int[np.ndarray, "n"]) -> Int[np.ndarray, "n"]:
 
 
 def touching_things(points: Points, eyes: Eyes, height: Float[np.ndarray, "n"], spacing: float) -> Int[np.ndarray, "n"]:
-    """Tell apart the parts of a cluster that seams and waists bound and that stand on their own, all 0 where one is.
+    """Split a cluster at seams and waists into standing parts. Return each point's part number, all 0 for one part.
 
     Args:
-        points: thinned evenly [m].
-        eyes: where the cameras stood [m].
-        height: of the points above the support [m].
-        spacing: of the points [m].
+        points: evenly downsampled points [m].
+        eyes: camera positions [m].
+        height: height of each point above the support [m].
+        spacing: distance between neighbouring points [m].
     """
     one = np.zeros(len(points), dtype=int)
     if len(points) < 2 * _NEIGHBOURS:
@@ -161,13 +162,13 @@ def touching_things(points: Points, eyes: Eyes, height: Float[np.ndarray, "n"], 
             and waist <= _WAIST * depth[mine].max()
         ]
         if len(things) > 1:
-            # The seam itself, and pieces that occlusion set apart, belong to the part that is nearest.
+            # Points of the seam, and pieces separated by occlusion, belong to the nearest part.
             return np.argmin([KDTree(points[mine]).query(points)[0] for mine in things], axis=0)
     return one
 
 
 def _normals(points: Points, near: Int[np.ndarray, "n near"], eyes: Eyes) -> Points:
-    """Return unit normals of planes through neighbours, towards the camera that sees each the least from the side."""
+    """Return unit normals of planes fitted to neighbours, oriented to the camera that sees the plane most frontally."""
     spread = points[near] - points[near].mean(1, keepdims=True)
     normals = least_axes(spread.transpose(0, 2, 1) @ spread)
     way = eyes[:, None] - points
@@ -177,13 +178,13 @@ def _normals(points: Points, near: Int[np.ndarray, "n near"], eyes: Eyes) -> Poi
 
 
 def _outline(points: Points, normals: Points, near: Int[np.ndarray, "n near"]) -> Bool[np.ndarray, "n"]:
-    """Tell which points have a wide sector about them, in the surface, without any of their neighbours. -1 is none."""
+    """Return which points have a wide sector around them in the surface without neighbours (-1 in `near` is none)."""
     near = near[:, 1 : 1 + _OUTLINE_NEIGHBOURS]
     way = points[near] - points[:, None]
     right = np.cross(normals, np.eye(3)[np.abs(normals).argmin(1)])
     right /= np.linalg.norm(right, axis=1, keepdims=True)
     angle = np.arctan2(*(np.einsum("nkd,nd->nk", way, axis) for axis in (np.cross(normals, right), right)))
-    # NaN is sorted to the end, and no gap to it is wider than any.
+    # Sorting moves NaN to the end. Gaps to NaN do not count.
     angle = np.sort(np.where(near < 0, np.nan, angle), axis=1)
     first, last = angle[:, 0], np.nan_to_num(angle, nan=-np.inf).max(1)
     gaps = np.diff(angle, axis=1, append=np.nan)
@@ -193,10 +194,10 @@ def _outline(points: Points, normals: Points, near: Int[np.ndarray, "n near"]) -
 def _bend(
     points: Points, normals: Points, one: Int[np.ndarray, "pairs"], other: Int[np.ndarray, "pairs"]
 ) -> Float[np.ndarray, "n"]:
-    """Measure the mean curvature about each point [1/m], of pairs `_REACH_M` apart at most, negative in hollows."""
+    """Return the mean curvature at each point [1/m], from the given pairs. It is negative on concave surfaces."""
     way = points[other] - points[one]
     squared = np.einsum("pd,pd->p", way, way)
-    # Near ones say more of noise than of the surface.
+    # Close pairs measure noise rather than curvature.
     far = squared > (0.4 * _REACH_M) ** 2
     one, other, way, squared = one[far], other[far], way[far], squared[far]
     bend = np.einsum("pd,pd->p", normals[other] - normals[one], way) / squared
@@ -206,7 +207,7 @@ def _bend(
 
 
 def _linked(kept: Bool[np.ndarray, "n"], links: Int[np.ndarray, "links 2"]) -> Int[np.ndarray, "n"]:
-    """Return the connected part that each of the kept points is of, -1 for the others."""
+    """Return the connected component of each kept point, -1 for the other points."""
     one, other = links[kept[links].all(1)].T
     graph = coo_matrix((np.ones(len(one), dtype=bool), (one, other)), shape=(len(kept), len(kept)))
     return np.where(kept, connected_components(graph, directed=False)[1], -1)
@@ -222,16 +223,16 @@ def merge_occluded(
     settings: SegmentationConfig,
     support: FlatPart | None,
 ) -> Int[np.ndarray, "n"]:
-    """Return the clusters with such pieces joined, numbered from the largest. A stray is -1.
+    """Join clusters that occlusion split. Return cluster numbers, from the largest, and -1 for noise.
 
     Args:
-        points: evenly dense [m].
-        distance: of each from its camera [m].
-        label: their clusters, numbered from the largest, -1 for a stray.
-        viewpoints: where the cameras stood [m].
-        link: distance at which points were linked [m].
-        settings: pieces that are longer than its largest object together are not one thing.
-        support: what the things stand on. Pieces that end well above it hang on others.
+        points: evenly dense points [m].
+        distance: distance of each point from its camera [m].
+        label: cluster number of each point, from the largest, -1 for noise.
+        viewpoints: camera positions [m].
+        link: distance up to which points were linked [m].
+        settings: sizes and distances. Clusters are not joined if the result would exceed the largest object.
+        support: support plane, or None. Clusters that end well above it belong to other clusters.
     """
     many = min(int(label.max(initial=-1)) + 1, MAX_PIECES)
     pieces = [points[label == k] for k in range(many)]
@@ -248,7 +249,7 @@ def merge_occluded(
         if one and any(_touch_in_image(pieces[a], pieces[b], eye, IMAGE_GAP_LINKS * link) for eye in viewpoints):
             root, leaf = sorted((owner[a], owner[b]))
             owner = [root if k == leaf else k for k in owner]
-            # What hangs on one thing does not hang on the next: it would make one of all that are near it.
+            # A hanging cluster joins only one standing cluster. Otherwise it would connect all objects near it.
             stands = not (hangs[a] and hangs[b])
             hangs = [hangs[k] and not (stands and owner[k] == root) for k in range(many)]
     joined = label.copy()
@@ -266,8 +267,8 @@ def _near(
     settings: SegmentationConfig,
     support: FlatPart | None,
 ) -> bool:
-    """Whether two pieces, the larger first, are near enough to be one thing, as far as each hangs on others."""
-    if support is None:  # nothing tells one thing behind another from one thing's two sides
+    """Return True if two clusters, the larger first, are near enough to be one object. Hanging ones may be farther."""
+    if support is None:  # two objects behind each other look like two sides of one object
         return apart <= settings.unsupported_reach
     if apart <= max(link, settings.gap) or _share_within(b, a, support) >= OUTLINE_SHARE:
         return True
@@ -280,7 +281,7 @@ def _near(
 
 
 def _hangs(piece: Points, distance: Float[np.ndarray, "n"], support: FlatPart, viewpoints: Eyes, link: float) -> bool:
-    """Whether a piece ends above the support and does not itself hide, from all cameras, what it might stand on."""
+    """Return True if a cluster ends above the support and does not hide the place below it from any camera."""
     height = support.height(piece)
     if (height - support.tolerance(distance)).min() <= FLOATING_LINKS * link:
         return False

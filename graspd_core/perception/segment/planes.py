@@ -1,7 +1,7 @@
-"""Large flat parts of a scene: RANSAC finds them, weighted least squares refines them.
+"""Large flat parts of a scene, found by RANSAC and refined by weighted least squares.
 
-The noise of a depth camera grows with the square of the distance (stereo and structured light both measure disparity),
-so a plane's tolerance does too: the residuals themselves say how fast.
+The noise of a depth camera grows with the square of the distance, because stereo and structured light measure
+disparity. A plane's tolerance grows likewise, at a rate estimated from its residuals.
 """
 
 from __future__ import annotations
@@ -17,38 +17,38 @@ from graspd_core.mesh.topology import packed_rows
 from graspd_core.perception.cloud.point_cloud import Eyes, Points, Vector, convex_hull, longest_side
 from graspd_core.types import Plane
 
-# So many points, evenly taken, show which plane has most of them.
+# Number of evenly chosen points for RANSAC.
 RANSAC_POINTS = 10_000
-# Residuals of a plane gather in the middle of the slab in which it is searched: their median is this share of it at
-# most, and the tolerance they need is not much wider. Those of a curved surface fill the slab, and the next again.
+# For a plane, the median residual is at most this fraction of the search width, and the needed tolerance is at most
+# this factor wider. The residuals of a curved surface fill any search width.
 MAX_MEDIAN_RESIDUAL_SHARE, MAX_GATE_GROWTH = 0.4, 1.5
-# A point is on the plane within so many standard deviations.
+# Points within this many standard deviations are on the plane.
 INLIER_DEVIATIONS = 4.0
-# It is fitted to those within so many.
+# The plane is fitted to points within this many standard deviations.
 FIT_DEVIATIONS = 3.0
 MAX_PLANES = 4
-# Side of the cells by which a plane's visible part is measured; occlusion and holes of a few cells are bridged [m].
+# Cell size of the raster that measures a plane's visible part [m]. Gaps of a few cells are bridged.
 RASTER_CELL_M = 0.01
-# Cells of that raster along a side at most; of larger parts the cells are wider.
+# Greatest number of raster cells along a side. For larger parts the cells are wider.
 MAX_RASTER_CELLS = 2000
 BRIDGED_CELLS = 3
 
 
 @dataclass(frozen=True)
 class FlatPart:
-    """A plane and the part of it that was seen.
+    """A plane and its visible part.
 
     Attributes:
-        plane: normal towards the cameras.
-        axes: two unit vectors in the plane, columns.
-        noise: standard deviation of the points from it, over the square of their distance from the camera [1/m].
-        least: tolerance where the noise is small [m].
-        most: tolerance where it is large [m].
-        inliers: which of the scene's points lie on it.
-        sides: length and width of the seen part [m].
-        hull: half-planes n·x + c <= 0 around the seen part, in the coordinates of `axes`, as rows n, c.
-        area: inside the hull [m²].
-        filled: share of that area where it was seen.
+        plane: the plane, its normal towards the cameras.
+        axes: two unit vectors in the plane, as columns.
+        noise: standard deviation of the points from the plane over their squared distance from the camera [1/m].
+        least: lower limit of the tolerance [m].
+        most: upper limit of the tolerance [m].
+        inliers: which of the scene's points lie on the plane.
+        sides: length and width of the visible part [m].
+        hull: convex hull of the visible part: rows (n, c) with n·x + c <= 0, in the coordinates of `axes`.
+        area: area of the hull [m²].
+        filled: fraction of the hull's area that is visible.
     """
 
     plane: Plane
@@ -63,15 +63,15 @@ class FlatPart:
     filled: float
 
     def height(self, points: Points) -> Float[np.ndarray, "n"]:
-        """Above the plane, towards the cameras [m]."""
+        """Return the height of points above the plane, towards the cameras [m]."""
         return points @ self.plane.normal - self.plane.offset
 
     def tolerance(self, distance: Float[np.ndarray, "n"]) -> Float[np.ndarray, "n"]:
-        """How high a point may be and still belong to the plane, by its distance from the camera [m]."""
+        """Return the height up to which a point belongs to the plane [m], for its distance from the camera [m]."""
         return np.clip(INLIER_DEVIATIONS * self.noise * distance**2, self.least, self.most)
 
     def beneath(self, points: Points, margin: float) -> Bool[np.ndarray, "n"]:
-        """Whether points lie over the seen part, or at most `margin` beside it [m]."""
+        """Return which points project into the visible part's hull, or at most `margin` [m] outside."""
         flat = points @ self.axes
         return np.asarray((flat @ self.hull[:, :2].T + self.hull[:, 2] <= margin).all(1))
 
@@ -79,13 +79,13 @@ class FlatPart:
 def find_planes(
     points: Points, distance: Float[np.ndarray, "n"], viewpoints: Eyes, settings: SegmentationConfig
 ) -> list[FlatPart]:
-    """Find flat parts in order of their number of points, each point in at most one.
+    """Find flat parts, the largest first. Each point belongs to at most one part.
 
     Args:
-        points: evenly dense [m].
-        distance: of each from its camera [m].
-        viewpoints: where the cameras stood [m].
-        settings: sizes and tolerances. Parts smaller than a support are left alone.
+        points: evenly dense points [m].
+        distance: distance of each point from its camera [m].
+        viewpoints: camera positions [m].
+        settings: sizes and tolerances. Parts smaller than a support are ignored.
     """
     with Extra("clouds"):
         import open3d as o3d
@@ -98,9 +98,9 @@ def find_planes(
         some = left[:: 1 + len(left) // RANSAC_POINTS]
         cloud = o3d.geometry.PointCloud(o3d.utility.Vector3dVector(points[some]))
         part, guess, gate = None, np.zeros(4), wide
-        # A step in a table lies within the wide gate, which then takes both levels for one slope.
+        # A wide gate may fit one slope to both levels of a stepped table. The narrow gate is tried next.
         for gate in (wide, min(settings.plane_tolerance, 0.5 * wide)):
-            # All trials, whatever they find: threads that may stop early give another plane each time.
+            # Run all trials (probability 1). If threads could stop early, the plane would differ between runs.
             o3d.utility.random.seed(0)
             guess = np.asarray(cloud.segment_plane(gate, 3, settings.ransac_trials, 1.0)[0])
             part = _refine(points, distance, left, guess, viewpoints.mean(0), gate, settings)
@@ -123,7 +123,7 @@ def _refine(
     gate: float,
     settings: SegmentationConfig,
 ) -> FlatPart | None:
-    """Fit by weighted least squares to the points that the last fit calls near. None where too few are."""
+    """Refine a plane by iterated weighted least squares. None for too few inliers or a curved surface."""
     least, most = settings.plane_tolerance, settings.max_plane_tolerance
     size = float(np.linalg.norm(guess[:3]))
     if not size > 0:
@@ -148,7 +148,7 @@ def _refine(
         runs_away = INLIER_DEVIATIONS * noise * np.median(far[inlier] / coarse[inlier]) > MAX_GATE_GROWTH
         if runs_away or (step == 0 and np.median(residual / width[inlier]) > MAX_MEDIAN_RESIDUAL_SHARE):
             return None
-        # Tighter than the tolerance: the feet of what stands on it would tilt it.
+        # This is tighter than the tolerance. Otherwise the feet of objects on the plane would tilt it.
         width = np.clip(FIT_DEVIATIONS * noise * far, 0.25 * least, most)
     if normal @ viewpoint < offset:
         normal, offset = -normal, -offset
@@ -160,7 +160,7 @@ def _refine(
 def _measure(
     points: Points, inliers: Bool[np.ndarray, "n"], plane: Plane, noise: float, settings: SegmentationConfig
 ) -> FlatPart | None:
-    """Keep the largest connected part of the inliers, by a raster in the plane. The others are no inliers."""
+    """Return the flat part with only the largest connected region of the inliers. None if it has no hull."""
     from scipy.ndimage import binary_dilation, label
 
     axes = np.linalg.svd(plane.normal[None])[2][1:].T

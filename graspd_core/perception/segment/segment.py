@@ -1,4 +1,4 @@
-"""An object cut out of what depth cameras saw: crop, thin, support, clusters, choice."""
+"""Segmentation of an object from depth camera views: crop, downsample, find the support, cluster, select."""
 
 from __future__ import annotations
 
@@ -33,25 +33,25 @@ from graspd_core.perception.segment.target_selection import (
 )
 from graspd_core.types import Plane
 
-# Scenes nearer than this to their cameras are in another unit than metres [m].
+# A scene nearer than this to its cameras is probably not in metres [m].
 MIN_SCENE_DISTANCE_M = 0.02
-# A target inside a thing is no farther from the middle of what is seen of it than this share of half its length: aside,
-# and nearer to the camera, unless it is so near to the centroid of what is seen. Chosen on 90 pairs that touch and 60
-# single things, seeds from 0 (docs/inputs.md).
+# Greatest offset of a target point from the middle of its object's visible part, as fractions of half the object's
+# length: sideways, and towards the camera. A point within the third fraction of the centroid is also valid. Chosen on
+# 90 touching pairs and 60 single objects, seeds from 0 (docs/inputs.md).
 _MOST_ASIDE, _MOST_AHEAD, _AT_CENTROID = 0.3, 0.25, 0.25
 
 
 @dataclass(frozen=True)
 class Segmentation:
-    """An object and what is around it, in the frame of the clouds.
+    """A segmented object and its surroundings, in the frame of the clouds.
 
     Attributes:
-        views: the object's points as each camera saw them, at full density. Views that do not show it are left out.
-        support: what it stands on, None where none was seen.
-        obstacles: the points of each other thing near it, thinned [m].
-        warnings: what the user should know.
-        cut: whether the object reaches the border of the picture or of the workspace.
-        beside: why what was taken may be more than the target, or another thing. Empty if nothing says so.
+        views: the object's points in each view, at full density. Views that do not show the object are left out.
+        support: support plane of the object. None if none was seen.
+        obstacles: downsampled points of each other object or surface nearby [m].
+        warnings: warnings for the user.
+        cut: whether the object reaches the border of an image or of the workspace.
+        beside: why the segment may be larger than the target or another object. Empty without such a reason.
     """
 
     views: tuple[PointCloud, ...]
@@ -65,17 +65,17 @@ class Segmentation:
 def segment(
     views: Sequence[PointCloud], *, target: Target | None = None, settings: SegmentationConfig | None = None
 ) -> Segmentation:
-    """Find the object in one or several views of a scene, or take a cloud of an object alone as it is.
+    """Segment the object in one or several views of a scene.
 
     Args:
-        views: what each camera saw, in one frame. Points may be NaN.
-        target: what tells the object from other things. Without it, the thing nearest the first view's axis is taken.
-            Where the axis is not known, it points to the middle of the points.
+        views: point cloud of each camera, in one frame. Points may be NaN.
+        target: selects the object. Without a target, take the object nearest the first view's optical axis. If the axis
+            is unknown, it points to the mean of the points.
         settings: sizes and tolerances.
 
     Raises:
-        CloudError: empty, all NaN, too few points, or a target that cannot be meant.
-        NoObjectError: the scene is seen, and what was asked for is not in it.
+        CloudError: a cloud is empty, all NaN or has too few points, or the target is not valid.
+        NoObjectError: the scene is usable, but does not contain the requested object.
     """
     settings, target = settings or SegmentationConfig(), target or Target()
     parted = _parted(views, settings, target)
@@ -107,17 +107,17 @@ def segment(
 def find_things(
     views: Sequence[PointCloud], settings: SegmentationConfig | None = None
 ) -> tuple[Float[np.ndarray, "_ 3"], ...]:
-    """Return the points [m] of each thing that `segment` would choose from, parted at seams where things touch.
+    """Return the points [m] of each object from which `segment` would select. Touching objects are split at seams.
 
-    One of them as a target's point means the thing it is of. There may be none.
+    A point of the result, given as target, selects its object. The result may be empty.
 
     Raises:
-        CloudError: empty, all NaN, or too few points.
+        CloudError: a cloud is empty, all NaN, or has too few points.
     """
     parted = _parted(views, settings or SegmentationConfig())
     scene, label, most = parted.scene, parted.label, parted.settings.largest_object
     known, found = _candidates(parted), []
-    # Of what is too large for a thing, parts at seams may be things.
+    # If a cluster is too large for an object, its parts between seams may be objects.
     large = [k for k in range(int(label.max(initial=-1)) + 1) if extent(scene.mean[label == k]) > most]
     for k in [*known, *(k for k in large if k not in known)]:
         part = _parts(parted, label == k)
@@ -129,9 +129,9 @@ def find_things(
 
 @dataclass(frozen=True)
 class _Parted:
-    """A scene, where its cameras stood [m], what things stand on, and the thing that each voxel is part of.
+    """A scene with its camera positions `eyes` [m], its support and the object number of each voxel (`label`).
 
-    Things are numbered from the largest. Background and noise are -1.
+    Objects are numbered from the largest. Background and noise are -1.
     """
 
     scene: VoxelScene
@@ -168,7 +168,7 @@ def _things(scene: VoxelScene, ground: Ground, eyes: Eyes, settings: Segmentatio
 
 
 def _candidates(parted: _Parted) -> list[int]:
-    """Return the things of a size to be grasped: those that stand on the support, else all."""
+    """Return the objects of graspable size that stand on the support. If none does, return all of graspable size."""
     scene, label, settings, part = parted.scene, parted.label, parted.settings, parted.ground.support
     things = {k: label == k for k in range(int(label.max(initial=-1)) + 1)}
     fits = [k for k, mine in things.items() if extent(scene.mean[mine]) <= settings.largest_object]
@@ -180,7 +180,7 @@ def _candidates(parted: _Parted) -> list[int]:
 
 
 def _cut_out(views: Sequence[PointCloud], scene: VoxelScene, chosen: Mask, ground: Ground) -> tuple[PointCloud, ...]:
-    """Return the object's points of every view that shows it."""
+    """Return the object's points in every view that shows the object."""
     wanted = chosen[scene.voxel]
     if ground.support is not None:
         rows = np.flatnonzero(wanted)
@@ -195,7 +195,7 @@ def _cut_out(views: Sequence[PointCloud], scene: VoxelScene, chosen: Mask, groun
 
 
 def _obstacles(parted: _Parted, chosen: Mask) -> tuple[Float[np.ndarray, "_ 3"], ...]:
-    """Return other things and large flat parts, as far as they are within reach of the object's bounding box."""
+    """Return the points of other objects and large flat parts within reach of the object's bounding box [m]."""
     mean, label, reach = parted.scene.mean, parted.label, parted.settings.obstacle_range
     mine = mean[chosen]
     low, high = mine.min(0) - reach, mine.max(0) + reach
@@ -206,7 +206,7 @@ def _obstacles(parted: _Parted, chosen: Mask) -> tuple[Float[np.ndarray, "_ 3"],
 
 
 def _doubts(parted: _Parted, chosen: Mask, crowded: bool) -> tuple[str, ...]:
-    """Return what the user should know of how the object was found."""
+    """Return warnings about the segmentation."""
     scene, ground, settings = parted.scene, parted.ground, parted.settings
     doubts = []
     if scene.size > 0.5 * settings.gap:
@@ -218,7 +218,7 @@ def _doubts(parted: _Parted, chosen: Mask, crowded: bool) -> tuple[str, ...]:
         doubts.append(f"cloud: of {len(scene.rows)} views these show nothing near enough: {', '.join(blind)}")
     if ground.support is None and crowded:
         doubts.append("cloud: no support is seen under the object; what is behind it in the image may be taken as part")
-    # A thing alone makes the outline itself.
+    # Without surroundings, the object itself is the outline of the view.
     surrounded = ground.support is not None or len(ground.background) > 0
     for k in range(len(scene.rows) if surrounded else 0):
         part = scene.of_view(k)
@@ -230,7 +230,7 @@ def _doubts(parted: _Parted, chosen: Mask, crowded: bool) -> tuple[str, ...]:
 
 
 def _parts(parted: _Parted, chosen: Mask) -> Labels:
-    """Return the thing that each voxel is of, where a seam parts what was taken for one on a support."""
+    """Return the part of each voxel of the chosen object, split at seams if it is on a support. Others are -1."""
     scene, support = parted.scene, parted.ground.support
     part = np.where(chosen, 0, -1)
     if support is not None:
@@ -241,7 +241,7 @@ def _parts(parted: _Parted, chosen: Mask) -> Labels:
 
 
 def _touching(scene: VoxelScene, chosen: Mask, part: Labels) -> tuple[str, ...]:
-    """Say that what was taken for one thing may be several, or what a seam set apart from the one that is meant."""
+    """Return a warning that the object may be several objects, or that parts beyond a seam were left out."""
     parts = [part == k for k in range(int(part.max(initial=-1)) + 1)]
     apart = [mine for mine in parts if not (mine & chosen).any()]
     if len(parts) < 2:
@@ -256,9 +256,10 @@ def _touching(scene: VoxelScene, chosen: Mask, part: Labels) -> tuple[str, ...]:
 
 
 def _beside(parted: _Parted, chosen: Mask, point: Vector) -> str:
-    """Return why a thing is not the one around a target inside it: seen from the camera it extends to one side of it.
+    """Return why the segment may be wrong for a target point inside it: the point is too far from its middle.
 
-    A point on the surface may be anywhere on a thing. One inside is meant to be the middle, as pose estimators give it.
+    A target point on the surface may be anywhere on the object. A point inside is taken for the object's middle, as
+    pose estimators give it.
     """
     points, part = parted.scene.mean[chosen], parted.ground.support
     if part is None or np.linalg.norm(points - point, axis=1).min() <= SURFACE_VOXELS * parted.scene.size:
@@ -266,7 +267,7 @@ def _beside(parted: _Parted, chosen: Mask, point: Vector) -> str:
     flat, middle = (one @ part.axes for one in (points, point))
     half = 0.5 * float(np.ptp(flat, axis=0).max())
     if np.linalg.norm(np.median(flat, axis=0) - middle) < _AT_CENTROID * half:
-        # The centroid of what was seen, as of a mask, is nearer to the camera than the middle.
+        # The point is the centroid of visible points, for example of a mask, which is nearer to the camera.
         return ""
     sight = flat.mean(0) - parted.eyes[0] @ part.axes
     sight /= max(float(np.linalg.norm(sight)), 1e-9)
@@ -290,7 +291,7 @@ def _cut_off(scene: VoxelScene, chosen: Mask, settings: SegmentationConfig) -> b
 
 
 def _nothing(parted: _Parted) -> str:
-    """Say what was seen instead of an object."""
+    """Return the error message for a scene without a graspable object. It describes what was seen instead."""
     scene, label, ground, settings = parted.scene, parted.label, parted.ground, parted.settings
     told = f"cloud: no object among {len(scene.points)} points:"
     if label.max(initial=-1) >= 0:

@@ -1,8 +1,8 @@
-"""Which flat part of a scene is what things stand on, which are background, and which a face of a thing.
+"""Classification of a scene's flat parts: support, background, or face of an object.
 
-A support has the cameras on its free side, is larger than what stands on it, and something stands on it: comes down to
-it, lies over its seen part, and is of a size to be grasped. A face of a convex body has nothing on its free side. The
-floor of a tray has only a rim that is as wide as itself. A wall has things before it that do not come down to it.
+A support faces the cameras, is larger than the objects on it, and has at least one object on it. This object reaches
+down to the support, lies over its visible part, and has a graspable size. A face of a convex body has nothing above it.
+The floor of a tray has only a rim above it, as wide as the floor. Objects in front of a wall do not reach it.
 """
 
 from __future__ import annotations
@@ -20,31 +20,32 @@ from graspd_core.perception.cloud.voxel_downsample import Mask, VoxelScene
 from graspd_core.perception.segment.clusters import extent, link_length, link_points
 from graspd_core.perception.segment.planes import FlatPart
 
-# Share of its width by which the lowest seen point of a thing may be above its support.
+# Greatest height of an object's lowest visible point above the support, as a fraction of the object's width.
 HIDDEN_HEIGHT_SHARE = 0.5
-# Lines of sight this near to upright [cosine, 15°] show no sides, however high: what they end on rests on something.
+# From lines of sight within 15° of vertical (this is the cosine), an object's sides are not visible. Then the lowest
+# visible point may be high above the support.
 MIN_UPRIGHT_COSINE = 0.966
-# Less of a plane's hull seen than this share, it is a slice through several things.
+# If less than this fraction of its hull is visible, a plane is a slice through several objects.
 MIN_SEEN_SHARE = 0.3
-# Points down to so many tolerances below a part, as many as this share of its own, are a body's other faces.
+# A flat part is a face of a body if the points up to this many tolerances below it exceed this fraction of its own.
 EDGE_BAND_TOLERANCES, EDGE_BAND_SHARE = 4.0, 0.25
-# A point is on a flat part, and not where the part's plane cuts through a thing, if of the points within so many
-# tolerances at least this share is on the plane too: on a wall that it cuts squarely, four in ten are.
+# A plane may cut through an object. A point is on the flat part only if, of the points within this many tolerances, at
+# least this fraction is also on the plane. On a wall that the plane cuts at right angles it is 0.4.
 NEIGHBOURHOOD_TOLERANCES, ON_PLANE_SHARE = 3.0, 0.6
-# Of so many points around it is asked; where there are more, as noise makes it wide, some of them stand for all.
+# Number of neighbours for this check. If there are more, because noise widens the tolerance, a random sample is used.
 NEIGHBOUR_SAMPLES = 50
-# Beyond so many clusters the rest is noise.
+# Only the largest clusters up to this number count. The rest is noise.
 MAX_CLUSTERS = 20
 
 
 @dataclass(frozen=True)
 class Ground:
-    """What a scene's things stand on, and what is left when all background is taken away.
+    """Support and background of a scene.
 
     Attributes:
-        support: None where nothing is seen to stand on anything.
-        background: large flat parts that are no support: walls, floors, an empty table.
-        left: which of the scene's voxels may belong to things.
+        support: the support plane. None if no object stands on a visible plane.
+        background: large flat parts that are not the support, such as walls, floors and empty tables.
+        left: which of the scene's voxels may belong to objects.
     """
 
     support: FlatPart | None
@@ -53,11 +54,11 @@ class Ground:
 
 
 def find_ground(scene: VoxelScene, parts: list[FlatPart], viewpoints: Eyes, settings: SegmentationConfig) -> Ground:
-    """Sort the flat parts."""
+    """Find the support and the background among the flat parts of a scene. `viewpoints` are camera positions [m]."""
     margin = settings.support_margin
     parts = [part for part in parts if part.filled > MIN_SEEN_SHARE and not _falls_off(scene, part, margin)]
     large = [part for part in parts if part.sides[0] > settings.largest_object]
-    # As they are asked for: of a table alone in view, which is the support, never.
+    # Computed when needed. For a lone table in view, which is the support, it is never needed.
     known: dict[int, Mask] = {}
 
     def covered(others: Sequence[FlatPart]) -> list[Mask]:
@@ -77,7 +78,7 @@ def find_ground(scene: VoxelScene, parts: list[FlatPart], viewpoints: Eyes, sett
 
 
 def _left(scene: VoxelScene, support: FlatPart | None, background: Sequence[Mask]) -> Mask:
-    """Tell what is above the support and not part of the background."""
+    """Return which voxels are above the support and not part of the background."""
     left = np.ones(len(scene.mean), dtype=bool)
     if support is not None:
         left = support.height(scene.mean) > support.tolerance(scene.mean_distance)
@@ -87,7 +88,7 @@ def _left(scene: VoxelScene, support: FlatPart | None, background: Sequence[Mask
 
 
 def _covered(scene: VoxelScene, part: FlatPart, margin: float) -> Mask:
-    """Which voxels are on a flat part, what goes on beside it and no camera saw whole included."""
+    """Return which voxels are on a flat part or within `margin` [m] beside it, in its plane."""
     height, tolerance = np.abs(part.height(scene.mean)), part.tolerance(scene.mean_distance)
     band = np.flatnonzero(height <= (1 + NEIGHBOURHOOD_TOLERANCES) * tolerance.max())
     band = band[part.beneath(scene.mean[band], 2 * margin)]
@@ -95,7 +96,7 @@ def _covered(scene: VoxelScene, part: FlatPart, margin: float) -> Mask:
     if len(on) == 0:
         return np.zeros(len(scene.mean), dtype=bool)
     reach = NEIGHBOURHOOD_TOLERANCES * tolerance[on]
-    # A flat part has so many voxels within reach.
+    # Fraction of the voxels to keep, so that about `NEIGHBOUR_SAMPLES` are within reach on a flat part.
     share = NEIGHBOUR_SAMPLES * scene.size**2 / (np.pi * np.median(reach) ** 2)
     band = band[np.random.default_rng(0).random(len(band)) < share]
     around, alike = (
@@ -117,7 +118,7 @@ def _falls_off(scene: VoxelScene, part: FlatPart, margin: float) -> bool:
 def _standing(
     scene: VoxelScene, part: FlatPart, left: Mask, viewpoints: Eyes, settings: SegmentationConfig
 ) -> tuple[int, int]:
-    """How many voxels belong to things that touch that part, and to things that may stand on it."""
+    """Count the voxels of objects that touch a flat part, and of objects that may stand on it."""
     points, distance = scene.mean[left], scene.mean_distance[left]
     label = link_points(points, scene.weight[left], link_length(points, settings), settings.neighbour_share)
     touching, standing = 0, 0
@@ -132,12 +133,12 @@ def _standing(
 def stands_on(
     part: FlatPart, thing: Points, distance: Float[np.ndarray, "n"], viewpoints: Eyes, settings: SegmentationConfig
 ) -> bool:
-    """Whether a cluster of voxels is a thing on that support."""
+    """Return True if a cluster of voxels has the size and position of an object that stands on a flat part."""
     most = np.inf if settings.piled else settings.largest_object
     if not settings.smallest_object <= extent(thing) <= most:
         return False
     flat = thing @ part.axes
-    # From above, a round body hides as much of its height as half its width.
+    # Seen from above, a round body hides its lower part, up to half its width.
     hidden = HIDDEN_HEIGHT_SHARE * float(np.ptp(flat, axis=0).max())
     sight = viewpoints - thing.mean(0)
     upright = (sight @ part.plane.normal > MIN_UPRIGHT_COSINE * np.linalg.norm(sight, axis=1)).all()

@@ -1,4 +1,4 @@
-"""Which of the things in a scene is meant: by a point, a box or a mask, else the one nearest the view axis."""
+"""Selection of the object by a point, a box or a mask. Without them, the object nearest the view axis is selected."""
 
 from __future__ import annotations
 
@@ -14,21 +14,21 @@ from graspd_core.perception.cloud.point_cloud import PointCloud, Points, Vector,
 from graspd_core.perception.cloud.voxel_downsample import Labels, Mask, VoxelScene
 from graspd_core.perception.segment.clusters import extent
 
-# Errors list so many things.
+# Greatest number of objects in an error message.
 MAX_LISTED_THINGS = 4
-# A point so near to a voxel is on its thing. Voxels so near to a line of sight are on it.
+# Distances in voxels: a point this near to a voxel is on its object, and a voxel this near to a line of sight is on it.
 SURFACE_VOXELS, RAY_VOXELS = 3.0, 1.5
 MIDDLE_SHARE = 0.4
 
 
 @dataclass(frozen=True)
 class Target:
-    """What tells the object from other things. At most one of these is given.
+    """Selection of the object to grasp. At most one attribute is given.
 
     Attributes:
-        point: on or near the object, in the clouds' frame [m].
-        box: two opposite corners of a box around it, along the axes of the clouds' frame [m].
-        mask: which points of the first view, as given, show it.
+        point: a point on or near the object, in the clouds' frame [m].
+        box: two opposite corners of a box around the object, along the axes of the clouds' frame [m].
+        mask: which points of the first view, as given, show the object.
     """
 
     point: Vector | None = None
@@ -37,29 +37,30 @@ class Target:
 
 
 def check_target(target: Target, views: Sequence[PointCloud]) -> None:
-    """Refuse a target that cannot be meant.
+    """Check a target.
 
     Raises:
-        CloudError: two kinds at once, not finite, an empty box, a mask of another length or without any point.
+        CloudError: several kinds are given, a value is not finite, the box is empty, or the mask has no point or
+            another length than the first view.
     """
     given = [name for name in ("point", "box", "mask") if getattr(target, name) is not None]
     if len(given) > 1:
-        raise CloudError(f"target: {' and '.join(given)} given; give one of point, box, mask")
+        raise CloudError(f"target: {' and '.join(given)} given; valid: only one of point, box, mask")
     for corner in (target.point, *(target.box or ())):
         if corner is not None and np.shape(corner) != (3,):
-            raise CloudError(f"target: a place of shape {np.shape(corner)}; give x, y, z")
+            raise CloudError(f"target: a point of shape {np.shape(corner)}; valid: x, y, z")
     if target.point is not None and not np.isfinite(target.point).all():
-        raise CloudError(f"target: point {_place(target.point)} is not finite")
+        raise CloudError(f"target: point {_place(target.point)}; valid: finite numbers")
     if target.box is not None:
         low, high = target.box
         if not (np.isfinite(low).all() and np.isfinite(high).all() and (low != high).all()):
-            raise CloudError(f"target: box from {_place(low)} to {_place(high)} holds no volume")
+            raise CloudError(f"target: box from {_place(low)} to {_place(high)}; valid: finite, with a volume above 0")
     if target.mask is not None:
         if len(target.mask) != len(views[0].points):
             many = len(views[0].points)
-            raise CloudError(f"target: mask of {len(target.mask)} for the {many} points of the first view")
+            raise CloudError(f"target: mask of length {len(target.mask)}; valid: {many}, the points of the first view")
         if not target.mask.any():
-            raise CloudError("target: mask shows no point at all")
+            raise CloudError("target: mask selects no point; valid: at least one True")
 
 
 def select_target(
@@ -70,17 +71,16 @@ def select_target(
     views: Sequence[PointCloud],
     settings: SegmentationConfig,
 ) -> Mask:
-    """Return the voxels of the object.
+    """Return the voxels of the selected object.
 
     Args:
-        label: the thing each voxel is part of, -1 for none.
-        free: the things to choose from if no target says which.
-        target: checked.
-        views: as given.
-        settings: how near a point, and how much of a thing a box or mask, must be.
+        label: object number of each voxel, -1 for none.
+        free: object numbers to select from without a target.
+        target: a valid target (`check_target`).
+        settings: greatest distance of a point from its object, and least fraction of an object in a box or mask.
 
     Raises:
-        NoObjectError: nothing where the target says. It lists the things there are.
+        NoObjectError: no object is at the target. The message lists the objects.
     """
     many = int(label.max(initial=-1)) + 1
     if target.point is not None:
@@ -101,10 +101,10 @@ def select_target(
 def select_part(
     scene: VoxelScene, part: Labels, target: Target, views: Sequence[PointCloud], settings: SegmentationConfig
 ) -> Mask:
-    """Return the voxels of the parts that the target means, of a thing that it chose.
+    """Return the voxels of the parts of the selected object at which the target points.
 
     Args:
-        part: of things that touch, the one that each voxel is of, -1 for none.
+        part: part number of each voxel of the selected object, split at seams, -1 for other voxels.
         target: a point, a box or a mask.
     """
     if part.max(initial=-1) < 1:
@@ -131,10 +131,10 @@ def _meant(scene: VoxelScene, target: Target) -> Mask:
 
 
 def seen(scene: VoxelScene, label: Labels) -> str:
-    """Where there are things, for errors: the centres of the largest."""
+    """Return the number of objects and the centres of the largest as text, for error messages."""
     many = int(label.max(initial=-1)) + 1
     if many == 0:
-        return "nothing stands anywhere in the scene"
+        return "no object is seen"
     places = [_place(scene.mean[label == k].mean(0)) for k in range(min(many, MAX_LISTED_THINGS))]
     told = f"{many} things are seen, the largest" if many > 1 else "one thing is seen,"
     return f"{told} about {', '.join(places)} m"
@@ -143,10 +143,10 @@ def seen(scene: VoxelScene, label: Labels) -> str:
 def _thing_of(
     point: Vector, scene: VoxelScene, label: Labels, views: Sequence[PointCloud], settings: SegmentationConfig
 ) -> int:
-    """Return the thing that a point means: one it lies on or in, else the nearest within reach.
+    """Return the object that a point selects: the object that contains the point, else the nearest within reach.
 
-    A point is in a thing if the thing's hull holds it, or if the thing hides it from a camera, not deeper than half the
-    thing's length. Deeper than `MIDDLE_SHARE` of the length, it may as well mean a nearer thing.
+    A point is inside an object if the object's hull contains it or the object hides it from a camera, and if its depth
+    is at most half the object's length. Deeper than `MIDDLE_SHARE` of the length, a nearer object is preferred.
     """
     away = np.linalg.norm(scene.mean - point, axis=1)
     things = [np.flatnonzero(label == k) for k in range(int(label.max(initial=-1)) + 1)]
@@ -170,7 +170,7 @@ def _thing_of(
 
 
 def _hiding(point: Vector, scene: VoxelScene, views: Sequence[PointCloud]) -> Mask:
-    """Return the voxels that hide a point from a camera, none if a camera sees through it to what is behind."""
+    """Return the voxels that hide a point from a camera. If a camera sees through the point, return none."""
     hiding = np.zeros(len(scene.mean), dtype=bool)
     for view in views:
         ray = point - view.viewpoint
@@ -191,7 +191,7 @@ def _holds(points: Points, point: Vector) -> bool:
 
 
 def _masked(scene: VoxelScene, label: Labels, many: int, meant: Mask, least: float) -> Mask:
-    """Return what a mask covers: several things, pieces of one that others hide in part. A few points may miss."""
+    """Return the voxels of the objects under a mask. A cluster counts if the mask covers at least half of it."""
     of_first = scene.voxel[scene.of_view(0)]
     shown, covered = (
         np.bincount(label[rows][label[rows] >= 0], minlength=many) for rows in (of_first, of_first[meant[of_first]])
@@ -209,7 +209,7 @@ def _covered(label: Labels, meant: Mask, things: list[int], share: Float[np.ndar
 
 
 def _off_axis(thing: Points, scene: VoxelScene, views: Sequence[PointCloud]) -> float:
-    """Angle between the axis of the first view that shows anything and a thing, to a twentieth of its points [rad]."""
+    """Return the angle between the first non-empty view's axis and an object [rad], the 5th percentile of points."""
     first = next(k for k, rows in enumerate(scene.rows) if len(rows))
     axis, viewpoint = views[first].forward, views[first].viewpoint
     if axis is None:

@@ -134,7 +134,7 @@ def test_from_below_the_table_is_said_to_be_impossible_without_a_search_and_from
     standing = replace(bottle, support=Plane(np.array([0.0, 0.0, 1.0]), low))
     found = plan(standing, hand, Steering(approach_direction=-DOWN))
     assert found.outcome is Outcome.NO_CANDIDATES
-    assert found.message.startswith("approach_direction: nothing is left of it")
+    assert found.message.startswith("approach_direction: impossible, because the hand would reach")
     for direction in (DOWN, np.array([1.0, 0.0, 0.0]), np.array([0.0, 1.0, -1.0])):
         assert Steering(approach_direction=direction).bind(standing, hand).impossible == ""
 
@@ -158,8 +158,8 @@ def test_what_cannot_be_met_says_which_wish_refused_the_rest(bottle, hand):
         (partial(Steering, (0, 0, 1), approach_angle=np.nan), "approach_angle: nan"),
         (partial(Steering, (0, 0, 1), roll=np.inf), "roll: inf"),
         (partial(Steering, (0, 0, 1), roll=0, roll_tolerance=-1), "roll_tolerance: -1"),
-        (partial(Steering, (0, 0, 1), approach_angle=2.0, roll=0), "roll: needs .*below pi/2"),
-        (partial(Steering, roll=0.0), "roll: needs approach_direction"),
+        (partial(Steering, (0, 0, 1), approach_angle=2.0, roll=0), "roll: it needs .*below pi/2"),
+        (partial(Steering, roll=0.0), "roll: it needs approach_direction"),
         (partial(Steering, (0, 0, 1), roll=0.0, roll_zero=(0, 0, 2)), "roll_zero: .*not along"),
         (partial(Box, (0, 0), (1, 1, 1)), "box center: .*3 finite numbers"),
         (partial(Box, (0, 0, np.nan), (1, 1, 1)), "box center"),
@@ -167,8 +167,8 @@ def test_what_cannot_be_met_says_which_wish_refused_the_rest(bottle, hand):
         (partial(Box, (0, 0, 0), (1, 1, 1), (0, 0, 0, 0)), "quaternion_wxyz: all 0"),
         (partial(Sphere, (0, 0, 0), 0.0), "sphere radius: 0.0 m"),
         (partial(Sphere, (0, 0, 0), np.nan), "sphere radius"),
-        (partial(NearPoints, np.full((2, 3), np.nan)), "none is finite"),
-        (partial(NearPoints, np.zeros((0, 3))), "none is finite"),
+        (partial(NearPoints, np.full((2, 3), np.nan)), "no finite row"),
+        (partial(NearPoints, np.zeros((0, 3))), "no finite row"),
         (partial(NearPoints, np.zeros((1, 3)), radius=-1.0), "region radius"),
     ],
 )
@@ -183,7 +183,7 @@ def test_a_region_off_the_object_or_in_an_avoided_box_is_refused(bottle, hand):
     ):
         plan(bottle, hand, Steering(region=Sphere((1.1, 0.0, 0.0), 0.1)))
     both = Steering(region=Sphere((0.0, 0.0, 0.0), 1.0), avoid=[Box((1, 1, 1), (1, 1, 1)), Box((0, 0, 0), (2, 2, 2))])
-    with pytest.raises(ConfigError, match="region: all of it that is on the object lies in avoid box 1"):
+    with pytest.raises(ConfigError, match="region: avoid box 1 covers all of it on the object"):
         plan(bottle, hand, both)
 
 

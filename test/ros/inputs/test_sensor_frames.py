@@ -226,7 +226,7 @@ def test_a_cloud_without_a_frame_or_with_a_stamp_of_another_clock_is_refused(sce
 def test_data_that_contradicts_the_name_of_its_frame_is_told(scene):
     grid, _, T = scene
     body = grid[..., [2, 0, 1]] * [1, -1, -1]  # x forward, y left, z up
-    doubted = "which by its name looks along"
+    doubted = "by its name the camera looks along"
     for points, frame, told in (
         (grid, OPTICAL, False), (grid, "camera", False), (grid, "camera_link", True),
         (grid, "camera_depth_frame", True), (body, "camera_link", False), (body, OPTICAL, True),
