@@ -95,7 +95,7 @@ def pages(figures: Path, benchmark: Path) -> None:
     from playwright.sync_api import sync_playwright
 
     sys.path.insert(0, str(Path(__file__).parents[1] / "test" / "viewer"))
-    from conftest import FLAGS, Page  # pyright: ignore[reportMissingImports]
+    from conftest import FLAGS, Page  # pyright: ignore
 
     scene, hand, config = load_scene("shape:mug"), load_hand("allegro_right"), load_preset("fast")
     grasps = plan_grasps(scene, hand, count=16, preset=config).grasps

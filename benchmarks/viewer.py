@@ -30,7 +30,7 @@ from playwright.sync_api import Error, sync_playwright
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "test" / "viewer"))
 
-from conftest import FLAGS  # pyright: ignore[reportMissingImports]
+from conftest import FLAGS  # pyright: ignore
 
 from graspd_core import load_hand, load_preset, load_scene, plan_grasps, save_result
 from graspd_viewer.session import make_session, open_grasps
