@@ -39,7 +39,7 @@ DEVELOPED_ON, _FIRST_SEED = 199, 200
 SEEDS = tuple(range(_FIRST_SEED, _FIRST_SEED + 4))
 # Most attempts at a bin: this many per object, plus some more.
 _TRIES_A_THING, _MORE_TRIES = 2, 3
-# Time after which graspd plans for no further object [s]. It is long, so that a busy machine does not change the figures.
+# Time after which graspd plans for no further object [s]. It is long so that a busy machine does not change results.
 _SECONDS = 20.0
 # Upper bounds of the probability bands in the calibration table.
 _BANDS = (0.5, 0.7, 0.85, 0.95, 1.01)

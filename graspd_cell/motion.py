@@ -301,7 +301,7 @@ def dense(path: Path, step: float = _STEP) -> Path:
     return np.concatenate([*parts, path[-1:]])
 
 
-# Deepest penetration allowed at the end of a motion [m]: of the whole robot, because the grid is as coarse as its cells,
+# Deepest penetration allowed at the end of a motion [m]: of the whole robot, because the grid is as coarse as a cell,
 # and of the arm alone, because its capsules are larger than its links.
 _DEEPEST, ARM_DEEPEST = -0.02, -0.01
 
@@ -316,14 +316,14 @@ def find_path(mover: Mover, start: Joints, goal: Joints, seconds: float = 5.0) -
     # Only the goal is checked. The arm is already at the start, even if it touches something there.
     whole, own = mover.clearances(ends)[1].min(), mover.arm_clearances(ends)[1].min()
     if whole < _DEEPEST or own < ARM_DEEPEST:
-        told = f"{-1e3 * min(whole, own):.0f} mm deep in something at its goal; valid: clear of all"
-        raise NoMotionError(f"motion: {mover.shape.arm.name} is {told}")
+        told = f"penetrates an obstacle by {-1e3 * min(whole, own):.0f} mm at its goal; valid: a goal without collision"
+        raise NoMotionError(f"motion: {mover.shape.arm.name} {told}")
     allowed = mover.allowed(ends)
     if mover.clear(ends, allowed):
         return ends
     found = _planned(mover, start, goal, allowed, seconds)
     if found is None:
-        raise NoMotionError(f"motion: no clear way of {mover.shape.arm.name} was found in {seconds:g} s")
+        raise NoMotionError(f"motion: no collision-free path of {mover.shape.arm.name} was found in {seconds:g} s")
     return _rounded(mover, found, allowed)
 
 

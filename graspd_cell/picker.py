@@ -238,8 +238,8 @@ class Picker:
         mover = self._mover(taking.world, start)
         depth = -mover.arm_clearances(dense(taking.execution.arm)).min()
         if depth > -ARM_DEEPEST:
-            told = f"{1e3 * depth:.0f} mm deep in something; valid: clear of all"
-            raise NoMotionError(f"motion: on its way through the grasp {self._arm.name} is {told}")
+            told = f"penetrates an obstacle by {1e3 * depth:.0f} mm on the grasp's path"
+            raise NoMotionError(f"motion: {self._arm.name} {told}; valid: a path without collision")
         goal = taking.execution.arm[0]
         # Come straight down as far as that is collision-free. The planner finds the rest.
         above = straight(mover, goal, np.array([0.0, 0.0, 0.12]))[::-1]

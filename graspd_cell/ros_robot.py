@@ -151,7 +151,7 @@ class RosRobot:
                 handles.append(goal.result())
             refused = [handle for handle in handles if not handle.accepted]
             if refused:
-                raise MotionAborted("a controller refused the motion")
+                raise MotionAborted("a controller rejected the motion; its log gives the reason")
             results = [handle.get_result_async() for handle in handles]
             for result in results:
                 self._wait_for(result, end, stop, watched=results)
@@ -211,7 +211,7 @@ class RosRobot:
         end = time.monotonic() + self._topics.patience + extra
         while not condition():
             if time.monotonic() > end:
-                raise RobotSilentError(f"nothing came of {what()} within {self._topics.patience + extra:g} s")
+                raise RobotSilentError(f"not received within {self._topics.patience + extra:g} s: {what()}")
             time.sleep(_POLL)
 
     def _on_joints(self, message: JointState) -> None:

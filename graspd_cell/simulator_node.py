@@ -46,7 +46,7 @@ def _parse(arguments: list[str]) -> argparse.Namespace:
     parser.add_argument("--speed", type=float, default=1.0, metavar="X", help="times as fast as real time (default 1)")
     options = parser.parse_args(arguments)
     if not options.speed > 0:
-        raise ConfigError(f"speed: {options.speed}; it must be positive")
+        raise ConfigError(f"speed: {options.speed}; valid: more than zero")
     if not 0 <= options.seed < 2**31:
         raise ConfigError(f"seed: {options.seed}; valid: 0 to 2^31 - 1")
     return options
