@@ -185,7 +185,7 @@ def test_images_without_any_calibration_are_counted():
         assert pairs.add(image(np.ones((48, 64)), "16UC1")) is None
         now[0] += 0.2
     assert pairs.doubt().startswith("depth images: 200 images and 0 CameraInfos received")
-    assert pairs.doubt().endswith("and none has come")
+    assert pairs.doubt().endswith("last CameraInfo: none; valid: a CameraInfo of the same frame and size")
     # Of binned and cropped images the size counts that they are sent with; one without a frame is of any.
     binned = calibration(128, 96, binning_x=2, binning_y=2)
     binned.header.frame_id = ""
