@@ -427,7 +427,7 @@ class Responses:
         self._publish(answer, request.listener)
 
     def drawn(self, settings: Settings) -> Sequence[Primitive]:
-        """Return the solids with which markers draw the hand. The first call reads them, for seconds if they are large."""
+        """Return the solids with which markers draw the hand. The first call may read large ones for seconds."""
         if settings.marker_geometry != "visual":
             return self._hand.primitives
         if self._visuals is None:
