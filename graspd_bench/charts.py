@@ -1,6 +1,6 @@
-"""The charts: speed against accuracy, planned grasps, and the settings sweeps.
+"""Charts of speed against accuracy, of planned grasps, and of settings sweeps.
 
-They are light, printable, and told apart by shape as well as by colour.
+Markers differ in shape and colour, so that prints without colour remain readable.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ from graspd_bench.suites import SWEEPS
 from graspd_core.errors import Extra
 from graspd_core.optimize.plan_config import method_row
 
-# Colours of Okabe and Ito (2008), which the colour-blind can tell apart. A marker's shape says the same.
+# Colours of Okabe and Ito (2008), which colour-blind readers can distinguish. Markers differ in shape too.
 FRONT = "#222222"
 _STYLE: Any = {
     "font.size": 9,
@@ -47,16 +47,16 @@ _STYLE: Any = {
     "svg.hashsalt": "graspd",
     "figure.dpi": 100,
 }
-# The line from a label that stands far off to its point.
+# Style of the line from a distant label to its point.
 _LEADER = {"arrowstyle": "-", "lw": 0.5, "alpha": 0.6, "shrinkA": 0, "shrinkB": 3}
-# Where a label may stand about its point, in points of print. The nearest free place is taken.
+# Candidate positions of a label around its point: angles [rad] and distances [points]. The nearest free one is used.
 _ANGLES = np.deg2rad([0, 180, 90, 270, 45, 135, 315, 225, 22, 158, 202, 338, 67, 113, 247, 293])
 _DISTANCES = (7.0, 13.0, 20.0, 28.0, 38.0, 50.0, 64.0)
 
 
 @contextmanager
 def figure(width: float, height: float, **grid: Any) -> Iterator[tuple[Any, Any]]:
-    """Yield a figure and its axes in the common style [inches], and close it at the end."""
+    """Yield a figure of `width` by `height` [inches] and its axes in the common style. Close it at the end."""
     with Extra("bench"):
         import matplotlib
 
@@ -72,7 +72,7 @@ def figure(width: float, height: float, **grid: Any) -> Iterator[tuple[Any, Any]
 
 
 def save(made: Any, path: Path) -> Path:
-    """Write PNG and SVG, the same bytes for the same data. Return the PNG's path."""
+    """Write a figure as PNG and SVG and return the PNG's path. The same data give the same bytes."""
     png, svg = path.with_name(f"{path.name}.png"), path.with_name(f"{path.name}.svg")
     png.parent.mkdir(parents=True, exist_ok=True)
     made.savefig(png, dpi=160, metadata={"Software": None})
@@ -83,7 +83,7 @@ def save(made: Any, path: Path) -> Path:
 def place_labels(
     axes: Any, points: Sequence[tuple[float, float]], texts: Sequence[str], colours: Sequence[str]
 ) -> None:
-    """Write a label beside each point of an axes, clear of the points, of other labels and of the frame.
+    """Write a label beside each point so that it overlaps no point, label or frame, if possible.
 
     Call it last, because it needs the final layout.
     """
@@ -120,7 +120,7 @@ def _place(point: np.ndarray, half: np.ndarray, distance: float, angle: float) -
 
 
 def _trouble(place: np.ndarray, half: np.ndarray, taken: Sequence[tuple[float, ...]], frame: Any) -> float:
-    """Return the area that a label would share with taken places or have outside the frame. The first wins ties."""
+    """Return the cost of a label position: its overlap with `taken` boxes plus 50 times its length beyond the frame."""
     low, high = place - half, place + half
     shared = 0.0
     for x0, y0, x1, y1 in taken:
@@ -141,15 +141,15 @@ _SUCCESS, _TIME = method_row("closed_form").colour, method_row("graspd2022").col
 
 @dataclass(frozen=True)
 class Panel:
-    """One figure against time.
+    """Chart panel that plots one figure against time.
 
     Attributes:
-        figure: of `figures.Row`.
-        label: of its axis.
-        factor: from the figure's unit to the label's.
-        less_is_better: whether less is better, not more.
-        mean: whether the marker is the mean over objects, not the median. A share's median hides failures.
-        log: whether the axis is logarithmic.
+        figure: name of the figure in `figures.Row.values`.
+        label: label of the vertical axis.
+        factor: conversion factor from the figure's unit to the label's unit.
+        less_is_better: True if smaller values are better.
+        mean: if True, plot the mean over objects instead of the median. The median of a success rate hides failures.
+        log: True for a logarithmic vertical axis.
     """
 
     figure: str
@@ -165,17 +165,17 @@ PANELS = (
     Panel("sd_cm", "simulation displacement SD [cm]", log=True),
     Panel("penetration_mm", "penetration [mm]"),
 )
-# What a log axis shows of less than this [cm].
+# A logarithmic axis shows smaller values as this value [cm].
 _LEAST = 0.01
-# Objects that a chart names. It counts more of them.
+# Most objects that a chart lists by name. For more it gives their number.
 _NAMED = 4
 
 
 @dataclass(frozen=True)
 class Point:
-    """One preset on one panel: low, middle and high on both axes, and whether any of its grasps held.
+    """Point of one preset on a panel: (low, middle, high) on both axes. `held` is True if any grasp held.
 
-    They are the middle and quartiles over objects, or over the grasps of a single one. A share has its 95 % interval.
+    Low and high are quartiles over objects, or over grasps of a single object. For a share they are its 95 % interval.
     """
 
     name: str
@@ -186,9 +186,9 @@ class Point:
 
 
 def draw_charts(records: Sequence[Record], path: Path) -> dict[str, Path]:
-    """Draw what the records have figures for: PATH.png and .svg, PATH_short, PATH_planned, PATH_ladder.
+    """Draw all charts for which the records have data: PATH, PATH_short, PATH_planned and PATH_ladder (.png, .svg).
 
-    Return the PNGs drawn, by "speed", "short", "planned" and "ladder".
+    Return the paths of the PNGs by "speed", "short", "planned" and "ladder". Charts without data are missing.
     """
     found = rows(records)
     swept = [row for row in found if is_sweep_value(row.name)]
@@ -205,7 +205,7 @@ def draw_charts(records: Sequence[Record], path: Path) -> dict[str, Path]:
 
 
 def about_records(records: Sequence[Record], kind: str) -> str:
-    """Return hands, objects, numbers of grasps and what bars mean, of a chart's records in two lines."""
+    """Return two lines for a chart: hands and objects, then the number of grasps and the meaning of the bars."""
     shown = [r for r in records if r.get("kind") == kind and not r["error"] and is_preset(r["name"])]
     if not shown:
         return ""
@@ -216,7 +216,7 @@ def about_records(records: Sequence[Record], kind: str) -> str:
     few, most = min(asked.values()), max(asked.values())
     things = ", ".join(objects) if len(objects) <= _NAMED else f"{len(objects)} objects"
     number = f"{few}" if few == most else f"{few} to {most}"
-    # Times are those of whole runs.
+    # Times are measured per run, so planned grasps of a single object have no bars.
     bars = "objects" if len(objects) > 1 else "grasps" if kind == "raw" else ""
     shares = ", the 95 % interval of a share" if kind == "raw" else ""
     told = f"; bars: quartiles over {bars}{shares}" if bars else ""
@@ -224,7 +224,7 @@ def about_records(records: Sequence[Record], kind: str) -> str:
 
 
 def draw_planned(presets: dict[str, list[Row]], path: Path, about: str = "") -> Path | None:
-    """Draw seconds per verified grasp against seconds to the first, both as planned. None if there is nothing."""
+    """Draw CPU seconds per verified grasp against those to the first one. Return the PNG's path, None without data."""
     panel = Panel("cpu_per_verified", "CPU seconds per verified grasp, all included")
     points = points_of(presets, "first_cpu", panel)
     if not points:
@@ -241,9 +241,9 @@ def draw_planned(presets: dict[str, list[Row]], path: Path, about: str = "") -> 
 
 
 def draw_speed(presets: dict[str, list[Row]], path: Path, about: str = "") -> Path | None:
-    """Draw a panel for every figure of accuracy, against time for a raw grasp. None where there is nothing to draw.
+    """Draw each accuracy figure against CPU seconds per raw grasp. Return the PNG's path, None without data.
 
-    `about` says of which hands, objects and how many grasps.
+    `about` is the text below the chart, from `about_records`.
     """
     panels = [(panel, points) for panel in PANELS if (points := points_of(presets, "cpu_per_grasp", panel))]
     if not panels:
@@ -260,7 +260,7 @@ def draw_speed(presets: dict[str, list[Row]], path: Path, about: str = "") -> Pa
 
 
 def points_of(presets: dict[str, list[Row]], time: str, panel: Panel) -> list[Point]:
-    """Return a point for every preset that has both figures, in the panel's unit."""
+    """Return a point for each preset that has both the time and the panel's figure, in the panel's unit."""
     points = []
     for name, group in presets.items():
         x, y = spread(group, time), spread(group, panel.figure)
@@ -279,7 +279,7 @@ def points_of(presets: dict[str, list[Row]], time: str, panel: Panel) -> list[Po
 
 
 def _draw_panel(axis: Any, points: Sequence[Point], panel: Panel) -> int:
-    """Draw the points of a panel and their front. Return how many points the front has."""
+    """Draw the points of a panel and their Pareto front. Return the number of points on the front."""
     place = {p.name: (p.x[1], p.y[1]) for p in points}
     for p in points:
         (x, y), colour, parent = place[p.name], method_row(p.method).colour, parent_of(p.name)
@@ -300,7 +300,7 @@ def _draw_panel(axis: Any, points: Sequence[Point], panel: Panel) -> int:
             zorder=5,
             clip_on=False,
         )
-    # What holds nothing sinks into nothing either: it is drawn, but it beats nobody.
+    # A preset without any held grasp is drawn, but is not part of the front. Its penetration is low for no merit.
     spots = np.array([place[p.name] for p in points if p.held] or list(place.values()))
     front = spots[pareto_front(spots * [1.0, 1.0 if panel.less_is_better else -1.0])]
     axis.plot(*front[front[:, 0].argsort()].T, color=FRONT, lw=1.2, alpha=0.6, zorder=1)
@@ -320,7 +320,7 @@ def _draw_panel(axis: Any, points: Sequence[Point], panel: Panel) -> int:
 
 
 def _few_ticks(axis: Any) -> None:
-    """Label a logarithmic axis with round numbers that stand apart. Over less than a decade it has no powers of ten."""
+    """Label a logarithmic axis with few round numbers. A range below one decade gets linear ticks."""
     from matplotlib.ticker import FuncFormatter, LogLocator, MaxNLocator, NullFormatter
 
     low, high = axis.get_view_interval()
@@ -336,7 +336,7 @@ def _bars(low: float, middle: float, high: float) -> list[list[float]]:
 
 
 def _legend(made: Any, points: Sequence[Point], *, front: bool) -> None:
-    """Name what is drawn, and nothing else."""
+    """Add a legend with the methods that are drawn, the ablations and the front."""
     from matplotlib.lines import Line2D
 
     plain = {"ls": "none", "ms": 7, "mew": 1.3}
@@ -352,7 +352,7 @@ def _legend(made: Any, points: Sequence[Point], *, front: bool) -> None:
 
 
 def draw_sweeps(found: Sequence[Row], path: Path) -> Path:
-    """Draw a panel for every sweep. Return the PNG's path."""
+    """Draw one panel per settings sweep. Return the PNG's path."""
     sweeps = {name: {} for name in SWEEPS}
     for name, group in by_name(found).items():
         sweep, sweep_value = name.split("=")

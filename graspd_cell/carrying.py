@@ -1,4 +1,4 @@
-"""Where the arm goes beside graspd's own path: straight up and down, and to where a thing is let go."""
+"""Arm motions that graspd does not plan: straight lines of the tip, and postures above a bin to release an object."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from graspd_core.se3 import SE3
 
 Joints = Float[np.ndarray, "joints"]
 Pose = Float[np.ndarray, "4 4"]
-# Between two poses of a straight way [m], and the farthest that a joint moves between them [rad].
+# Step between two poses of a straight path [m], and the greatest joint motion in one step [rad].
 _STEP, _JUMP = 0.02, 0.25
 _STEPS = 12
 
@@ -30,9 +30,9 @@ def tip_pose(mover: Mover, q: Joints) -> Pose:
 
 
 def straight(mover: Mover, q: Joints, way: Float[np.ndarray, "3"]) -> Float[np.ndarray, "rows joints"]:
-    """Return joint values along a straight way of the tip [m], as far as it is reached and clear.
+    """Return joint values along the straight displacement `way` of the tip, base frame [m]. The first row is `q`.
 
-    The first row is `q`.
+    The path ends at the last pose that inverse kinematics reaches without collision.
     """
     arm, pose, rows = mover.shape.arm, tip_pose(mover, q), [q]
     allowed = mover.allowed(q[None])
@@ -50,22 +50,22 @@ def straight(mover: Mover, q: Joints, way: Float[np.ndarray, "3"]) -> Float[np.n
 
 
 def held_balls(mover: Mover, q: Joints, surface: Points) -> Balls:
-    """Return what is carried with a thing whose surface [m], base frame, is in the hand at joint values `q`."""
+    """Return the carried balls, tip frame, and those of an object with surface points [m], base frame, at `q`."""
     pose = tip_pose(mover, q)
     local = balls_about((surface - pose[:3, 3]) @ pose[:3, :3])
     at, radius = (np.concatenate(both) for both in ((mover.carried.at, local.at), (mover.carried.radius, local.radius)))
     return Balls(at, radius)
 
 
-# Turns about the vertical that a thing is let go at, and spots in the bin, shares of half its side.
+# Rotations about the vertical at which an object may be released [rad]. Release spots as fractions of the bin's `half`.
 _TURNS = np.linspace(-np.pi, np.pi, 16, endpoint=False)
 SPOTS = ((0.0, 0.0), (0.45, 0.45), (-0.45, -0.45), (0.45, -0.45), (-0.45, 0.45))
-# Lowest point of a thing that is let go above the table [m], lowest first.
+# Heights of the object's lowest point above the table at release [m], tried in this order.
 _HEIGHTS = (0.08, 0.12, 0.17, 0.22, 0.28)
 
 
 def dropped_box(thing: Points) -> Box:
-    """Return the room that a thing may fill which was let go where its points were [m]: no camera looks there."""
+    """Return a box on the table that covers an object released at the points `thing` [m]. No camera sees that place."""
     low, high = thing.min(0), thing.max(0)
     half, rise = 0.5 * (high - low)[:2], 0.5 * float(high[2] - low[2])
     x, y = (0.5 * (low + high))[:2].tolist()
@@ -73,14 +73,14 @@ def dropped_box(thing: Points) -> Box:
 
 
 def release_posture(mover: Mover, q: Joints, thing: Points, bin_: Bin, number: int) -> Joints | None:
-    """Return the nearest clear posture at which a thing hangs above a bin, turned as it is but for the vertical.
+    """Return the nearest clear posture with the object above a bin, rotated about the vertical only. None if none.
 
     Args:
-        mover: with the thing in the hand.
-        q: where the arm is.
-        thing: points of its surface at `q`, base frame [m].
-        bin_: that it is brought to.
-        number: of the thing. Spots take turns.
+        mover: arm and hand with the object in the hand.
+        q: current joint values of the arm.
+        thing: points of the object's surface at `q`, base frame [m].
+        bin_: the target bin.
+        number: count of objects already released. The release spots are used in turn.
     """
     arm, pose = mover.shape.arm, tip_pose(mover, q)
     middle = np.array([*thing.mean(0)[:2], thing[:, 2].min()])
@@ -109,7 +109,7 @@ def _clear_postures(mover: Mover, arm: Arm, q: Joints, targets: Sequence[Pose]) 
     rows = torch.arange(len(targets)).repeat_interleave(count)
     found = solve(arm, goal[rows], starts.flatten(0, 1), _STEPS)
     reached = found.q[found.reached].double().numpy()
-    # Whole turns back to where the arm is.
+    # Choose the equivalent angle (modulo 2π) that is nearest to the current joint value.
     turned = reached + 2 * np.pi * np.round((q - reached) / (2 * np.pi))
     inside = (turned >= arm.lower) & (turned <= arm.upper)
     reached = np.where(inside, turned, reached)

@@ -1,4 +1,4 @@
-"""`graspd cell`: a simulated arm empties a bin, shown in a browser or told in a line a pick."""
+"""`graspd cell`: a simulated arm empties a bin. Each pick prints one line, and a browser can show the cell."""
 
 from __future__ import annotations
 
@@ -19,9 +19,9 @@ if TYPE_CHECKING:
     from graspd_cell.picker import Attempt
     from graspd_cell.referee import Report
 
-# The exit status where something is left in the bin that the picker could not take.
+# Exit status if an object did not end in the place bin.
 EXIT_LEFT = 3
-# Seconds that a page waits for somebody to look.
+# Seconds that the page waits for a first visitor.
 _PATIENCE = 20.0
 
 
@@ -46,7 +46,7 @@ def add_command(commands: Any) -> None:
 
 
 def run(options: argparse.Namespace) -> int:
-    """Empty the bin; 0 where nothing is left, 3 where something is, 130 after Ctrl-C."""
+    """Empty the bin. Return 0 if no object is left, 3 if one is left, 130 after Ctrl-C."""
     import torch
 
     from graspd_cell.cell_study import CellCase
@@ -61,7 +61,7 @@ def run(options: argparse.Namespace) -> int:
 
     _refuse(options)
     torch.set_num_threads(1)
-    # What is frozen at the end is never freed, and OMPL's library complains of that on many lines.
+    # Objects still frozen at exit are never freed. OMPL prints many warnings about them.
     atexit.register(gc.unfreeze)
     found = () if options.things == ["families"] else find_sources(options.things)
     things = tuple((source.source, source.mass) for source in found)
@@ -127,7 +127,7 @@ def _greet(live: LiveCell | None, stop: Callable[[], bool]) -> None:
 
 
 def _tell(live: LiveCell | None, attempt: Attempt, report: Report) -> None:
-    """Print a line of an attempt; the page has the same, and how many things are out."""
+    """Print one line about an attempt. The page shows the same line and the count of objects in the place bin."""
     out = sum(place == "place bin" for place in report.places.values())
     sure = "verified" if attempt.verified else "likely"
     chance = "" if attempt.probability is None else f" {attempt.probability:.2f}"

@@ -1,8 +1,8 @@
-"""`graspd bench cell`: bins emptied in simulated cells as fast as it goes, and what truly came of it.
+"""`graspd bench cell`: bins emptied in simulated cells, and the true outcome of each attempt.
 
-What the picker knows it was told by joints and camera. What is reported is what the referee saw. Before a bin is
-emptied, its things are named that the hand can hold at all: graspd finds a verified grasp of the true mesh at its true
-mass, alone in free space. Families and seeds up to `DEVELOPED_ON` were looked at while the picker was written.
+The picker knows only joint readings and depth images. The tables report the simulator's ground truth (the referee).
+Before a bin is emptied, the study finds the objects that the hand can hold at all. For these graspd finds a verified
+grasp of the true mesh at its true mass in free space. Seeds up to `DEVELOPED_ON` were used to develop the picker.
 """
 
 from __future__ import annotations
@@ -34,20 +34,20 @@ from graspd_dataset.run_records import markdown_table, peak_mb
 
 PAIRS = ("ur5e_like+allegro_right", "panda_like+leap_right", "ur5e_like+parallel_gripper")
 SIZES, MOST_THINGS = (1, 5, 10), 24
-# Numbers of drawn things that nothing was chosen on begin here.
+# Seeds from `_FIRST_SEED` on were not used to choose anything.
 DEVELOPED_ON, _FIRST_SEED = 199, 200
 SEEDS = tuple(range(_FIRST_SEED, _FIRST_SEED + 4))
-# Attempts at a bin: so many a thing, and some more.
+# Most attempts at a bin: this many per object, plus some more.
 _TRIES_A_THING, _MORE_TRIES = 2, 3
-# After so long graspd looks at no further thing [s]: longer than a robot waits, or a busy machine would spoil figures.
+# Time after which graspd plans for no further object [s]. It is long so that a busy machine does not change results.
 _SECONDS = 20.0
-# Upper bounds of probabilities that the curve is told for.
+# Upper bounds of the probability bands in the calibration table.
 _BANDS = (0.5, 0.7, 0.85, 0.95, 1.01)
 
 
 @dataclass(frozen=True)
 class CellCase(Case):
-    """One bin: `size` things, drawn from `things` or from the families, and a robot that empties it."""
+    """One bin and one robot. The bin holds `size` objects, drawn from `things` or from the families."""
 
     pair: str
     size: int
@@ -60,7 +60,7 @@ class CellCase(Case):
         return f"{self.pair} {self.size} {self.seed} {self.preset} {'folder' if self.things else 'families'}"
 
     def sources(self) -> tuple[ThingSource, ...]:
-        """Return the things that are dropped, in this order."""
+        """Return the objects in the order in which they are dropped."""
         given = [ThingSource(*thing) for thing in self.things]
         rng, order = np.random.default_rng((self.seed, self.size)), list[ThingSource]()
         number = self.seed
@@ -72,7 +72,7 @@ class CellCase(Case):
 
 
 def cell_cases(request: Request) -> tuple[CellCase, ...]:
-    """Return a case a pair, size and seed. Raises ConfigError: a pair, a size or a thing that there is not."""
+    """Return one case per pair, size and seed. Raises ConfigError: a pair, a size or an object is unknown."""
     pairs, sizes = list[str](), list[int]()
     for case in request.cases:
         if case.isdigit() and 1 <= int(case) <= MOST_THINGS:
@@ -91,12 +91,12 @@ def cell_cases(request: Request) -> tuple[CellCase, ...]:
 
 
 def cell_seconds(case: CellCase) -> float:
-    """CPU seconds of a case, roughly."""
+    """Estimate the CPU seconds of a case."""
     return 8.0 + 12.0 * case.size
 
 
 def run_cell(case: CellCase) -> Record:
-    """Return all that is told of one bin."""
+    """Empty one bin and return its record."""
     arm_name, hand_name = case.pair.split("+")
     arm, hand = load_arm(arm_name), load_hand(hand_name)
     world = pile_cell(arm, hand, case.sources(), case.seed)
@@ -133,20 +133,20 @@ def run_cell(case: CellCase) -> Record:
 
 
 def can_be_held(hand: HandModel, thing: Thing, preset: str) -> bool:
-    """Return whether graspd finds a verified grasp of a thing's true mesh at its true mass, alone in free space."""
+    """Return True if graspd finds a verified grasp of the object's true mesh at its true mass in free space."""
     scene = build_scene(thing.model.mesh, source=thing.name, mass=thing.model.mass)
     result = plan_grasps(scene, hand, count=1, seed=0, preset=preset, measure=False)
     return any(grasp.verdict is Verdict.VERIFIED for grasp in result.grasps)
 
 
 class _TimedSource:
-    """Counts the processor's seconds that grasps take."""
+    """Grasp source that measures the CPU seconds of every call."""
 
     def __init__(self, source: InProcessGrasps) -> None:
         self._source, self.cpu, self.all_cpu, self.looks = source, 0.0, 0.0, 0
 
     def next(self, view: Any, failures: Any) -> Offer:
-        """Ask on, and count."""
+        """Return the offer of the wrapped source and add its CPU seconds."""
         began = time.process_time()
         offer = self._source.next(view, failures)
         self.cpu = time.process_time() - began
@@ -156,10 +156,10 @@ class _TimedSource:
 
 
 class AttemptWatch:
-    """Compares what a picker says of its attempts with what the referee saw.
+    """Comparison of the picker's report of each attempt with the referee's ground truth.
 
     Attributes:
-        records: of the attempts, JSON-ready.
+        records: one JSON-ready record per attempt.
     """
 
     def __init__(self, robot: SimulatedRobot) -> None:
@@ -167,7 +167,7 @@ class AttemptWatch:
         self.about_to_look()
 
     def about_to_look(self) -> None:
-        """Remember where all is before an attempt."""
+        """Store the true object poses before an attempt and reset the contact forces."""
         self._before: Report = self._robot.referee()
         self._poses = self._robot.thing_poses()
         self._robot.clear_forces()
@@ -193,7 +193,7 @@ class AttemptWatch:
         return record
 
     def _target(self, place: np.ndarray) -> str:
-        """The thing in the first bin that is nearest to where the picker saw it."""
+        """Return the name of the object in the pick bin that is nearest to `place`, base frame [m]. Empty if none."""
         world = self._robot.world
         surfaces = [
             (np.linalg.norm((thing.seen.vertices @ pose[:3, :3].T + pose[:3, 3]) - place, axis=1).min(), thing.name)
@@ -204,12 +204,12 @@ class AttemptWatch:
 
 
 def executed(attempt: Record) -> bool:
-    """Return whether an attempt came as far as the hand at the thing: what arms cannot reach says nothing of grasps."""
+    """Return True if the arm had a path to the object. Unreachable grasps say nothing about grasp quality."""
     return attempt["ending"] != str(Ending.NO_WAY)
 
 
 def first_attempts(attempts: Sequence[Record]) -> list[Record]:
-    """Return the first attempt at each thing, by what the thing truly was."""
+    """Return the first attempt at each object, as identified by the referee."""
     firsts: dict[str, Record] = {}
     for attempt in attempts:
         firsts.setdefault(attempt["target"], attempt)
@@ -223,7 +223,7 @@ _HEADINGS = [
 
 
 def cell_sections(records: Sequence[Record], chart: Path | None) -> Sections:
-    """Return the table a pair and size, the curve of probabilities, the endings and the times."""
+    """Return four tables: results per pair and size, calibration of the probability, endings and times."""
     groups: dict[tuple[str, str], list[Record]] = {}
     for record in records:
         groups.setdefault((_stock(record), str(record["size"])), []).append(record)
@@ -235,7 +235,7 @@ def cell_sections(records: Sequence[Record], chart: Path | None) -> Sections:
 
 
 def _stock(record: Record) -> str:
-    """Arm and hand, and whether the things were drawn or given."""
+    """Return the pair of arm and hand, with `given things` if the user named the objects."""
     return f"{record['pair']}, given things" if record.get("things") else str(record["pair"])
 
 
@@ -301,7 +301,7 @@ def _times(records: Sequence[Record]) -> str:
 
 
 def cell_came(record: Record) -> str:
-    """Return what came of a bin in a few words."""
+    """Return a one-line summary: objects in the place bin and attempts."""
     there = [name for name, place in record["dropped"].items() if place == "pick bin"]
     out = sum(record["ended"][name] == "place bin" for name in there)
     return f"{out} of {len(there)} out in {len(record['attempts'])} attempts"

@@ -1,4 +1,4 @@
-"""Pictures of a simulated cell: live in a browser, and a film strip of one pick for the pages."""
+"""Pictures of a simulated cell: a live view in a browser, and an image with eight frames of one pick."""
 
 from __future__ import annotations
 
@@ -37,21 +37,21 @@ THINGS: tuple[Colour, ...] = (
     (0.84, 0.37, 0.30), (0.36, 0.58, 0.80), (0.95, 0.72, 0.28), (0.45, 0.70, 0.45), (0.62, 0.48, 0.72),
     (0.55, 0.44, 0.36), (0.88, 0.56, 0.70), (0.30, 0.65, 0.68), (0.70, 0.70, 0.32), (0.90, 0.52, 0.22),
 )  # fmt: skip
-# Simulated seconds between two pictures of the page, and between two frames that a film may be made of.
+# Simulated seconds between two updates of the page, and between two frames stored for the film.
 _PICTURE, _FRAME = 1 / 15, 0.2
-# Frames of a film, in rows of so many; their size, and the frames kept of one attempt at most.
+# Frames of a film, frames per row, width and height of a frame [pixels], and most frames stored of one attempt.
 FRAMES, _ROW, _WIDTH, _HEIGHT, _KEPT = 8, 4, 320, 240, 200
 _BORDER = 3
 
 
 def colour_of(name: str, names: Sequence[str]) -> Colour:
-    """Return the colour of a part of the cell or of one of the things `names`."""
+    """Return the colour of a part of the cell or of one of the objects in `names`."""
     known = ROBOT | SOLIDS
     return known[name] if name in known else THINGS[list(names).index(name) % len(THINGS)]
 
 
 def view_point(robot: SimulatedRobot) -> tuple[np.ndarray, np.ndarray]:
-    """Return where a visitor looks from, and at what [m]: from beyond the table, both bins before the robot."""
+    """Return the camera position and the point it looks at, base frame [m]. It looks across the bins at the robot."""
     pick, place = (np.array([*bin_.center, 0.0]) for bin_ in (robot.world.layout.pick, robot.world.layout.place))
     middle = 0.4 * (pick + place)
     ahead = middle / np.linalg.norm(middle)
@@ -62,7 +62,7 @@ def view_point(robot: SimulatedRobot) -> tuple[np.ndarray, np.ndarray]:
 def cell_picture(
     robot: SimulatedRobot, meshes: Sequence[tuple[str, TriangleMesh]]
 ) -> UInt8[np.ndarray, "rows columns 3"]:
-    """Draw the surfaces of a cell, as `SimulatedRobot.meshes` gives them."""
+    """Render the surfaces that `SimulatedRobot.meshes` returns as an RGB image."""
     names = [thing.name for thing in robot.world.things]
     coloured = [(mesh, colour_of(name, names)) for name, mesh in meshes]
     image = render_shaded(coloured, T_world_camera=look_at(*view_point(robot)), width=_WIDTH, height=_HEIGHT)
@@ -71,7 +71,7 @@ def cell_picture(
 
 
 class Film:
-    """Keeps moments of one attempt, and draws eight of them. A watcher of a simulated robot."""
+    """Recorder of one attempt, which writes eight of its frames. It is a watcher of the simulated robot."""
 
     def __init__(self, robot: SimulatedRobot) -> None:
         self._robot, self._due = robot, 0.0
@@ -84,11 +84,11 @@ class Film:
             self._moments.append(robot.meshes())
 
     def begin(self) -> None:
-        """Forget the moments up to now."""
+        """Delete the recorded frames."""
         self._moments.clear()
 
     def save(self, path: Path) -> None:
-        """Write frames spread evenly over the moments kept, and end the film."""
+        """Write eight frames, evenly spaced over the recording, and stop recording."""
         self._robot.watchers.remove(self._watch)
         places = np.linspace(0, len(self._moments) - 1, FRAMES).round().astype(int)
         frames = [cell_picture(self._robot, self._moments[k]) for k in places]
@@ -98,12 +98,12 @@ class Film:
 
 
 class LiveCell:
-    """A page that shows a simulated cell while a picker empties its bin. A watcher of the robot.
+    """Web page that shows a simulated cell while a picker empties its bin. It is a watcher of the robot.
 
     Args:
-        robot: that is shown.
-        host, port: of the page.
-        speed: simulated seconds in one second of a visitor's.
+        robot: the robot to show.
+        host, port: address of the page.
+        speed: simulated seconds per second of wall clock.
     """
 
     def __init__(self, robot: SimulatedRobot, *, host: str, port: int, speed: float = 1.0) -> None:
@@ -124,7 +124,7 @@ class LiveCell:
             return
         self._due = robot.time + _PICTURE
         self.page.place(robot.solid_poses())
-        # While grasps are planned no simulated time passes: the robot does not catch up afterwards.
+        # No simulated time passes during planning. The view does not catch up afterwards.
         wait = (robot.time - self._simulated) / self._speed - (time.monotonic() - self._wall)
         if not wait > -0.2:
             self._wall, self._simulated = time.monotonic(), robot.time
@@ -132,7 +132,7 @@ class LiveCell:
             time.sleep(wait)
 
     def show_offer(self, hand: HandModel, view: DepthView, offer: Offer) -> None:
-        """Show what the camera saw, and the hand where it is to grasp."""
+        """Show the camera's points and the hand at the chosen grasp, coloured by verdict."""
         from graspd_viewer.drawing import VERDICTS, Part
 
         self.page.draw_points(cloud_of(view).points)
@@ -152,13 +152,13 @@ def posed_hand(hand: HandModel, posture: Posture) -> TriangleMesh:
 
 
 class ToldSource:
-    """A source of grasps that tells somebody what it answers."""
+    """Grasp source that passes every view and offer to a callback."""
 
     def __init__(self, source: GraspSource, tell: Callable[[DepthView, Offer], None]) -> None:
         self._source, self._tell = source, tell
 
     def next(self, view: DepthView, failures: Sequence[Failure]) -> Offer:
-        """Ask on; see `GraspSource`."""
+        """Return the offer of the wrapped source. See `GraspSource`."""
         offer = self._source.next(view, failures)
         self._tell(view, offer)
         return offer

@@ -1,4 +1,4 @@
-"""A trajectory controller, as ros2_control has: targets in time, tolerances, abort, and a new motion at any time."""
+"""Joint trajectory controller like that of ros2_control: tolerances, abort, and replacement of a running motion."""
 
 from __future__ import annotations
 
@@ -11,12 +11,12 @@ from jaxtyping import Float
 from graspd_cell.robot import JointMotion
 from graspd_core.errors import ConfigError
 
-# Limits of position and speed are held to this, since numbers are rounded on their way [rad] or [m], and a factor.
+# Rounding error that limits allow: of positions [rad] or [m], and of speeds as a factor.
 _SLACK, _SPEED_SLACK = 1e-3, 1.05
 
 
 class MotionState(Enum):
-    """How a motion is getting on."""
+    """State of a motion."""
 
     RUNNING = "running"
     REACHED = "reached"
@@ -26,12 +26,12 @@ class MotionState(Enum):
 
 @dataclass(frozen=True, eq=False)
 class JointLimits:
-    """Of the joints of one controller.
+    """Limits of the joints of one controller.
 
     Attributes:
-        names: of the joints.
-        lower, upper: limits of the positions [rad] or [m].
-        velocity: greatest speeds [rad/s] or [m/s].
+        names: joint names.
+        lower, upper: position limits [rad] or [m].
+        velocity: speed limits [rad/s] or [m/s].
     """
 
     names: tuple[str, ...]
@@ -42,12 +42,12 @@ class JointLimits:
 
 @dataclass(frozen=True)
 class Tolerances:
-    """What a controller allows where a motion asks for nothing else.
+    """Default tolerances of a controller, for motions without tolerances of their own.
 
     Attributes:
-        path: greatest distance of a joint from its target on the path [rad] or [m].
-        goal: greatest distance from the last target at the end [rad] or [m].
-        goal_time: so long after the end of the motion the goal has to be reached [s].
+        path: greatest error of a joint during the motion [rad] or [m].
+        goal: greatest error of a joint at the end [rad] or [m].
+        goal_time: time allowed after the last waypoint to reach the goal [s].
     """
 
     path: float = np.inf
@@ -56,12 +56,12 @@ class Tolerances:
 
 
 class TrajectoryController:
-    """Targets of some joints over time.
+    """Controller that computes joint targets over time.
 
     Args:
-        limits: of the joints.
-        tolerances: that hold where a motion asks for none.
-        targets: that the joints begin with [rad] or [m].
+        limits: joint limits.
+        tolerances: defaults for motions without tolerances.
+        targets: initial joint targets [rad] or [m].
     """
 
     def __init__(self, limits: JointLimits, tolerances: Tolerances, targets: Float[np.ndarray, "joints"]) -> None:
@@ -71,20 +71,20 @@ class TrajectoryController:
         self._begun, self._from = 0.0, self.targets
 
     def begin(self, motion: JointMotion, now: float) -> None:
-        """Follow a motion from `now` on [s], in place of the one before.
+        """Start a motion at time `now` [s]. It replaces the running motion.
 
-        Raises ConfigError: the motion is for other joints, or beyond the limits of position or speed.
+        Raises ConfigError: the motion names other joints, or exceeds a position or speed limit.
         """
         motion = self._ordered(motion)
         self._refuse(motion)
         self.motion, self._begun, self._from = motion, now, self.targets.copy()
 
     def hold(self, positions: Float[np.ndarray, "joints"]) -> None:
-        """Drop the motion and stay at some positions."""
+        """End the motion and set the targets to `positions` [rad] or [m], clipped to the limits."""
         self.motion, self.targets = None, np.clip(positions, self.limits.lower, self.limits.upper)
 
     def advance(self, now: float, step: float) -> tuple[Float[np.ndarray, "joints"], Float[np.ndarray, "joints"]]:
-        """Return the targets at `now` and their speeds over the `step` before [s]."""
+        """Return the targets at `now` [s] and their mean speeds over the last `step` [s]."""
         if self.motion is None:
             return self.targets, np.zeros_like(self.targets)
         before = self.targets
@@ -92,7 +92,7 @@ class TrajectoryController:
         return self.targets, (self.targets - before) / step
 
     def state(self, now: float, positions: Float[np.ndarray, "joints"]) -> tuple[MotionState, str]:
-        """Return how the motion is getting on at some measured positions, and of an abort why."""
+        """Return the state of the motion at measured positions [rad] or [m], and the reason if it must be aborted."""
         motion = self.motion
         if motion is None:
             return MotionState.REACHED, ""

@@ -1,8 +1,8 @@
-"""Whether a hand holds something, from what real hands tell: joint positions and efforts.
+"""Detection of a held object from joint positions and efforts, which real hands report.
 
-Joints whose squeeze target lies beyond the grasp press. What is in the hand stops them short of it. A joint that
-arrived at its target presses on nothing, and its effort is gone. Fingers that meet press on each other: they cover only
-a part of the way too, and a thing that turns between two jaws lets them cover as much. Their places tell both apart.
+A joint presses if its squeeze target lies beyond the grasp. An object in the hand stops it before the target. A joint
+that reaches its target presses on nothing, and its effort drops. Fingers that press on each other also stop early, as
+do jaws between which an object rotates. Surface points of the fingers distinguish these two cases.
 """
 
 from __future__ import annotations
@@ -20,26 +20,26 @@ from graspd_core.types import Grasp
 
 Joints = Float[np.ndarray, "joints"]
 
-# A joint presses whose target is this far beyond the grasp [rad].
+# A joint presses if its target is farther than this from its value at the grasp [rad].
 _PRESSES = 0.03
-# Of the way from the grasp to the target, joints that press on nothing cover more than this share. Those of things held
-# covered up to 0.37 in 38 lifts, and 0.57 where a thing turned between jaws.
+# Joints that press on nothing cover more than this fraction of the motion from grasp to target. With an object held,
+# joints covered up to 0.37 in 38 lifts, and 0.57 if the object rotated between jaws.
 _ARRIVED = 0.6
-# Fingers that press on each other cover more than this share.
+# Fingers that press on each other cover more than this fraction.
 _MEETING = 0.4
-# Surface points of two fingers that were so far apart at the grasp, and are so near now, meet [m].
+# Two fingers meet if points of theirs were farther apart than `_APART` at the grasp and are within `_NEAR` now [m].
 _APART, _NEAR = 0.009, 0.004
-# Of what the joints pressed with after the squeeze, less than this share is left of what slipped out.
+# If the object slipped out, less than this fraction of the effort after the squeeze is left.
 _EFFORT_LEFT = 0.2
 
 
 @dataclass(frozen=True, eq=False)
 class Held:
-    """What was decided, and of what.
+    """Decision whether an object is in the hand.
 
     Attributes:
-        held: whether something is in the hand.
-        reason: what speaks against it; empty where it is held.
+        held: True if an object is in the hand.
+        reason: why no object is held. Empty if `held` is True.
     """
 
     held: bool
@@ -48,12 +48,12 @@ class Held:
 
 @dataclass(frozen=True, eq=False)
 class Hold:
-    """A hand that squeezed.
+    """State of the hand after the squeeze.
 
     Attributes:
-        presses: which joints press.
-        touch, target: joint values at the grasp and targets of the squeeze [rad] or [m].
-        positions, efforts: of the joints after the squeeze.
+        presses: True for joints that press.
+        touch, target: joint values at the grasp and squeeze targets [rad] or [m].
+        positions, efforts: joint readings after the squeeze [rad] or [m], [N·m] or [N].
     """
 
     presses: Bool[np.ndarray, "joints"]
@@ -64,7 +64,7 @@ class Hold:
 
 
 def after_squeeze(hand: HandModel, grasp: Grasp, reading: JointReading) -> Hold:
-    """Return what later readings are compared with; `reading` is that of the hand after the squeeze."""
+    """Return the reference for later readings. `reading` is taken after the squeeze."""
     own = reading.of(hand.joint_names)
     scale = np.where(hand.slides, 1.0 / METRES_PER_RADIAN, 1.0)
     touch, target = (np.clip(p.joint_positions, hand.lower, hand.upper) for p in (grasp.grasp, grasp.squeeze))
@@ -72,12 +72,12 @@ def after_squeeze(hand: HandModel, grasp: Grasp, reading: JointReading) -> Hold:
 
 
 def grips(hold: Hold, hand: HandModel) -> Held:
-    """Return whether the hand closed on something at all."""
+    """Decide from the reading after the squeeze whether the hand closed on an object."""
     return _stopped(hold, hand, hold.positions)
 
 
 def still_holds(hold: Hold, hand: HandModel, reading: JointReading) -> Held:
-    """Return whether what the hand gripped is still in it."""
+    """Decide from a later reading whether the object is still in the hand."""
     own, toward = reading.of(hand.joint_names), np.sign(hold.target - hold.touch)
     before, now = (np.maximum((toward * efforts)[hold.presses], 0.0).sum() for efforts in (hold.efforts, own.efforts))
     if before > 0 and now < _EFFORT_LEFT * before:
@@ -86,7 +86,7 @@ def still_holds(hold: Hold, hand: HandModel, reading: JointReading) -> Held:
 
 
 def _stopped(hold: Hold, hand: HandModel, positions: Joints) -> Held:
-    """Return whether something stops the joints short of their targets that is not the hand."""
+    """Decide whether an object stops the joints before their targets, and not another finger."""
     if not hold.presses.any():
         return Held(True)
     way = (hold.target - hold.touch)[hold.presses]
@@ -99,7 +99,7 @@ def _stopped(hold: Hold, hand: HandModel, positions: Joints) -> Held:
 
 
 def fingers_meet(hand: HandModel, before: Joints, now: Joints) -> bool:
-    """Return whether links touch at some joint values that were apart before."""
+    """Return True if two links that were apart at joint values `before` touch at `now`."""
     at, links = hand_points(hand, now)
     one, other = KDTree(at).query_pairs(_NEAR, output_type="ndarray").T
     group = hand.link_group[links]

@@ -1,4 +1,4 @@
-"""Where a picker's grasps come from: graspd as a library, in the picker's own process, or `graspd_node` over ROS."""
+"""Sources of grasps for a picker: the interface, and graspd as a library in the picker's process."""
 
 from __future__ import annotations
 
@@ -29,19 +29,19 @@ __all__ = ["Failure", "GraspSource", "InProcessGrasps", "Offer", "cloud_of"]
 
 @dataclass(frozen=True, eq=False)
 class Offer:
-    """A grasp of one of the things seen, or why there is none; all in the base frame.
+    """A grasp of one of the objects seen, or the reason why there is none. All poses are in the base frame.
 
     Attributes:
-        grasp: with its arm path; None where nothing can be grasped.
-        place: the middle of the points of the thing [m].
-        surface: of the thing, as it was made whole; None where there is none.
-        mass: that it was tried with [kg].
-        verified: whether the grasp is as sure as was asked for.
-        things: how many were seen.
+        grasp: the grasp with its arm path. None if no object can be grasped.
+        place: centre of the object's points [m].
+        surface: completed surface of the object. None without a grasp.
+        mass: mass used in the trials [kg].
+        verified: True if the grasp's verdict is `VERIFIED`.
+        things: number of objects seen.
         reason: why there is no verified grasp.
-        failures: things that were looked at and have no grasp at all.
-        exhausted: whether each thing seen has been tried in vain too often.
-        seconds: graspd's time, wall clock.
+        failures: objects for which planning found no grasp.
+        exhausted: True if no further try is worthwhile: every object seen failed too often, or the cloud is unusable.
+        seconds: graspd's wall-clock time [s].
     """
 
     grasp: Grasp | None
@@ -57,45 +57,45 @@ class Offer:
 
 
 class GraspSource(Protocol):
-    """Who is asked for the next grasp."""
+    """Interface of a source of grasps."""
 
     def next(self, view: DepthView, failures: Sequence[Failure]) -> Offer:
-        """Return the surest grasp of the things that a view shows, unlike those that were lost."""
+        """Return the most reliable grasp of an object in the view. Grasps similar to `failures` are excluded."""
         ...
 
 
 def cloud_of(view: DepthView) -> PointCloud:
-    """Return what a view shows, base frame."""
+    """Return the point cloud of a view in the base frame [m]."""
     height, width = view.depth.shape
     k = view.intrinsics
     camera = PinholeCamera(width, height, float(k[0, 0]), float(k[1, 1]), float(k[0, 2]), float(k[1, 2]))
     return cloud_from_depth(view.depth, camera, view.T_base_camera)
 
 
-# Why no thing is left.
+# Reason if no object is left.
 EMPTY = "the bin is empty"
-# Measured surfaces stray so far; things rise at most so far above the floor [m].
+# Error of measured surfaces, and greatest height of objects above the floor [m].
 _STRAY, _RISE = 0.006, 0.3
-# The table's top, and how far above it hands keep [m]: arms and cameras are no more exact.
+# Plane that hands keep above. Its offset above the table top [m] allows for errors of arm and camera.
 TABLE = Plane(np.array([0.0, 0.0, 1.0]), 0.002)
 
 
 def scene_config(source: Bin) -> SceneConfig:
-    """Return settings under which clouds are cut down to what lies in a bin."""
+    """Return scene settings that crop clouds to the inside of a bin."""
     (x, y), half = source.center, source.half - _STRAY
     cut = SegmentationConfig(roi_low=(x - half, y - half, -0.02), roi_high=(x + half, y + half, _RISE), piled=True)
     return SceneConfig(segmentation=cut)
 
 
 class InProcessGrasps:
-    """graspd as a library.
+    """Grasp source that runs graspd as a library.
 
     Args:
-        arm, hand, layout: of the cell.
-        preset: speed or accuracy.
-        seconds: after which no further thing is looked at. One thing gets as many again.
-        seed: of the optimiser.
-        tries: grasps of a thing that may fail before it is given up.
+        arm, hand, layout: parts of the cell.
+        preset: name of graspd's preset.
+        seconds: time after which no further object is planned. Each object may take as long again.
+        seed: seed of the optimiser.
+        tries: failed grasps of an object before it is given up.
     """
 
     def __init__(
@@ -112,7 +112,7 @@ class InProcessGrasps:
         warm_up(hand)
 
     def next(self, view: DepthView, failures: Sequence[Failure]) -> Offer:
-        """Return the surest grasp of the things in the source bin. See `GraspSource`."""
+        """Return the most reliable grasp of an object in the pick bin. See `GraspSource`."""
         began = time.perf_counter()
         try:
             found = plan_any_thing([cloud_of(view)], self._hand, failures=failures, **self._plan)

@@ -1,4 +1,4 @@
-"""Where table, bins and camera stand about an arm. The base frame is that of the arm's base link, z up."""
+"""Poses of table, bins and camera relative to an arm. The base frame is that of the arm's base link, z up."""
 
 from __future__ import annotations
 
@@ -16,12 +16,12 @@ from graspd_core.perception.cloud.camera import PinholeCamera
 
 @dataclass(frozen=True)
 class Box:
-    """A solid with edges along the base frame's axes, fixed in the cell.
+    """Fixed solid with edges along the axes of the base frame.
 
     Attributes:
-        name: of the solid.
-        center: [m].
-        half: half edges [m].
+        name: name of the solid.
+        center: centre in the base frame [m].
+        half: half edge lengths [m].
     """
 
     name: str
@@ -34,11 +34,11 @@ class Bin:
     """Four walls on the table.
 
     Attributes:
-        name: of the bin.
-        center: of its floor, x and y [m].
-        half: half its inner side [m].
-        height: of its walls [m].
-        wall: their thickness [m].
+        name: name of the bin.
+        center: centre of the floor, x and y in the base frame [m].
+        half: half of the inner side length [m].
+        height: height of the walls [m].
+        wall: thickness of the walls [m].
     """
 
     name: str
@@ -48,7 +48,7 @@ class Bin:
     wall: float = 0.01
 
     def holds(self, point: Float[np.ndarray, "3"]) -> bool:
-        """Whether a point is above the bin's floor, within its walls [m]."""
+        """Return True if the x and y of a point [m] lie within the bin, walls included."""
         return bool(np.abs(point[:2] - self.center).max() < self.half + self.wall)
 
     @property
@@ -66,15 +66,15 @@ class Bin:
 
 @dataclass(frozen=True, eq=False)
 class CellLayout:
-    """What stands in the cell beside the robot, as a team measures it in its own.
+    """Objects in the cell beside the robot. Measure the same values in a real cell.
 
     Attributes:
-        table: its top is the plane z = 0.
-        pick: the bin that is emptied.
-        place: the bin that is filled.
-        camera: the depth camera's lens.
-        T_base_camera: pose of its optical frame [m].
-        start: joint values at which the arm hides nothing from the camera [rad].
+        table: the table, whose top is the plane z = 0.
+        pick: the bin to empty.
+        place: the bin to fill.
+        camera: intrinsics of the depth camera.
+        T_base_camera: pose of the camera's optical frame in the base frame [m].
+        start: joint values at which the arm does not occlude the pick bin [rad].
     """
 
     table: Box
@@ -90,22 +90,22 @@ class CellLayout:
         return (self.table, *self.pick.walls, *self.place.walls)
 
 
-# Of a robot that looks along x [m].
+# Table and bins for a robot that faces along x [m].
 _TABLE = Box("table", (0.32, 0.02, -0.025), (0.55, 0.6, 0.025))
 _PICK, _PLACE = (0.44, -0.19), (0.42, 0.21)
-# At the start the arm points so far beyond the second bin, so that its shadow leaves the first one alone [rad].
+# At the start the arm points this angle beyond the place bin, so that it does not occlude the pick bin [rad].
 _ASIDE = 0.5
 # The camera's elevation [rad] and distance [m] from the middle of the bin that it looks at.
 _ELEVATION, _DISTANCE = np.deg2rad(62.0), 0.75
 
 
 def layout_of(arm: Arm) -> CellLayout:
-    """Return the cell of an arm. Both bins lie where the arm's `seed` posture reaches to.
+    """Return the cell of an arm. Both bins lie in the direction of the tip at the arm's `seed` posture.
 
-    The arm's first joint turns about the vertical: at the start it is turned beyond the second bin.
+    The first joint must rotate about the vertical. At the start it is rotated beyond the place bin.
     """
     tip = arm_links(arm, torch.as_tensor(arm.seed)[None]).translation[0, arm.tip].numpy()
-    # The table's edges stay along the axes.
+    # Rotate by a multiple of 90°, so that the table's edges stay along the axes.
     turn = 0.5 * np.pi * float(np.round(np.arctan2(tip[1], tip[0]) / (0.5 * np.pi)))
     cos, sin = float(np.round(np.cos(turn))), float(np.round(np.sin(turn)))
 

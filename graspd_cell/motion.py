@@ -1,12 +1,11 @@
-"""Motions of the arm between postures, clear of all that the camera saw and of what is known to stand in the cell.
+"""Collision-free motions of the arm between postures. Obstacles are the camera's points and the known solids.
 
-Arm, hand and the thing in the hand are balls: the arm's from its capsules (docs/arms.md), the others from points of
-their surfaces, which are fixed to the tip while a motion lasts. What must not be touched is a grid of distances from
-the points seen, a floor, and boxes. Paths are found by OMPL's RRTConnect, which asks about whole edges at once, and
-timed by toppra within the arm's limits.
+Arm, hand and the held object are modelled as balls. The arm's balls come from its capsules (docs/arms.md). The others
+come from surface points, which are fixed to the tip during a motion. Obstacles are a distance grid of the points seen,
+a floor, and boxes. OMPL's RRTConnect finds paths and checks whole edges at once. toppra times them within the limits.
 
-OMPL's wheel stands alone, where roboplan's brings 25 others and asks for a model of its own of arm and scene. Ruckig's
-wheel goes from state to state only: waypoints in between are sent to a server.
+OMPL's wheel has no dependencies. roboplan's needs 25 other packages and its own model of arm and scene. Ruckig's wheel
+connects only two states, and sends waypoints in between to a server.
 """
 
 from __future__ import annotations
@@ -37,23 +36,23 @@ Points = Float[np.ndarray, "_ 3"]
 
 
 class NoMotionError(GraspdError):
-    """No way for the arm, or its goal is in something."""
+    """No collision-free path was found for the arm, or its goal is in collision."""
 
 
-# Cells of the grid of distances, and how far it reaches beyond the points seen [m].
+# Cell size of the distance grid, and its margin around the points seen [m].
 _CELL, _AROUND = 0.01, 0.12
 
 
 @dataclass(frozen=True, eq=False)
 class SeenWorld:
-    """What must not be touched, base frame [m].
+    """Obstacles of a motion, base frame [m].
 
     Attributes:
-        floor: height of what all stands on; the arm's first link is not held against it.
+        floor: height of the floor. The base and the first moving link are not checked against it.
         boxes: known solids.
-        points: that were seen, but for those of floor and boxes.
-        origin: the grid's lowest corner.
-        distances: distance of each cell to the nearest point seen.
+        points: points seen, without those on floor and boxes.
+        origin: lowest corner of the grid.
+        distances: distance of each cell to the nearest point seen. None without points.
     """
 
     floor: float
@@ -63,7 +62,7 @@ class SeenWorld:
     distances: Float[np.ndarray, "x y z"] | None = None
 
     def clearance(self, at: Float[np.ndarray, "*batch 3"]) -> Float[np.ndarray, "*batch"]:
-        """Return the distance of places to the points seen and to the boxes. The floor is not among them."""
+        """Return the distance of positions `at` [m] to the nearest point seen or box [m]. The floor is left out."""
         away = np.full(at.shape[:-1], np.inf)
         for box in self.boxes:
             beyond = np.abs(at - box.center) - box.half
@@ -78,9 +77,9 @@ class SeenWorld:
 
 
 def seen_world(points: Points, floor: float, boxes: Sequence[Box] = (), slack: float = 0.012) -> SeenWorld:
-    """Return the world that a camera's points [m], base frame, and known solids make.
+    """Build the obstacles from a camera's points [m], base frame, and known solids.
 
-    Points within `slack` of the floor or of a box are the floor's or the box's own.
+    Points within `slack` [m] of the floor or of a box are dropped as part of it.
     """
     known = SeenWorld(floor, tuple(boxes))
     points = points[np.isfinite(points).all(1)]
@@ -94,26 +93,26 @@ def seen_world(points: Points, floor: float, boxes: Sequence[Box] = (), slack: f
     free = np.ones(shape, dtype=bool)
     free[tuple(cell.T)] = False
     away: Any = distance_transform_edt(free)
-    # From the middle of a cell to a point somewhere in another.
+    # A distance runs from the centre of one cell to any point in another.
     return replace(known, points=points, origin=origin, distances=(_CELL * (away - 0.5)).astype(np.float32))
 
 
 @dataclass(frozen=True, eq=False)
 class Balls:
-    """Balls fixed to a link: their middles in its frame and their radii [m]."""
+    """Balls fixed to a link: centres in the link's frame and radii [m]."""
 
     at: Points
     radius: Float[np.ndarray, "_"]
 
 
-# Surface points of hands and things are kept so far apart, and stand for balls of this radius [m].
+# Spacing of the surface points kept of hands and objects, and radius of their balls [m].
 _SPACING, _BALL = 0.012, 0.004
-# Points of a hand's surface that are drawn.
+# Points sampled on a hand's surface.
 _SAMPLES = 4000
 
 
 def balls_about(points: Points, spacing: float = _SPACING, radius: float = _BALL) -> Balls:
-    """Return a ball about one point in every cube of side `spacing` [m]."""
+    """Return a ball of radius `radius` [m] at one point in every cube of side `spacing` [m]."""
     kept = np.unique(voxel_keys(points - points.min(0), spacing), return_index=True)[1]
     return Balls(points[kept], np.full(len(kept), radius))
 
@@ -124,27 +123,27 @@ def _hand_surface(hand: HandModel) -> tuple[Points, Int[np.ndarray, "_"]]:
 
 
 def hand_points(hand: HandModel, joints: Joints) -> tuple[Points, Int[np.ndarray, "_"]]:
-    """Return points of the hand's surface at its joint values, base frame of the hand [m], and their links."""
+    """Return surface points of the hand at joint values, in the hand's base frame [m], and each point's link index."""
     points, links = _hand_surface(hand)
     rotations, translations = link_poses(hand, joints)
     return np.einsum("nij,nj->ni", np.asarray(rotations)[links], points) + np.asarray(translations)[links], links
 
 
 def hand_balls(arm: Arm, hand: HandModel, joints: Joints) -> Balls:
-    """Return the hand at its joint values, in the frame of the arm's tip."""
+    """Return the balls of the hand at joint values, in the frame of the arm's tip."""
     local, mount = hand_points(hand, joints)[0], tip_hand(arm, hand)
     return balls_about(local @ mount.rotation.numpy().T + mount.translation.numpy())
 
 
 @dataclass(frozen=True, eq=False)
 class ArmShape:
-    """An arm as balls, with what its kinematics need as arrays.
+    """Collision model of an arm as balls, with fast forward kinematics.
 
     Attributes:
         arm: the arm.
-        local: the arm's balls, frame of the link of each [m].
-        radius: of each, so much larger that they cover the capsule they were drawn in [m].
-        link: of each.
+        local: centre of each ball in the frame of its link [m].
+        radius: radius of each ball [m]. The balls of a capsule cover the whole capsule.
+        link: link index of each ball.
     """
 
     arm: Arm
@@ -154,7 +153,7 @@ class ArmShape:
 
     @cached_property
     def _constants(self) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-        """Offset, sine and cosine parts of each link's turn, and what a slide adds: `R = A + sin B + cos C`."""
+        """Return A, B, C and d of each link. Its rotation is `R = A + sin(q) B + cos(q) C`, its slide `q d` [m]."""
         chain = self.arm.chain
         x, y, z = chain.joint_axis.T
         zero = np.zeros_like(x)
@@ -167,7 +166,7 @@ class ArmShape:
         return offset + square, offset @ skew, -square, slide
 
     def links(self, q: Path) -> tuple[Float[np.ndarray, "rows links 3 3"], Float[np.ndarray, "rows links 3"]]:
-        """Return turn and place of every link at joint values, base frame."""
+        """Return rotation and translation [m] of every link at joint values, base frame."""
         chain, (constant, sine, cosine, slide) = self.arm.chain, self._constants
         rotation = np.empty((len(q), len(chain.link_names), 3, 3))
         place = np.empty((len(q), len(chain.link_names), 3))
@@ -185,14 +184,14 @@ class ArmShape:
 
     @cached_property
     def beyond_shoulder(self) -> Bool[np.ndarray, "_"]:
-        """Which balls are held against floor and boxes: all but those of the base and the first link that moves."""
+        """Mask of the balls to check against obstacles: all except those of the base and the first moving link."""
         group = self.arm.chain.link_group
         return (group[self.link] != 0) & (group[self.link] != group[self.arm.moved_link[0]])
 
 
 @lru_cache(maxsize=4)
 def arm_shape(arm: Arm) -> ArmShape:
-    """Return the balls of an arm's capsules, so dense that they stand out by less than an eighth of a radius."""
+    """Return the arm with balls along its capsules. They exceed a capsule by less than an eighth of its radius."""
     at, radius, link = [], [], []
     for k, owner in enumerate(arm.capsules.link):
         start, end, thick = arm.capsules.start[k], arm.capsules.end[k], arm.capsules.radius[k]
@@ -204,21 +203,21 @@ def arm_shape(arm: Arm) -> ArmShape:
     return ArmShape(arm, np.concatenate(at), np.concatenate(radius), np.concatenate(link))
 
 
-# Balls that are nearer to each other than this in the seed posture are never held against each other [m].
+# Pairs of balls that are nearer than this in the seed posture are not checked against each other [m].
 _TOUCHING = 0.01
-# Balls of hand and held thing that are held against the arm are so large [m].
+# Diameter of the balls of hand and held object for the check against the arm [m].
 _COARSE = 0.03
 
 
 @dataclass(frozen=True, eq=False)
 class Mover:
-    """An arm with a hand at some joint values, and perhaps a thing in it, in a world.
+    """Collision checker of an arm with a hand, and perhaps a held object, among obstacles.
 
     Attributes:
         shape: the arm.
-        world: what must not be touched.
-        carried: the hand and what is in it, frame of the tip.
-        margin: distance kept from all, where the ends of a motion keep it [m].
+        world: the obstacles.
+        carried: balls of the hand and the held object, tip frame.
+        margin: distance that a motion keeps from obstacles, unless one of its ends is nearer [m].
     """
 
     shape: ArmShape
@@ -228,7 +227,7 @@ class Mover:
 
     @cached_property
     def _own(self) -> tuple[Balls, np.ndarray, np.ndarray]:
-        """Coarse balls of what is carried, and the pairs of arm balls, and of arm and carried balls, held apart."""
+        """Return coarse carried balls, and the index pairs to check: arm with arm balls, and arm with coarse balls."""
         shape, arm = self.shape, self.shape.arm
         coarse = balls_about(self.carried.at, _COARSE, 0.5 * _COARSE)
         group = arm.chain.link_group
@@ -250,16 +249,16 @@ class Mover:
         return balls, carried.at @ rotation[:, tip].swapaxes(1, 2) + place[:, None, tip]
 
     def placed(self, q: Joints) -> tuple[Points, Points]:
-        """Return the middles of the balls of the arm, and of what it carries, base frame [m]."""
+        """Return the centres of the arm's balls and of the carried balls, base frame [m]."""
         balls, carried = self._placed(q[None], self.carried)
         return balls[0], carried[0]
 
     def height(self, q: Joints) -> float:
-        """Return how high the tip is, base frame [m]."""
+        """Return the height of the tip in the base frame [m]."""
         return float(self.shape.links(q[None])[1][0, self.shape.arm.tip, 2])
 
     def clearances(self, q: Path) -> Float[np.ndarray, "rows balls"]:
-        """Return the distance of every ball of arm and hand, and of every pair of them, to what must not be touched."""
+        """Return the distance of every checked ball to obstacles, then the gap of every pair plus the margin [m]."""
         shape = self.shape
         coarse, pairs, with_carried = self._own
         balls, carried = self._placed(q, self.carried)
@@ -277,24 +276,24 @@ class Mover:
         return np.concatenate(parts, 1)
 
     def arm_clearances(self, q: Path) -> Float[np.ndarray, "rows balls"]:
-        """Return the distance of the arm's balls, without the hand's, to floor, boxes and points seen."""
+        """Return the distance of the arm's balls, without the carried ones, to floor, boxes and points seen [m]."""
         return self.clearances(q)[:, : int(self.shape.beyond_shoulder.sum())]
 
     def allowed(self, ends: Path) -> Float[np.ndarray, "balls"]:
-        """Return how near each ball may come: the margin, or as near as it is at one of the ends."""
+        """Return the distance each ball must keep [m]: the margin, or less if it is nearer at one of the ends."""
         return np.minimum(self.margin, self.clearances(ends).min(0) - 1e-3)
 
     def clear(self, path: Path, allowed: Float[np.ndarray, "balls"]) -> bool:
-        """Whether the straight ways between rows keep away as far as is allowed."""
+        """Return True if straight lines in joint space between rows keep the allowed distances [m]."""
         return bool((self.clearances(dense(path)) >= allowed).all())
 
 
-# Rows of a checked path are so near to each other [rad].
+# Greatest joint step between rows of a checked path [rad].
 _STEP = 0.04
 
 
 def dense(path: Path, step: float = _STEP) -> Path:
-    """Return the path with rows on the lines between its rows, none farther than `step` from the next [rad]."""
+    """Return the path with rows inserted on straight lines, so that no joint moves more than `step` [rad] per row."""
     if len(path) < 2:
         return path
     counts = [max(1, int(np.ceil(np.abs(b - a).max() / step))) for a, b in pairwise(path)]
@@ -302,29 +301,29 @@ def dense(path: Path, step: float = _STEP) -> Path:
     return np.concatenate([*parts, path[-1:]])
 
 
-# A motion may end with the hand this deep in what was seen, whose surface is known to a cell, and with the
-# arm, whose capsules are larger than its links, this deep in anything [m].
+# Deepest penetration allowed at the end of a motion [m]: of the whole robot, because the grid is as coarse as a cell,
+# and of the arm alone, because its capsules are larger than its links.
 _DEEPEST, ARM_DEEPEST = -0.02, -0.01
 
 
 def find_path(mover: Mover, start: Joints, goal: Joints, seconds: float = 5.0) -> Path:
-    """Return waypoints from one posture to another whose straight connections are clear.
+    """Return waypoints from one posture to another. Straight lines between them are collision-free.
 
     Raises:
-        NoMotionError: the goal is in something, or no way was found in `seconds` of this thread.
+        NoMotionError: the goal is in collision, or no path was found in `seconds` of this thread's CPU time.
     """
     ends = np.stack([start, goal])
-    # Where the arm stands it stands, whatever it touches there.
+    # Only the goal is checked. The arm is already at the start, even if it touches something there.
     whole, own = mover.clearances(ends)[1].min(), mover.arm_clearances(ends)[1].min()
     if whole < _DEEPEST or own < ARM_DEEPEST:
-        told = f"{-1e3 * min(whole, own):.0f} mm deep in something at its goal; valid: clear of all"
-        raise NoMotionError(f"motion: {mover.shape.arm.name} is {told}")
+        told = f"penetrates an obstacle by {-1e3 * min(whole, own):.0f} mm at its goal; valid: a goal without collision"
+        raise NoMotionError(f"motion: {mover.shape.arm.name} {told}")
     allowed = mover.allowed(ends)
     if mover.clear(ends, allowed):
         return ends
     found = _planned(mover, start, goal, allowed, seconds)
     if found is None:
-        raise NoMotionError(f"motion: no clear way of {mover.shape.arm.name} was found in {seconds:g} s")
+        raise NoMotionError(f"motion: no collision-free path of {mover.shape.arm.name} was found in {seconds:g} s")
     return _rounded(mover, found, allowed)
 
 
@@ -336,7 +335,7 @@ def _planned(mover: Mover, start: Joints, goal: Joints, allowed: np.ndarray, sec
     arm, count = mover.shape.arm, len(start)
     space, bounds = base.RealVectorStateSpace(count), base.RealVectorBounds(count)
     for joint in range(count):
-        # Whole turns away from both ends nothing is gained.
+        # Search at most half a turn beyond either end.
         low, high = min(start[joint], goal[joint]) - np.pi, max(start[joint], goal[joint]) + np.pi
         bounds.setLow(joint, float(max(arm.lower[joint], low)))
         bounds.setHigh(joint, float(min(arm.upper[joint], high)))
@@ -363,7 +362,7 @@ def _planned(mover: Mover, start: Joints, goal: Joints, allowed: np.ndarray, sec
     planner.setRange(0.6)
     planner.setProblemDefinition(problem)
     planner.setup()
-    # Of the processor's time: what a busy machine takes away says nothing of the way.
+    # The limit is CPU time, so that a busy machine does not change the result.
     end = time.thread_time() + seconds
     if str(planner.solve(base.PlannerTerminationCondition(lambda: time.thread_time() > end))) != "Exact solution":
         return None
@@ -373,7 +372,7 @@ def _planned(mover: Mover, start: Joints, goal: Joints, allowed: np.ndarray, sec
 
 
 def _rounded(mover: Mover, path: Path, allowed: np.ndarray) -> Path:
-    """Return the path with its corners cut twice (Chaikin), where that is clear."""
+    """Return the path with its corners cut twice (Chaikin), or the path itself if that would collide."""
     smooth = path
     for _ in range(2):
         inner = [row for a, b in pairwise(smooth) for row in (0.75 * a + 0.25 * b, 0.25 * a + 0.75 * b)]
@@ -383,11 +382,11 @@ def _rounded(mover: Mover, path: Path, allowed: np.ndarray) -> Path:
 
 @dataclass(frozen=True)
 class Speeds:
-    """How fast an arm is driven.
+    """Speed limits of an arm motion.
 
     Attributes:
-        share: of its greatest joint speeds.
-        acceleration: of its joints [rad/s²].
+        share: fraction of the arm's joint speed limits.
+        acceleration: greatest joint acceleration [rad/s²].
     """
 
     share: float = 0.6
@@ -399,13 +398,13 @@ _PERIOD = 0.02
 
 
 def timed(arm: Arm, path: Path, speeds: Speeds) -> JointMotion:
-    """Return the fastest motion along a path within the speeds, from rest to rest."""
+    """Return the fastest motion along a path within the limits, from rest to rest. Raises NoMotionError: none found."""
     import toppra
     from toppra.algorithm import TOPPRA
     from toppra.constraint import JointAccelerationConstraint, JointVelocityConstraint
 
     rows = dense(path)
-    # Rows that say the same twice have no direction.
+    # Repeated rows have no direction.
     rows = rows[np.r_[True, np.abs(np.diff(rows, axis=0)).max(1) > 1e-6]]
     if len(rows) < 2:
         return JointMotion(arm.joint_names, np.array([_PERIOD]), path[-1:], np.zeros_like(path[-1:]))
@@ -423,6 +422,6 @@ def timed(arm: Arm, path: Path, speeds: Speeds) -> JointMotion:
     if trajectory is None:
         raise NoMotionError(f"motion: toppra found no times for a path of {len(rows)} rows of {arm.name}")
     times = np.linspace(0.0, trajectory.duration, max(2, 1 + int(np.ceil(trajectory.duration / _PERIOD))))
-    # The spline may swing beyond a limit that the path touches.
+    # The spline may exceed a limit that the path touches.
     rows = np.clip(trajectory(times)[1:], arm.lower, arm.upper)
     return JointMotion(arm.joint_names, times[1:], rows, trajectory(times, 1)[1:])

@@ -1,8 +1,8 @@
-"""Empty a bin: look, ask graspd for the next thing, take it, carry it to the other bin, until nothing is left.
+"""Bin picking loop: take an image, ask graspd for a grasp, carry the object to the other bin, until the bin is empty.
 
-Written to be copied. A behaviour is one function of `Picker`; each returns how it ended. Every wait has a timeout. All
-that the picker knows it was told by joints and camera, so that it drives a real cell as well: give it another `Robot`.
-When `cancelled` says so, the arm stops where it is and the hand stays as it is.
+Use it as a template. Each behaviour is one method of `Picker`. Every wait has a timeout. The picker uses only joint
+readings and depth images, so it drives a real cell if given another `Robot`. When `cancelled` returns True, the arm
+stops and the hand keeps its posture.
 """
 
 from __future__ import annotations
@@ -41,7 +41,7 @@ from graspd_core.mesh.mesh_files import surface_samples
 
 
 class Ending(StrEnum):
-    """How one attempt ended."""
+    """Outcome of one attempt."""
 
     PICKED = "picked"
     NO_WAY = "no way for the arm"
@@ -52,25 +52,25 @@ class Ending(StrEnum):
 
 
 class Cancelled(GraspdError):
-    """Somebody cancelled: the arm is still, the hand is as it was."""
+    """The caller cancelled the picker. The arm has stopped and the hand keeps its posture."""
 
 
 @dataclass(frozen=True, eq=False)
 class Attempt:
-    """One attempt at one thing.
+    """One attempt at one object.
 
     Attributes:
-        number: of the attempt, from 1.
-        ending: how it ended.
-        reason: why it failed; empty where it did not.
-        place: the middle of the thing's points [m].
-        verified: whether graspd called the grasp verified.
-        probability: that graspd gave it; None where it gave none.
-        tries: failures at this thing before.
-        graspd_seconds: from the image to the grasp, wall clock.
-        closing_seconds: from the image to the closed hand on the robot's clock, graspd's part not counted.
-        seconds: of the whole attempt on the robot's clock.
-        things: seen before it.
+        number: number of the attempt, from 1.
+        ending: outcome.
+        reason: why the attempt failed. Empty after success.
+        place: centre of the object's points, base frame [m].
+        verified: True if graspd verified the grasp.
+        probability: graspd's success probability. None if graspd gave none.
+        tries: earlier failures at this object.
+        graspd_seconds: wall-clock time from the image to the grasp [s].
+        closing_seconds: robot time from the image to the closed hand, without graspd's planning [s].
+        seconds: robot time of the whole attempt [s].
+        things: number of objects seen before the attempt.
     """
 
     number: int
@@ -88,15 +88,15 @@ class Attempt:
 
 @dataclass(frozen=True)
 class Pace:
-    """How fast the picker works, and how long it waits.
+    """Speeds, waits and thresholds of the picker.
 
     Attributes:
-        free: of motions with an empty hand.
-        loaded: of motions with a thing in the hand.
-        grasp: of approach, closing and lift.
-        patience: seconds beyond a motion's own until it has to be over.
-        settle: seconds that the fingers get to press.
-        least_probability: of a grasp that is not verified, to be tried when nothing is.
+        free: speeds with an empty hand.
+        loaded: speeds with an object in the hand.
+        grasp: speeds of approach, closing and lift.
+        patience: time allowed beyond a motion's duration [s].
+        settle: wait after the squeeze and after the release [s].
+        least_probability: least success probability of an unverified grasp that is tried.
     """
 
     free: Speeds = field(default_factory=lambda: Speeds(0.7, 5.0))
@@ -109,7 +109,7 @@ class Pace:
 
 @dataclass(eq=False)
 class _Taking:
-    """What is known of the attempt that goes on."""
+    """State of the running attempt."""
 
     offer: Offer
     execution: Execution
@@ -121,15 +121,15 @@ class _Taking:
 
 
 class Picker:
-    """Drives one robot.
+    """Picker that drives one robot.
 
     Args:
-        robot: that is driven.
-        source: of grasps.
-        arm, hand: of the robot.
-        layout: of the cell; the arm waits at its `start`.
+        robot: the robot to drive.
+        source: source of grasps.
+        arm, hand: models of the robot.
+        layout: layout of the cell. The arm waits at its `start`.
         pace: speeds and timeouts.
-        cancelled: polled all the time.
+        cancelled: polled during motions and waits. True stops the picker.
     """
 
     def __init__(
@@ -140,17 +140,17 @@ class Picker:
         self._pace, self._cancelled = pace or Pace(), cancelled
         self._failures: list[Failure] = []
         self._picked = 0
-        # Of things in the second bin, which the camera hardly sees.
+        # Boxes of objects in the place bin, which the camera hardly sees.
         self._dropped: list[Box] = []
         self.offer: Offer | None = None
         self.why_ended = ""
 
     def empty_the_bin(self, most: int = 500) -> Iterator[Attempt]:
-        """Take thing after thing and yield each attempt; `why_ended` says then why there is no further one.
+        """Take one object after another and yield each attempt. Afterwards `why_ended` says why the loop ended.
 
         Raises:
-            Cancelled: somebody cancelled.
-            MotionAborted: the arm does not come home, so that nothing can be seen any more.
+            Cancelled: the caller cancelled.
+            MotionAborted: the arm cannot return to `start`, where it does not occlude the camera.
         """
         attempts = 0
         while attempts < most:
@@ -173,7 +173,7 @@ class Picker:
         self.why_ended = f"{most} attempts"
 
     def attempt(self, offer: Offer, world: SeenWorld, began: float, number: int = 1) -> Attempt:
-        """Take one thing to the other bin, and tell how it ended."""
+        """Carry one object to the place bin and return the outcome."""
         taking: _Taking | None = None
         try:
             assert offer.grasp is not None
@@ -213,7 +213,7 @@ class Picker:
         return Ending.PICKED, ""
 
     def world_of(self, view: DepthView) -> SeenWorld:
-        """Return what must not be touched: what a view shows without the robot, and what is known of the cell."""
+        """Build the obstacles from the points of a view without the robot's, and the known solids of the cell."""
         points = cloud_of(view).points
         mover = self._mover(SeenWorld(0.0))
         balls, carried = mover.placed(self._arm_now())
@@ -222,7 +222,7 @@ class Picker:
         return seen_world(points[away > radius[nearest] + 0.03], 0.0, self._known)
 
     def go_home(self) -> None:
-        """Bring the arm out of the camera's sight, the hand open."""
+        """Move the arm to `start`, out of the camera's view, and open the hand."""
         now = self._arm_now()
         if np.abs(now - self._layout.start).max() > 0.02:
             mover = self._mover(SeenWorld(0.0, self._known))
@@ -232,16 +232,16 @@ class Picker:
         self._move_hand(self._hand.open_posture)
 
     def go_to_retreat(self, taking: _Taking) -> None:
-        """Bring the arm to where graspd's own path begins, with the fingers as at the pregrasp."""
+        """Move the fingers to the pregrasp posture, then the arm to the start of graspd's path."""
         start = taking.execution.hand[0]
         self._move_hand(start)
         mover = self._mover(taking.world, start)
         depth = -mover.arm_clearances(dense(taking.execution.arm)).min()
         if depth > -ARM_DEEPEST:
-            told = f"{1e3 * depth:.0f} mm deep in something; valid: clear of all"
-            raise NoMotionError(f"motion: on its way through the grasp {self._arm.name} is {told}")
+            told = f"penetrates an obstacle by {1e3 * depth:.0f} mm on the grasp's path"
+            raise NoMotionError(f"motion: {self._arm.name} {told}; valid: a path without collision")
         goal = taking.execution.arm[0]
-        # From above, where the way down is straight, else as the planner finds.
+        # Come straight down as far as that is collision-free. The planner finds the rest.
         above = straight(mover, goal, np.array([0.0, 0.0, 0.12]))[::-1]
         path = find_path(mover, self._arm_now(), above[0])
         self._follow_arm(np.concatenate([path, above[1:]]), self._pace.free)
@@ -253,7 +253,7 @@ class Picker:
         taking.closed = self._robot.joints().time
 
     def squeeze(self, taking: _Taking):
-        """Press, and tell whether the fingers closed on something."""
+        """Squeeze, and return whether the fingers closed on an object."""
         self._follow_gate(taking.execution, "squeezed")
         self._wait(self._pace.settle)
         assert taking.offer.grasp is not None
@@ -265,7 +265,7 @@ class Picker:
         self._follow_gate(taking.execution, "lifted")
 
     def carry(self, taking: _Taking) -> str:
-        """Bring the thing above the other bin. Returns why it was lost on the way; empty where it was not."""
+        """Carry the object above the place bin. Return why it was lost, or an empty string if it is still held."""
         hold, here = taking.hold, self._arm_now()
         assert hold is not None
         thing = self._surface_now(taking, here)
@@ -305,7 +305,7 @@ class Picker:
         self._dropped += [taking.dropped] if taking.dropped is not None else []
 
     def back_off(self, world: SeenWorld) -> None:
-        """After a failure: open the hand and rise, as far as that goes."""
+        """Open the hand and raise the arm after a failure, as far as no collision or abort prevents it."""
         self._stop_if_cancelled()
         try:
             self._move_hand(self._hand.open_posture)
@@ -315,17 +315,17 @@ class Picker:
             self._stop_if_cancelled()
 
     def _learn(self, attempt: Attempt, offer: Offer) -> None:
-        """Remember what failed. Where something was taken out, things without a grasp may have one now."""
+        """Store a failed grasp. After a success forget objects without a grasp, because one may be free now."""
         if attempt.ending is Ending.PICKED:
             self._failures = [failure for failure in self._failures if failure.grasp is not None]
         elif offer.grasp is not None:
             self._failures.append(Failure(offer.place, offer.grasp.grasp))
 
-    # What the behaviours are made of.
+    # Helpers of the behaviours.
 
     @property
     def _known(self) -> tuple[Box, ...]:
-        """What stands in the cell, seen or not."""
+        """Known solids of the cell and boxes of released objects. The camera need not see them."""
         return (*self._layout.solids[1:], *self._dropped)
 
     def _mover(self, world: SeenWorld, fingers: np.ndarray | None = None) -> Mover:
@@ -333,7 +333,7 @@ class Picker:
         return Mover(arm_shape(self._arm), world, hand_balls(self._arm, self._hand, fingers))
 
     def _surface_now(self, taking: _Taking, here: np.ndarray) -> np.ndarray:
-        """Points of the thing in the hand: it rose with the tip since the grasp."""
+        """Return surface points of the held object [m], raised as far as the tip rose since the grasp."""
         assert taking.offer.surface is not None
         mover = self._mover(taking.world)
         points = surface_samples(taking.offer.surface, 1500, 0)[0]
@@ -341,7 +341,7 @@ class Picker:
         return points + np.array([0.0, 0.0, mover.height(here) - mover.height(at)])
 
     def _without_thing(self, taking: _Taking) -> SeenWorld:
-        """The world without the points of the thing that is in the hand now."""
+        """Return the obstacles without the points of the held object."""
         assert taking.offer.surface is not None
         own = KDTree(surface_samples(taking.offer.surface, 1500, 0)[0])
         points = taking.world.points
@@ -359,7 +359,7 @@ class Picker:
             self._follow(timed(self._arm, path, speeds), stop)
 
     def _follow_gate(self, execution: Execution, gate: str) -> None:
-        """Run the part of a grasp's trajectory that leads to one gate."""
+        """Execute the part of the grasp's trajectory that ends at a gate."""
         rows = execution.rows_to(gate)
         times = execution.times[rows] - execution.times[rows.start]
         positions = np.concatenate([execution.arm[rows], execution.hand[rows]], 1)[1:]
@@ -367,7 +367,7 @@ class Picker:
         self._follow(JointMotion((*execution.arm_joints, *execution.hand_joints), times[1:], positions, speeds))
 
     def _move_hand(self, goal: np.ndarray) -> None:
-        """Move the fingers to joint values, all of them in step."""
+        """Move all fingers to joint values [rad] or [m], so that they arrive together."""
         hand, now = self._hand, self._hand_now()
         speed = np.minimum(np.where(hand.slides, 0.1, 1.5), 0.6 * hand.velocity)
         seconds = max(0.3, 1.5 * float((np.abs(goal - now) / speed).max()))
@@ -393,7 +393,7 @@ class Picker:
 
 
 def summary(attempts: Sequence[Attempt]) -> str:
-    """Say in a line what came of some attempts."""
+    """Return a one-line summary of attempts."""
     picked = [attempt for attempt in attempts if attempt.ending is Ending.PICKED]
     first = [attempt for attempt in attempts if attempt.tries == 0]
     good = sum(attempt.ending is Ending.PICKED for attempt in first)

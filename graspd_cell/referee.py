@@ -1,6 +1,6 @@
-"""What truly happens in a simulated cell: where things are, what the hand holds, and how hard the robot hits something.
+"""Ground truth of a simulated cell: where objects are, what the hand holds, and the robot's contact forces.
 
-Only the referee knows. A picker never asks.
+The picker never uses it.
 """
 
 from __future__ import annotations
@@ -14,25 +14,25 @@ from jaxtyping import Float
 
 from graspd_cell.world import ARM, HAND, PARTS, PICK_BIN, PLACE_BIN, TABLE, THING, CellWorld, Pose
 
-# A thing that is so low fell off the table [m].
+# An object whose centre of mass is lower than this fell off the table [m].
 _LOST = -0.1
-# A hand that presses on a thing this hard touches it [N].
+# Least normal force that counts as contact between hand and object [N].
 _TOUCH = 0.05
-# Of a contact's force [N]: what is beyond is a collision with something hard.
+# A greater normal force counts as a hard collision [N].
 HARD = 50.0
-# Whom the robot touches, and how hard: the key is a part of `PARTS` and a part or a thing.
+# Normal force [N] of each touching pair. A key holds a number of `PARTS`, and a number of `PARTS` or of an object.
 Forces = dict[tuple[int, int], float]
 
 
 @dataclass(frozen=True)
 class Report:
-    """What the referee says at one time.
+    """Ground truth at one time.
 
     Attributes:
-        time: simulated [s].
-        places: of each thing, by name: `pick bin`, `place bin`, `table` or `lost`.
-        in_hand: the thing that hangs in the hand, empty without one.
-        hardest: the greatest force of each pair since the last `clear` [N], as `arm on table` or `hand on pear 0`.
+        time: simulated time [s].
+        places: place of each object by name: `pick bin`, `place bin`, `table` or `lost`.
+        in_hand: name of the object in the hand. Empty if the hand holds none.
+        hardest: greatest force of each pair since the last `clear` [N], by names such as `hand on pear 0`.
     """
 
     time: float
@@ -41,29 +41,29 @@ class Report:
     hardest: Mapping[str, float]
 
     def hard(self, target: str = "") -> dict[str, float]:
-        """Return the pairs beyond `HARD`, but for the hand on the thing that it is to take."""
+        """Return the pairs whose force exceeds `HARD`, except the hand on its target object."""
         return {pair: force for pair, force in self.hardest.items() if force > HARD and pair != f"hand on {target}"}
 
 
 class Referee:
-    """Watches a simulated cell. `watch` is called after the steps of the simulation."""
+    """Observer of a simulated cell. The simulation calls `watch` after its steps."""
 
     def __init__(self, world: CellWorld) -> None:
         self._world = world
         self._peaks: Forces = {}
 
     def watch(self, data: Any) -> None:
-        """Note the forces of this moment."""
+        """Update the peak forces with the current ones."""
         for pair, force in robot_forces(self._world, data).items():
             if force > self._peaks.get(pair, 0.0):
                 self._peaks[pair] = force
 
     def clear(self) -> None:
-        """Forget the forces up to now."""
+        """Reset the peak forces."""
         self._peaks = {}
 
     def report(self, data: Any) -> Report:
-        """Return what is true now."""
+        """Return the ground truth now."""
         world = self._world
         places = {thing.name: place_of(world, data, index) for index, thing in enumerate(world.things)}
         held = thing_in_hand(world, data)
@@ -75,7 +75,7 @@ class Referee:
 
 
 def robot_forces(world: CellWorld, data: Any) -> Forces:
-    """Return the sum of the normal forces of arm and hand on everything that is not the robot [N]."""
+    """Return the summed normal force of each pair of arm or hand with another body [N]."""
     return {(a, b): force for (a, b), force in _pair_forces(world, data).items() if a in (ARM, HAND) and b >= TABLE}
 
 
@@ -93,7 +93,7 @@ def _pair_forces(world: CellWorld, data: Any) -> Forces:
 
 
 def place_of(world: CellWorld, data: Any, index: int) -> str:
-    """Return where a thing is, by its centre of mass."""
+    """Return the place of an object, decided by its centre of mass."""
     center = data.xipos[world.thing_bodies[index]]
     if center[2] < _LOST:
         return "lost"
@@ -104,9 +104,9 @@ def place_of(world: CellWorld, data: Any, index: int) -> str:
 
 
 def thing_in_hand(world: CellWorld, data: Any) -> int | None:
-    """Return the number of the thing that hangs in the hand: pressed by the hand, and touched by nothing that is fixed.
+    """Return the index of the held object. None if there is none.
 
-    Of several that one which is pressed hardest.
+    The hand presses on a held object, and table and bins do not touch it. Of several, the most pressed one counts.
     """
     forces = _pair_forces(world, data)
     pressed = {b - THING: force for (a, b), force in forces.items() if a == HAND and b >= THING and force > _TOUCH}
@@ -115,7 +115,7 @@ def thing_in_hand(world: CellWorld, data: Any) -> int | None:
 
 
 def thing_poses(world: CellWorld, data: Any) -> list[Pose]:
-    """Return the poses of the things' frames in the base frame [m]."""
+    """Return the poses of the objects in the base frame [m]."""
     return [body_pose(data, int(body)) for body in world.thing_bodies]
 
 

@@ -1,4 +1,4 @@
-"""What a picker sees of a robot: joint readings, depth images and motions, whether simulated or behind ROS topics.
+"""Robot interface of the picker: joint readings, depth images and motions, simulated or over ROS.
 
 The base frame is that of the arm's base link, z up. The table's top is the plane z = 0.
 """
@@ -16,18 +16,18 @@ from graspd_core.errors import ConfigError, GraspdError
 
 
 class MotionAborted(GraspdError):
-    """A controller gave up on a motion. The message names the joint, its error and its tolerance."""
+    """A motion did not end as commanded. The message of a joint out of tolerance names joint, error and tolerance."""
 
 
 @dataclass(frozen=True, eq=False)
 class JointReading:
-    """What the joints of arm and hand tell at one time.
+    """Reading of the joints of arm and hand at one time.
 
     Attributes:
-        time: of the robot's clock [s].
-        names: of the joints.
-        positions: of the joints, in the order of `names` [rad] or [m].
-        efforts: of the motors, in the order of `names` [N·m] or [N].
+        time: robot time [s].
+        names: joint names.
+        positions: joint positions in the order of `names` [rad] or [m].
+        efforts: motor efforts in the order of `names` [N·m] or [N].
     """
 
     time: float
@@ -36,19 +36,19 @@ class JointReading:
     efforts: Float[np.ndarray, "joints"]
 
     def of(self, names: tuple[str, ...]) -> JointReading:
-        """Return the reading of some joints, in the order of `names`. Raises GraspdError: a joint is missing."""
+        """Return the reading of the joints `names`, in this order. Raises ConfigError: a joint is missing."""
         rows = _rows(self.names, names)
         return JointReading(self.time, names, self.positions[rows], self.efforts[rows])
 
 
 @dataclass(frozen=True, eq=False)
 class DepthView:
-    """One depth image, and where it was taken from.
+    """One depth image with intrinsics and camera pose.
 
     Attributes:
-        time: of the robot's clock [s].
-        depth: along the optical axis [m], zero where none was measured.
-        intrinsics: the pinhole camera's matrix K [pixels].
+        time: robot time [s].
+        depth: depth along the optical axis [m]. Zero means no measurement.
+        intrinsics: matrix K of the pinhole camera [pixels].
         T_base_camera: pose of the camera's optical frame (z forward, y down) in the base frame [m].
     """
 
@@ -60,18 +60,18 @@ class DepthView:
 
 @dataclass(frozen=True, eq=False)
 class JointMotion:
-    """A timed trajectory of the joints of the arm, of those of the hand, or of both.
+    """Timed trajectory of the joints of the arm, the hand, or both.
 
-    A tolerance of None is the controller's own: an arm has one, a hand has none because fingers stop at what they hold.
+    If a tolerance is None, the controller's own applies. A hand has none, because an object stops its fingers.
 
     Attributes:
-        names: of the joints.
-        times: of the waypoints from the start of the motion [s], increasing.
-        positions: of the joints, a row a waypoint [rad] or [m].
-        velocities: of the joints, likewise [rad/s] or [m/s]. None: straight lines from waypoint to waypoint.
-        path_tolerance: greatest distance of a joint from its target on the path, of all or of each [rad] or [m].
-        goal_tolerance: greatest distance of a joint from its last target at the end, likewise [rad] or [m].
-        goal_time: so long after the last waypoint the goal has to be reached [s].
+        names: joint names.
+        times: increasing times of the waypoints from the start of the motion [s].
+        positions: joint positions, one row per waypoint [rad] or [m].
+        velocities: joint velocities, one row per waypoint [rad/s] or [m/s]. If None, waypoints are joined linearly.
+        path_tolerance: greatest joint error during the motion, for all or for each joint [rad] or [m].
+        goal_tolerance: greatest joint error at the end, for all or for each joint [rad] or [m].
+        goal_time: time allowed after the last waypoint to reach the goal [s]. If None, the controller's own applies.
     """
 
     names: tuple[str, ...]
@@ -93,7 +93,7 @@ class JointMotion:
                 raise ConfigError(f"a motion's {name} have shape {table.shape}; valid: {shape} finite numbers")
 
     def part(self, names: tuple[str, ...]) -> JointMotion:
-        """Return the motion of some of the joints, in the order of `names`. Raises ConfigError: a joint is missing."""
+        """Return the motion of the joints `names`, in this order. Raises ConfigError: a joint is missing."""
         rows = _rows(self.names, names)
         path, goal = (
             allowed[rows] if isinstance(allowed, np.ndarray) else allowed
@@ -108,9 +108,9 @@ class JointMotion:
         return float(self.times[-1])
 
     def at(self, time: float, start: Float[np.ndarray, "joints"]) -> Float[np.ndarray, "joints"]:
-        """Return the targets at `time` [s] of a motion that begins with the targets `start`.
+        """Return the joint targets at `time` [s] if the motion begins with the targets `start`.
 
-        Cubic splines between waypoints with velocities, straight lines else, as ros2_control interpolates.
+        Interpolate as ros2_control does: cubic if the waypoints have velocities, otherwise linear.
         """
         times, positions, velocities = self._with_start(start)
         last = len(times) - 1
@@ -141,12 +141,12 @@ class JointMotion:
 
 
 def never() -> bool:
-    """Return False: the `stop` of a motion that nobody stops."""
+    """Return False. This is the default of `stop`."""
     return False
 
 
 class Robot(Protocol):
-    """An arm with a hand and a depth camera."""
+    """Interface of an arm with a hand and a depth camera."""
 
     def joints(self) -> JointReading:
         """Return the latest reading of all joints."""
@@ -157,22 +157,22 @@ class Robot(Protocol):
         ...
 
     def follow(self, motion: JointMotion, timeout: float, stop: Callable[[], bool] = never) -> JointReading:
-        """Run a motion to its end and return the reading there.
+        """Execute a motion and return the joint reading at its end.
 
-        Joints that are not part of it keep their targets. Once `stop` returns True the joints stay where they are.
+        Other joints keep their targets. If `stop` returns True, the joints hold their current positions.
 
         Args:
-            motion: of the arm's joints, of the hand's, or of both.
-            timeout: for the whole motion, in seconds of the robot's clock.
+            motion: motion of all joints of the arm, the hand, or both.
+            timeout: limit for the whole motion in robot time [s].
             stop: polled while the robot moves.
 
         Raises:
-            MotionAborted: a joint left its tolerance, time ran out, or `stop` asked.
+            MotionAborted: a joint left its tolerance, the timeout passed, or `stop` returned True.
         """
         ...
 
     def wait(self, seconds: float) -> None:
-        """Let so much time of the robot's clock pass."""
+        """Wait for `seconds` of robot time."""
         ...
 
 

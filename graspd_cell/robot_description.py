@@ -1,6 +1,6 @@
-"""Arm and hand as one robot: its URDF, and its frames as they are published on /tf.
+"""URDF of arm and hand as one robot, and its frames for /tf.
 
-Frames of the arm keep their names; those of the hand begin with `hand_`, since both have a base link.
+Frames of the arm keep their names. Frames of the hand begin with `hand_`, because both have a base link.
 """
 
 from __future__ import annotations
@@ -22,9 +22,9 @@ CAMERA_FRAME, HAND_PREFIX = "camera_depth_optical_frame", "hand_"
 
 
 def robot_description(arm: Arm, hand: HandModel) -> str:
-    """Return the URDF of the arm that carries the hand. A hand without a URDF is left out.
+    """Return the URDF of the arm with the hand mounted. A hand without a URDF is omitted.
 
-    Links of the hand begin with `hand_`; joints keep their names.
+    Names of the hand's links begin with `hand_`. Joints keep their names.
     """
     root = read_xml(Path(arm.chain.urdf))
     root.set("name", f"{arm.name}_{hand.name}")
@@ -46,7 +46,7 @@ def robot_description(arm: Arm, hand: HandModel) -> str:
             root.append(element)
     mount, turn = ET.SubElement(root, "joint", name=f"{HAND_PREFIX}mount", type="fixed"), tip_hand(arm, hand)
     with warnings.catch_warnings():
-        # A hand that points straight along x has more than one set of angles. Any will do.
+        # In gimbal lock the angles are not unique. Any set is correct.
         warnings.simplefilter("ignore")
         roll, pitch, yaw = Rotation.from_matrix(turn.rotation.numpy()).as_euler("xyz")
     x, y, z = turn.translation.tolist()
@@ -57,11 +57,11 @@ def robot_description(arm: Arm, hand: HandModel) -> str:
 
 
 def frames_of(world: CellWorld, poses: Mapping[str, Pose]) -> list[tuple[str, str, Pose]]:
-    """Return each link's frame as parent, child and `T_parent_child` [m].
+    """Return parent, child and `T_parent_child` [m] of each link.
 
     Args:
         world: the cell.
-        poses: of the links in the base frame, as `SimulatedRobot.link_poses` gives them.
+        poses: link poses in the base frame, from `SimulatedRobot.link_poses`.
     """
     arm, hand, found = world.arm, world.hand, []
     for prefix, key, robot in (("", "", arm.chain), (HAND_PREFIX, "hand/", hand)):

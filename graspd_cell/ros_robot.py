@@ -1,7 +1,7 @@
-"""A robot behind ROS topics: joint states, a depth camera, and FollowJointTrajectory for arm and hand.
+"""Robot over ROS: joint states, a depth camera, and FollowJointTrajectory actions for arm and hand.
 
-Other topic names make the picker drive another cell. Messages are heard in a thread of their own. All waiting is done
-in the caller's and has an end.
+Set other topic names to drive another cell. A background thread receives messages. Every wait runs in the caller's
+thread and has a timeout.
 """
 
 from __future__ import annotations
@@ -34,19 +34,19 @@ _RESULT = FollowJointTrajectory.Result
 
 
 class RobotSilentError(GraspdError):
-    """A topic or an action server that does not answer. The message names it, and for how long it was waited for."""
+    """A topic or an action server does not answer. The message names it and the timeout."""
 
 
 @dataclass(frozen=True)
 class RobotTopics:
-    """Names of what a cell speaks, and how long it may be silent.
+    """Topics, actions and frame of a cell, and the timeout.
 
     Attributes:
-        joint_states: positions and efforts of all joints; several publishers may share them out.
-        depth, camera_info: of the camera.
-        controllers: action servers, by the joints that each drives: those of the arm, those of the hand.
-        base_frame: of the arm.
-        patience: seconds until a silent topic or server is given up.
+        joint_states: topic of positions and efforts. Several publishers may each send part of the joints.
+        depth, camera_info: topics of the camera.
+        controllers: names of the action servers of the arm and of the hand.
+        base_frame: base frame of the arm.
+        patience: timeout of a silent topic or server [s].
     """
 
     joint_states: str = "/joint_states"
@@ -62,7 +62,7 @@ class RobotTopics:
 
 @dataclass
 class _Heard:
-    """The newest of what came: stamps by the robot's clock, `heard_at` by the wall clock [s]."""
+    """Newest messages. `joints_at` and `image_at` are robot time, `heard_at` is monotonic time [s]."""
 
     joints: dict[str, tuple[float, float]] = field(default_factory=dict)
     joints_at: float = 0.0
@@ -73,12 +73,12 @@ class _Heard:
 
 
 class RosRobot:
-    """Implements `Robot`.
+    """Implementation of `Robot` over ROS.
 
     Args:
-        node: of rclpy. It is spun here until `close`.
-        arm_joints, hand_joints: that the two controllers drive.
-        topics: names and patience.
+        node: rclpy node. This class spins it until `close`.
+        arm_joints, hand_joints: joints of the two controllers.
+        topics: names and timeout. None for the defaults.
     """
 
     def __init__(
@@ -100,7 +100,7 @@ class RosRobot:
         self._thread.start()
 
     def close(self) -> None:
-        """Stop hearing. The node is the caller's to destroy."""
+        """Stop receiving messages. The caller destroys the node."""
         self._closed.set()
         self._thread.join(2.0)
         self._executor.shutdown(timeout_sec=1.0)
@@ -116,7 +116,7 @@ class RosRobot:
 
     def look(self) -> DepthView:
         """Return a depth image that was taken after this call. See `Robot`."""
-        # By the stamps of joint states, which are of the robot's clock too.
+        # Joint states have stamps of the same clock as the images.
         begun = self.joints().time
         topics, heard = self._topics, self._heard
         self._until(lambda: heard.info is not None, lambda: topics.camera_info)
@@ -141,7 +141,7 @@ class RosRobot:
         return DepthView(at, depth, np.array(info.k, dtype=float).reshape(3, 3), pose[0])
 
     def follow(self, motion: JointMotion, timeout: float, stop: Callable[[], bool] = never) -> JointReading:
-        """Run a motion to its end and return the reading there. See `Robot`."""
+        """Execute a motion and return the joint reading at its end. See `Robot`."""
         end, parts = self.joints().time + timeout, self._parts(motion)
         sent: list[Any] = [self._send(client, part) for client, part in parts]
         handles = []
@@ -151,7 +151,7 @@ class RosRobot:
                 handles.append(goal.result())
             refused = [handle for handle in handles if not handle.accepted]
             if refused:
-                raise MotionAborted("a controller refused the motion")
+                raise MotionAborted("a controller rejected the motion; its log gives the reason")
             results = [handle.get_result_async() for handle in handles]
             for result in results:
                 self._wait_for(result, end, stop, watched=results)
@@ -161,12 +161,12 @@ class RosRobot:
         return self.joints()
 
     def wait(self, seconds: float) -> None:
-        """Let time of the robot's clock pass. See `Robot`."""
+        """Wait for `seconds` of robot time. See `Robot`."""
         end = self.joints().time + seconds
         self._until(lambda: self._heard.joints_at >= end, lambda: self._topics.joint_states, extra=10 * seconds)
 
     def _parts(self, motion: JointMotion) -> list[tuple[ActionClient, JointMotion]]:
-        """The controllers that drive a motion's joints, each with its part."""
+        """Return the controllers of a motion's joints, each with its part. Raises MotionAborted: not all are driven."""
         parts = []
         for client, names in zip(self._clients, self._names, strict=True):
             if set(names) <= set(motion.names):
@@ -185,7 +185,7 @@ class RosRobot:
         return client.send_goal_async(goal_of(motion))
 
     def _wait_for(self, future: Any, end: float, stop: Callable[[], bool], watched: Any = ()) -> None:
-        """Wait for an answer. Raises MotionAborted: stopped, too late, or a controller aborted."""
+        """Wait for an answer. Raises MotionAborted: stopped, timeout, silence, or a controller aborted."""
         while not future.done() or watched:
             if stop():
                 raise MotionAborted("the motion was stopped")
@@ -201,7 +201,7 @@ class RosRobot:
             time.sleep(_POLL)
 
     def _cancel(self, handles: list[Any]) -> None:
-        """Stop all controllers, and wait until they say so."""
+        """Cancel the accepted goals and wait for the confirmations, at most `patience` seconds."""
         waiting = [handle.cancel_goal_async() for handle in handles if handle.accepted]
         end = time.monotonic() + self._topics.patience
         while not all(one.done() for one in waiting) and time.monotonic() < end:
@@ -211,7 +211,7 @@ class RosRobot:
         end = time.monotonic() + self._topics.patience + extra
         while not condition():
             if time.monotonic() > end:
-                raise RobotSilentError(f"nothing came of {what()} within {self._topics.patience + extra:g} s")
+                raise RobotSilentError(f"not received within {self._topics.patience + extra:g} s: {what()}")
             time.sleep(_POLL)
 
     def _on_joints(self, message: JointState) -> None:
@@ -235,7 +235,7 @@ class RosRobot:
 
 
 def goal_of(motion: JointMotion) -> FollowJointTrajectory.Goal:
-    """Return the goal that asks for a motion."""
+    """Return the FollowJointTrajectory goal of a motion."""
     points = []
     for row, at in enumerate(motion.times.tolist()):
         point = JointTrajectoryPoint(positions=motion.positions[row].tolist(), time_from_start=duration_of(at))

@@ -1,4 +1,4 @@
-"""A robot in a simulated cell. Time passes only while somebody waits for it, as fast as the processor goes."""
+"""Robot in a simulated cell. Simulated time passes only in waits and motions, as fast as the CPU allows."""
 
 from __future__ import annotations
 
@@ -23,21 +23,21 @@ from graspd_core.types import TriangleMesh, joined
 # mujoco is a compiled module without stubs.
 # pyright: reportAttributeAccessIssue=false
 
-# Of the arm's controller [rad], [s]; the hand's has none.
+# Tolerances of the arm's controller [rad], [s]. The hand's controller has none.
 ARM_TOLERANCES = Tolerances(path=0.1, goal=0.02, goal_time=1.0)
-# What was dropped into a bin comes to rest within this [s].
+# Time in which dropped objects come to rest [s].
 SETTLING = 2.0
-# Steps between two looks at tolerances and forces. So long an arm brakes, and a camera takes for an image [s].
+# Steps between two checks of tolerances and forces. Time for the arm to brake, and period of the camera [s].
 _LOOK_EVERY, _BRAKING, CAMERA_PERIOD = 2, 0.3, 0.1
 
 
 class SimulatedRobot:
-    """Implements `Robot` in simulated time.
+    """Implementation of `Robot` in simulated time.
 
     Args:
         world: the cell.
-        noise: of the depth camera.
-        seed: of the noise; each image has noise of its own.
+        noise: noise model of the depth camera.
+        seed: seed of the noise. Every image has different noise.
     """
 
     def __init__(self, world: CellWorld, *, noise: DepthNoise = DEFAULT, seed: int = 0) -> None:
@@ -53,7 +53,7 @@ class SimulatedRobot:
         self.hand = TrajectoryController(self._limits(slice(count, None)), Tolerances(), world.start[count:])
         self._referee = Referee(world)
         self._solids = _visible_solids(world)
-        # Called after every step that the referee looks at: pictures, pages.
+        # Callbacks after every step that the referee observes, for films and pages.
         self.watchers: list[Callable[[SimulatedRobot], None]] = []
 
     @property
@@ -62,7 +62,7 @@ class SimulatedRobot:
         return float(self._data.time)
 
     def joints(self) -> JointReading:
-        """Return positions and efforts of all joints now."""
+        """Return the current positions and efforts of all joints."""
         world, data = self.world, self._data
         efforts = data.qfrc_actuator[world.joint_dof].copy()
         return JointReading(self.time, world.joint_names, data.qpos[world.joint_qpos].copy(), efforts)
@@ -73,11 +73,11 @@ class SimulatedRobot:
         return self.view_now()
 
     def view_now(self) -> DepthView:
-        """Return an image of this moment, with noise. No time passes."""
+        """Return a noisy image of the current state. No simulated time passes."""
         return self.view_of(self.meshes(), self.time)
 
     def view_of(self, meshes: Sequence[tuple[str, TriangleMesh]], time: float) -> DepthView:
-        """Return the image of surfaces as they were at some time, with noise."""
+        """Return a noisy image of `meshes`, base frame [m], with the stamp `time` [s]."""
         camera = self.world.layout.camera
         self._images += 1
         depth = add_noise(self._depth(meshes), camera, self._noise, 100_000 * self._seed + self._images)
@@ -85,25 +85,25 @@ class SimulatedRobot:
         return DepthView(time, depth.astype(np.float32), matrix, self.world.layout.T_base_camera)
 
     def true_depth(self) -> Float32[np.ndarray, "height width"]:
-        """Return the depth image of this moment without noise [m], zero where nothing is."""
+        """Return the current depth image without noise [m]. Zero means no surface."""
         return self._depth(self.meshes()).astype(np.float32)
 
     def meshes(self) -> list[tuple[str, TriangleMesh]]:
-        """Return the surfaces of everything as it is now, base frame [m], with the names of their parts or things."""
+        """Return name and current surface of every part and object, base frame [m]."""
         return [(name, moved(mesh, pose)) for (name, mesh), pose in zip(self.solids(), self.solid_poses(), strict=True)]
 
     def solids(self) -> list[tuple[str, TriangleMesh]]:
-        """Return the same surfaces, each in a frame of its own."""
+        """Return name and surface of every part and object, each in its body's frame [m]."""
         own = [(name, mesh) for name, _, mesh in self._solids]
         return own + [(thing.name, thing.seen) for thing in self.world.things]
 
     def solid_poses(self) -> list[Pose]:
-        """Return the poses of the frames of `solids` [m]."""
+        """Return the current poses of `solids` in the base frame [m]."""
         own = [body_pose(self._data, body) if body >= 0 else np.eye(4) for _, body, _ in self._solids]
         return own + self.thing_poses()
 
     def follow(self, motion: JointMotion, timeout: float, stop: Callable[[], bool] = never) -> JointReading:
-        """Run a motion to its end; see `Robot.follow`."""
+        """Execute a motion. See `Robot.follow`."""
         parts = self.parts_of(motion)
         end, reason = self.time + timeout, ""
         for controller, part in parts:
@@ -124,13 +124,13 @@ class SimulatedRobot:
         raise MotionAborted(reason)
 
     def wait(self, seconds: float) -> None:
-        """Simulate so long; joints hold their targets."""
+        """Simulate `seconds`. Joints hold their targets."""
         steps = round(seconds / self.world.model.opt.timestep)
         for done in range(0, steps, _LOOK_EVERY):
             self.step(min(_LOOK_EVERY, steps - done))
 
     def parts_of(self, motion: JointMotion) -> list[tuple[TrajectoryController, JointMotion]]:
-        """Return the controllers that a motion is for, each with its part. Joints of neither stay with the first."""
+        """Return the controllers of a motion, each with its part. Unknown joints go to the arm's, where they fail."""
         hand = tuple(name for name in motion.names if name in self.hand.limits.names)
         arm = tuple(name for name in motion.names if name not in hand)
         if not hand or not arm:
@@ -138,15 +138,15 @@ class SimulatedRobot:
         return [(self.arm, motion.part(arm)), (self.hand, motion.part(hand))]
 
     def state_of(self, controller: TrajectoryController) -> tuple[MotionState, str]:
-        """Return how a controller's motion is getting on now, and of an abort why."""
+        """Return the state of a controller's motion, and the reason if it must be aborted."""
         return controller.state(self.time, self._positions(controller))
 
     def hold(self, controller: TrajectoryController) -> None:
-        """Make the joints of a controller stay where they are."""
+        """Make the joints of a controller hold their current positions."""
         controller.hold(self._positions(controller))
 
     def step(self, steps: int = 1) -> None:
-        """Simulate some steps. The referee looks at the last of them."""
+        """Simulate `steps` steps. The referee observes the last one."""
         import mujoco
 
         world, data = self.world, self._data
@@ -162,19 +162,19 @@ class SimulatedRobot:
             watcher(self)
 
     def referee(self) -> Report:
-        """Return what is true now. No picker may ask."""
+        """Return the ground truth. Pickers must not use it."""
         return self._referee.report(self._data)
 
     def clear_forces(self) -> None:
-        """Make the referee forget the forces up to now."""
+        """Reset the referee's peak forces."""
         self._referee.clear()
 
     def thing_poses(self) -> list[Pose]:
-        """Return the true poses of the things [m]."""
+        """Return the true poses of the objects in the base frame [m]."""
         return thing_poses(self.world, self._data)
 
     def link_poses(self) -> dict[str, Pose]:
-        """Return the poses of the links of arm and hand [m]; the hand's are named `hand/…`."""
+        """Return the poses of the links of arm and hand in the base frame [m]. The hand's keys begin with `hand/`."""
         world, found = self.world, dict[str, Pose]()
         for prefix, robot, bodies in (
             ("", world.arm.chain, world.arm_bodies),
@@ -197,7 +197,7 @@ class SimulatedRobot:
 
 
 def _visible_solids(world: CellWorld) -> list[tuple[str, int, TriangleMesh]]:
-    """What the camera sees beside the things: name, body (-1 for what is fixed) and surface in the body's frame [m]."""
+    """Return name, body id (-1 if fixed) and surface in the body's frame [m] of robot, table and bins."""
     fixed = [(solid.name, -1, box_mesh(solid)) for solid in world.layout.solids]
     robot: Sequence[tuple[str, HandModel, Any]] = (
         ("arm", world.arm.chain, world.arm_bodies),
@@ -212,7 +212,7 @@ def _visible_solids(world: CellWorld) -> list[tuple[str, int, TriangleMesh]]:
 
 
 def box_mesh(solid: Box) -> TriangleMesh:
-    """Return the surface of a box [m]."""
+    """Return the surface of a box in the base frame [m]."""
     import trimesh
 
     box = trimesh.creation.box(extents=2 * np.array(solid.half))

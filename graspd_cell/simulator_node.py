@@ -1,7 +1,7 @@
-"""`graspd_cell_simulator`: the simulated cell in real time, which speaks what the drivers of a real cell speak.
+"""`graspd_cell_simulator`: the simulated cell in real time, with the ROS interfaces of a real cell's drivers.
 
-It publishes /joint_states, /tf, /tf_static, /robot_description, /camera/depth/image_raw and camera_info, and serves
-FollowJointTrajectory for the arm and for the hand, as ros2_control does. The truth goes to /cell/referee alone.
+It publishes /joint_states, /tf, /tf_static, /robot_description, /camera/depth/image_raw and camera_info. It serves
+FollowJointTrajectory for arm and hand, as ros2_control does. Only /cell/referee carries the ground truth.
 """
 
 from __future__ import annotations
@@ -23,14 +23,14 @@ from graspd_core.errors import ConfigError, GraspdError
 from graspd_core.types import TriangleMesh
 from graspd_ros.node import Parser, run_command
 
-# Seconds between two joint states, two sets of transforms, two words of the referee, two feedbacks of an action.
+# Periods of joint states, transforms, referee reports and action feedback [s].
 _JOINTS, _FRAMES, _REFEREE, _FEEDBACK = 0.01, 0.02, 0.2, 0.05
-# Further behind real time than this the simulation does not catch up [s].
+# If the simulation falls farther behind real time than this, it does not catch up [s].
 _LATE = 0.2
 
 
 def main(args: list[str] | None = None) -> int:
-    """Run the cell until a signal; 0 when stopped, 2 for bad input."""
+    """Run the cell until a signal. Return 0 when stopped, 2 for bad input."""
     return run_command("graspd_cell_simulator", args, _parse, _serve)
 
 
@@ -46,7 +46,7 @@ def _parse(arguments: list[str]) -> argparse.Namespace:
     parser.add_argument("--speed", type=float, default=1.0, metavar="X", help="times as fast as real time (default 1)")
     options = parser.parse_args(arguments)
     if not options.speed > 0:
-        raise ConfigError(f"speed: {options.speed}; it must be positive")
+        raise ConfigError(f"speed: {options.speed}; valid: more than zero")
     if not 0 <= options.seed < 2**31:
         raise ConfigError(f"seed: {options.seed}; valid: 0 to 2^31 - 1")
     return options
@@ -71,7 +71,7 @@ def _serve(options: argparse.Namespace, stop: threading.Event) -> None:
         try:
             executor.spin()
         except Exception:
-            # The executor is shut down under a callback to end this.
+            # The shutdown may interrupt a callback.
             if not stop.is_set():
                 stop.set()
                 raise
@@ -87,14 +87,14 @@ def _serve(options: argparse.Namespace, stop: threading.Event) -> None:
 
 
 class SimulatorNode:
-    """Publishers and action servers around a simulated robot; `simulate` and `film` run in threads of their own.
+    """Publishers and action servers of a simulated robot. `simulate` and `film` run in separate threads.
 
     Args:
-        node: of rclpy.
-        robot: that is simulated.
-        stop: ends both threads.
-        clock: publish /clock, and stamp with simulated time.
-        speed: times as fast as real time.
+        node: rclpy node.
+        robot: the simulated robot.
+        stop: event that ends both threads.
+        clock: if True, publish /clock and stamp messages with simulated time.
+        speed: simulated seconds per second of wall clock.
     """
 
     def __init__(
@@ -127,7 +127,7 @@ class SimulatorNode:
         ]
 
     def simulate(self) -> None:
-        """Step the simulation in real time, and publish what the robot tells."""
+        """Step the simulation in real time and publish the robot's state."""
         begun, offset, due = time.monotonic(), self.robot.time, {"joints": 0.0, "frames": 0.0, "referee": 0.0}
         while not self._stop.is_set():
             behind = offset + (time.monotonic() - begun) * self._speed - self.robot.time
@@ -163,7 +163,7 @@ class SimulatorNode:
             self._told.publish(String(data=json.dumps(vars(report) | {"hard": report.hard(report.in_hand)})))
 
     def film(self) -> None:
-        """Publish images at the camera's rate, or as fast as they can be made."""
+        """Publish images at the camera's rate, or as fast as rendering allows."""
         while not self._stop.is_set():
             begun = time.monotonic()
             with self._lock:
@@ -189,7 +189,7 @@ class SimulatorNode:
         self._image.publish(image)
 
     def _now(self) -> Any:
-        """The time that messages are stamped with."""
+        """Return the stamp of messages: simulated time if /clock is published, otherwise the node's time."""
         from builtin_interfaces.msg import Time
 
         if self._clock is None:
@@ -222,17 +222,17 @@ class SimulatorNode:
         return TFMessage(transforms=transforms)
 
     def begin(self, controller: TrajectoryController, motion: JointMotion) -> None:
-        """Begin a motion. Raises ConfigError: no robot could follow it."""
+        """Start a motion. Raises ConfigError: it names other joints or exceeds a limit."""
         with self._lock:
             controller.begin(motion, self.robot.time)
 
     def hold(self, controller: TrajectoryController) -> None:
-        """Leave the joints of a controller where they are."""
+        """Make the joints of a controller hold their current positions."""
         with self._lock:
             self.robot.hold(controller)
 
     def progress(self, controller: TrajectoryController) -> tuple[MotionState, str, np.ndarray, np.ndarray]:
-        """Return how a motion is getting on, why it was aborted, and the targets and positions of its joints."""
+        """Return state, reason of an abort, joint targets and joint positions of a controller's motion."""
         with self._lock:
             state, reason = self.robot.state_of(controller)
             positions = self.robot.joints().of(controller.limits.names).positions
@@ -240,12 +240,12 @@ class SimulatorNode:
 
     @property
     def stopped(self) -> bool:
-        """Whether the node is to end."""
+        """True if the node must end."""
         return self._stop.is_set()
 
 
 class MotionServer:
-    """Serves FollowJointTrajectory for one controller. A new goal takes the place of the one before."""
+    """FollowJointTrajectory server of one controller. A new goal replaces the running one, which is aborted."""
 
     def __init__(self, cell: SimulatorNode, name: str, controller: TrajectoryController) -> None:
         from control_msgs.action import FollowJointTrajectory
@@ -304,7 +304,7 @@ class MotionServer:
 
 
 def feedback_of(names: tuple[str, ...], targets: np.ndarray, positions: np.ndarray) -> Any:
-    """Return the feedback of FollowJointTrajectory: where joints should be and are."""
+    """Return FollowJointTrajectory feedback: desired and actual joint positions, and their error."""
     from control_msgs.action import FollowJointTrajectory
 
     message = FollowJointTrajectory.Feedback(joint_names=list(names))
@@ -315,7 +315,7 @@ def feedback_of(names: tuple[str, ...], targets: np.ndarray, positions: np.ndarr
 
 
 def motion_of(goal: Any, controller: TrajectoryController) -> JointMotion:
-    """Return the motion that a goal of FollowJointTrajectory asks for. Raises ConfigError: it makes no sense."""
+    """Return the motion of a FollowJointTrajectory goal. Raises ConfigError: a field is inconsistent or not served."""
     names, points = tuple(goal.trajectory.joint_names), goal.trajectory.points
     for kind in ("positions", "velocities"):
         for index, point in enumerate(points):
@@ -341,7 +341,7 @@ def motion_of(goal: Any, controller: TrajectoryController) -> JointMotion:
 
 
 def _tolerances(given: Any, names: tuple[str, ...], usual: float, field: str) -> np.ndarray | None:
-    """Zero is the controller's own, anything below any distance."""
+    """Return one tolerance per joint. Zero means the controller's own, a negative value none. None if none is given."""
     if not given:
         return None
     allowed = np.full(len(names), usual)

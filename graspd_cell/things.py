@@ -1,4 +1,4 @@
-"""Things with their real masses: drawn families, authored shapes, or a folder of meshes and a csv of masses."""
+"""Objects with realistic masses: random families, built-in shapes, or a folder of meshes with a csv of masses."""
 
 from __future__ import annotations
 
@@ -17,23 +17,23 @@ from graspd_core.perception.load_scene import SHAPE_PREFIX, load_scene
 from graspd_core.perception.scene import ObjectModel, object_parts
 from graspd_core.types import TriangleMesh
 
-# Of authored shapes: between wood and water [kg/m³].
+# Density of built-in shapes, between wood and water [kg/m³].
 SHAPE_DENSITY = 700.0
-# Columns of a csv of masses, the first of each that it has.
+# Accepted column names of a csv of masses. The first one present is used.
 _NAME_COLUMNS, _MASS_COLUMNS = ("name", "mesh", "file"), ("mass_kg", "mass")
-# Faces of a thing as the camera sees it.
+# Faces of an object's simplified surface for the camera.
 _SEEN_FACES = 2000
 
 
 @dataclass(frozen=True, eq=False)
 class Thing:
-    """Something to be taken out of a bin.
+    """Object to take out of a bin.
 
     Attributes:
-        name: of the thing.
+        name: name of the object.
         model: mesh, mass and inertia.
-        parts: its convex parts, which collide [m].
-        seen: its surface, simplified for the camera [m].
+        parts: convex parts for collisions [m].
+        seen: simplified surface for the camera [m].
     """
 
     name: str
@@ -44,26 +44,26 @@ class Thing:
 
 @dataclass(frozen=True)
 class ThingSource:
-    """Where a thing comes from: `family:NAME:SEED`, `shape:NAME` or a mesh file with its mass [kg]."""
+    """Source of an object: `family:NAME:SEED`, `shape:NAME`, or a mesh file with its mass [kg]."""
 
     source: str
     mass: float | None = None
 
     @property
     def name(self) -> str:
-        """A short name for reports."""
+        """Short name for reports."""
         return Path(self.source).stem if self.mass is not None else self.source.split(":", 1)[1].replace(":", " ")
 
 
 def family_sources(seeds: Sequence[int], families: Sequence[str] = tuple(FAMILIES)) -> tuple[ThingSource, ...]:
-    """Return one thing a family and seed."""
+    """Return one object source per family and seed."""
     return tuple(ThingSource(f"{PREFIX}{family}:{seed}") for seed in seeds for family in families)
 
 
 def find_sources(names: Sequence[str]) -> tuple[ThingSource, ...]:
-    """Return the things that names stand for: `family:NAME[:SEED]`, `shape:NAME`, or a folder.
+    """Return the object sources of names: `family:NAME[:SEED]`, `shape:NAME`, or a folder.
 
-    Raises GraspdError: there is no such thing, or a folder has no masses.
+    Raises ConfigError: a name is unknown, or a folder lacks meshes or masses.
     """
     found: list[ThingSource] = []
     for name in names:
@@ -83,9 +83,9 @@ def find_sources(names: Sequence[str]) -> tuple[ThingSource, ...]:
 
 
 def folder_sources(folder: Path) -> tuple[ThingSource, ...]:
-    """Return the meshes of a folder with the masses that its csv file gives.
+    """Return the meshes of a folder with their masses from its csv files.
 
-    Raises ConfigError: the folder has no csv file with names and masses, or a mesh without one.
+    Raises ConfigError: the folder has no meshes, or the csv files lack a mesh's mass.
     """
     meshes = sorted(path for path in folder.iterdir() if path.suffix.lower().lstrip(".") in MESH_ENDINGS)
     masses: dict[str, float] = {}
@@ -119,7 +119,7 @@ def _masses(path: Path) -> dict[str, float]:
 
 
 def load_thing(source: ThingSource) -> Thing:
-    """Load a thing with its mass. Raises GraspdError: its mesh cannot be used."""
+    """Load an object with its mass. Raises GraspdError: its mesh cannot be used."""
     kind, _, rest = source.source.partition(":")
     if f"{kind}:" == PREFIX:
         family, _, seed = rest.partition(":")

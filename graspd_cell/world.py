@@ -1,8 +1,8 @@
-"""The cell in MuJoCo: an arm with the masses of its links, a hand on it, table, bins, and things that lie in a bin.
+"""MuJoCo model of the cell: an arm with link masses, a hand, table, bins, and objects in a bin.
 
-Contacts, friction, solver and the hand's motors are those of the trials (graspd_core/verify/world.py), so that what
-differs from a trial is the arm and what lies about. The arm's motors hold a stiff position within their effort limits.
-They carry the weight of arm and hand, as real controllers do, and do not know of the thing in the hand.
+Contacts, friction, solver and the hand's motors are the same as in the trials (graspd_core/verify/world.py). Only the
+arm and the surrounding solids differ. The arm's motors hold stiff positions within their effort limits. They compensate
+the weight of arm and hand, as real controllers do, but not the weight of the held object.
 """
 
 from __future__ import annotations
@@ -27,15 +27,15 @@ from graspd_core.verify.world import PROTOCOLS, Friction, add_hand, add_object, 
 # pyright: reportAttributeAccessIssue=false
 
 _GRAVITY = 9.81
-# What falls off the table falls this deep [m].
+# Height of the ground, where objects that fall off the table land [m].
 FLOOR = -0.5
-# An arm's motor gives its full effort at this error [rad]. Its damping is this time times its stiffness [s]. Gears and
-# rotors weigh this much [kg·m²].
+# Position error at which an arm's motor gives its full effort [rad]. Ratio of its damping to its stiffness [s]. Inertia
+# of gears and rotors [kg·m²].
 _FULL_EFFORT_AT, DAMPING_TIME, _ARMATURE = 0.02, 0.04, 0.1
 _HAND = "hand/"
-# What is dropped into a bin keeps so far from its walls [m].
+# Gap between dropped objects and the bin's walls [m].
 _GAP = 0.005
-# Whose a geom is. Things have the numbers from THING on.
+# Owners of geoms. Object k has the number THING + k.
 NOTHING, ARM, HAND, TABLE, PICK_BIN, PLACE_BIN, THING = range(7)
 PARTS = {ARM: "arm", HAND: "hand", TABLE: "table", PICK_BIN: "pick bin", PLACE_BIN: "place bin"}
 Pose = Float[np.ndarray, "4 4"]
@@ -43,23 +43,23 @@ Pose = Float[np.ndarray, "4 4"]
 
 @dataclass(frozen=True, eq=False)
 class CellWorld:
-    """A compiled cell, and where things are in it.
+    """Compiled cell with indices into MuJoCo's arrays.
 
     Attributes:
         model: the `mujoco.MjModel`.
-        arm, hand: the robot.
-        layout: what stands about it.
-        things: what lies there.
-        joint_names: those of the arm, then the actuated ones of the hand.
-        joint_qpos, joint_dof, actuators: of these joints, indices into `qpos`, `qvel` and `ctrl`.
-        coupled_qpos: index into `qpos` of each of `hand.mimics`.
-        thing_qpos, thing_dof: of each thing's free joint.
-        thing_bodies: body ids of the things.
-        arm_bodies, hand_bodies: body ids of their links, in their order.
-        owner: whose each geom is, by its id: `ARM`, …, `THING` + number of the thing.
-        effort: greatest of each joint [N·m] or [N].
-        velocity: greatest of each joint [rad/s] or [m/s].
-        lower, upper: limits of each joint [rad] or [m].
+        arm, hand: models of the robot.
+        layout: solids and camera around the arm.
+        things: objects in the cell.
+        joint_names: names of the arm's joints, then of the hand's actuated joints.
+        joint_qpos, joint_dof, actuators: indices of these joints into `qpos`, `qvel` and `ctrl`.
+        coupled_qpos: index into `qpos` of each joint in `hand.mimics`.
+        thing_qpos, thing_dof: first index of each object's free joint in `qpos` and `qvel`.
+        thing_bodies: body ids of the objects.
+        arm_bodies, hand_bodies: body ids of the links, in the order of the models.
+        owner: owner of each geom by geom id: `NOTHING`, `ARM`, …, or `THING` + index of the object.
+        effort: effort limit of each joint [N·m] or [N].
+        velocity: speed limit of each joint [rad/s] or [m/s].
+        lower, upper: position limits of each joint [rad] or [m].
     """
 
     model: Any
@@ -85,7 +85,7 @@ class CellWorld:
 
     @property
     def start(self) -> Float[np.ndarray, "joints"]:
-        """Joint values at the start: the arm aside, the hand open."""
+        """Joint values at the start [rad] or [m]: the arm out of the camera's view, the hand open."""
         return np.concatenate([self.layout.start, self.hand.open_posture])
 
 
@@ -98,23 +98,23 @@ def build_cell(
     *,
     friction: float | None = None,
 ) -> CellWorld:
-    """Compile a cell with things at some poses.
+    """Compile a cell with objects at given poses.
 
     Args:
-        arm, hand: the arm carries the hand where its description says.
-        layout: what stands about the arm.
-        things: what lies there.
-        poses: of the things' frames in the base frame [m].
-        friction: sliding coefficient of everything, None: that of the trials.
+        arm, hand: models of the robot. Their descriptions say where the hand is mounted on the arm.
+        layout: solids and camera around the arm.
+        things: objects to add.
+        poses: one pose per object in the base frame [m].
+        friction: sliding friction coefficient of all contacts. If None, the trials' value is used.
 
     Raises:
-        ConfigError: nobody says how the hand is mounted, or arm and hand have joints of one name.
+        ConfigError: no mount of the hand is described, or arm and hand share a joint name.
     """
     import mujoco
 
     if twice := set(arm.joint_names) & set(hand.joint_names):
         raise ConfigError(f"arm {arm.name} and hand {hand.name} both have a joint {sorted(twice)[0]!r}")
-    # Or MuJoCo writes a log file into the working directory.
+    # Without this MuJoCo writes a log file into the working directory.
     mujoco.set_mju_user_warning(lambda message: None)
     protocol = PROTOCOLS["standard"]
     slide, *rest = protocol.friction
@@ -145,7 +145,7 @@ def _add_robot(spec: Any, arm: Arm, hand: HandModel, friction: Friction) -> None
     for name, effort in zip(arm.joint_names, arm.chain.effort, strict=True):
         joint, stiffness = spec.joint(f"joint:{name}"), float(effort) / _FULL_EFFORT_AT
         joint.armature = _ARMATURE
-        # The motor carries the links too, within its limit.
+        # The effort that compensates gravity counts against the motor's limit.
         joint.actgravcomp, joint.actfrclimited, joint.actfrcrange = True, True, [-effort, effort]
         spec.actuator(f"joint:{name}").set_to_position(kp=stiffness, kv=DAMPING_TIME * stiffness)
     own = mujoco.MjSpec()
@@ -215,10 +215,10 @@ def _world_of(model: Any, arm: Arm, hand: HandModel, layout: CellLayout, things:
 def pile_cell(
     arm: Arm, hand: HandModel, sources: Sequence[ThingSource], seed: int, *, friction: float | None = None
 ) -> CellWorld:
-    """Compile a cell with things that were dropped into the first bin. The same seed drops them the same way."""
+    """Compile a cell with objects dropped into the pick bin. The same seed gives the same poses."""
     layout, things = layout_of(arm), [load_thing(source) for source in sources]
     poses = []
-    # Without the fence they would roll to where the bin's walls are.
+    # The fence keeps objects from rolling into the bin's walls.
     for body in dropped([thing.model for thing in things], seed, layout.pick.half - _GAP, stays=True):
         pose = body.pose.copy()
         pose[:2, 3] += layout.pick.center
@@ -227,7 +227,7 @@ def pile_cell(
 
 
 def put_robot(world: CellWorld, data: Any, values: Float[np.ndarray, "joints"]) -> None:
-    """Put joints and targets at some values, coupled joints where they belong."""
+    """Set joint positions and targets to `values` [rad] or [m], and coupled joints accordingly."""
     data.qpos[world.joint_qpos] = values
     data.ctrl[world.actuators] = values
     hand = values[len(world.arm.joint_names) :]
@@ -236,7 +236,7 @@ def put_robot(world: CellWorld, data: Any, values: Float[np.ndarray, "joints"]) 
 
 
 def _touching(world: CellWorld) -> set[tuple[str, str]]:
-    """Pairs of links that are in each other at the start, one of them the arm's: their solids are too wide."""
+    """Return pairs of links that intersect at the start, one of them the arm's. Their collision solids are too wide."""
     import mujoco
 
     data = mujoco.MjData(world.model)

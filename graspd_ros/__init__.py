@@ -1,1 +1,1 @@
-"""The ROS 2 shell around graspd_core: messages in, messages out. Nothing about grasping is decided here."""
+"""ROS 2 interface of graspd_core. It converts messages and makes no decisions about grasping."""

@@ -1,7 +1,7 @@
-"""Conversions between messages and core values, and results in another frame.
+"""Conversions between messages and core values, and transforms of results to another frame.
 
-Quaternions turn from wxyz (core) to xyzw (messages) and back here and nowhere else. `T_a_b` maps coordinates in frame b
-to frame a.
+Only this module converts quaternions between wxyz (core) and xyzw (messages). `T_a_b` maps coordinates in frame b to
+frame a.
 """
 
 from __future__ import annotations
@@ -23,8 +23,8 @@ from graspd_ros.error_codes import bad_request
 
 Matrix = Float[np.ndarray, "4 4"]
 
-_FARTHEST = 1e3  # metres. What is farther away is a mistake, and costs precision
-_ROUNDED = 0.05  # quaternions written by hand are off their unit length by this much, those that are wrong by more
+_FARTHEST = 1e3  # metres. Larger coordinates are a mistake and cost precision
+_ROUNDED = 0.05  # tolerance of a quaternion's length, for quaternions rounded by hand
 
 
 def nanoseconds(stamp: Time | Duration) -> int:
@@ -61,7 +61,7 @@ def vector_of(direction: Sequence[float] | np.ndarray) -> Vector3:
 
 
 def wxyz_of(turn: Quaternion) -> Float[np.ndarray, "4"]:
-    """Return a quaternion as core has it."""
+    """Return a quaternion as an array in the order wxyz."""
     return np.array([turn.w, turn.x, turn.y, turn.z])
 
 
@@ -77,12 +77,12 @@ def pose_of_posture(posture: Posture) -> Pose:
 
 
 def pose_of_matrix(T: Matrix) -> Pose:
-    """Return the pose that a matrix stands for."""
+    """Return a homogeneous transform as a pose message."""
     return pose_of(T[:3, 3], wxyz_of_matrix(T))
 
 
 def wxyz_of_matrix(T: Matrix) -> Float[np.ndarray, "4"]:
-    """Return the rotation of a matrix as a unit quaternion."""
+    """Return the rotation of a homogeneous transform as a unit quaternion wxyz."""
     return np.roll(Rotation.from_matrix(T[:3, :3]).as_quat(), 1)
 
 
@@ -100,7 +100,7 @@ def near(point: Point, name: str, what: str = "") -> Float[np.ndarray, "3"]:
 
 
 def pose_matrix(pose: Pose, name: str = "object_pose") -> Matrix:
-    """Return a pose as a matrix. All zeros are no rotation. Raises RequestError if it is no pose within 1 km."""
+    """Return a pose as a matrix. An all-zero quaternion means identity. Raises RequestError if it is not valid."""
     near(pose.position, name, "position ")
     length = float(np.linalg.norm(wxyz_of(pose.orientation)))
     if length == 0:
@@ -125,7 +125,7 @@ def matrix_of(position: Sequence[float] | np.ndarray, quaternion_wxyz: Sequence[
     """Return a position and a quaternion as a matrix. Raises TransformError if they are not finite or no rotation."""
     px, py, pz = map(float, position)
     w, x, y, z = map(float, quaternion_wxyz)
-    # In plain numbers: robots send thousands of transforms a second, and small arrays are slow.
+    # Plain numbers are faster than small arrays. Robots send thousands of transforms a second.
     length = math.sqrt(x * x + y * y + z * z + w * w)
     if not (math.isfinite(px) and math.isfinite(py) and math.isfinite(pz)):
         raise TransformError(f"position {[px, py, pz]}: not finite")
@@ -148,7 +148,7 @@ def moved_points(points: Float[np.ndarray, "n 3"], T: Matrix) -> Float[np.ndarra
 
 
 def moved_result(result: GraspResult, T_new_old: Matrix) -> GraspResult:
-    """Return a result with its postures, contacts, support and next view in another frame. Nothing else has a frame."""
+    """Return a result with postures, contacts, support plane and next view transformed to another frame."""
     return replace(
         result,
         tried=tuple(moved_grasp(grasp, T_new_old) for grasp in result.tried),

@@ -1,4 +1,4 @@
-"""Error codes of answers, for programs. People read the sentences beside them."""
+"""Machine-readable error codes of answers, and one-line error messages for people."""
 
 from __future__ import annotations
 
@@ -9,19 +9,19 @@ from graspd_core.errors import GraspdError
 
 
 class ErrorCode(StrEnum):
-    """`error_code` of a GraspArray, and `code` of an error or refusal on `~/status`. Empty where nothing is wrong."""
+    """`error_code` of a GraspArray, and `code` of an error or refusal on `~/status`. Empty if there is no error."""
 
     NONE = ""
     BAD_REQUEST = "BAD_REQUEST"  # a field is out of range or unknown
     BAD_MESH = "BAD_MESH"  # the mesh cannot be read, used or reached
-    BAD_CLOUD = "BAD_CLOUD"  # the cloud or depth image cannot be read or shows nothing usable
+    BAD_CLOUD = "BAD_CLOUD"  # the cloud or depth image cannot be read or shows no usable object
     BAD_LIBRARY = "BAD_LIBRARY"  # grasp_library is torn, of another version, locked or gone
-    NO_OBJECT = "NO_OBJECT"  # the scene was seen, and what was asked for is not in it
-    NO_CLOUD = "NO_CLOUD"  # LATEST_CLOUD, and none has come. VIEWS, and none is kept
+    NO_OBJECT = "NO_OBJECT"  # the scene does not contain the object asked for
+    NO_CLOUD = "NO_CLOUD"  # LATEST_CLOUD without a received cloud, or VIEWS without a stored view
     STALE_CLOUD = "STALE_CLOUD"  # the cloud is older than cloud_max_age
     NO_TRANSFORM = "NO_TRANSFORM"  # /tf does not connect the frames
     WRONG_HAND = "WRONG_HAND"  # another hand than the node's
-    NOT_FOUND = "NOT_FOUND"  # a cancel of a request that has ended, or never was
+    NOT_FOUND = "NOT_FOUND"  # a cancel names no waiting or running request
     DUPLICATE_ID = "DUPLICATE_ID"  # a request of this id is waiting or running
     BUSY = "BUSY"  # refused under busy_policy, or the queue is full
     SHUTTING_DOWN = "SHUTTING_DOWN"  # the node is ending
@@ -34,7 +34,7 @@ class ErrorCode(StrEnum):
 
 
 class RequestError(GraspdError):
-    """A request that cannot be worked on. `code` is its error code."""
+    """The request cannot be processed. `code` is the error code."""
 
     def __init__(self, code: ErrorCode, message: str) -> None:
         super().__init__(message)
@@ -46,7 +46,7 @@ def bad_request(message: str) -> RequestError:
     return RequestError(ErrorCode.BAD_REQUEST, message)
 
 
-# The first that fits: subclasses stand before their bases.
+# The first matching row counts, so subclasses stand before their bases.
 _CODES: tuple[tuple[type[BaseException], ErrorCode], ...] = (
     (errors.NoObjectError, ErrorCode.NO_OBJECT),
     (errors.CloudError, ErrorCode.BAD_CLOUD),
@@ -70,7 +70,7 @@ def code_of(error: BaseException) -> ErrorCode:
 
 
 def sentence_of(error: BaseException) -> str:
-    """Return an error as one line for people. One that graspd did not raise on purpose is called internal."""
+    """Return an error as one line for people. Unexpected exceptions are marked as internal errors."""
     if isinstance(error, GraspdError | OSError):
         text = str(error)
     else:

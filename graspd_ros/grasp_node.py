@@ -1,7 +1,7 @@
-"""The node. Its callbacks hand requests to the worker and publish the worker's reports as messages.
+"""The ROS node. Its callbacks pass requests to the worker and publish the worker's reports as messages.
 
-Every request ends in exactly one GraspArray on `~/grasps` and one terminal event on `~/status`. One that came as a goal
-also ends in one result. Callbacks run in the executor's thread, all heavy work in the worker's. Both threads publish.
+Every request ends in exactly one GraspArray on `~/grasps` and one terminal event on `~/status`. An action goal also
+gets one result. Callbacks run in the executor's thread, heavy work in the worker's. Both threads publish.
 """
 
 from __future__ import annotations
@@ -55,20 +55,20 @@ from graspd_ros.request import Listener, Request
 from graspd_ros.request_planner import PATIENCE, Planned, Planner, overdue
 from graspd_ros.worker import BusyPolicy, StopHook, Worker
 
-GOAL_PATIENCE = 0.3  # seconds that the executor has at the end to tell clients how their goals ended
+GOAL_PATIENCE = 0.3  # seconds that the executor has at shutdown to end all goals
 RESULT_PATIENCE = 0.05  # seconds from then until the last result is sent
-IMAGES = "depth images"  # those that find no calibration, beside the names of topics from which nothing comes
-OVERDUE_PERIOD = 0.25  # seconds between two looks for requests whose deadline passed while they waited
-# A reader keeps only its newest messages, even a reliable one: a burst must fit in, or requests are lost unanswered.
+IMAGES = "depth images"  # key in `missing` of images without a matching CameraInfo. The other keys are topic names
+OVERDUE_PERIOD = 0.25  # seconds between two checks for waiting requests whose deadline passed
+# Even a reliable reader keeps only its newest messages. A burst must fit in, or requests are lost unanswered.
 REQUEST_DEPTH = 500
-THINGS_DEPTH = 500  # a planning scene is told of in one burst
-RESULT_TIMEOUT = 60  # seconds that a client has to ask for a result. The 900 of rclpy keep a lot in memory
+THINGS_DEPTH = 500  # a planning scene arrives in one burst
+RESULT_TIMEOUT = 60  # seconds for which results are kept for clients. rclpy's 900 s need much memory
 
 
 class GraspNode(Node):
-    """The node that takes objects and answers with grasps. `on_failure` is called when it cannot serve at all.
+    """ROS node that receives objects and answers with grasps.
 
-    Raises GraspdError if the hand or a parameter is unusable.
+    It calls `on_failure` if its warm-up fails. Raises GraspdError if the hand or a parameter is unusable.
     """
 
     def __init__(self, on_failure: Callable[[], None]) -> None:
@@ -76,7 +76,7 @@ class GraspNode(Node):
         transforms = TransformBuffer()
         self._settings = LiveSettings(self, transforms.frames)
         settings = self._settings.now
-        # Before the first work: on a busy machine, more threads than asked for make loading the hand take seconds.
+        # Set before the hand is loaded. With more threads loading takes seconds on a busy machine.
         torch.set_num_threads(settings.torch_threads)
         self._hand = load_hand(settings.hand, prefix=settings.hand_prefix)
         self._on_failure = on_failure
@@ -145,9 +145,9 @@ class GraspNode(Node):
         return [*servers, GoalServer(self, GraspPlanning, "~/grasp_planning", make, submit, cancel)]
 
     def close(self, timeout: float) -> bool:
-        """Cancel everything and publish no more. Return whether the worker ended within `timeout` seconds.
+        """Cancel all requests and stop publishing. Return True if the worker ended within `timeout` seconds.
 
-        The executor must still spin, because goals end there.
+        The executor must still spin, because it ends the goals.
         """
         ended = self._worker.stop(timeout) and self._planner.rest(PATIENCE)
         end = time.monotonic() + GOAL_PATIENCE
@@ -232,7 +232,7 @@ class GraspNode(Node):
         return response
 
     def _watch_sensors(self) -> None:
-        """Log once which sensor topics bring no messages, and tell clients that ask for them."""
+        """Log once which sensor topics deliver no messages. Requests for the latest cloud repeat the reason."""
         before = self._request_builder.missing
         missing = {sensor.name: told for sensor in self._sensors if (told := sensor.check())}
         for name in missing.keys() - before.keys():  # some publish on demand only: no fault by itself
@@ -311,16 +311,16 @@ class GraspNode(Node):
                 from graspd_ros.known_objects import warm_up_library
 
                 warm_up_library(settings, self._hand)
-        except BaseException as error:  # without this the node would stand there deaf
+        except BaseException as error:  # otherwise the node would run on without a worker
             self._responses.tell_error("", "node", error)
             self._on_failure()
             return
         if self._worker.stopping():
             return
-        # What is there now stays: looking through all of it for garbage again would take 0.2 s each time.
+        # The present objects stay alive. Scanning them again would cost 0.2 s in each garbage collection.
         gc.collect()
         gc.freeze()
-        # The first line of the log takes 0.1 s of looking through all modules for its place.
+        # The first log call takes 0.1 s, because rclpy searches all modules for the caller.
         self.get_logger().info(f"ready: {self._hand.name} waits for objects")
         self._ready = True
         self._responses.publishers.tell("ready", "", "node", hand=self._hand.name, base_link=self._hand.base_link)
@@ -344,32 +344,32 @@ def _collision_object() -> type:
 
 
 class SynthesizeMessages:
-    """Feedback and result of a goal of `~/synthesize`, in the action's messages."""
+    """Feedback and result messages of a goal of `~/synthesize`."""
 
     def progressed(self, message: GraspProgress) -> SynthesizeGrasps.Feedback:
         return SynthesizeGrasps.Feedback(progress=message)
 
     def found(self, message: Grasp) -> None:
-        """Return nothing, because the answer holds all grasps."""
+        """Return None, because the result holds all grasps."""
 
     def result(self, message: GraspArray) -> SynthesizeGrasps.Result:
         return SynthesizeGrasps.Result(result=message)
 
     def succeeded(self, result: SynthesizeGrasps.Result) -> bool:
-        """Return true, because the answer's status says how good it is."""
+        """Return True, because the answer's status tells how good the answer is."""
         return True
 
 
 class GoalServer:
-    """An action server whose goals are handled like all other requests.
+    """Action server whose goals are handled like other requests.
 
-    A goal that is refused is accepted and aborted at once, so that its client gets the reason. Nothing here waits. The
-    worker decides when a goal starts and ends, and the executor only carries it out.
+    An invalid goal is accepted and aborted at once, so that the client gets the reason. No method blocks. The worker
+    decides when a goal starts and ends, and the executor carries it out.
 
     Args:
-        make_messages: makes the messages of a new goal, as `SynthesizeMessages`.
-        submit: takes a goal's request with its listener and returns the request's id.
-        cancel: cancels a request by its id and returns whether there was one.
+        make_messages: makes the message converter of a new goal, for example `SynthesizeMessages`.
+        submit: submits a goal's request with its listener and returns the request's id.
+        cancel: cancels a request by id and returns True if there was one.
     """
 
     def __init__(
@@ -415,7 +415,7 @@ class GoalServer:
 
 
 class Goal:
-    """A request's listener that informs an action client."""
+    """Listener of a request that sends feedback and result to an action client."""
 
     def __init__(self, node: Node, handle: ServerGoalHandle, messages: Any, on_end: Callable[[], object]) -> None:
         self._node = node
@@ -426,13 +426,13 @@ class Goal:
         self._begun = False
 
     def progressed(self, message: GraspProgress) -> None:
-        """Send feedback. The first that is not of waiting starts the execution of the goal."""
+        """Send feedback. The first message after `queued` sets the goal to executing."""
         if message.stage != "queued":
             self._begin()
         self._feed(self.messages.progressed(message))
 
     def found(self, message: Grasp) -> None:
-        """Send the grasp as feedback if the action gives grasps while others are still tried."""
+        """Send a grasp as feedback if the action has feedback for grasps."""
         self._begin()
         self._feed(self.messages.found(message))
 
@@ -445,14 +445,14 @@ class Goal:
         self._begin()
         self._answer.set_result(message)
         if self._node.executor is not None:
-            self._node.executor.wake()  # it looks at the future only when something happens
+            self._node.executor.wake()  # the executor checks the future only after an event
 
     def _begin(self) -> None:
         if not self._begun:
             self._begun = True
             try:
                 self._handle.execute(self._conclude)
-            except RCLError:  # its client cancelled it after rclpy had looked for that: the second look finds it
+            except RCLError:  # the client cancelled in between. The second call takes this into account
                 self._handle.execute(self._conclude)
 
     async def _conclude(self, handle: ServerGoalHandle) -> Any:
@@ -462,7 +462,7 @@ class Goal:
             if message.status in (GraspArray.SUCCEEDED, GraspArray.PARTIAL) and self.messages.succeeded(result):
                 handle.succeed()
             elif message.status == GraspArray.CANCELLED and handle.is_cancel_requested:
-                handle.canceled()  # rcl allows it only after the client's own wish; ~/cancel and ~/reset abort
+                handle.canceled()  # rcl allows this only if the client cancelled. ~/cancel and ~/reset abort the goal
             else:
                 handle.abort()
             return result

@@ -1,7 +1,7 @@
-"""The action server of the standard action `grasping_msgs/action/GraspPlanning`, which answers with MoveIt's messages.
+"""Requests and answers of the standard action `grasping_msgs/action/GraspPlanning`. Grasps are MoveIt messages.
 
-Of an object the meshes are used, else the primitives, else the point cluster. The support surface becomes the plane
-that the object stands on, and no hand may pass through it.
+An object's meshes are used first. Without meshes its primitives are used, and without both its point cluster. The
+support surface is the plane on which the object stands. No hand may pass through it.
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ class PlanningMessages:
         self._up: tuple[str, tuple[float, float, float]] | None = None
 
     def watching(self, request: Request, goal: Any) -> Request:
-        """Return a goal's request, which also sets what the hand may touch and which direction is up."""
+        """Return the goal's request and store the object the hand may touch. Loading also stores the up direction."""
         self._touch = (goal.object.name,) if goal.object.name else ()
 
         def loaded() -> Scene:
@@ -58,16 +58,16 @@ class PlanningMessages:
         return GraspPlanning.Feedback(grasps=list(self._found))
 
     def result(self, message: GraspArray) -> GraspPlanning.Result:
-        """Return the grasps that failed no trial and that MoveIt can reach, best first. None is marked as uncertain."""
+        """Return the grasps that failed no trial and have an arrival posture, best first. Uncertainty is not stated."""
         good = [grasp for grasp in message.grasps if all(trial.passed for trial in grasp.trials)]
         return GraspPlanning.Result(grasps=[self._grasp(grasp) for grasp in good if grasp.arrival_joints.name])
 
     def succeeded(self, result: GraspPlanning.Result) -> bool:
-        """Return whether there is a grasp. A goal without any is aborted."""
+        """Return True if there is a grasp. A goal without grasps is aborted."""
         return bool(result.grasps)
 
     def _grasp(self, message: Grasp) -> Any:
-        """Return a grasp in MoveIt's message, with a retreat upwards or, if up is unknown, along its approach."""
+        """Return a grasp as a MoveIt message. It retreats upwards, or back along the approach if up is unknown."""
         x, y, z = (array_of(message.pregrasp_pose.position) - array_of(message.grasp_pose.position)).tolist()
         back = (x, y, z) if any((x, y, z)) else (0.0, 0.0, 1.0)
         frame, direction = self._up or (message.header.frame_id, back)

@@ -1,4 +1,4 @@
-"""Answers from a library of grasps, at once where no obstacle is near the object. Missing grasps are planned."""
+"""Answers from a library of grasps. Missing grasps are planned, as are grasps under restrictions or near obstacles."""
 
 from __future__ import annotations
 
@@ -20,9 +20,9 @@ from graspd_ros.request_planner import unlike
 
 
 def find_entry(known: KnownObject, settings: Settings, hand: HandModel | None) -> LibraryEntry | None:
-    """Return the library's entry for a request and a hand (None: any), or None where it need not have one.
+    """Return the library's entry for a request. `hand` None matches any hand. None if an optional entry is missing.
 
-    Raises GraspdError if the library must have one and does not, or cannot be read.
+    Raises GraspdError if a required entry is missing or the library cannot be read.
     """
     library = GraspLibrary(Path(settings.grasp_library))
     physics = Physics(settings.mass or None, settings.friction, settings.verify)
@@ -32,14 +32,14 @@ def find_entry(known: KnownObject, settings: Settings, hand: HandModel | None) -
 
 
 def warm_up_library(settings: Settings, hand: HandModel) -> None:
-    """Do the first-use work of a look-up. Raises FormatError if the library cannot be read."""
+    """Read one entry, so that the first request is not slow. Raises FormatError if the library cannot be read."""
     library = GraspLibrary(Path(settings.grasp_library))
     for entry, _ in library.entries(hand_content=hand_hash(hand))[:1]:
         library.grasps(entry, hand)
 
 
 def named_loader(known: KnownObject, settings: Settings) -> Callable[[], Scene]:
-    """Return a function that reads the mesh of an object by its name in the library."""
+    """Return a function that loads the mesh of the library object with the name in `known`."""
 
     def load() -> Scene:
         entry = find_entry(known, settings, None)
@@ -58,9 +58,9 @@ def answer_known(
     restrictions: Sequence[Steering | Reach],
     **plan: Any,
 ) -> tuple[GraspResult, Scene | None]:
-    """Return grasps unlike those excluded, planned where the library has too few, and the scene if it was read.
+    """Return grasps that differ from the excluded poses, and the scene, or None if it was not loaded.
 
-    Raises GraspdError as `find_entry`, loading and planning do.
+    If the library has too few grasps, more are planned. Raises GraspdError as `find_entry`, loading and planning do.
     """
     began, settings = time.perf_counter(), request.settings
     count, library = settings.num_grasps, GraspLibrary(Path(settings.grasp_library))

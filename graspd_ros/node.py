@@ -1,7 +1,7 @@
-"""The process, which starts the node, waits for a signal and ends cleanly, and code that the commands share with it.
+"""Process of the node: start, wait for a signal, clean shutdown. It also holds code that the other commands share.
 
-Ctrl-C and SIGTERM are handled here instead of by rclpy, from before the slow imports on, so that neither leaves a
-traceback at any time. Once the node runs, the main thread only waits, since Python runs signal handlers nowhere else.
+This module handles Ctrl-C and SIGTERM itself, before the slow imports, so that they never cause a traceback. While the
+node runs, the main thread only waits, because Python runs signal handlers only in the main thread.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ if TYPE_CHECKING:
 
     from graspd_ros.grasp_node import GraspNode
 
-# Of these all have to be of one ROS: what another Python or release compiled cannot be loaded, or not beside them.
+# All of these must come from the same ROS. Packages built for another Python or ROS release cannot be loaded together.
 ROS_PACKAGES = (
     "rclpy",
     "rcl_interfaces",
@@ -35,13 +35,13 @@ ROS_PACKAGES = (
     "graspd_msgs",
 )
 EXIT_STOPPED, EXIT_FAILED, EXIT_BAD_INPUT = 0, 1, 2
-STOP_TIMEOUT = 2.0  # seconds that a busy worker has to notice that it must stop
-# Seconds that a thread may keep Python from others (5 ms by itself): the executor asks for it several times a message.
+STOP_TIMEOUT = 2.0  # seconds that a busy worker has to stop
+# Seconds after which Python switches threads (default 5 ms). The executor needs the interpreter often per message.
 SWITCH_INTERVAL = 0.001
 
 
 class Parser(argparse.ArgumentParser):
-    """An argument parser that raises ConfigError for an option that is not valid."""
+    """Argument parser that raises ConfigError for an invalid option."""
 
     def error(self, message: str) -> NoReturn:
         raise ConfigError(f"{message} (see {self.prog} --help)")
@@ -53,9 +53,9 @@ def run_command(
     parse: Callable[[list[str]], argparse.Namespace],
     work: Callable[[argparse.Namespace, threading.Event], None],
 ) -> int:
-    """Run `work` with rclpy initialised until it is done or a signal sets the event. Return 0 then, or 2 for bad input.
+    """Run `work` with rclpy initialised. A signal sets its event. Return 0 when it ends, 2 for bad input.
 
-    `args` are without the name (None: those of this process). `parse` takes those that are not for ROS.
+    `args` exclude the program name (None for this process's own). `parse` receives the arguments that are not for ROS.
     """
     if told := foreign_ros():
         sys.stderr.write(f"{name}: {told}\n")
@@ -82,10 +82,10 @@ def run_command(
 
 
 def foreign_ros() -> str:
-    """Return one line about a ROS that comes before the environment's own, empty where there is only one ROS."""
+    """Return one line about a ROS that shadows the environment's own, or "" if there is none."""
     for package in ROS_PACKAGES:
         own = next((Path(sys.prefix) / "lib").glob(f"python3*/site-packages/{package}/__init__.py"), None)
-        # Found without being imported: what another Python compiled would only raise.
+        # Find the package without importing it, because one built for another Python would raise.
         spec = importlib.util.find_spec(package)
         if own is None or spec is None or not spec.origin or Path(spec.origin).resolve() == own.resolve():
             continue
@@ -95,9 +95,9 @@ def foreign_ros() -> str:
 
 
 def probe() -> str:
-    """Make and destroy a node and return the middleware's name, for `graspd doctor`, in a process of its own.
+    """Create and destroy a node and return the middleware's name. `graspd doctor` calls it in a separate process.
 
-    Raises what rclpy raises where ROS does not work.
+    Raises ImportError if two ROS are mixed, and rclpy's own exceptions if ROS does not work.
     """
     if told := foreign_ros():
         raise ImportError(told)
@@ -118,7 +118,7 @@ def probe() -> str:
 
 
 def main(args: list[str] | None = None) -> int:
-    """Run the node until a signal. Return 0 when stopped, 1 when it cannot go on, 2 for a bad argument or parameter."""
+    """Run the node until a signal. Return 0 when stopped, 1 after a failure, 2 for a bad argument or parameter."""
     try:
         _refuse_arguments(sys.argv[1:] if args is None else args)
         if told := foreign_ros():
@@ -126,13 +126,13 @@ def main(args: list[str] | None = None) -> int:
     except ConfigError as error:
         sys.stderr.write(f"graspd_node: {error}\n")
         return EXIT_BAD_INPUT
-    # Nothing has been promised to anybody yet, and neither an import nor reading a hand can be ended otherwise.
+    # No request is pending yet, and an import or the reading of a hand cannot be interrupted otherwise.
     _on_signal(lambda: os._exit(EXIT_STOPPED))
     os.environ.setdefault("AMENT_PREFIX_PATH", sys.prefix)  # the wheels leave it unset
 
     from graspd_core.runtime.worker_process import limit_malloc_arenas, start_planning_worker
 
-    # First, so that the child's imports, two seconds of them, go on beside this process's own.
+    # Start the child first, so that its imports (2 s) run in parallel with this process's imports.
     start_planning_worker()
     from rclpy.executors import SingleThreadedExecutor
     from rclpy.utilities import try_shutdown
@@ -154,14 +154,14 @@ def main(args: list[str] | None = None) -> int:
     spinner = _spinning(executor, wake, fail)
     wake.wait()
     ended = node.close(STOP_TIMEOUT)
-    # In this order: shutting the executor down takes what it waits with from under it.
+    # Keep this order. Shutting down the executor destroys objects on which its thread waits.
     try_shutdown()
     spinner.join(0.5)
     executor.shutdown(timeout_sec=0.5)
     node.destroy_node()
     status = EXIT_FAILED if failed.is_set() else EXIT_STOPPED
     if not ended:
-        # A worker deep in a library call would abort the interpreter's teardown. There is nothing left to save.
+        # A worker inside a library call would crash the interpreter's shutdown. All answers are already published.
         sys.stdout.flush()
         sys.stderr.flush()
         os._exit(status)
@@ -175,7 +175,7 @@ def _refuse_arguments(args: list[str]) -> None:
 
 
 def _spinning(executor: Executor, wake: threading.Event, fail: Callable[[], None]) -> threading.Thread:
-    """Return a thread that runs the executor until `wake` is set. If the executor ends earlier, `fail` is called."""
+    """Start a thread that spins the executor until `wake` is set, and return it. An earlier end calls `fail`."""
 
     def spin() -> None:
         try:
@@ -183,7 +183,7 @@ def _spinning(executor: Executor, wake: threading.Event, fail: Callable[[], None
         except Exception:
             if not wake.is_set():
                 raise
-            # The context was shut down, under a callback perhaps, to end this.
+            # The shutdown may interrupt a callback.
         finally:
             if not wake.is_set():
                 fail()
@@ -194,7 +194,7 @@ def _spinning(executor: Executor, wake: threading.Event, fail: Callable[[], None
 
 
 def _make_node(args: list[str] | None, on_failure: Callable[[], None]) -> GraspNode | None:
-    """Return the node, or None where an argument or a parameter is bad, which is written to standard error."""
+    """Return the node. If an argument or parameter is invalid, print the error to stderr and return None."""
     import rclpy
 
     if told := log_directory():
@@ -207,7 +207,7 @@ def _make_node(args: list[str] | None, on_failure: Callable[[], None]) -> GraspN
 
     try:
         rclpy.init(args=args, signal_handler_options=SignalHandlerOptions.NO)
-    except RuntimeError as error:  # what rcl says of arguments that it cannot read, over several lines
+    except RuntimeError as error:  # rcl reports invalid arguments on several lines
         sys.stderr.write(f"graspd_node: {' '.join(str(error).split())}\n")
         return None
     try:
@@ -219,7 +219,7 @@ def _make_node(args: list[str] | None, on_failure: Callable[[], None]) -> GraspN
 
 
 def log_directory() -> str:
-    """Set a writable directory for logs where the usual one is not. Return the line that says so."""
+    """Set ROS_LOG_DIR to a temporary directory if the default one is not writable. Return a line about it, or ""."""
     if os.environ.get("ROS_LOG_DIR"):
         return ""
     usual = Path(os.environ.get("ROS_HOME") or Path.home() / ".ros") / "log"

@@ -1,4 +1,4 @@
-"""The node's parameters. One list of fields with type, default, range and description is used by ROS and settings."""
+"""Parameters of the node. The fields of `Settings` give type, default, range and description of each."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ BUDGETS = (0.1, 3600.0)  # seconds
 SCALES = (1e-6, 1e6)
 MASSES = (1e-6, 100.0)  # kilograms
 _CORNERS = ("roi_min", "roi_max", "view_point")
-WORKSPACE = 10.0  # metres from the camera: beyond any depth sensor that grasps
+WORKSPACE = 10.0  # metres from the camera. It exceeds the range of depth sensors used for grasping
 
 
 def _setting(
@@ -84,7 +84,7 @@ def _check_library(path: str) -> None:
 
 def _check_corner(corner: Any) -> None:
     if not _numbers(corner) or len(corner) != 3 or not np.isfinite(corner).all():
-        raise ConfigError(f"{corner} is no place; give three finite numbers, x, y and z in metres")
+        raise ConfigError(f"{corner} is no position; valid: three finite numbers, x, y and z in metres")
 
 
 def _check_parts(parts: Any) -> None:
@@ -95,7 +95,7 @@ def _check_parts(parts: Any) -> None:
 
 @dataclass(frozen=True)
 class Settings:
-    """The parameters at the time of a request. The descriptions are those that `ros2 param describe` shows."""
+    """Values of the parameters at the time of a request. `ros2 param describe` shows the descriptions."""
 
     hand: str = _setting("allegro_right", "name of a shipped hand, or path of a hand's yaml file", read_only=True)
     hand_prefix: str = _setting(
@@ -202,10 +202,10 @@ class Settings:
 
 
 class LiveSettings:
-    """A node's parameters as settings, in `now`, read again when one changes. Doubtful values are logged.
+    """Settings of a node, updated when a parameter changes. `now` has the current values. Doubtful values are logged.
 
-    `frames` returns those that /tf knows. Raises ConfigError if a value given at the start is not a valid choice, and
-    rclpy's ParameterException if it has a wrong type or is out of range.
+    `frames` returns the frames in /tf. Raises ConfigError if a start value is not a valid choice, and rclpy's
+    ParameterException if its type is wrong or it is out of range.
     """
 
     def __init__(self, node: Node, frames: Callable[[], Sequence[str]] = tuple) -> None:
@@ -215,7 +215,7 @@ class LiveSettings:
         for setting in fields:
             _check_value(setting.name, node.get_parameter(setting.name).value)
         self._node, self._frames = node, frames
-        # An integer that stands for a number is one from here on: who describes or gets it sees no other type.
+        # Convert integers of float parameters once, so that clients always see a float.
         given = [node.get_parameter(setting.name) for setting in fields if not setting.metadata["read_only"]]
         node.set_parameters(_of_their_types(given))
         self._doubts: list[str] = []
@@ -244,18 +244,18 @@ class LiveSettings:
 
 
 def unknown_names(node: Node) -> list[str]:
-    """Return a sentence for each name given at the start that no parameter has."""
+    """Return a warning for each unknown parameter name given at the start."""
     told, known = [], [setting.name for setting in dataclasses.fields(Settings)]
-    # rclpy keeps what was given to the node in no public place, and says nothing of what nobody declares.
+    # rclpy has no public access to start parameters, and does not report undeclared ones.
     for name in getattr(node, "_parameter_overrides", {}):
         if not node.has_parameter(name) and not name.startswith("qos_overrides."):
             near = difflib.get_close_matches(name, known, 1)
-            told.append(f"parameter {name}: there is none; " + (f"is {near[0]} meant?" if near else "it is ignored"))
+            told.append(f"unknown parameter {name!r}; " + (f"did you mean {near[0]!r}?" if near else "it is ignored"))
     return told
 
 
 def doubts(settings: Settings) -> list[str]:
-    """Return warnings about values that leave nothing to do."""
+    """Return warnings about values under which no request can succeed: an empty workspace or missing mesh roots."""
     told = []
     if any(low > high for low, high in zip(settings.roi_min, settings.roi_max, strict=True)):
         told.append(f"roi_min={settings.roi_min} is above roi_max={settings.roi_max}: no point lies in the workspace")
@@ -266,17 +266,17 @@ def doubts(settings: Settings) -> list[str]:
 
 
 def _unknown_frames(settings: Settings, changed: Collection[str], known: Sequence[str]) -> list[str]:
-    """Return a sentence for each frame set now that /tf lacks. Before any transform came, none is unknown."""
+    """Return a warning for each changed frame that is not in /tf. Without any transform yet, there is no warning."""
     told = []
     for name in ("sensor_frame", "output_frame", "fixed_frame", "arm_base_frame"):
         frame = getattr(settings, name).removeprefix("/")
         if name in changed and frame and known and frame not in known:
-            told.append(f"parameter {name}: /tf knows no frame {frame!r} by now; known: {', '.join(known)}")
+            told.append(f"parameter {name}: frame {frame!r} is not in /tf yet; known: {', '.join(known)}")
     return told
 
 
 def _of_their_types(parameters: list[Parameter]) -> list[Parameter]:
-    """Return parameters with numbers where integers were given for them, and words where YAML reads truth values."""
+    """Return parameters in their fields' types: floats in place of integers, and `off` in place of YAML's false."""
     kept = []
     for parameter in parameters:
         setting = Settings.__dataclass_fields__.get(parameter.name)
@@ -286,7 +286,7 @@ def _of_their_types(parameters: list[Parameter]) -> list[Parameter]:
 
 
 def check_parameters(parameters: list[Parameter]) -> SetParametersResult:
-    """Refuse values that are not valid choices. ROS itself refuses wrong types and ranges."""
+    """Check that values are valid choices, and return the result. ROS itself refuses wrong types and ranges."""
     try:
         for parameter in parameters:
             _check_value(parameter.name, parameter.value)
@@ -298,10 +298,10 @@ def check_parameters(parameters: list[Parameter]) -> SetParametersResult:
 def _check_value(name: str, value: Any) -> None:
     setting = Settings.__dataclass_fields__.get(name)
     if setting is None:
-        return  # ROS has parameters of its own on every node
+        return  # every node also has parameters of ROS itself
     choices, check, value = setting.metadata["choices"], setting.metadata["check"], _word(setting, value)
     if _is_number(setting) and not _is_number_like(value):
-        raise ConfigError(f"parameter {name}: {value!r} is no number")
+        raise ConfigError(f"parameter {name}: {value!r} is no number; valid: a number such as 1.0")
     if _is_number(setting) and setting.metadata["range"] is not None:
         low, high = setting.metadata["range"]
         if not low <= value <= high:
@@ -316,7 +316,7 @@ def _check_value(name: str, value: Any) -> None:
 
 
 def _word(setting: dataclasses.Field, value: Any) -> Any:
-    """Return the value in its field's type. YAML reads an unquoted `off` as a truth value, `1` as an integer."""
+    """Return a value in its field's type. YAML reads an unquoted `off` as a boolean and `1` as an integer."""
     if isinstance(value, int) and not isinstance(value, bool) and _is_number(setting):
         return float(value)
     if setting.name in _CORNERS:
@@ -343,7 +343,7 @@ def _descriptor(setting: dataclasses.Field) -> ParameterDescriptor:
     descriptor = ParameterDescriptor(
         description=setting.metadata["description"],
         read_only=setting.metadata["read_only"],
-        # What is given is checked here: ROS would refuse 5 where 5.0 is meant.
+        # This module checks these types, because ROS would refuse 5 for 5.0.
         dynamic_typing="off" in choices or _is_number(setting) or setting.name in _CORNERS,
         additional_constraints=f"one of {', '.join(choices)}" if choices else "",
     )

@@ -1,4 +1,4 @@
-"""`graspd_play BAG`: a recording's topics over DDS as they were recorded, where `ros2 bag play` is not at hand.
+"""`graspd_play BAG`: publishes a recording's topics over DDS at the recorded times, if `ros2 bag play` is missing.
 
 graspd_play BAG [--rate R] [--loop] [--topics NAME ...] [--now] [--wait SEC] [--ros-args -r /recorded:=/wanted]
 """
@@ -20,8 +20,8 @@ from graspd_core.transforms import SECOND
 from graspd_ros.node import Parser, run_command
 
 DEPTH = 10
-SETTLE = 0.3  # seconds after a match in which the first messages could still be lost
-DELIVERY = 5.0  # seconds that reliable subscribers get to confirm the last messages, which end with their publisher
+SETTLE = 0.3  # seconds after discovery in which the first messages could still be lost
+DELIVERY = 5.0  # seconds for reliable subscribers to confirm the last messages, before the publisher ends
 
 
 def main(args: list[str] | None = None) -> int:
@@ -48,10 +48,10 @@ def play(
     wait: float = 0.0,
     stop: threading.Event | None = None,
 ) -> int:
-    """Publish a recording's messages at their recorded times until `stop` is set. Return how many.
+    """Publish a recording's messages at their recorded times until `stop` is set. Return the number of messages.
 
-    `_parse` explains the options. Raises BagError if the bag cannot be read, lacks a topic, or holds none of a type
-    known here.
+    `_parse` explains the options. Raises BagError if the bag cannot be read, lacks a topic, or has no topic of an
+    installed type.
     """
     stop = stop or threading.Event()
     publishers = _publishers(node, bag, topics)
@@ -88,7 +88,7 @@ def _parse(arguments: list[str]) -> argparse.Namespace:
 
 
 def _publishers(node: Any, bag: Path, wanted: Sequence[str]) -> dict[str, tuple[Any, type]]:
-    """Return a publisher and the message type for each topic of a type known here. Warn of the others."""
+    """Return publisher and message type of each topic whose type is installed. Log a warning for the others."""
     from rclpy.qos import DurabilityPolicy, QoSProfile
 
     recorded = bag_topics(bag)
@@ -142,10 +142,10 @@ def _wait_for_delivery(publishers: dict[str, tuple[Any, type]]) -> None:
 
 
 def _shifted(data: bytes, kind: type, start: int, began: int, rate: float) -> Any:
-    """Return the message with the stamp of every header moved to when it is due.
+    """Return the message with the stamps of its headers moved to the time of publication.
 
-    Messages without headers are unchanged. What was stamped at `start` of the recording [ns] is due at `began` [ns],
-    and time goes `rate` times as fast.
+    The stamp `start` [ns] becomes `began` [ns]. Later stamps are scaled by `rate`. Messages without headers do not
+    change.
     """
     from rclpy.serialization import deserialize_message
 

@@ -1,4 +1,4 @@
-"""Requests as the worker gets them: one object to grasp, and everything asked of its grasps."""
+"""Requests for the worker: one object to grasp, and all constraints on its grasps."""
 
 from __future__ import annotations
 
@@ -21,12 +21,12 @@ if TYPE_CHECKING:
     from graspd_ros.inputs.solids import Thing
 
 MOST_ID = 128
-# `T_target_source` of two frames. May raise a TransformError.
+# Returns `T_target_source` of two frames. May raise a TransformError.
 FrameLookup = Callable[[str, str], Matrix]
 
 
 class Listener(Protocol):
-    """A receiver of one request's outcome, beside the topics. It is called in the thread that publishes."""
+    """Receiver of one request's messages, in addition to the topics. It is called in the publishing thread."""
 
     def progressed(self, message: GraspProgress) -> None: ...
     def found(self, message: Grasp) -> None: ...
@@ -35,9 +35,9 @@ class Listener(Protocol):
 
 @dataclass(frozen=True)
 class KnownObject:
-    """An object by its name in the library or, where that is empty, by the path of its mesh file.
+    """Key of an object in the library: its name or, if `name` is empty, the path of its mesh file.
 
-    `required` is whether the library must have it.
+    If `required` is True, a missing entry is an error.
     """
 
     name: str
@@ -47,29 +47,28 @@ class KnownObject:
 
 @dataclass(frozen=True, eq=False)
 class Request:
-    """One object to grasp.
+    """Request for grasps of one object.
 
     Attributes:
-        source: name of its source (`SOURCES`): mesh, cloud, latest_cloud, views or known.
-        frame: the frame of the results, unless the settings name an output_frame.
-        stamp: the time at which the object was as it was given.
-        settings: the parameters at the time of the request, with those of the request itself.
-        load: reads the object. It is slow and may raise a GraspdError.
-        T_frame_object: pose of the object's own frame in `frame`. None where they are one.
-        only_newest: whether a newer request of this kind takes its place while it waits.
-        listener: informed of it beside the topics. None where there is none.
-        timeless: whether it came without a time of its own, so that the newest transforms are used.
-        object_key: equal for requests of the very same object, as it is or was seen then. Empty: equal to no other.
-        exclude: ids of grasps that the answer must not be like.
-        exclude_poses: the same by frame and pose of the base link in it.
-        known: how a library of grasps may know the object. None: not at all.
-        surface: the plane the object stands on, in its own frame. None: none.
-        steering: makes the restrictions on a grasp's place and direction from the frames that were seen. It is slow and
-            may raise a GraspdError. None where nothing is asked.
-        shown: reads the points that the request's region_mask shows, in `frame` [m]. None where there is no image.
-        closes_late: whether the hand closes only when it has arrived, so that grasps need their `arrival`.
-        things: all things of the planning scene at that time, by id. Empty where the node has no such topic.
-        accepted: when the request came, by the monotonic clock [s].
+        source: name of the object's source: cloud, mesh, latest_cloud, views, known or grasp_planning.
+        frame: frame of the results, unless the settings name an `output_frame`.
+        stamp: time for which the object's pose is valid.
+        settings: the parameters at the time of the request, overridden by the request's own values.
+        load: loads the object as a scene. It is slow and may raise a GraspdError.
+        T_frame_object: pose of the object's own frame in `frame` [m]. None if both are the same.
+        only_newest: if True, a newer request of this kind replaces this one while it waits.
+        listener: receives the request's messages in addition to the topics. May be None.
+        timeless: True if the request has no stamp of its own. Then the newest transforms are used.
+        object_key: equal for requests of the same object in the same measurement. An empty key equals no other.
+        exclude: ids of grasps. The answer must contain no similar grasp.
+        exclude_poses: frames and base-link poses of grasps to exclude in the same way.
+        known: key of the object in a grasp library. None if no library is used.
+        surface: support plane in the object's frame. None if the request gives none.
+        steering: makes the steering constraints. It is slow and may raise a GraspdError. None without constraints.
+        shown: returns the points inside the request's `region_mask`, in `frame` [m]. None for sources without an image.
+        closes_late: True if the hand closes only after it has arrived. Then grasps need their `arrival`.
+        things: collision objects of the planning scene by id. Empty if the node has no such topic.
+        accepted: time of arrival on the monotonic clock [s].
     """
 
     id: str
@@ -98,17 +97,17 @@ class Request:
         return self.settings.output_frame or self.frame
 
     def elapsed(self) -> float:
-        """Return the seconds since the request came."""
+        """Return the time since the request arrived [s]."""
         return time.monotonic() - self.accepted
 
     def time_left(self) -> float:
-        """Return the seconds until its deadline."""
+        """Return the time until the deadline [s]."""
         return self.settings.deadline - self.elapsed()
 
     def to_object(self, frame: str, T: Matrix, lookup: FrameLookup) -> Matrix:
-        """Return a pose of another frame (empty: the request's) in the object's own. May raise TransformError.
+        """Transform the pose `T` from `frame` to the object's frame. An empty `frame` means the request's frame.
 
-        `lookup` is called only if the frame is not the request's.
+        `lookup` is called only for other frames. It may raise a TransformError.
         """
         placed = T if frame in ("", self.frame) else lookup(self.frame, frame) @ T
         return placed if self.T_frame_object is None else np.linalg.inv(self.T_frame_object) @ placed

@@ -1,6 +1,7 @@
-"""The worker's work on one request: read the object, plan, move the result to the frame asked for.
+"""Processing of one request: load the object, plan, and transform the result to the output frame.
 
-Grasps that were tried and failed are left out. The answer is the next best of the same run, or a new run without them.
+Grasps similar to the excluded ones are left out. The answer has the next best grasps of an earlier run on the same
+object, or those of a new run.
 """
 
 from __future__ import annotations
@@ -43,27 +44,27 @@ from graspd_ros.worker import Report, WorkerEnding
 if TYPE_CHECKING:
     from graspd_core import Reach
 
-PATIENCE = 0.15  # seconds that work gets to end by itself when its request is over
-_POLL = 0.02  # seconds between two looks at stop and deadline
+PATIENCE = 0.15  # seconds for a run to end by itself after its request has ended
+_POLL = 0.02  # seconds between two checks of stop and deadline
 MOST_RUNS = 16
-# A grasp is like one that was lost where its base is this near to it and turned by less [m], [rad].
+# Two grasps are similar if their bases are within this distance [m] and this angle [rad].
 LIKE_DISTANCE, LIKE_TURN = 0.015, 0.26
 
-# `T_target_source` of two frames at a time (0: the newest there is). Waits a little, unless the hook says stop. May
-# raise a TransformError.
+# Returns `T_target_source` at a time (0 for the newest). It waits for late transforms until the stop hook returns True,
+# and may raise a TransformError.
 Lookup = Callable[[str, str, Time, StopHook], Matrix]
 
 
 @dataclass(frozen=True)
 class Planned:
-    """A result in the frame of its answer.
+    """Result of a request in the frame of its answer.
 
     Attributes:
         result: the grasps.
-        file: where it was written. Empty: nowhere.
-        worked_on: whether there was a run at all.
-        mass: the object's mass in the trials [kg], 0 where there was none.
-        mass_assumed: whether the request gave no mass.
+        file: path of the written file. Empty if none was written.
+        worked_on: False if the request ended before any run.
+        mass: object's mass in the trials [kg]. 0 without trials.
+        mass_assumed: True if the request gave no mass.
     """
 
     result: GraspResult
@@ -86,21 +87,21 @@ class _Run:
 
 
 class RecentRuns:
-    """The grasps of the last runs, by the id of their request. Used by one thread at a time."""
+    """Store of the grasps of the last runs by request id. One thread may use it at a time."""
 
     def __init__(self) -> None:
         self._runs: OrderedDict[str, _Run] = OrderedDict()
 
     def keep(self, request: Request, planned: Planned) -> None:
-        """Remember a result, in the frame that it was planned in."""
+        """Store a result in its planning frame."""
         self._runs[request.id] = _Run(request.object_key, request.frame, request.T_frame_object, planned)
         while len(self._runs) > MOST_RUNS:
             self._runs.popitem(last=False)
 
     def excluded(self, request: Request, lookup: FrameLookup) -> list[Matrix]:
-        """Return poses of the base link that the request excludes by id or pose, in the frame that it is planned in.
+        """Return the base-link poses that the request excludes by id or pose, in the object's frame [m].
 
-        Raises RequestError for an id that no grasp of the last runs has, and TransformError as `lookup`.
+        Raises RequestError for an id that is not among the last runs, and TransformError as `lookup`.
         """
         poses = []
         for name in request.exclude:
@@ -121,7 +122,7 @@ class RecentRuns:
         return run, run.grasps[int(rank)]
 
     def next_best(self, request: Request, excluded: Sequence[Matrix]) -> Planned | None:
-        """Return the rest of the runs on the very same object, or None if no good grasp is left."""
+        """Return the remaining good grasps of earlier runs on the same object. None if there are none."""
         runs = [run for run in self._runs.values() if run.object_key == request.object_key and request.object_key]
         known = {id(grasp): grasp for run in runs for grasp in run.grasps}
         wanted = Verdict.UNVERIFIED if request.settings.verify == "none" else Verdict.VERIFIED
@@ -136,12 +137,12 @@ class RecentRuns:
 
 
 def unlike(grasps: Iterable[Grasp], excluded: Sequence[Matrix]) -> list[Grasp]:
-    """Return the grasps that are not like any of the poses."""
+    """Return the grasps that are not similar to any of the base-link poses."""
     return [grasp for grasp in grasps if not any(_alike(matrix_of_posture(grasp.grasp), pose) for pose in excluded)]
 
 
 def without(result: GraspResult, excluded: Sequence[Matrix], count: int) -> GraspResult:
-    """Return a run's result without grasps like those excluded, at most `count` of the good ones."""
+    """Return a result with at most `count` good grasps and all failed ones, without grasps similar to `excluded`."""
     left = unlike(result.tried, excluded)
     good = [grasp for grasp in left if grasp.verdict is not Verdict.FAILED]
     failed = [grasp for grasp in left if grasp.verdict is Verdict.FAILED]
@@ -158,11 +159,11 @@ def _alike(a: Matrix, b: Matrix) -> bool:
 
 
 class Planner:
-    """A planner for one hand. Used by one thread at a time.
+    """Planner for one hand. One thread may use it at a time.
 
-    The work is done in a thread of its own, since steps that read a mesh or compute a large batch do not check whether
-    to stop. When a request is over, that thread is left behind after a moment, and the answer is sent. It ends by
-    itself soon after, and the next request waits for that, so that cancelled work does not pile up.
+    A background thread does the work, because reading a mesh or computing a large batch cannot be stopped. When a
+    request ends early, the answer is sent after `PATIENCE` seconds without the thread. The thread ends by itself soon
+    after. The next request waits for this end, so that cancelled work does not pile up.
     """
 
     def __init__(self, hand: HandModel, lookup: Lookup, robot_description: str = "") -> None:
@@ -173,14 +174,14 @@ class Planner:
         self._runs = RecentRuns()
 
     def plan(self, request: Request, stop: StopHook, tell: ProgressHook) -> Planned:
-        """Work off one request. Raises what reading, planning and /tf raise."""
+        """Process one request. Raises the errors of loading, planning and transforms."""
         left, telling = threading.Event(), threading.Lock()
 
         def over() -> bool:
             return stop() or request.time_left() <= -PATIENCE
 
         def tell_if_wanted(progress: Progress) -> None:
-            with telling:  # nothing is told of a request once this has returned
+            with telling:  # no progress of a request is reported after `plan` has returned
                 if not left.is_set():
                     tell(progress)
 
@@ -189,7 +190,7 @@ class Planner:
             return _empty(request, stop)
 
         def run() -> Planned:
-            torch.set_num_threads(request.settings.torch_threads)  # holds for the calling thread only
+            torch.set_num_threads(request.settings.torch_threads)  # affects the calling thread only
             return self._run(request, lambda: left.is_set() or stop(), tell_if_wanted)
 
         work = self._behind = begin_in_thread("graspd_planner", run)
@@ -204,12 +205,12 @@ class Planner:
         return work.result()
 
     def rest(self, timeout: float) -> bool:
-        """Wait for work that was left behind. Return whether it ended within `timeout` seconds."""
+        """Wait for a background thread that still runs. Return True if it ended within `timeout` seconds."""
         end = time.monotonic() + timeout
         return self._behind is None or _ended(self._behind, lambda: time.monotonic() > end)
 
     def _run(self, request: Request, stop: StopHook, tell: ProgressHook) -> Planned:
-        # Looked up before the work, which would be lost where there is no transform.
+        # Look up the transform first. A run would be lost if it is missing.
         seen = self._lookup_at(Time() if request.timeless else request.stamp, stop)
         T_out_object = request.T_frame_object
         if request.frame_out != request.frame:
@@ -221,8 +222,8 @@ class Planner:
         if request.things:
             request = among_things(request, seen)
         excluded = self._runs.excluded(request, self._lookup_at(Time(), stop))
-        # What an earlier run found was not asked for these wishes, and an arm or other things may have stood elsewhere.
-        # A library has what that run found, and more.
+        # Do not reuse an earlier run if its constraints, arm pose or obstacles may differ. With a library do not reuse
+        # it either, because the library contains those grasps.
         free = request.steering is None and not reach and not request.things
         known = excluded and free and request.known is None
         planned = self._runs.next_best(request, excluded) if known else None
@@ -240,13 +241,13 @@ class Planner:
     def _search(
         self, request: Request, excluded: list[Matrix], reach: tuple[Reach, ...], stop: StopHook, tell: ProgressHook
     ) -> Planned:
-        """Search for grasps, leave out those like the excluded, and write what is left to a file if one is wanted."""
+        """Plan grasps, drop those similar to `excluded`, and write the rest to a file if `output_dir` is set."""
         settings = request.settings
         config = load_preset(settings.preset)
         steering = () if request.steering is None else (request.steering(),)
         restrictions = (*steering, *reach)
         plan: dict[str, Any] = {"preset": config, "device": settings.device, "progress": tell, "stop": stop}
-        # Of those that are planned some may be like those excluded, which other starts make less likely.
+        # Another seed makes grasps similar to the excluded ones less likely.
         plan["seed"] = settings.seed + len(excluded)
         if settings.grasp_library and request.known is not None:
             from graspd_ros.known_objects import answer_known
@@ -269,7 +270,7 @@ class Planner:
         if not settings.output_dir or stop():
             return planned
         path = Path(settings.output_dir) / f"{request.id}.json"
-        # As planned: a mesh's grasps in the mesh's own frame, wherever it stands.
+        # The file has the planning frame. For a mesh this is the mesh's own frame.
         frame = request.frame if request.T_frame_object is None else settings.mesh_frame
         seconds, scene = 1e-9 * nanoseconds(request.stamp), scene or request.load()
         save_result(path, result, scene.object, self._hand, config, frame=frame, stamp=seconds)
@@ -288,7 +289,7 @@ def _with_found(progress: Progress, change: Callable[[Grasp], Grasp]) -> Progres
 
 
 def _arrivals(scene: Scene, hand: HandModel) -> Callable[[Grasp], Grasp]:
-    """Return a function that adds `arrival` to each grasp that failed no trial. Its first call is slow."""
+    """Return a function that adds `arrival` to a grasp unless it failed a trial. Results are cached by posture."""
     context, known = make_metrics_context(scene.object, hand), dict[bytes, Posture | None]()
 
     def arrived(grasp: Grasp) -> Grasp:
@@ -308,5 +309,5 @@ def _empty(request: Request, stop: StopHook) -> Planned:
 
 
 def overdue() -> Report[Planned]:
-    """Return the end of a request whose deadline passed before its turn came."""
+    """Return the report of a request whose deadline passed while it waited."""
     return Report(WorkerEnding.DONE, value=Planned(GraspResult(Outcome.DEADLINE, (), Timing(), 0, ""), worked_on=False))

@@ -1,4 +1,4 @@
-"""`graspd_view`: follows a running node by its topics and shows its grasps in a browser, from any machine of a domain.
+"""`graspd_view`: shows the grasps of a running node in a browser. It runs on any machine in the node's ROS domain.
 
 graspd_view [--node /graspd] [--object OBJECT] [--hand FILE] [--host H] [--port P] [--ros-args -r points:=/seen]
 """
@@ -55,11 +55,11 @@ def _serve(options: argparse.Namespace, stop: threading.Event) -> None:
 
 
 class Follower:
-    """Subscriptions to the node `name`, whose newest answer a viewer shows.
+    """Subscriber to the node `name` that shows the newest answer in a viewer.
 
     Args:
-        scene: the object in the frame of the answers, where it is known.
-        hand: a name or a path, instead of the hand named in the answer.
+        scene: the object in the frame of the answers. None if unknown.
+        hand: name or path of a hand. If None, the hand named in the answer is used.
     """
 
     def __init__(self, node: Any, viewer: Any, name: str, *, scene: Any = None, hand: str | None = None) -> None:
@@ -103,7 +103,7 @@ class Follower:
             self._viewer.show(make_session(title, hand, grasps, self._scene, PlanConfig(), seen, notes))
 
     def _seen(self, frame: str) -> np.ndarray:
-        """Return the points of the newest cloud if it is in the frame of the answer [m]."""
+        """Return the points of the newest cloud [m]. They are empty if the cloud is not in the answer's frame."""
         from graspd_core.io.messages import points_from_message
 
         if self._cloud is None or self._cloud.header.frame_id != frame:

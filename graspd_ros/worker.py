@@ -1,7 +1,6 @@
-"""A thread that works off requests, one at a time. It knows neither ROS nor grasps.
+"""Worker thread that processes requests one at a time. It is independent of ROS and of grasps.
 
-Every request that `submit` accepted ends in exactly one call of `finish`, whether it is done, failed, cancelled, or
-superseded by a newer one.
+Every request that `submit` accepts ends in exactly one call of `finish`: done, failed, cancelled, or superseded.
 """
 
 from __future__ import annotations
@@ -15,7 +14,7 @@ from typing import Generic, Protocol, TypeVar
 
 
 class BusyPolicy(StrEnum):
-    """What becomes of a request that arrives while another is being worked on."""
+    """Treatment of a request that arrives while another one is running."""
 
     REJECT = "reject"
     QUEUE = "queue"
@@ -23,7 +22,7 @@ class BusyPolicy(StrEnum):
 
 
 class WorkerEnding(StrEnum):
-    """How a request ended."""
+    """Outcome of a request."""
 
     DONE = "done"
     FAILED = "failed"
@@ -32,7 +31,7 @@ class WorkerEnding(StrEnum):
 
 
 class Refusal(StrEnum):
-    """Why `submit` did not take a request."""
+    """Reason why `submit` did not accept a request."""
 
     BUSY = "busy"
     DUPLICATE = "duplicate"
@@ -40,9 +39,9 @@ class Refusal(StrEnum):
 
 
 class WorkerRequest(Protocol):
-    """What the worker needs to know of a request.
+    """Interface of a request.
 
-    `only_newest` requests wait in a place of their own, where a newer one takes the place of an older.
+    `only_newest` requests wait outside the queue, in one slot. A newer one replaces the waiting one.
     """
 
     @property
@@ -58,7 +57,7 @@ StopHook = Callable[[], bool]
 
 @dataclass(frozen=True)
 class Admission:
-    """The answer to `submit`: taken or, where there is a refusal, the reason. `ahead` requests come before it."""
+    """Answer of `submit`: accepted if `refusal` is None. Then `ahead` is the number of requests before this one."""
 
     refusal: Refusal | None = None
     reason: str = ""
@@ -67,7 +66,7 @@ class Admission:
 
 @dataclass(frozen=True)
 class Report(Generic[V]):
-    """The end of a request: `error` when it failed, `value` when done, or what there was when it was stopped."""
+    """End of a request: `error` if it failed, `value` if it is done. A stopped request may have a partial `value`."""
 
     ending: WorkerEnding
     value: V | None = None
@@ -75,13 +74,13 @@ class Report(Generic[V]):
 
 
 class Worker(Generic[R, V]):
-    """A worker thread with a bounded queue.
+    """Worker thread with a bounded queue.
 
     Args:
-        work: does one request. It must call its stop hook often and return early when that returns true. May raise
-            anything.
-        finish: called at each accepted request's end, in the worker thread, or in the caller's when `submit` or
-            `cancel` ends a waiting request. Must not raise.
+        work: processes one request. It must call its stop hook often and return early if that returns True. It may
+            raise anything.
+        finish: called once at the end of each accepted request. It runs in the worker thread, or in the thread that
+            ends a waiting request. It must not raise.
         prepare: runs in the worker thread before the first request.
         queue_size: most requests that wait behind the running one under the policy `queue`.
     """
@@ -102,8 +101,8 @@ class Worker(Generic[R, V]):
         self._waiting: deque[R] = deque()
         self._newest: R | None = None
         self._running: R | None = None
-        self._live: set[str] = set()  # ids of those accepted and not yet told to have ended
-        self._ending: WorkerEnding | None = None  # what the running request was told to end as
+        self._live: set[str] = set()  # ids of accepted requests that have not been finished
+        self._ending: WorkerEnding | None = None  # ending that the running request will get
         self._stopping = False
         self._thread = threading.Thread(target=self._loop, name="graspd_worker", daemon=True)
 
@@ -111,7 +110,7 @@ class Worker(Generic[R, V]):
         self._thread.start()
 
     def submit(self, request: R, policy: BusyPolicy) -> Admission:
-        """Take a request or return why not. An `only_newest` request is taken whatever the policy."""
+        """Accept a request or return the reason of the refusal. The policy does not apply to `only_newest` requests."""
         superseded: list[R] = []
         with self._condition:
             ahead = len(self._waiting) + (self._running is not None)
@@ -148,7 +147,7 @@ class Worker(Generic[R, V]):
         return None
 
     def cancel(self, request_id: str) -> int:
-        """Cancel a waiting or running request, or all of them when the id is empty. Return how many."""
+        """Cancel a waiting or running request by id, or all if the id is empty. Return the number of requests."""
         with self._condition:
             dropped = self._take_out(lambda request: request_id in ("", request.id))
             running = self._running is not None and request_id in ("", self._running.id)
@@ -158,7 +157,7 @@ class Worker(Generic[R, V]):
         return len(dropped) + running
 
     def end_waiting(self, which: Callable[[R], bool], report: Report[V]) -> int:
-        """End the waiting requests that `which` picks, with a report. Return how many."""
+        """End the waiting requests for which `which` returns True. Return the number of requests."""
         with self._condition:
             dropped = self._take_out(which)
         self._end_all(dropped, report)
@@ -172,7 +171,7 @@ class Worker(Generic[R, V]):
         return dropped
 
     def state(self) -> tuple[str | None, int]:
-        """Return the id of the running request, and how many wait in the queue, not counting an `only_newest` one."""
+        """Return the id of the running request and the length of the queue, without a waiting `only_newest` request."""
         with self._condition:
             running = self._running.id if self._running else None
             return running, len(self._waiting)
@@ -181,11 +180,11 @@ class Worker(Generic[R, V]):
         return self._thread.is_alive()
 
     def stopping(self) -> bool:
-        """Return whether `stop` was called. Long work outside requests polls this."""
+        """Return True after `stop` was called. Long work outside requests polls this."""
         return self._stopping
 
     def stop(self, timeout: float) -> bool:
-        """End everything as cancelled. Return whether the thread ended within `timeout` seconds."""
+        """Cancel all requests and end the thread. Return True if it ended within `timeout` seconds."""
         with self._condition:
             self._stopping = True
             self._condition.notify()
@@ -213,7 +212,7 @@ class Worker(Generic[R, V]):
     def _done(self, request: R) -> Report[V]:
         try:
             return Report(WorkerEnding.DONE, value=self._work(request, self._should_stop))
-        except BaseException as error:  # SystemExit too: whatever one request does, the next one is still served
+        except BaseException as error:  # even SystemExit, so that one request cannot end the worker
             return Report(WorkerEnding.FAILED, error=error)
 
     def _next(self) -> R | None:

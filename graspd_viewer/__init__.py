@@ -1,1 +1,1 @@
-"""Grasps in a browser."""
+"""Viewer of grasps in a browser."""

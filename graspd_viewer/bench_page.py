@@ -1,7 +1,7 @@
-"""HTML page of a benchmark: charts of speed against accuracy. A point of a chart opens its runs and their grasps.
+"""HTML page of a benchmark: charts of speed against accuracy. A click on a point opens its runs and their grasps.
 
-The page is one file that needs no network and no library. Results hold figures of grasps, but no postures. To show the
-grasps of a run, the server plans it again with the same settings and seed, which gives the same grasps.
+The page is one file without network access or libraries. Results contain figures of grasps, but no postures. To show
+the grasps of a run, the server repeats the planning with the same settings and seed. The same code then finds the same.
 """
 
 from __future__ import annotations
@@ -85,7 +85,7 @@ def page_data(runs: Sequence[Record]) -> dict[str, Any]:
 
 def _point(point: Point, time: str, group: Sequence[Row]) -> dict[str, Any]:
     method, (low, middle, high) = method_row(point.method), point.x
-    if time == "cpu_per_verified":  # as the tables have it, all objects together
+    if time == "cpu_per_verified":  # over all objects together, as in the tables
         middle = per_verified(group)
     x = (low, middle, high)
     return {"name": point.name, "colour": method.colour, "method": method.label, "x": x, "y": point.y}
@@ -101,7 +101,7 @@ def _run(record: Record) -> dict[str, Any]:
 
 
 def _source(record: Record) -> str:
-    # Of a file only the name is kept.
+    # A record stores only the name of a file.
     return f"{SHAPE_PREFIX}{record['object']}" if record["object"] in SHAPES else record["object"]
 
 
@@ -113,7 +113,7 @@ def _grasp(grasp: dict[str, Any]) -> dict[str, Any]:
 
 
 def plan_again(record: Record, show: Callable[[Session], None], tell: Tell, stop: StopHook) -> None:
-    """Plan a run again, try and measure its grasps, and show them. `tell` gets the progress as text and fraction.
+    """Repeat the planning of a run, then simulate, measure and show its grasps. `tell` receives progress (0 to 1).
 
     Raises GraspdError: the object or the hand of the run is not available.
     """
@@ -146,7 +146,7 @@ def serve_page(page: str, host: str, port: int, open_run: Callable[[str], int | 
     Args:
         page: the HTML text.
         host, port: the address to listen on.
-        open_run: shows the grasps of a run by key. It returns the viewer's port, or None for an unknown run.
+        open_run: shows the grasps of a run by key. It returns the viewer's port, or None if the key is unknown.
 
     Raises:
         ConfigError: the address cannot be listened on.

@@ -1,6 +1,6 @@
-"""All drawings as plain meshes: the browser (`scene_nodes`) and the docs (`benchmarks/pictures.py`) show the same.
+"""Meshes of everything drawn, shared by the browser (`scene_nodes`) and the docs (`benchmarks/pictures.py`).
 
-Also the forces of a grasp's squeeze, the push that it resists least, and the hand's postures on its path.
+It also computes squeeze forces, the disturbance that a grasp resists least, and the hand's postures along its path.
 """
 
 from __future__ import annotations
@@ -34,14 +34,14 @@ VERDICTS = {
     Verdict.UNVERIFIED: (0.60, 0.62, 0.66),
     Verdict.FAILED: (0.85, 0.20, 0.20),
 }
-# Lengths of arrows: a contact's normal [m], a force [m/N], and a push [radii of the object], which comes out of it.
+# Arrow lengths: contact normal [m], force [m/N], and disturbance [radii of the object] as offset and factor.
 NORMAL_LENGTH, FORCE_LENGTH, PUSH_LENGTH = 0.02, 0.008, (1.1, 0.7)
 _SHAFT, _SLICE = 0.0012, 96
 
 
 @dataclass(frozen=True)
 class Part:
-    """One mesh of one colour (RGB, 0 to 1) in its frame [m]."""
+    """Mesh of one colour (RGB, 0 to 1) in its own frame [m]."""
 
     name: str
     mesh: TriangleMesh
@@ -50,7 +50,7 @@ class Part:
 
 
 def hand_parts(hand: HandModel) -> dict[int, Part]:
-    """Return the solids of every link that has any, by link number, link frame."""
+    """Return the collision solids of each link that has any, by link index, in the link's frame [m]."""
     parts = {}
     for link, primitives in enumerate(hand.primitives_of):
         if primitives:
@@ -60,7 +60,7 @@ def hand_parts(hand: HandModel) -> dict[int, Part]:
 
 
 def scene_parts(scene: Scene) -> list[Part]:
-    """Return the object, its seen and its guessed part, and what stands around it."""
+    """Return the object (split into its seen and guessed part for clouds), the support and the obstacles."""
     mesh, parts = scene.object.mesh, []
     if scene.confidence is None:
         parts.append(Part("object/known", mesh, OBJECT))
@@ -76,7 +76,7 @@ def scene_parts(scene: Scene) -> list[Part]:
 
 
 def contact_parts(contacts: Sequence[Contact]) -> list[Part]:
-    """Return an arrow along the object's outward normal from every contact."""
+    """Return one arrow per contact along the object's outward normal."""
     if not contacts:
         return []
     starts = np.array([contact.position for contact in contacts])
@@ -85,7 +85,7 @@ def contact_parts(contacts: Sequence[Contact]) -> list[Part]:
 
 
 def force_parts(positions: Float[np.ndarray, "n 3"], forces: Float[np.ndarray, "n 3"]) -> list[Part]:
-    """Return an arrow for every force on the object [N], which ends where the force acts."""
+    """Return one arrow per force on the object [N]. Each arrow ends at the point of application, `positions` [m]."""
     strong = np.linalg.norm(forces, axis=1) > 0.02
     if not strong.any():
         return []
@@ -94,7 +94,7 @@ def force_parts(positions: Float[np.ndarray, "n 3"], forces: Float[np.ndarray, "
 
 
 def weakest_parts(push: Float[np.ndarray, "6"], target: ObjectModel) -> list[Part]:
-    """Return arrows of the push that a grasp resists least: its force at the centre of mass, and its turning axis."""
+    """Return arrows of the disturbance that a grasp resists least: its force, and the axis of its torque."""
     center, parts = target.center_of_mass, []
     for name, way, colour in (("weakest/force", push[:3], WEAKEST), ("weakest/turn", push[3:], TURN)):
         share = float(np.linalg.norm(way))
@@ -107,10 +107,10 @@ def weakest_parts(push: Float[np.ndarray, "6"], target: ObjectModel) -> list[Par
 def sdf_slice(
     scene: Scene, axis: int, share: float
 ) -> tuple[UInt8[np.ndarray, "rows columns 3"], Float[np.ndarray, "3"]]:
-    """Return the signed distance on a plane normal to an axis, `share` of the grid along it, and the plane's middle
-    [m].
+    """Return an image of the SDF on a plane normal to `axis`, and the plane's centre [m].
 
-    Blue is inside, red outside, white at the surface. The picture's rows and columns are `slice_axes`.
+    `share` is the plane's position along the axis, as a fraction of the grid. Blue is inside, red outside, white at the
+    surface. Rows and columns of the image run along `slice_axes`.
     """
     sdf = scene.sdf
     low = sdf.origin.double().cpu().numpy()
@@ -129,12 +129,12 @@ def sdf_slice(
 
 
 def slice_axes(axis: int) -> tuple[int, int]:
-    """Return the axes that the rows and the columns of a slice normal to `axis` run along."""
+    """Return the axes along which the rows and the columns of a slice normal to `axis` run."""
     return (axis + 2) % 3, (axis + 1) % 3
 
 
 def arrows(starts: Float[np.ndarray, "n 3"], ends: Float[np.ndarray, "n 3"], radius: float = _SHAFT) -> TriangleMesh:
-    """Return arrows as closed bodies: a shaft, and a head of three times its radius."""
+    """Return arrows as one closed mesh [m]. The head has three times the radius of the shaft."""
     import trimesh
 
     bodies = []
@@ -165,14 +165,14 @@ def _square(support: Plane, mesh: TriangleMesh) -> TriangleMesh:
 
 @dataclass(frozen=True)
 class SqueezeForces:
-    """The planned forces of a squeeze on the object [N], and where they act [m]."""
+    """Planned squeeze forces on the object [N] and their points of application [m]."""
 
     positions: Float[np.ndarray, "contacts 3"]
     forces: Float[np.ndarray, "contacts 3"]
 
 
 class Mechanics:
-    """Forces of the grasps of a session with a scene. Shared parts are prepared once."""
+    """Calculator of forces for the grasps of a session that has a scene. It prepares the shared data once."""
 
     def __init__(self, session: Session) -> None:
         assert session.scene is not None
@@ -181,7 +181,7 @@ class Mechanics:
         self._metrics = make_metrics_context(session.scene.object, session.hand)
 
     def squeeze_forces(self, grasp: Grasp) -> SqueezeForces:
-        """Return the balanced contact forces that the squeeze was made from."""
+        """Return the balanced contact forces from which the squeeze targets were computed."""
         posture = grasp.grasp
         rows = (posture.position, posture.quaternion_wxyz, posture.joint_positions)
         poses = Poses(*(torch.as_tensor(row)[None].to(self._problem.hand.lower) for row in rows))
@@ -192,9 +192,9 @@ class Mechanics:
         return SqueezeForces(contacts.position[0][pressing].double().numpy(), forces[pressing].double().numpy())
 
     def weakest_push(self, grasp: Grasp) -> Float[np.ndarray, "6"] | None:
-        """Return the unit disturbance (force, torque over the object's radius) that the contacts resist least.
+        """Return the unit disturbance (force, torque divided by the object's radius) that the contacts resist least.
 
-        None if the contacts do not close around the object: there is a push that they do not resist at all.
+        None without force closure, because some disturbance is then not resisted at all.
         """
         return prepare_grasp(self._metrics, grasp.grasp).wrench_hull.weakest_push
 
@@ -203,12 +203,12 @@ STAGES = ("retreat", "pregrasp", "grasp", "squeeze")
 
 
 def posture_at(hand: HandModel, grasp: Grasp, at: float) -> Posture:
-    """Return the posture at `at`, 0 for the retreat to 3 for the squeeze, on the straight path between two stages."""
+    """Return the posture at `at` on the path, from 0 (retreat) to 3 (squeeze), with interpolation between stages."""
     stages = (retreat_posture(hand, grasp.pregrasp), grasp.pregrasp, grasp.grasp, grasp.squeeze)
     first = min(max(int(at), 0), len(stages) - 2)
     share = min(max(at - first, 0.0), 1.0)
     start, end = stages[first], stages[first + 1]
-    # The shorter way round: a quaternion and its negative are the same rotation.
+    # q and -q are the same rotation. Interpolate over the smaller angle.
     sign = 1.0 if start.quaternion_wxyz @ end.quaternion_wxyz >= 0 else -1.0
     quaternion = (1 - share) * start.quaternion_wxyz + share * sign * end.quaternion_wxyz
     return Posture(
@@ -229,7 +229,7 @@ def placed_links(
 
 
 def skeletons(hand: HandModel, seen: Snapshot) -> Float[np.ndarray, "hands bones 2 3"]:
-    """Return every hand as lines from each link's origin to its parent's, object frame [m]."""
+    """Return each hand as line segments from the origin of a link's parent to the link's origin, object frame [m]."""
     joints = torch.as_tensor(seen.joint_positions).float()
     links = forward(make_kinematics(hand), joints).translation
     quaternions = torch.as_tensor(seen.quaternions_wxyz).float()

@@ -1,6 +1,6 @@
-"""The list of grasps beside the scene: filter, order and figures. Pure text and HTML.
+"""List of grasps beside the scene: filter, order and figures as text and HTML.
 
-Names and reasons come out of files that strangers may have written. None of them reaches the page unescaped.
+Names and reasons may come from untrusted files, so all of them are escaped.
 """
 
 from __future__ import annotations
@@ -14,13 +14,13 @@ from graspd_core.verify.metrics import METRICS
 from graspd_viewer.drawing import FORCE, GUESSED, HAND, NORMAL, OBJECT, TURN, VERDICTS, WEAKEST
 
 ALL = "all"
-# What is unverified although it was tried: it holds on the likeliest shape, and is not as sure as was asked for.
+# Label of a grasp that passed on the likeliest shape, but not enough robustness checks to be verified.
 LESS_SURE = "less sure"
 FILTERS = (ALL, "verified", LESS_SURE, "unverified", "failed")
-# Metrics of which less is better. More is better for all others.
+# Metrics for which less is better. For all others more is better.
 _LESS = ("penetration", "contact_depth", "self_penetration", "intersection_volume", "least_friction")
 ORDERS = ("rank", "score", "probability", "displacement", *METRICS)
-# Columns of the table, and how many rows are shown about the chosen one.
+# Columns of the table, and rows shown before and after the selected one.
 _COLUMNS, _AROUND = ("payload", "penetration", "contact_area"), 2
 BLOCK = "<div style='font-size:0.8em;line-height:1.5;padding:0 0.8em'>"
 _LEGEND = (
@@ -36,14 +36,14 @@ _OTHER_FIGURES = {
 
 
 def standing(grasp: Grasp) -> str:
-    """Return what is known of a grasp, one of the filters: its verdict, or that it is less sure."""
+    """Return the filter that matches a grasp: its verdict, or `LESS_SURE`."""
     return LESS_SURE if grasp.verdict is Verdict.UNVERIFIED and grasp.trials else str(grasp.verdict)
 
 
 def listed(grasps: Sequence[Grasp], which: str, by: str) -> list[int]:
-    """Return ranks of the grasps that pass a filter, best first by an order, those without the figure last.
+    """Return the ranks of the grasps that pass filter `which`, sorted best first by `by`. Missing figures come last.
 
-    An unknown filter or order, which only a forged message can hold, counts as the first.
+    An unknown filter or order counts as the first one. Only a forged message can contain it.
     """
     ranks = [rank for rank, grasp in enumerate(grasps) if which not in FILTERS[1:] or standing(grasp) == which]
 
@@ -55,7 +55,7 @@ def listed(grasps: Sequence[Grasp], which: str, by: str) -> list[int]:
 
 
 def _value(grasp: Grasp, rank: int, by: str) -> float | None:
-    """Return the value that a grasp is sorted by, less first, None without such a figure."""
+    """Return the sort key of a grasp (smaller is better). None if the grasp lacks the figure."""
     if by == "score":
         return -grasp.score
     if by == "probability":
@@ -67,7 +67,7 @@ def _value(grasp: Grasp, rank: int, by: str) -> float | None:
 
 
 def label(grasp: Grasp, rank: int) -> str:
-    """Return one line for the list of choices."""
+    """Return the text of a grasp in the dropdown list."""
     said = standing(grasp)
     mark = {"verified": "✓", LESS_SURE: "~", "failed": "✗"}.get(said, "·")
     return f"{mark} #{rank} {said}{_likely(grasp, ', ')}, {len(grasp.contacts)} contacts"
@@ -78,7 +78,7 @@ def _likely(grasp: Grasp, before: str) -> str:
 
 
 def legend_html() -> str:
-    """Return the colours of the scene with their names, of which every arrow has one."""
+    """Return the legend of the scene's colours."""
     patches = (
         f"<span style='white-space:nowrap;margin-right:0.8em'>"
         f"<span style='color:rgb({', '.join(str(round(255 * c)) for c in colour)})'>{mark}</span> {name}</span>"
@@ -88,7 +88,7 @@ def legend_html() -> str:
 
 
 def table_html(grasps: Sequence[Grasp], ranks: Sequence[int], chosen: int | None) -> str:
-    """Return the rows of the list about the chosen one."""
+    """Return the rows of the table around the selected grasp."""
     if not ranks:
         return "<i>no grasp passes this filter</i>"
     middle = ranks.index(chosen) if chosen in ranks else 0
@@ -104,7 +104,7 @@ def table_html(grasps: Sequence[Grasp], ranks: Sequence[int], chosen: int | None
 
 
 def figures_html(grasp: Grasp, rank: int) -> str:
-    """Return all that is known of one grasp, each figure with its meaning."""
+    """Return all figures of one grasp. Each has its description as a tooltip."""
     r, g, b = (round(255 * channel) for channel in VERDICTS[grasp.verdict])
     reason = f": {html.escape(grasp.reason)}" if grasp.reason else ""
     head = f"<b>#{rank} <span style='color:rgb({r},{g},{b})'>{standing(grasp)}</span></b>{reason}"

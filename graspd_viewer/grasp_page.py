@@ -1,4 +1,4 @@
-"""Grasps to look at: a page for any browser that needs no network, and a picture. Both look from where most is seen."""
+"""HTML page and PNG picture of grasps. Both use the view in which object and hand are least hidden."""
 
 from __future__ import annotations
 
@@ -25,11 +25,11 @@ from graspd_viewer.drawing import HAND, NORMAL, OBJECT, Colour, contact_parts, h
 from graspd_viewer.grasp_list import label
 
 PREGRASP: Colour = (0.62, 0.66, 0.72)
-# Grasps that a page has at most, vertical field of view [rad], and the size of a picture.
+# Most grasps of a page, vertical field of view [rad], and size of a picture [pixels].
 _MOST, _FIELD, _SIZE = 16, 0.7, (960, 720)
-# Where a view may be from, and the size of the pictures that decide: azimuths, and elevations [rad].
+# Candidate views: number of azimuths, elevations [rad], and size of the test images [pixels].
 _AZIMUTHS, _ELEVATIONS, _SMALL = 12, (0.2, 0.6, 1.0), (48, 36)
-# Kinds of a page's nodes: their name in the legend, their colour, and whether they are shown at first.
+# Kinds of nodes on a page: key, name in the legend, colour, and whether they are visible at first.
 _LEGEND = (
     ("object", "object", OBJECT, True),
     ("hand", "hand at the grasp", HAND, True),
@@ -47,19 +47,19 @@ def save_view(
     name: str = "object",
     up: Float[np.ndarray, "3"] | None = None,
 ) -> None:
-    """Write a page with the object and the hand at the grasps that did not fail, of which a visitor chooses one.
+    """Write an HTML page with the object and the hand. The visitor selects one of the grasps that did not fail.
 
     Args:
-        path: of the page. It appears whole or not at all.
-        object_mesh: object frame [m].
-        hand: that the grasps are for.
-        grasps: in rank order. If all failed, the page shows the object alone.
-        name: of the object, for the page's title.
-        up: upwards in the object's frame, by default its z axis.
+        path: path of the page. The file is written atomically.
+        object_mesh: mesh in the object's frame [m].
+        hand: the hand of the grasps.
+        grasps: grasps in rank order. If all failed, the page shows only the object.
+        name: name of the object for the page's title.
+        up: up direction in the object's frame. If None, this is the z axis.
     """
     from trimesh.viewer.notebook import scene_to_html
 
-    # The page keeps places as float32.
+    # The page stores positions as float32.
     far = far_centre(object_mesh.vertices)
     mesh = moved_mesh(object_mesh, -far)
     shown = [(rank, moved_grasp(g, -far)) for rank, g in enumerate(grasps) if g.verdict is not Verdict.FAILED][:_MOST]
@@ -73,7 +73,7 @@ def save_view(
     }
     title = html.escape(f"{name}, {hand.name}: {f'{shown[0][1].verdict} grasp' if shown else 'no grasp'}")
     added = _PAGE.replace("@TITLE@", title).replace("@FOV@", f"{np.degrees(_FIELD):.1f}")
-    # `</` would end the script that the data stands in.
+    # The sequence `</` could end the script element early.
     added = added.replace("@DATA@", json.dumps(data).replace("</", "<\\/"))
     page = scene_to_html(view_scene(mesh, hand, [grasp for _, grasp in shown]))
     page = re.sub("<title>.*?</title>", lambda _: f"<title>{title}</title>", page, count=1)
@@ -94,7 +94,7 @@ def save_picture(
     eye, target, up = best_view(object_mesh, held, up)
     look: Any = {"T_world_camera": look_at(eye, target, up), "width": _SIZE[0], "height": _SIZE[1]}
     image = render_shaded([(object_mesh, OBJECT), *([(held, HAND)] if held else [])], **look)
-    # Contacts lie between hand and object: they are drawn through both.
+    # Contacts are hidden between hand and object, so their arrows are drawn on top.
     for part in contact_parts(grasp.contacts) if grasp else ():
         arrows = render_shaded([(part.mesh, part.colour)], **look)
         image = np.where((arrows == BACKGROUND).all(-1, keepdims=True), image, arrows)
@@ -104,9 +104,9 @@ def save_picture(
 def best_view(
     object_mesh: TriangleMesh, hand: TriangleMesh | None, up: Float[np.ndarray, "3"] | None = None
 ) -> tuple[Float[np.ndarray, "3"], Float[np.ndarray, "3"], Float[np.ndarray, "3"]]:
-    """Return an eye, what it looks at and upwards [m], from where the lesser seen of object and hand is seen most.
+    """Return eye position, target position [m] and up direction of the best view on object and hand.
 
-    How much is seen counts in pixels, as a share of the most that any view shows of it.
+    The view maximises the lower of both bodies' visibilities: pixel counts relative to the maximum over all views.
     """
     meshes = [object_mesh] if hand is None else [object_mesh, hand]
     corners = np.concatenate([mesh.vertices for mesh in meshes])
@@ -127,7 +127,7 @@ def best_view(
 
 
 def view_scene(object_mesh: TriangleMesh, hand: HandModel, grasps: Sequence[Grasp]):
-    """Return the object and the hand's links at grasps and pregrasps as a `trimesh.Scene`, object frame [m]."""
+    """Return a `trimesh.Scene` with the object and the hand's links at grasps and pregrasps, object frame [m]."""
     import trimesh
 
     scene = trimesh.Scene()
@@ -156,14 +156,14 @@ def _body(mesh: TriangleMesh, colour: Colour) -> Any:
     from trimesh.visual import TextureVisuals
     from trimesh.visual.material import PBRMaterial
 
-    # A metal without surroundings to reflect is black, and metal is what a file means that does not say.
+    # The default material is metallic, and metal without an environment map is rendered black.
     material = PBRMaterial(
         baseColorFactor=[*(round(255 * c) for c in colour), 255],
         metallicFactor=0.0,
         roughnessFactor=0.9,
         doubleSided=True,
     )
-    # Faces that share no vertices are shaded flat, which is what shows the edges of a hand made of boxes.
+    # Faces without shared vertices are shaded flat, which shows the edges of the hand's boxes.
     corners = mesh.vertices[mesh.faces].reshape(-1, 3)
     body = trimesh.Trimesh(corners, np.arange(len(corners)).reshape(-1, 3), process=False)
     body.visual = TextureVisuals(material=material)

@@ -1,4 +1,4 @@
-"""The tab of grasps: the list, the path of the hand, the drawings of a grasp, and its trial."""
+"""Tab of grasps: the list, the hand's path, the drawings of a grasp, and its trial."""
 
 from __future__ import annotations
 
@@ -16,11 +16,11 @@ from graspd_viewer.session import Session
 from graspd_viewer.trial_controls import TrialControls
 
 _NONE = "no grasp"
-# From half-way to the scrubber's place [s]: half of the time between two positions of a slider, of which the page sends
-# at most 20 a second.
+# Delay between the intermediate pose and the slider's pose [s]. The page sends at most 20 slider positions a second.
+# Half of this period makes the motion smoother.
 _HALF_PERIOD = 0.025
 _AXES = ("none", "x", "y", "z")
-# What a visitor may hide, by group of nodes, and whether it is shown at first.
+# Groups of nodes that a visitor may hide, and whether they are visible at first.
 _SHOWN = {"contacts": True, "forces": True, "weakest": True, "around": True, "cloud": True, "object": True}
 _NAMES = {
     "contacts": "Contacts and normals (blue)", "forces": "Squeeze forces (red)",
@@ -30,7 +30,7 @@ _NAMES = {
 
 
 class GraspTab:
-    """Widgets of the tab and their actions. `jobs` draws everything, in one thread."""
+    """Widgets of the tab and their actions. All drawing runs in the thread of `jobs`."""
 
     def __init__(self, server: Any, jobs: LatestJobs, nodes: SceneNodes) -> None:
         self._server, self._jobs, self._nodes = server, jobs, nodes
@@ -87,9 +87,9 @@ class GraspTab:
             self.step(-1 if self._step.value == "Previous" else 1)
 
     def show(self, session: Session) -> None:
-        """Show another session, its first grasp first. Call it from the drawing thread."""
+        """Show another session and select its first grasp. Call it in the drawing thread."""
         self._session = session
-        # Made when the first grasp asks: it takes as long as opening the file does.
+        # Created for the first selected grasp, because it takes as long as opening the file.
         self._mechanics = None
         notes = "".join(f"\n\n*{_plain(note)}*" for note in session.notes[:6])
         self._title.content = f"**{_plain(session.title)}**, {_plain(session.hand.name)}{notes}"
@@ -100,11 +100,11 @@ class GraspTab:
         self._draw_slice()
 
     def step(self, by: int) -> None:
-        """Choose the next grasp of the list, or the one before."""
+        """Select the grasp `by` places further in the list. Negative values go back."""
         self._jobs.submit("choose", lambda: self._choose_place(by))
 
     def draw_pose(self, at: float | None = None) -> None:
-        """Put hand and object where the scrubber says, or at another place of the path."""
+        """Pose the hand at the slider's place on the path, or at `at` (0 to 3), and reset the object's pose."""
         self._at = float(self._stage.value) if at is None else at
         grasp = self._grasp()
         if self.trial.stop():
@@ -155,7 +155,7 @@ class GraspTab:
     def _draw_contacts(self) -> None:
         grasp = self._grasp()
         self._nodes.draw("contacts", contact_parts(grasp.contacts) if grasp else ())
-        # Behind the pose, which is what a visitor waits for.
+        # Draw these after the pose, for which the visitor waits.
         self._nodes.draw("forces", ())
         self._nodes.draw("weakest", ())
         self._jobs.submit("mechanics", self._draw_mechanics, after=0.05)

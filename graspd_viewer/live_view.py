@@ -1,4 +1,4 @@
-"""A run while it plans: starts that move, candidates that drop out, trials that turn green or red."""
+"""Live view of a run: starts during the optimisation, candidates, and verdicts of the trials."""
 
 from __future__ import annotations
 
@@ -14,18 +14,18 @@ from graspd_viewer.scene_nodes import SceneNodes
 from graspd_viewer.server import LatestJobs
 from graspd_viewer.session import Session
 
-# Least time from one picture to the next [s], and hands in one at most.
+# Least time between two updates [s], and most hands drawn.
 INTERVAL, _MOST_HANDS = 0.2, 256
 _WORDS = {Stage.OPTIMISE: "searching", Stage.VERIFY: "trying"}
 
 
 class LiveView:
-    """Hooks for `plan_grasps`: the planning thread hands over what it has, and the drawing thread draws it.
+    """Hooks for `plan_grasps`. The planning thread passes snapshots, and the drawing thread draws them.
 
     Args:
-        jobs: that draw.
-        nodes: that are drawn.
-        told: shows how far the run is: a line, and the share of its stage that is done.
+        jobs: queue of the drawing thread.
+        nodes: nodes to draw.
+        told: shows progress as a line and the fraction of the stage that is done.
     """
 
     def __init__(self, jobs: LatestJobs, nodes: SceneNodes, told: Callable[[str, float], None]) -> None:
@@ -35,23 +35,23 @@ class LiveView:
         self._drawn = -float("inf")
 
     def begin(self, session: Session) -> None:
-        """Begin a run for the hand and the object of a session."""
+        """Start the view of a run with the hand and the origin of a session."""
         self._origin, self._hand = session.origin, session.hand
 
     def end(self) -> None:
-        """End the run and remove its drawings."""
+        """End the view and remove its drawings."""
         self._hand = None
         self._jobs.submit("live", lambda: self._nodes.draw_lines(np.zeros((0, 2, 3)), np.zeros((0, 3))))
 
     def progress(self, progress: Progress) -> None:
-        """Take a report of `plan_grasps`, as its progress hook."""
+        """Show a progress report. This is the progress hook of `plan_grasps`."""
         found = f", {progress.verified} verified" if progress.verified else ""
         line = f"{_WORDS.get(progress.stage, progress.stage)} {progress.step} of {progress.of}{found}"
         share = progress.step / progress.of if progress.of else 0.0
         self._jobs.submit("progress", lambda: self._told(f"{line}, {progress.elapsed:.1f} s", share), self._wait())
 
     def watch(self, seen: Snapshot) -> None:
-        """Take hands of `plan_grasps`, as its watch hook. It costs the run no more than handing over."""
+        """Draw a snapshot. This is the watch hook of `plan_grasps`. It returns at once."""
         hand = self._hand
         if hand is not None:
             self._jobs.submit("live", lambda: self._draw(hand, seen), self._wait())

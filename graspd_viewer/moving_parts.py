@@ -1,4 +1,4 @@
-"""A page with parts that move while something runs, the points that a camera saw, and a line of text."""
+"""Web page with moving parts, camera points and lines of text, for a running simulation."""
 
 from __future__ import annotations
 
@@ -21,12 +21,12 @@ Pose = Float[np.ndarray, "4 4"]
 
 
 class MovingParts:
-    """A page that shows parts. Every method returns at once, and a thread of the page draws the newest.
+    """Web page that shows moving parts. A thread draws the newest state, and drawing methods return at once.
 
     Args:
-        parts: that move, each in its own frame.
-        eye, middle: where visitors look from, and at what [m].
-        host, port: to listen on. By default only this machine can connect, and the next free port is taken.
+        parts: moving parts, each in its own frame.
+        eye, middle: position of the visitor's camera, and the point at which it looks [m].
+        host, port: address to listen on. By default only this machine can connect. A used port is replaced by the next.
 
     Raises:
         ConfigError: the address cannot be listened on, or viser is not installed.
@@ -59,25 +59,25 @@ class MovingParts:
         return f"http://{host}:{self._server.get_port()}"
 
     def wait_for_visitor(self, patience: float, stop: Callable[[], bool] = lambda: False) -> None:
-        """Return when somebody has opened the page, or after `patience` seconds."""
+        """Wait until a visitor opens the page, `patience` seconds have passed, or `stop` returns True."""
         end = time.monotonic() + patience
         while not self._server.get_clients() and time.monotonic() < end and not stop():
             time.sleep(0.05)
 
     def place(self, poses: Sequence[Pose]) -> None:
-        """Put the moving parts somewhere, in their order [m]."""
+        """Set the poses of the moving parts, in their order [m]."""
         self._jobs.submit("place", lambda: self._nodes.place("moving", poses))
 
     def draw(self, group: str, parts: Sequence[Part]) -> None:
-        """Draw parts that stand still, in place of the group's earlier ones."""
+        """Replace the fixed parts of a group."""
         self._jobs.submit(group, lambda: self._nodes.draw(group, parts))
 
     def draw_points(self, points: Float[np.ndarray, "n 3"]) -> None:
-        """Draw the points that a camera saw, in place of earlier ones [m]."""
+        """Replace the drawn camera points [m]."""
         self._jobs.submit("points", lambda: self._nodes.draw_points(points))
 
     def tell(self, *lines: str) -> None:
-        """Show lines of text in place of earlier ones."""
+        """Replace the lines of text."""
         text = "<br>".join(map(html.escape, lines))
         self._jobs.submit("text", lambda: setattr(self._text, "content", f"{BLOCK}{text}</div>"))
 

@@ -1,6 +1,6 @@
-"""The tab where visitors plan: an object, a hand, a preset, and Plan, Stop and Save. One run at a time, seen by all.
+"""Tab where visitors plan: object, hand, preset, and the buttons Plan, Stop and Save. All visitors share one run.
 
-A visitor's request is checked here, because a forged message may hold anything in any field.
+This module checks every request, because a forged message may contain any value.
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ from graspd_viewer.live_view import LiveView
 from graspd_viewer.session import Session, make_session, seen_points
 
 UNITS = {"m": 1.0, "cm": 1e-2, "mm": 1e-3}
-# Directions that the hand may be asked to come from, and the way that it then moves, in the object's frame.
+# Sides from which the hand may come, and the direction in which it then moves, in the object's frame.
 APPROACHES = {
     "any side": None,
     "above": (0.0, 0.0, -1.0),
@@ -51,31 +51,31 @@ MOST_GRASPS = 64
 
 @dataclass(frozen=True)
 class Upload:
-    """A file that a visitor sent: its name, which is only ever shown, and its content."""
+    """File from a visitor. Its name is only displayed and never used as a path."""
 
     name: str
     content: bytes
 
     @property
     def ending(self) -> str:
-        """The ending in lower case, without a dot."""
+        """File ending in lower case without the dot. Empty if there is none."""
         return self.name.rpartition(".")[2].lower() if "." in self.name else ""
 
 
 @dataclass(frozen=True)
 class PlanRequest:
-    """One run.
+    """Settings of one run.
 
     Attributes:
-        shape: name of an authored shape, if no file was sent.
-        upload: the object's file.
-        units: of the file's coordinates, a key of `UNITS`.
-        alone: a cloud shows the object and nothing else.
-        hand, preset: names.
-        friction: coefficient.
-        approach: where the hand comes from, a key of `APPROACHES`.
-        approach_angle: greatest angle between that direction and a grasp's [degrees].
-        count, seed: as of `plan_grasps`.
+        shape: name of a built-in shape. It is used if there is no upload.
+        upload: file of the object, or None.
+        units: unit of the file's coordinates, a key of `UNITS`.
+        alone: True if the cloud contains only the object.
+        hand, preset: names of built-in hands and presets.
+        friction: friction coefficient.
+        approach: side from which the hand comes, a key of `APPROACHES`.
+        approach_angle: greatest angle between this direction and the grasp's approach [degrees].
+        count, seed: arguments of `plan_grasps`.
     """
 
     shape: str
@@ -92,13 +92,13 @@ class PlanRequest:
 
     @property
     def restrictions(self) -> tuple[Steering, ...]:
-        """The restrictions for `plan_grasps`. Raises ConfigError: the angle is out of its range."""
+        """Restrictions for `plan_grasps`. Raises ConfigError: the angle is out of range."""
         direction = APPROACHES[self.approach]
         return () if direction is None else (Steering(direction, math.radians(self.approach_angle)),)
 
 
 def check(request: PlanRequest) -> None:
-    """Refuse what no honest visitor can ask for: names only, no paths. Raises ConfigError: names the valid values."""
+    """Check all fields of a request. Raises ConfigError: a value is invalid. The message names the valid values."""
     chosen = (
         ("shape", request.shape, tuple(SHAPES)),
         ("units", request.units, tuple(UNITS)),
@@ -120,19 +120,19 @@ def check(request: PlanRequest) -> None:
 
 
 def load_object(request: PlanRequest) -> tuple[Scene, Any]:
-    """Load the scene of a checked request, and the points that it was made of [m].
+    """Return the scene of a checked request, and the camera points from which it was made [m].
 
-    The process's child reads a file: a reader that crashes or is misled ends there.
+    A child process reads the file, so that a crash or an exploit of a reader cannot harm this process.
 
     Raises:
-        GraspdError: the object cannot be used. The message names the file as the visitor does.
+        GraspdError: the object cannot be used. The message contains the visitor's file name.
     """
     if request.upload is None:
         source = f"{SHAPE_PREFIX}{request.shape}"
         return load_scene(source, friction=request.friction), seen_points(source)
     start_planning_worker()
     with tempfile.TemporaryDirectory(prefix="graspd-view-") as folder:
-        # The name is ours, its ending one of ours: nothing that a visitor typed is part of a path.
+        # The path contains no text of the visitor, except an ending from a fixed list.
         path = Path(folder) / f"object.{request.upload.ending}"
         path.write_bytes(request.upload.content)
         scale = UNITS[request.units]
@@ -147,13 +147,13 @@ _FILE = "the file sent"
 
 
 class PlanTab:
-    """Widgets of the tab, and the thread that plans.
+    """Widgets of the tab, and the planning thread.
 
     Args:
-        server: of the page.
-        live: shows the run.
-        show: shows a session, from any thread.
-        say: shows a line and how far the run is, from any thread.
+        server: server of the page.
+        live: live view of the run.
+        show: thread-safe function that shows a session.
+        say: thread-safe function that shows a line and the progress, 0 to 1.
     """
 
     def __init__(self, server: Any, live: LiveView, show: Callable[[Session], None], say: Callable[..., None]) -> None:
@@ -191,15 +191,15 @@ class PlanTab:
                 event.client.send_file_download("grasps.json", self._saved, save_immediately=True)
 
     def tell(self, line: str, share: float) -> None:
-        """Show how far a run is. From the drawing thread."""
+        """Show a line and the progress (0 to 1) of a run. Call it in the drawing thread."""
         self._status.content, self._bar.value = f"{BLOCK}{html.escape(line)}</div>", 100.0 * min(max(share, 0.0), 1.0)
 
     def plan(self) -> None:
-        """Begin the run that the widgets ask for, unless one is under way."""
+        """Start a run with the values of the widgets, unless a run is in progress."""
         self.begin(lambda _: self._plan_and_show(self._request()))
 
     def begin(self, work: Callable[[StopHook], None]) -> None:
-        """Do other work in the planning thread, unless a run is under way. `work` gets the stop hook."""
+        """Call `work` with the stop hook in the planning thread, unless a run is in progress."""
         if not self._busy.acquire(blocking=False):
             return
         self._stop.clear()
@@ -208,7 +208,7 @@ class PlanTab:
         self._thread.start()
 
     def close(self) -> None:
-        """End the run that is under way, if any."""
+        """Stop the run in progress, if any, and wait at most 10 s for its end."""
         self._stop.set()
         if self._thread is not None:
             self._thread.join(10.0)
@@ -228,7 +228,7 @@ class PlanTab:
         self._say(f"refused: {reason}")
 
     def _request(self) -> PlanRequest:
-        """Return the checked request of the widgets. Raises ConfigError."""
+        """Return the checked request of the widgets. Raises ConfigError: a value is invalid."""
         sent = self._upload if self._object.value == _FILE else None
         try:
             friction, count, angle = float(self._friction.value), int(self._count.value), float(self._angle.value)

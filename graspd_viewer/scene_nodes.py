@@ -1,4 +1,4 @@
-"""The three-dimensional half of the page: the meshes of `drawing` as viser's nodes. Used from the drawing thread."""
+"""3D scene of the page: the meshes of `drawing` as viser nodes. Only the drawing thread uses it."""
 
 from __future__ import annotations
 
@@ -17,13 +17,13 @@ from graspd_viewer.drawing import SEEN, Colour, Part, hand_parts, placed_links, 
 from graspd_viewer.session import Session
 
 _MOST_POINTS = 20_000
-# The browser's scene is in centimetres. viser's page holds an empty background one unit before the camera, which takes
-# a software browser a fifth of a frame's time. Nothing is drawn that is nearer than `_NEAR` units.
+# The browser's scene is in centimetres. viser draws an empty background one unit from the camera, which costs a
+# software renderer a fifth of the frame time. The near plane at `_NEAR` units removes this background.
 PER_METRE, _NEAR = 100.0, 1.01
 
 
 class SceneNodes:
-    """The nodes of one server: one hand, one object and its surroundings, arrows, a slice, and lines."""
+    """Scene nodes of one server: a hand, an object with its surroundings, arrows, a slice, and lines."""
 
     def __init__(self, server: Any) -> None:
         self._server = server
@@ -32,7 +32,7 @@ class SceneNodes:
         self._object: Any = None
         self._hidden: set[str] = set()
         self._opacity = 1.0
-        # viser's own lights, shadows and reflections bring a browser that draws in software to 1 frame a second.
+        # With viser's default lights, shadows and reflections a software renderer reaches only 1 frame a second.
         server.initial_camera.near = _NEAR
         server.scene.configure_default_lights(False)
         server.scene.configure_environment_map(None)
@@ -42,7 +42,7 @@ class SceneNodes:
         server.scene.add_light_directional("/light/sun", intensity=1.5, cast_shadow=False, position=(1.0, 1.0, 2.0))
 
     def show(self, session: Session) -> None:
-        """Draw a session's object and hand anew, and nothing else."""
+        """Clear the scene and draw the object, surroundings, points and hand of a session."""
         with self._server.atomic():
             for name in list(self._groups):
                 self.draw(name, ())
@@ -57,7 +57,7 @@ class SceneNodes:
         self._aim(session)
 
     def draw(self, group: str, parts: Sequence[Part]) -> None:
-        """Draw parts in place of the group's earlier ones."""
+        """Replace the parts of a group."""
         for node in self._groups.pop(group, ()):
             node.remove()
         nodes = [self._mesh(f"/{part.name}", part) for part in parts]
@@ -66,7 +66,7 @@ class SceneNodes:
         self._groups[group] = nodes
 
     def draw_lines(self, lines: Float[np.ndarray, "n 2 3"], colours: Float[np.ndarray, "n 3"]) -> None:
-        """Draw lines in place of earlier ones."""
+        """Replace the drawn line segments [m]. `colours` are RGB, 0 to 1."""
         for node in self._groups.pop("lines", ()):
             node.remove()
         if len(lines):
@@ -77,7 +77,7 @@ class SceneNodes:
             self._groups["lines"] = [node]
 
     def draw_slice(self, session: Session, axis: int | None, share: float) -> None:
-        """Draw the signed distance on a plane normal to an axis, for None nothing."""
+        """Replace the SDF slice normal to `axis` at the fraction `share` of the grid. If `axis` is None, remove it."""
         for node in self._groups.pop("slice", ()):
             node.remove()
         if axis is None or session.scene is None:
@@ -94,23 +94,23 @@ class SceneNodes:
         self._groups["slice"] = [node]
 
     def set_visible(self, group: str, visible: bool) -> None:
-        """Show or hide a group, now and when it is drawn again."""
+        """Show or hide a group, now and in later drawings."""
         (self._hidden.discard if visible else self._hidden.add)(group)
         for node in self._groups.get(group, ()):
             node.visible = visible
 
     def pose_hand(self, hand: HandModel, posture: Posture) -> None:
-        """Put the hand at a posture."""
+        """Set the hand's posture."""
         self.pose_links(*placed_links(hand, posture))
 
     def pose_links(self, positions: Float[np.ndarray, "_ 3"], quaternions: Float[np.ndarray, "_ 4"]) -> None:
-        """Put every link at its pose. Rows beyond the links are left out."""
+        """Set the pose of each link: positions [m] and quaternions wxyz, by link index."""
         with self._server.atomic():
             for link, node in self._links.items():
                 node.position, node.wxyz = PER_METRE * positions[link], quaternions[link]
 
     def pose_object(self, position: Float[np.ndarray, "3"], quaternion: Float[np.ndarray, "4"]) -> None:
-        """Move the object from where it was planned on."""
+        """Set the object's pose relative to its pose during planning: position [m] and quaternion wxyz."""
         if self._object is not None:
             self._object.position, self._object.wxyz = PER_METRE * position, quaternion
 
@@ -119,7 +119,7 @@ class SceneNodes:
             node.visible = visible
 
     def fade_hand(self, opacity: float) -> None:
-        """Make the hand more or less see-through, now and when it is drawn again."""
+        """Set the hand's opacity (0.05 to 1), now and in later drawings."""
         self._opacity = min(max(opacity, 0.05), 1.0)
         for node in self._links.values():
             node.opacity = None if self._opacity == 1.0 else self._opacity
@@ -131,12 +131,12 @@ class SceneNodes:
         self.fade_hand(self._opacity)
 
     def place(self, group: str, poses: Sequence[Float[np.ndarray, "4 4"]]) -> None:
-        """Move the parts of a group, in their order [m]."""
+        """Set the poses of the parts of a group, in their order [m]."""
         for node, pose in zip(self._groups.get(group, ()), poses, strict=True):
             node.position, node.wxyz = PER_METRE * pose[:3, 3], _quaternion(pose[:3, :3])
 
     def draw_points(self, points: Float[np.ndarray, "n 3"]) -> None:
-        """Draw points in place of earlier ones [m]."""
+        """Replace the drawn points [m]."""
         for node in self._groups.pop("cloud", ()):
             node.remove()
         nodes = []
@@ -147,11 +147,11 @@ class SceneNodes:
         self._groups["cloud"] = nodes
 
     def _mesh(self, name: str, part: Part) -> Any:
-        # Of a closed body nobody sees the inside: to draw it takes a software browser a fifth of a frame's time.
+        # The inside of a closed body is invisible. Drawing it costs a software renderer a fifth of the frame time.
         mesh, hand = part.mesh, name.startswith("/hand")
         closed = hand or is_closed(mesh)
-        # Solids look much the same in five shades, which take a sixth less of that time. They know no flat shading, so
-        # that every face has corners of its own.
+        # Toon shading looks similar on solids and saves a sixth of that time. It has no flat shading, so each face gets
+        # its own vertices.
         if hand:
             mesh = TriangleMesh(mesh.vertices[mesh.faces].reshape(-1, 3), np.arange(mesh.faces.size).reshape(-1, 3))
         return self._server.scene.add_mesh_simple(
@@ -161,7 +161,7 @@ class SceneNodes:
         )  # fmt: skip
 
     def _aim(self, session: Session) -> None:
-        """Aim every visitor's camera at the object, with the support's free side up."""
+        """Point every visitor's camera at the object. Up is the support's normal, or z without a support."""
         middle, size, up = np.zeros(3), 0.1, np.array([0.0, 0.0, 1.0])
         if session.scene is not None:
             corners = session.scene.object.mesh.vertices
@@ -173,7 +173,7 @@ class SceneNodes:
         self.aim(middle + (0.14 + 1.5 * size) * (0.75 * side + 0.55 * np.cross(up, side) + 0.45 * up), middle, up)
 
     def aim(self, eye: Float[np.ndarray, "3"], middle: Float[np.ndarray, "3"], up: Float[np.ndarray, "3"]) -> None:
-        """Let every visitor's camera look from `eye` at `middle` [m]."""
+        """Point every visitor's camera from `eye` at `middle` [m]."""
         self._server.scene.set_up_direction(up)
         for camera in (self._server.initial_camera, *(c.camera for c in self._server.get_clients().values())):
             camera.position, camera.look_at = PER_METRE * eye, PER_METRE * middle

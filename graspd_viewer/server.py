@@ -1,8 +1,8 @@
-"""A viser server that may be left running, and the one thread that draws.
+"""Restricted viser server, and the drawing thread.
 
-viser serves anybody on every interface, lets any page in the same browser connect, takes files of any size, and opens a
-public tunnel when a visitor asks for one. This server does none of it. The thread draws the newest job of each kind, so
-that no flood of sliders piles up.
+By default viser listens on every interface, lets any web page connect, accepts files of any size, and opens a public
+tunnel for a visitor. This server does none of these. The drawing thread runs only the newest job of each kind, so that
+slider events do not pile up.
 """
 
 from __future__ import annotations
@@ -23,10 +23,10 @@ Work = Callable[[], object]
 
 
 class LatestJobs:
-    """A thread that does the newest job of each kind. Replaced jobs are never done.
+    """Thread that runs the newest job of each kind. Replaced jobs never run.
 
     Args:
-        failed: called with the exception of a job.
+        failed: called with the exception of a failed job.
     """
 
     def __init__(self, failed: Callable[[Exception], None]) -> None:
@@ -38,18 +38,18 @@ class LatestJobs:
         self._thread.start()
 
     def submit(self, kind: str, work: Work, after: float = 0.0) -> None:
-        """Submit a job, due `after` seconds from now, in place of a waiting one of its kind."""
+        """Submit a job to run after `after` seconds. It replaces a waiting job of its kind."""
         with self._change:
             self._waiting[kind] = time.monotonic() + after, work
             self._change.notify()
 
     def drop(self, kind: str) -> None:
-        """Drop a waiting job of that kind."""
+        """Remove the waiting job of a kind, if any."""
         with self._change:
             self._waiting.pop(kind, None)
 
     def close(self) -> None:
-        """End the thread after its present job."""
+        """End the thread after its current job."""
         with self._change:
             self._closed = True
             self._change.notify()
@@ -74,17 +74,17 @@ class LatestJobs:
                 self._failed(error)
 
 
-# Largest file that a visitor may send, and how many at a time [bytes].
+# Largest file that a visitor may upload [bytes], and most simultaneous uploads of a visitor.
 LARGEST_UPLOAD = 64 * 2**20
 _UPLOADS_AT_ONCE = 2
 LOCAL = ("localhost", "127.0.0.1", "::1")
 
 
 def start_server(host: str, port: int) -> Any:
-    """Start a `viser.ViserServer` on that address, on the next free port after `port`.
+    """Start a `viser.ViserServer` on `host`, at `port` or the next free port.
 
     Raises:
-        ConfigError: no viser, or no such address on this machine.
+        ConfigError: viser is not installed, the port is invalid, or this machine does not have the address.
     """
     with Extra("view"):
         import viser
@@ -105,7 +105,7 @@ def start_server(host: str, port: int) -> Any:
 
 
 def name_tab(server: Any, title: str) -> None:
-    """Name the tab of the page in every visitor's browser. viser has no public way to do so."""
+    """Set the title of every visitor's browser tab. viser has no public API for this."""
     from viser._messages import RunJavascriptMessage
 
     told = RunJavascriptMessage(source=f"document.title = {json.dumps(title)}")
@@ -113,15 +113,15 @@ def name_tab(server: Any, title: str) -> None:
 
 
 def quiet() -> contextlib.AbstractContextManager[Any]:
-    """Keep viser from printing banners."""
+    """Return a context that suppresses viser's banners."""
     return contextlib.redirect_stdout(io.StringIO())
 
 
 def may_connect(origin: str | None, named: str | None, host: str) -> bool:
-    """Tell whether a page of `origin` may talk to the server that it calls `named`, which listens on `host`.
+    """Return True if a client may connect. `origin` and `named` are its Origin and Host headers.
 
-    A page of another site may not, nor a page that calls a local server by a name that is not local. A client that is
-    no page has no origin.
+    Pages of another site must not connect. A server on a local `host` must be addressed by a local name. Clients that
+    are no web pages have no origin and may connect.
     """
     name = urlsplit(f"//{named or ''}")
     if host in LOCAL and name.hostname not in LOCAL:
@@ -149,7 +149,7 @@ def _refuse_tunnels(server: Any) -> None:
 
 
 def _limit_uploads(server: Any) -> None:
-    """Refuse files that are too large or one too many. End a transfer that sends more than it said."""
+    """Refuse too large files and more than two uploads at once. End transfers that exceed their stated size."""
     from viser import _messages
 
     gui = server.gui

@@ -1,4 +1,4 @@
-"""A session of the viewer: grasps, their hand, and the object if it can be had."""
+"""Session of the viewer: grasps, their hand, and the object if available."""
 
 from __future__ import annotations
 
@@ -23,17 +23,17 @@ from graspd_core.types import Grasp, TriangleMesh
 
 @dataclass(frozen=True, eq=False)
 class Session:
-    """What the viewer shows.
+    """Content of the viewer.
 
     Attributes:
-        title: for people.
-        hand: that the grasps are for.
-        grasps: in rank order.
-        scene: None if the object cannot be had. The grasps are shown all the same.
-        config: of the run that found them.
-        seen: points that the cameras saw, object frame [m], empty for a mesh.
-        notes: what a visitor should know, one sentence each.
-        origin: of what is shown, in the frame of the file [m]: zero except for an object far from its own.
+        title: title of the page.
+        hand: the hand of the grasps.
+        grasps: grasps in rank order.
+        scene: scene of the object. None if the object is not available. The grasps are still shown.
+        config: settings of the run that found the grasps.
+        seen: camera points in the object's frame [m]. Empty for a mesh.
+        notes: warnings for visitors, one sentence each.
+        origin: displayed origin in the file's frame [m]. Zero unless the object is far from the file's origin.
     """
 
     title: str
@@ -47,19 +47,19 @@ class Session:
 
 
 def open_grasps(path: Path, *, object_source: str | None = None, hand: str | None = None) -> Session:
-    """Open a grasps file, with the object and the hand that it names.
+    """Open a grasps file with its object and hand.
 
-    An object that cannot be read, or differs from the one that the grasps were planned on, is a note.
+    The session gets a note if the file's object cannot be read, or differs from the planned object.
 
     Args:
-        path: of a file of the format graspd/grasps.
-        object_source: a mesh or cloud file, or shape:NAME. None: what the file names.
-        hand: a name or a path. None: what the file names.
+        path: path of a file in the format graspd/grasps.
+        object_source: mesh file, cloud file or shape:NAME. If None, the file's object is used.
+        hand: name or path of a hand. If None, the file's hand is used.
 
     Raises:
-        FormatError: the file cannot be read, or the hand has other joints than the file.
+        FormatError: the file cannot be read, or its joints are not those of the hand.
         HandError: the hand cannot be read.
-        GraspdError: the object that was asked for by name cannot be read.
+        GraspdError: `object_source` cannot be read.
     """
     document = load_document(path)
     grasps = grasps_of(document)
@@ -80,7 +80,7 @@ def make_session(
     seen: Float[np.ndarray, "points 3"],
     notes: tuple[str, ...],
 ) -> Session:
-    """Make a session about its object. Browsers keep positions as float32, which is too coarse far from the origin."""
+    """Make a session with its origin near the object. Browsers use float32, which is too coarse far from the origin."""
     scene, far = planning_scene(scene, config.resolution)
     return Session(title, hand, tuple(moved_grasp(g, -far) for g in grasps), scene, config, seen - far, notes, far)
 
@@ -88,7 +88,7 @@ def make_session(
 def seen_points(
     source: str | TriangleMesh, scale: float = 1.0, camera: str | Path | None = None
 ) -> Float[np.ndarray, "points 3"]:
-    """Return the points of a cloud file, or of a depth image by its camera's file [m], none for all else."""
+    """Return the points of a cloud file, or of a depth image with its `camera` file [m]. Empty for other sources."""
     if isinstance(source, TriangleMesh) or (camera is None and not is_cloud_file(source)):
         return np.zeros((0, 3))
     points = np.concatenate([view.points for view in scaled_views(source, camera, scale)])
@@ -110,13 +110,13 @@ def _hand_of(document: dict[str, Any], path: Path, wanted: str | None) -> HandMo
 def _object_of(
     document: dict[str, Any], path: Path, wanted: str | None, config: PlanConfig
 ) -> tuple[Scene | None, Float[np.ndarray, "points 3"], tuple[str, ...]]:
-    """Return the scene, the points that it was made of, and notes."""
+    """Return the scene, its camera points [m], and notes."""
     told = document.get("object")
     told = told if isinstance(told, dict) else {}
     source = wanted or _beside(str(told.get("source")), path)
     given = {key: told[key] for key in ("mass", "friction", "scale") if isinstance(told.get(key), int | float)}
     try:
-        # Whether a cloud showed the object alone is not in the file. What stood on nothing was taken whole.
+        # The file does not state `alone`. An object without a support was planned with it.
         alone = told.get("support") is None
         scene = load_scene(source, **given, resolution=config.resolution, alone=alone)
         seen = seen_points(source, given.get("scale", 1.0))

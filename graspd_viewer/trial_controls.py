@@ -1,7 +1,7 @@
-"""A grasp's trial, run again and watched: forwards, step by step, up to the moment and the reason of its failure.
+"""Replay of a grasp's trial up to its end or failure.
 
-A recording holds the poses of hand and object in MuJoCo, and the forces on the object. A recorded trial takes the same
-steps and ends with the same result.
+A recording contains the poses of hand and object in MuJoCo and the contact forces. Recording changes neither the
+trial's steps nor its result.
 """
 
 from __future__ import annotations
@@ -31,19 +31,19 @@ from graspd_viewer.session import Session
 # pyright: reportAttributeAccessIssue=false
 
 
-# Steps from one frame to the next: 50 frames for each simulated second.
+# Simulation steps per frame, which give 50 frames per simulated second.
 FRAME_STEPS = 5
 
 
 @dataclass(frozen=True)
 class Frame:
-    """One moment of a trial in the object's frame at the start, in which a lift moves hand and object up.
+    """State of a trial at one time, in the object's frame at the start. A lift moves hand and object up.
 
     Attributes:
-        stage: what is being done.
-        positions, quaternions: of every link of the hand, in its order, and of the object last [m], wxyz.
-        contacts: where the hand touches the object [m].
-        forces: of the hand on the object there [N].
+        stage: name of the current stage.
+        positions, quaternions: poses of the hand's links in their order, then of the object [m], wxyz.
+        contacts: contact points between hand and object [m].
+        forces: forces of the hand on the object at these points [N].
     """
 
     stage: str
@@ -55,7 +55,7 @@ class Frame:
 
 @dataclass(frozen=True)
 class Recording:
-    """A trial with frames `seconds` of simulated time apart. The last frame is its very end."""
+    """Recorded trial. Frames are `seconds` of simulated time apart. The last frame is the end of the trial."""
 
     result: TrialResult
     frames: tuple[Frame, ...]
@@ -63,12 +63,12 @@ class Recording:
 
 
 def record_trial(context: TrialContext, grasp: Grasp, name: str) -> Recording:
-    """Run one trial of a grasp and record it. Raises ConfigError: no such trial, or none that applies to this scene."""
+    """Run and record one trial of a grasp. Raises ConfigError: the trial is unknown or does not apply to the scene."""
     names = [row.name for row in TRIALS.values() if row.applies(context)]
     if name not in names:
         raise ConfigError(f"trial {shown(name)}: valid for this scene: {', '.join(names)}")
     recorder = _Recorder(context, name)
-    # Data of its own: that of a trial which ended may be in use by a run beside.
+    # Use separate simulation data, because a parallel run may use the shared spare data.
     worlds = {
         which: world and replace(world, watch=recorder, spare=deque())
         for which, world in (("alone", context.alone), ("around", context.around))
@@ -78,7 +78,7 @@ def record_trial(context: TrialContext, grasp: Grasp, name: str) -> Recording:
 
 
 class _Recorder:
-    """A hook that keeps every fifth step of a trial, and the last."""
+    """Hook that stores every fifth step of a trial and the last one."""
 
     def __init__(self, context: TrialContext, name: str) -> None:
         world = context.around if name == "lift" else context.alone
@@ -92,7 +92,7 @@ class _Recorder:
 
     def __call__(self, data: Any) -> None:
         self._steps += 1
-        # The last frame is wanted wherever the trial ends, which nobody knows before.
+        # Any step may be the last one, so the newest frame is always kept.
         self._last = None if self._steps % FRAME_STEPS == 0 else self._frame(data)
         if self._last is None:
             self._frames.append(self._frame(data))
@@ -101,7 +101,7 @@ class _Recorder:
         return tuple(self._frames) if self._last is None else (*self._frames, self._last)
 
     def _frame(self, data: Any) -> Frame:
-        # What is beside the hand sinks in a lift (lift_trial.py). Seen from there, hand and object rise.
+        # In a lift trial the surroundings sink (lift_trial.py). Relative to them, hand and object rise.
         origin = -data.mocap_pos[1] if len(data.mocap_pos) > 1 else np.zeros(3)
         contacts, forces = _contact_forces(self._world, data)
         return Frame(
@@ -114,7 +114,7 @@ class _Recorder:
 
 
 def _contact_forces(world: World, data: Any) -> tuple[Float[np.ndarray, "n 3"], Float[np.ndarray, "n 3"]]:
-    """Return where the hand touches the object, and the force on the object there, world frame [m], [N]."""
+    """Return the contact points of the hand on the object [m] and the forces on the object [N], world frame."""
     import mujoco
 
     places, forces, wrench = [], [], np.zeros(6)
@@ -145,12 +145,12 @@ def _lift_stage(data: Any, protocol: Protocol) -> str:
     return names[int(np.searchsorted(ends + 1e-9, data.time))]
 
 
-# Frames of the page for each second, and of the recording for each of those: as fast as it happened.
+# Frames that the page shows per second. Playback runs in real time.
 _RATE = 25.0
 
 
 class TrialControls:
-    """Widgets of a trial. `jobs` draws everything, in one thread."""
+    """Widgets of a trial. All drawing runs in the thread of `jobs`."""
 
     def __init__(self, gui: Any, jobs: LatestJobs, nodes: SceneNodes) -> None:
         self._jobs, self._nodes = jobs, nodes
@@ -174,7 +174,7 @@ class TrialControls:
                 self._jobs.submit("frame", lambda: self._draw(int(self._time.value)))
 
     def show(self, session: Session, grasp: Grasp | None) -> None:
-        """Show another grasp, without a trial yet. Its own failed trial is offered first."""
+        """Select another grasp and clear the replay. If the grasp failed a trial, preselect this trial."""
         if session is not self._session:
             self._session, self._contexts = session, {}
         self._grasp = grasp
@@ -185,14 +185,14 @@ class TrialControls:
         self._text.content = ""
 
     def stop(self) -> bool:
-        """Leave the trial. Tells whether a moment of it was shown. Call it from the drawing thread."""
+        """End the replay. Return True if a trial was shown. Call it in the drawing thread."""
         self._jobs.drop("play")
         shown, self._recording, self._time.disabled = self._recording is not None, None, True
         self._nodes.draw("trial", ())
         return shown
 
     def play(self) -> None:
-        """Run the trial and play it from its beginning."""
+        """Run the trial and play it from the start."""
         self._jobs.submit("trial", self._run)
 
     def _run(self) -> None:
@@ -247,7 +247,7 @@ class TrialControls:
 
 
 def _told(recording: Recording, index: int, stage: str) -> str:
-    """Return time and stage, and how the trial ended."""
+    """Return time, stage and the trial's result as HTML."""
     result, seconds = recording.result, recording.seconds
     end = seconds * (len(recording.frames) - 1)
     line = f"{seconds * index:.2f} s of {end:.2f} s: {html.escape(stage)}"

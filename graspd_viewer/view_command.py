@@ -1,4 +1,4 @@
-"""`graspd view`: grasps, a benchmark, or a page to plan on, in a browser."""
+"""`graspd view`: shows grasps, a benchmark, or a planning page in a browser."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ if TYPE_CHECKING:
     from graspd_core.perception.scene import Scene
 
 
-# Seconds that a run with --view waits for somebody to look.
+# Seconds that a run with --view waits for a first visitor.
 _PATIENCE = 60.0
 
 
@@ -66,7 +66,7 @@ def run(options: argparse.Namespace) -> int:
 
 @contextmanager
 def watched(options: argparse.Namespace, scene: Scene, hand: HandModel, config: PlanConfig) -> Iterator[Watched]:
-    """Give a page for a run with --view. The run begins when somebody is there or a minute has passed."""
+    """Yield the hooks of a page for a run with --view. The run begins when a visitor is there or after a minute."""
     from graspd_viewer.session import make_session, seen_points
     from graspd_viewer.viewer import Viewer
 

@@ -1,4 +1,4 @@
-"""The page: its tabs, its help, and the thread that draws. It runs until it is closed, and visitors come and go."""
+"""Page of the viewer: tabs, help, and the drawing thread. It runs until it is closed, for any number of visitors."""
 
 from __future__ import annotations
 
@@ -57,11 +57,11 @@ HOST, PORT = "127.0.0.1", 8080
 
 
 class Viewer:
-    """A page that shows sessions to whoever comes.
+    """Web page that shows sessions to all visitors.
 
     Args:
-        host, port: to listen on. By default only this machine can connect, and the next free port is taken.
-        plan: whether visitors may plan.
+        host, port: address to listen on. By default only this machine can connect. A used port is replaced by the next.
+        plan: if True, visitors may plan.
 
     Raises:
         ConfigError: the address cannot be listened on, or viser is not installed.
@@ -74,7 +74,7 @@ class Viewer:
         self._nodes = SceneNodes(self._server)
         gui = self._server.gui
         self._theme(False)
-        # Beside the scene, not over it: what it hid would be drawn all the same.
+        # Dock the panel beside the scene. An overlay would hide part of the scene, which is rendered anyway.
         gui.main_panel.dock_right()
         tabs = gui.add_tab_group()
         with tabs.add_tab("Grasps"):
@@ -105,31 +105,31 @@ class Viewer:
         return self._server.get_port()
 
     def show(self, session: Session) -> None:
-        """Show a session in place of the one before, from any thread."""
+        """Replace the shown session. Thread-safe."""
         self._jobs.submit("session", lambda: self._grasps.show(session))
 
     def wait_for_visitor(self, patience: float) -> None:
-        """Return when somebody has opened the page, or after `patience` seconds."""
+        """Wait until a visitor opens the page, or `patience` seconds have passed."""
         end = time.monotonic() + patience
         while not self._server.get_clients() and time.monotonic() < end:
             time.sleep(0.05)
 
     def do(self, kind: str, work: Callable[[], None]) -> None:
-        """Submit a job to the drawing thread, which does the newest of each kind."""
+        """Submit a job to the drawing thread, which runs the newest job of each kind."""
         self._jobs.submit(kind, work)
 
     def run(self, work: Callable[[StopHook], None]) -> None:
-        """Run work in the planning thread, in place of its present run. It needs `plan`."""
+        """Stop the present run and call `work` in the planning thread. Without `plan` it does nothing."""
         if self._planner is not None:
             self._planner.close()
             self._planner.begin(work)
 
     def say(self, line: str, share: float = 0.0) -> None:
-        """Show how far a run is in place of the earlier line, from any thread."""
+        """Show a line and the progress (0 to 1) of a run. Thread-safe."""
         self._jobs.submit("progress", lambda: self.tell(line, share))
 
     def tell(self, line: str, share: float) -> None:
-        """Show how far a run is. From the drawing thread."""
+        """Show a line and the progress (0 to 1) of a run. Call it in the drawing thread."""
         self._status.content, self._status.visible = f"{BLOCK}{html.escape(line)}</div>", share < 1.0
         if self._planner is not None:
             self._planner.tell(line, share)

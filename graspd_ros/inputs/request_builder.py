@@ -1,7 +1,7 @@
-"""Messages to requests: from a mesh path, from what a camera showed, and from a GraspRequest, which is checked here.
+"""Conversion of messages to requests: mesh paths, clouds, depth images, and GraspRequest with its checks.
 
-The sources of a GraspRequest's object are rows of `SOURCES`. To add one, write its function and its row here, and its
-constant in `GraspRequest.msg`. Nothing else is edited.
+Each row of `SOURCES` is a source of a GraspRequest's object. To add one, write its function and its row here, and its
+constant in `GraspRequest.msg`. No other file changes.
 """
 
 from __future__ import annotations
@@ -40,25 +40,24 @@ from graspd_ros.request import MOST_ID, KnownObject, Listener, Request
 
 MOST_EXCLUDED = 256
 MOST_BOXES = 64
-MOST_MESH_BYTES = 10**8  # an OBJ of some 1.5 million faces; reading more takes minutes and gigabytes
+MOST_MESH_BYTES = 10**8  # an OBJ of about 1.5 million faces. Reading more takes minutes and gigabytes
 MOST_PATH = 4096
 _FORMS = "a path, file:///path or package://package/path"
 _ID = re.compile(rf"[A-Za-z0-9_.:@+-]{{1,{MOST_ID}}}")
 _OF_ONE_CLOUD = (GraspRequest.CLOUD, GraspRequest.LATEST_CLOUD)
-# The defaults of `Steering` stand for an angle of 0.
+# An angle of 0 in a message means the default of `Steering`.
 _DEFAULTS = Steering()
 
 
 class RequestBuilder:
-    """Makes requests, and holds what they may be made of: the newest frame and the kept views.
+    """Builder of requests. It stores the newest sensor frame and the views.
 
-    `missing` says in one line, by the topic's name, what does not arrive from sensors.
-
-    Used by the executor's thread only. Frames and views are immutable, so that requests may hold on to them.
+    `missing` maps a sensor topic to one line about its missing messages. Only the executor's thread uses a builder.
+    Frames and views are immutable, so requests may keep them.
 
     Args:
-        lookup: `T_target_source` of two frames at a time, without waiting. May raise a TransformError.
-        lookup_in_time: the same for the worker's thread. Waits for what comes late. None: as `lookup`.
+        lookup: returns `T_target_source` at a time without waiting. May raise a TransformError.
+        lookup_in_time: the same for the worker's thread, with a wait for late transforms. If None, `lookup` is used.
     """
 
     def __init__(
@@ -75,15 +74,15 @@ class RequestBuilder:
         self._started = time.strftime("%Y%m%dT%H%M%S")
 
     def new_id(self, kind: str) -> str:
-        """Return a name that no request had before, not before a restart either: files are called by it."""
+        """Return an id that is unique even after a restart, because output files have the id as their name."""
         return f"{kind}-{self._started}-{next(self._numbers)}"
 
     def forget(self) -> None:
-        """Drop the newest frame and the views."""
+        """Delete the newest frame and the views."""
         self.newest, self.views = None, Views()
 
     def latest(self, settings: Settings) -> SensorFrame:
-        """Return the newest frame. Raises RequestError: there is none, and what is known of why, or it is too old."""
+        """Return the newest frame. Raises RequestError: none has arrived (with known reasons), or it is too old."""
         if self.newest is None:
             why = "".join(f"; {told}" for told in self.missing.values())
             raise RequestError(ErrorCode.NO_CLOUD, f"no cloud or depth image has come yet{why}")
@@ -91,7 +90,7 @@ class RequestBuilder:
         return self.newest
 
     def add_view(self, settings: Settings) -> None:
-        """Keep the newest frame as one more view. Raises GraspdError: none has come, or it cannot be used."""
+        """Store the newest frame as a view. Raises GraspdError: none has arrived, or it cannot be used."""
         frame = self.latest(settings)
         cloud = seen.seen_by_camera(frame, place_of(settings), self.lookup)
         if settings.segment:
@@ -99,13 +98,13 @@ class RequestBuilder:
         self.views = self.views.add(frame, cloud, settings, self.lookup)
 
     def from_mesh(self, request_id: str, settings: Settings, uri: str) -> Request:
-        """Return the request for a mesh named by its path alone. Raises MeshError."""
+        """Return the request for a mesh that is given by its path only. Raises MeshError: the path is not usable."""
         path = resolve_mesh(uri, settings.mesh_roots)
         load, known = mesh_loader(path, settings), known_mesh(path, settings)
         return Request(request_id, "mesh", settings.mesh_frame, self._now(), settings, load, timeless=True, known=known)
 
     def from_sensor_frame(self, request_id: str, settings: Settings, sensor_frame: SensorFrame) -> Request:
-        """Return the request for what a camera showed unasked. Raises RequestError: it is too old."""
+        """Return the request for a frame that came without a GraspRequest. Raises RequestError: it is too old."""
         load = self._frame_loader(settings, sensor_frame)
         newest = settings.cloud_policy == "newest"
         return Request(request_id, "cloud", sensor_frame.frame, sensor_frame.stamp, settings, load, only_newest=newest)
@@ -113,9 +112,9 @@ class RequestBuilder:
     def from_message(
         self, request_id: str, settings: Settings, message: GraspRequest, listener: Listener | None = None
     ) -> Request:
-        """Return what a client asks for.
+        """Return the request of a GraspRequest.
 
-        Raises GraspdError: a field is out of range, the mesh out of reach, or the cloud missing, old or elsewhere.
+        Raises GraspdError: a field is invalid, the mesh is not readable, or the cloud is missing, old or not in /tf.
         """
         check_request(message, self._hand)
         settings = settings_of(message, settings)
@@ -128,7 +127,7 @@ class RequestBuilder:
         return replace(request, closes_late=message.closes_late, **asked)
 
     def _steering(self, message: GraspRequest, request: Request) -> Callable[[], Steering] | None:
-        """Read what the request asks of a grasp's place and direction, checked but for its mask. Raises GraspdError."""
+        """Check the steering fields and return a function that also reads `region_mask`. None without constraints."""
         if not _asks_for_any(message):
             return None
         stamp, shown = message.header.stamp, request.shown
@@ -141,7 +140,7 @@ class RequestBuilder:
     def from_loader(
         self, request_id: str, header: Header, settings: Settings, load: Callable[[], Scene], listener: Listener | None
     ) -> Request:
-        """Return the request for the object of a GraspPlanning in a header's frame, `mesh_frame` if that is empty."""
+        """Return the request for a GraspPlanning object. If the header's frame is empty, it is in `mesh_frame`."""
         timeless = nanoseconds(header.stamp) == 0
         stamp = self._now() if timeless else header.stamp
         frame = header.frame_id or settings.mesh_frame
@@ -162,7 +161,7 @@ class RequestBuilder:
 
 
 def check_request(message: GraspRequest, hand: str) -> None:
-    """Raise RequestError where no settings can make good what a field holds. `source_of` checks the source."""
+    """Raise RequestError if a field is invalid on its own. `source_of` checks the source."""
     if message.id and not _ID.fullmatch(message.id):
         shown = message.id[:MOST_ID]
         raise bad_request(f"id: {shown!r} may hold letters, digits and _.:@+- only, at most {MOST_ID} of them")
@@ -171,7 +170,7 @@ def check_request(message: GraspRequest, hand: str) -> None:
         raise RequestError(ErrorCode.WRONG_HAND, told)
     if message.num_grasps > MOST_GRASPS:
         raise bad_request(f"num_grasps: {message.num_grasps}; valid: 1 to {MOST_GRASPS}, 0 for the parameter")
-    # Presets by path are for the node's owner: a message must not have files read.
+    # Only the node's owner may set a preset by path. A message must not make the node read files.
     if message.preset not in ("", *preset_names()):
         valid = f"{', '.join(preset_names())}, empty for the parameter"
         raise bad_request(f"preset: {message.preset[:MOST_ID]!r}; valid: {valid}")
@@ -197,7 +196,7 @@ def check_request(message: GraspRequest, hand: str) -> None:
         raise bad_request(f"known_object: {name!r} with {told}; valid with KNOWN=4, without mesh_uri")
     if len(message.exclude) + len(message.exclude_poses) > MOST_EXCLUDED:
         counts = f"{len(message.exclude)} ids, {len(message.exclude_poses)} poses"
-        raise bad_request(f"exclude: {counts}; valid: {MOST_EXCLUDED}")
+        raise bad_request(f"exclude: {counts}; valid: at most {MOST_EXCLUDED} together")
 
 
 def _check_camera_and_mask(message: GraspRequest) -> None:
@@ -215,7 +214,7 @@ def _check_mask_source(message: GraspRequest, name: str, height: int) -> None:
 
 
 def settings_of(message: GraspRequest, settings: Settings) -> Settings:
-    """Return the settings with what a checked request asks for itself."""
+    """Return the settings with the values of a checked request in place of the parameters."""
     return replace(
         settings,
         num_grasps=message.num_grasps or settings.num_grasps,
@@ -241,9 +240,9 @@ def _asks_for_any(message: GraspRequest) -> bool:
 
 
 def steering_of(message: GraspRequest, T_object_header: Matrix) -> Steering:
-    """Return the wishes of a request in the object's frame, without its `region_mask`, which has to be read first.
+    """Return the steering constraints of a request in the object's frame, without its `region_mask`.
 
-    Raises GraspdError: a field, what it holds and what is valid.
+    Raises GraspdError: a field is invalid. The message names field, value and valid values.
     """
     _check(message)
     rotation = T_object_header[:3, :3]
@@ -265,7 +264,7 @@ def steering_of(message: GraspRequest, T_object_header: Matrix) -> Steering:
 
 
 def _check(message: GraspRequest) -> None:
-    """Refuse wishes that lack another, and those that say the same twice."""
+    """Refuse constraints that need another field, and constraints given twice."""
     if message.approach_angle and not _direction(message):
         raise bad_request("approach_angle: it needs approach_direction")
     if (message.roll or message.roll_tolerance) and not message.use_roll:
@@ -279,7 +278,7 @@ def _check(message: GraspRequest) -> None:
 
 
 def _direction(message: GraspRequest) -> tuple[float, ...]:
-    """Return the approach asked for, empty where it is all 0."""
+    """Return the approach direction of a request. It is empty if all components are 0."""
     given = message.approach_direction.x, message.approach_direction.y, message.approach_direction.z
     return given if any(given) else ()
 
@@ -307,9 +306,9 @@ def _box(name: str, solid: SolidPrimitive, pose: Pose, T_object_header: Matrix) 
 
 @dataclass(frozen=True, eq=False)
 class SourceInput:
-    """What a source may look at: the checked request, and the builder with the frames it holds.
+    """Input of a source: the checked message, and the builder with its frames and views.
 
-    `settings` have what the request asks for itself.
+    `settings` contain the values of the message.
     """
 
     request_id: str
@@ -321,7 +320,7 @@ class SourceInput:
     builder: RequestBuilder
 
     def request(self, frame: str, stamp: Time, load: Callable[[], Scene], **fields: Any) -> Request:
-        """Return the request for an object in a frame. A stamp of zero is that of now. `fields` are more of Request."""
+        """Return the request for an object in a frame. A zero stamp means now. `fields` are other fields of Request."""
         timeless = nanoseconds(stamp) == 0
         fields |= {"listener": self.listener, "timeless": timeless}
         stamp = self.now if timeless else stamp
@@ -330,9 +329,9 @@ class SourceInput:
 
 @dataclass(frozen=True)
 class Source:
-    """One place that objects come from. Its name in capitals is that of its constant in the message.
+    """Source of objects. Its name in capitals is the constant in the message.
 
-    `find` gives the object without reading it. Raises GraspdError: it is missing, old or out of reach.
+    `find` returns the request without reading the object. It raises GraspdError if that is missing, old or forbidden.
     """
 
     name: str
@@ -340,13 +339,13 @@ class Source:
 
 
 def mesh_loader(path: Path, settings: Settings) -> Callable[[], Scene]:
-    """Return a function that reads a mesh."""
+    """Return a function that loads a mesh as a scene."""
     mass, friction, scale = settings.mass or None, settings.friction, settings.mesh_scale
     return lambda: run_isolated(load_scene, str(path), mass=mass, friction=friction, scale=scale)
 
 
 def known_mesh(path: Path, settings: Settings) -> KnownObject | None:
-    """Return what a library may know a mesh by, None if the node has no library."""
+    """Return the library key of a mesh. None if the node has no library."""
     return KnownObject("", str(path), False) if settings.grasp_library else None
 
 
@@ -358,9 +357,9 @@ def frame_loader(
     point: Float[np.ndarray, "3"] | None = None,
     mask: Image | None = None,
 ) -> Callable[[], Scene]:
-    """Return a function that makes a scene of what one camera showed. `lookup` is for the worker's thread.
+    """Return a function that makes a scene from one sensor frame. The worker's thread calls `lookup`.
 
-    A `point` on or near the object, in the frame's own frame [m], or a `mask` of its pixels says which one is meant.
+    The target is selected by a `point` on or near it, in the frame's coordinates [m], or by a `mask` of its pixels.
     """
 
     def load() -> Scene:
@@ -380,7 +379,7 @@ def frame_loader(
 
 def _from_cloud(given: SourceInput) -> Request:
     frame = cloud_frame(given.message.cloud, nanoseconds(given.now))
-    if given.message.cloud.data:  # of one without, that is what there is to say
+    if given.message.cloud.data:  # an empty cloud gets a more specific error later
         frame.check(nanoseconds(given.now), given.settings.cloud_max_age)
     return _of_frame(given, frame)
 
@@ -388,12 +387,12 @@ def _from_cloud(given: SourceInput) -> Request:
 def _from_mesh(given: SourceInput) -> Request:
     settings, uri = given.settings, given.message.mesh_uri
     path = resolve_mesh(uri, settings.mesh_roots)
-    # Same for the same mesh in the same size, as long as the file is not written again.
+    # The key is equal for the same mesh at the same scale, until the file changes.
     key = f"mesh {uri} {path.stat().st_mtime_ns} {settings.mesh_scale} {settings.mass} {settings.friction}"
     found = _placed(given, mesh_loader(path, settings), key, known_mesh(path, settings))
     if found.surface is None:
         return found
-    # Grasps of an earlier run stand for another one where the same things stand about the object.
+    # Grasps of an earlier run are reused only on the same support surface.
     stands = f" {found.surface.normal.round(4)} {found.surface.offset:.4f}"
     return replace(found, object_key=found.object_key + stands)
 
@@ -405,7 +404,7 @@ def _from_known(given: SourceInput) -> Request:
     if not message.known_object:
         found = _from_mesh(given)
         return replace(found, known=found.known and replace(found.known, required=True))
-    # A node without a library imports nothing of it.
+    # Import here, so that a node without a library does not load this module.
     from graspd_ros.known_objects import named_loader
 
     known = KnownObject(message.known_object, "", True)
@@ -444,7 +443,7 @@ SOURCES: dict[int, Source] = {
 
 
 def source_of(message: GraspRequest) -> Source:
-    """Return the row of the source that a request names. Raises RequestError: there is none."""
+    """Return the row of the request's source. Raises RequestError: the source is unknown."""
     if message.source not in SOURCES:
         valid = ", ".join(f"{source.name.upper()}={number}" for number, source in SOURCES.items())
         raise bad_request(f"source: {message.source}; valid: {valid}")
@@ -478,11 +477,11 @@ def _target(given: SourceInput, frame: str) -> Float[np.ndarray, "3"] | None:
 
 
 def resolve_mesh(uri: str, roots: Sequence[str]) -> Path:
-    """Return the file that `uri` names: a path, `file://` or `package://`. Relative paths start at the first root.
+    """Return the mesh file of a path, `file://` or `package://` URI. Relative paths start at the first root.
 
-    Links are followed before the file is compared with the roots, so a link inside a root does not lead out of it.
-    A root may itself be a `package://` name. One whose package is not installed is left out.
-    Raises MeshError: an unknown form or package, a path outside every root, no such file, a file too large.
+    Symbolic links are resolved before the comparison with the roots, so that no link leads outside. A root may be a
+    `package://` name. Roots whose package is not installed are ignored.
+    Raises MeshError: unknown form or package, path outside every root, no such file, or file too large.
     """
     uri = uri.strip()
     if len(uri) > MOST_PATH:
@@ -507,13 +506,13 @@ def resolve_mesh(uri: str, roots: Sequence[str]) -> Path:
 
 
 def _allowed_roots(roots: Sequence[str]) -> list[Path]:
-    """Return the directories behind `mesh_roots`, links followed, without those that do not exist."""
+    """Return the existing directories of `mesh_roots`, with links resolved."""
     found = []
     for root in roots:
         try:
             path = _local_path(root).expanduser().resolve()
         except MeshError:
-            continue  # a package that is not installed holds nothing to read
+            continue  # the package is not installed
         if path.is_dir():
             found.append(path)
     return found

@@ -1,8 +1,8 @@
-"""Clouds and depth images that came from cameras, the views kept of one scene, and where the cameras stood.
+"""Clouds and depth images from cameras, stored views of one scene, and camera positions.
 
-A cloud message does not say where its camera stood. The request or the parameters say it. If neither does, the origin
-of the cloud's frame is assumed and checked against the cloud. With a wrong place the table is not found, the object
-gets a wrong shape, and grasps are verified on a shape that is not there.
+A cloud message does not contain its camera's position. The request or the parameters give it. Otherwise the origin of
+the cloud's frame is assumed and checked against the cloud. With a wrong position the table is not found, the object's
+shape is wrong, and grasps are verified on the wrong shape.
 """
 
 from __future__ import annotations
@@ -39,35 +39,34 @@ from graspd_ros.convert import Matrix, array_of, nanoseconds
 from graspd_ros.error_codes import ErrorCode, RequestError, bad_request
 from graspd_ros.parameters import WORKSPACE, Settings
 
-CLOUD = "cloud"  # the kind of frame whose camera the message does not name
+CLOUD = "cloud"  # kind of frame whose message does not contain the camera position
 Pixels = Float[np.ndarray, "height width 3"]
-# `T_target_source` of two frames at a time. May raise a TransformError.
+# Returns `T_target_source` at a time. May raise a TransformError.
 Lookup = Callable[[str, str, Time], Matrix]
 
 DepthMessage = Image | CompressedImage
-_Kind = tuple[str, int, int]  # frame, width and height of an image, packed or not, or of what a CameraInfo is of
+_Kind = tuple[str, int, int]  # frame, width and height of an image (compressed or not) or of a CameraInfo
 
-MOST_CALIBRATIONS = 8  # kept of one topic. Cameras that share it have one each
-AHEAD = 0.5  # seconds in the future that a stamp is taken without a word
-UNPAIRED = 2.0  # seconds that images may come without a calibration before that is told
+MOST_CALIBRATIONS = 8  # stored per topic. Several cameras may share a topic
+AHEAD = 0.5  # seconds that a stamp may lie in the future without a warning
+UNPAIRED = 2.0  # seconds without a matching CameraInfo before images cause a warning
 MOST_CLOUD_BYTES = 2**27  # 128 MiB: 4 million points of 32 bytes
 MOST_VIEWS = 64
-MOST_VIEW_POINTS = 200_000  # kept of each view: 64 views take 300 MB at most
+MOST_VIEW_POINTS = 200_000  # stored per view. 64 views take at most 300 MB
 
 
 @dataclass(frozen=True)
 class SensorFrame:
-    """One cloud or depth image as it came.
+    """One received cloud or depth image.
 
     Attributes:
-        kind: cloud or depth.
-        frame: the frame it was seen in.
-        stamp: when it was seen, by the sensor's clock. Zero where it has none.
-        arrived: when it came, by the node's clock [ns].
-        read: reads its points, in its frame, and where its camera stood. It is given the camera's place, where one is
-            known for a cloud, and a function that looks frames up. It takes some milliseconds and may raise a
-            CloudError or TransformError.
-        pixels: returns all of its points by pixel, NaN where nothing was seen. May raise a CloudError.
+        kind: `cloud` or `depth image`.
+        frame: coordinate frame of the points.
+        stamp: capture time on the sensor's clock. Zero if the message has no stamp.
+        arrived: time of arrival on the node's clock [ns].
+        read: returns the points in `frame` and the camera's position. Its arguments are the configured camera position
+            and a frame lookup. It takes some milliseconds and may raise a CloudError or TransformError.
+        pixels: returns one point per pixel, NaN without a measurement. May raise a CloudError.
     """
 
     kind: str
@@ -78,9 +77,9 @@ class SensorFrame:
     pixels: Callable[[], Pixels] | None = None
 
     def check(self, now: int, limit: float) -> None:
-        """Refuse a message without a frame, or with a stamp more than `limit` seconds (0: no limit) from `now` [ns].
+        """Check frame and age. Raises RequestError: no frame, or the stamp is more than `limit` [s] from `now` [ns].
 
-        Raises RequestError, which says what is wrong.
+        A `limit` of 0 means no limit.
         """
         if not self.frame.strip("/"):
             told = f"the {self.kind} names no frame: its header.frame_id is empty, so that its grasps could be anywhere"
@@ -96,16 +95,16 @@ class SensorFrame:
         raise RequestError(ErrorCode.STALE_CLOUD, f"the {self.kind} in {self.frame!r} {told}, {more}")
 
     def doubts(self, cloud: PointCloud) -> tuple[str, ...]:
-        """Return what is odd about the message of a cloud, one sentence each."""
+        """Return warnings about a cloud, one sentence each: a stamp in the future, or a wrong frame orientation."""
         ahead = (nanoseconds(self.stamp) - self.arrived) * 1e-9
         told = f"the {self.kind} came {ahead:.1f} s before its stamp: its clock is ahead of the node's"
-        # Where the camera stood elsewhere, its direction is not the frame's.
+        # The orientation is checked only if the camera is at the frame's origin.
         turned = "" if cloud.viewpoint.any() else frame_doubt(self.frame, cloud.points)
         return tuple(said for said in (told if ahead > AHEAD else "", turned) if said)
 
 
 def cloud_frame(message: PointCloud2, arrived: int) -> SensorFrame:
-    """Return a cloud message as a frame, which is read only when it is used. Raises RequestError if it is too large."""
+    """Return a cloud message as a frame. Its points are read on use. Raises RequestError if the cloud is too large."""
     if len(message.data) > MOST_CLOUD_BYTES:
         told = f"a cloud of {len(message.data)} bytes; at most {MOST_CLOUD_BYTES} are taken"
         raise RequestError(ErrorCode.BAD_CLOUD, told)
@@ -115,10 +114,10 @@ def cloud_frame(message: PointCloud2, arrived: int) -> SensorFrame:
 
 
 def depth_sensor_frame(image: DepthMessage, info: CameraInfo, arrived: int) -> SensorFrame:
-    """Return a depth image with its calibration as a frame, which is read only when it is used."""
+    """Return a depth image with its calibration as a frame. Its points are read on use."""
 
     def read(place: CameraPlace = ORIGIN, lookup: object = None) -> PointCloud:
-        # A depth image knows by itself.
+        # The camera of a depth image is at the origin of its frame.
         return cloud_from_depth(*depth_and_camera(image, info, rectified=True))
 
     def pixels() -> Pixels:
@@ -129,10 +128,10 @@ def depth_sensor_frame(image: DepthMessage, info: CameraInfo, arrived: int) -> S
 
 
 class ImagePairs:
-    """Pairs of each depth image and the last calibration of its frame and size. Not for several threads.
+    """Matcher of depth images with the last CameraInfo of the same frame and size. It is not thread-safe.
 
-    The newest image that comes before any such calibration waits for it. A CameraInfo without a frame fits every frame.
-    `clock` returns seconds that only rise.
+    The newest image without a match waits for one. A CameraInfo without a frame matches every frame. `clock` returns
+    monotonic time [s].
     """
 
     def __init__(self, clock: Callable[[], float] = time.monotonic) -> None:
@@ -143,7 +142,7 @@ class ImagePairs:
         self._alone_since = 0.0
 
     def add(self, message: DepthMessage | CameraInfo) -> tuple[DepthMessage, CameraInfo] | None:
-        """Take an image or a calibration and return the pair it completes, if any. Raises CloudError: no image."""
+        """Add an image or a CameraInfo and return the pair it completes, or None. Raises CloudError: no image."""
         if isinstance(message, CameraInfo):
             self._calibrations += 1
             kind = _kind(message)
@@ -169,14 +168,15 @@ class ImagePairs:
         return image, info
 
     def doubt(self) -> str:
-        """Return why images find no calibration, in one line, empty if they do or have waited less than `UNPAIRED`."""
+        """Return one line about images without a matching CameraInfo. Empty if they match or wait under `UNPAIRED`."""
         if self._waiting is None or self._clock() - self._alone_since < UNPAIRED:
             return ""
         last = next(reversed(self._infos.values()), None)
-        of = "none has come" if last is None else f"the last one is {_shown_kind(last)}"
+        of = "none" if last is None else _shown_kind(last)
         return (
-            f"depth images: {self._images} and {self._calibrations} CameraInfos came, and none of them pairs; the last "
-            f"image is {_shown_kind(self._waiting)}, a CameraInfo of its frame and size is needed, and {of}"
+            f"depth images: {self._images} images and {self._calibrations} CameraInfos received, but no two match; "
+            f"last image: {_shown_kind(self._waiting)}, last CameraInfo: {of}; "
+            "valid: a CameraInfo of the same frame and size"
         )
 
 
@@ -190,7 +190,7 @@ def _shown_kind(message: Any) -> str:
 
 
 def place_of(settings: Settings, message: GraspRequest | None = None) -> CameraPlace:
-    """Return the camera's place of the request or, where it has none, of the parameters."""
+    """Return the camera position from the request, or from the parameters if the request has none."""
     if message is not None and message.use_view_point:
         x, y, z = array_of(message.view_point).tolist()
         return CameraPlace((x, y, z))
@@ -201,11 +201,11 @@ def place_of(settings: Settings, message: GraspRequest | None = None) -> CameraP
 
 
 def seen_by_camera(frame: SensorFrame, place: CameraPlace, lookup: Lookup) -> PointCloud:
-    """Return the cloud of a frame, with where its camera stood.
+    """Return the cloud of a frame with its camera position.
 
     Raises:
-        CloudError: the cloud cannot be read, or its pixels show that its camera stood elsewhere.
-        TransformError: /tf does not know the camera's frame.
+        CloudError: the cloud cannot be read, or its pixels contradict the camera position.
+        TransformError: the camera's frame is not in /tf.
     """
     return frame.read(place, lambda target, source: lookup(target, source, frame.stamp))
 
@@ -213,10 +213,10 @@ def seen_by_camera(frame: SensorFrame, place: CameraPlace, lookup: Lookup) -> Po
 def masked_points(
     frame: SensorFrame, mask: Image, name: str = "target_mask"
 ) -> tuple[Float[np.ndarray, "points 3"], Bool[np.ndarray, "points"]]:
-    """Return one point for each pixel, NaN where nothing was seen, and which of them the mask named `name` shows.
+    """Return one point per pixel, NaN without a measurement, and True for the pixels inside the mask.
 
     Raises:
-        RequestError: the mask is no mono8 image of the cloud's size.
+        RequestError: the mask is no mono8 image of the cloud's size. The message names the field `name`.
         CloudError: the cloud cannot be read.
     """
     pixels = np.empty((0, 0, 3)) if frame.pixels is None else frame.pixels()
@@ -235,16 +235,16 @@ def masked_points(
 
 @dataclass(frozen=True)
 class Views:
-    """Clouds of one scene, all in one frame. Immutable, so `add` returns new ones."""
+    """Clouds of one scene in a common frame. Views are immutable, and `add` returns a new object."""
 
     frame: str = ""
     stamp: Time = field(default_factory=Time)
     clouds: tuple[PointCloud, ...] = ()
 
     def add(self, sensor_frame: SensorFrame, cloud: PointCloud, settings: Settings, lookup: Lookup) -> Views:
-        """Add a cloud, moved to the frame of the other views (the settings' fixed_frame, or the first's).
+        """Add a cloud, transformed to the common frame: `fixed_frame`, or the frame of the first view.
 
-        Raises GraspdError if there are as many views as are allowed, or this one cannot be trimmed or moved.
+        Raises GraspdError if there are `MOST_VIEWS` views already, or the cloud cannot be cropped or transformed.
         """
         if len(self.clouds) >= MOST_VIEWS:
             raise bad_request(f"{MOST_VIEWS} views are kept already; call ~/reset_views first")
@@ -261,12 +261,12 @@ class Views:
 def scene_of_views(
     views: tuple[PointCloud, ...], settings: Settings, target: Target | None, doubts: tuple[str, ...] = ()
 ) -> Scene:
-    """Return the scene of clouds that are in one frame. `target` says which object is meant, in that frame.
+    """Return the scene of clouds in a common frame. `target` selects the object in the same frame.
 
-    `doubts` become warnings of its object. Raises GraspdError if the clouds show no usable object, or the file of the
-    settings has changed and cannot be used.
+    `doubts` become warnings of the object. Raises GraspdError if no usable object is found in the clouds, or the
+    `scene_config` file is no longer valid.
     """
-    # Beside its distance grid, if grasps will have to hold on it.
+    # Start the robustness variants of the shape in parallel with its distance grid, if grasps are verified.
     certainty = load_preset(settings.preset).certainty
     ahead = None if settings.verify == "none" else partial(begin_other_shapes, certainty.probability)
     scene = scene_from_views(
@@ -282,13 +282,13 @@ def scene_of_views(
 
 
 def trimmed(cloud: PointCloud, settings: Settings) -> PointCloud:
-    """Return the points inside the workspace, one for each voxel where the settings give a voxel size."""
+    """Return the points inside the workspace, downsampled to one per voxel if `voxel_size` is set."""
     inside = replace(cloud, points=cloud.points[within(cloud, settings)])
     return inside.thinned(settings.voxel_size) if settings.voxel_size > 0 else inside
 
 
 def within(cloud: PointCloud, settings: Settings) -> Bool[np.ndarray, "n"]:
-    """Return which points lie in the workspace (NaN does not). Raises RequestError with their place if none does."""
+    """Return True for points inside the workspace, False for NaN. Raises RequestError if no point is inside."""
     points, low, high = cloud.points, np.array(settings.roi_min), np.array(settings.roi_max)
     inside = np.asarray(((points >= low) & (points <= high)).all(1))
     if inside.any():

@@ -1,7 +1,7 @@
-"""Subscriptions to topics of sensors, with the quality of service that their publishers offer, and a watch for losses.
+"""Subscriptions to sensor topics with the QoS that their publishers offer, and detection of lost messages.
 
-rmw's own BEST_AVAILABLE chooses once, when the subscription is made. It would ask a camera that starts later for what
-that camera does not offer, and nothing would come. Here the choice is made again as publishers come and go.
+rmw's BEST_AVAILABLE chooses the QoS once, when the subscription is created. It may be incompatible with a camera that
+starts later, and no message would arrive. This module chooses again when publishers appear or disappear.
 """
 
 from __future__ import annotations
@@ -19,9 +19,9 @@ from rclpy.subscription import Subscription
 from graspd_core.io.messages import stamp_of
 
 DEPTH = 5
-MOST_TWICE = 100  # messages that may be heard by two subscriptions
-SILENCE = 5.0  # seconds that a publisher may be there without a message before that is told
-REPEAT = 10.0  # seconds between two lines about messages that were lost
+MOST_TWICE = 100  # stamps remembered to drop duplicates while two subscriptions exist
+SILENCE = 5.0  # seconds that a publisher may be silent without a warning
+REPEAT = 10.0  # seconds between two warnings about lost messages
 REMEDY = (
     "large messages get lost in Fast DDS' shared memory of 512 KB; start both processes with "
     "FASTRTPS_DEFAULT_PROFILES_FILE=config/fastdds.xml, or have the sensor publish reliably (docs/ros.md, Large clouds)"
@@ -29,16 +29,15 @@ REMEDY = (
 
 
 class SensorTopic:
-    """One topic of a sensor. Used by the executor's thread only.
+    """Subscription to one sensor topic. Only the executor's thread uses it.
 
     Args:
-        node: subscribes to the topic, and logs lost messages.
-        kind: type of its messages.
-        name: of the topic, before remapping.
-        callback: takes each message.
-        instead_of: a topic that is used rather than this one while it has publishers. Where this topic's name is not
-            remapped, its name is that of the other and `ending`.
-        ending: see above.
+        node: node that subscribes and logs lost messages.
+        kind: message type.
+        name: name of the topic before remapping.
+        callback: called with each message.
+        instead_of: preferred topic. While it has publishers, this one is not subscribed.
+        ending: suffix. If `name` is not remapped, this topic is called `instead_of.name + ending`.
     """
 
     def __init__(
@@ -59,20 +58,20 @@ class SensorTopic:
         self._silent_since = self._told = -float("inf")
         self._subscription: Subscription | None = None
         self._before: Subscription | None = None
-        self._twice: set[int] = set()  # stamps of what the one before heard when there were two
+        self._twice: set[int] = set()  # stamps that the old subscription received while both existed
         self._qos = QoSProfile(depth=DEPTH, reliability=ReliabilityPolicy.BEST_EFFORT)
-        # What somebody asks for is left as it is, which rclpy keeps in no public place.
+        # A QoS override of the user stays. rclpy has no public access to it.
         self._fixed = f"qos_overrides.{self.name}.subscription.reliability" in getattr(node, "_parameter_overrides", {})
         if instead_of is None:
             self._listen(QoSOverridingOptions.with_default_policies())
 
     def publishers(self) -> list[Any]:
-        """Return information about the publishers of messages of its type."""
+        """Return information about the publishers of the right message type."""
         kind = f"{self._kind.__module__.partition('.')[0]}/msg/{self._kind.__name__}"
         return [info for info in self._node.get_publishers_info_by_topic(self.name) if info.topic_type == kind]
 
     def check(self) -> str:
-        """Adapt to what is offered now and return what does not arrive, empty if all does. Call it once a second."""
+        """Adapt the QoS to the publishers and return a line about missing messages, or "". Call it once a second."""
         publishers = self.publishers()
         if self._instead_of is not None and (not publishers or self._instead_of.publishers()):
             self._stop()
@@ -86,13 +85,13 @@ class SensorTopic:
         if self._silent_since < 0:
             self._silent_since = time.monotonic()
         silent = time.monotonic() - self._silent_since
-        lost = f"{self._lost} messages were lost on the way: {REMEDY}" if self._lost else "nothing has come"
-        return f"{self.name}: somebody publishes for {silent:.0f} s, and {lost}" if silent >= SILENCE else ""
+        lost = f"{self._lost} messages were lost: {REMEDY}" if self._lost else "no message has arrived"
+        return f"{self.name}: a publisher has existed for {silent:.0f} s, but {lost}" if silent >= SILENCE else ""
 
     def _other_types(self) -> str:
         types = {info.topic_type for info in self._node.get_publishers_info_by_topic(self.name)}
-        heard = f"this node hears {self._kind.__name__}"
-        return f"{self.name}: somebody publishes {', '.join(sorted(types))}, {heard}" if types else ""
+        heard = f"this node needs {self._kind.__name__}"
+        return f"{self.name}: publishers have type {', '.join(sorted(types))}, {heard}" if types else ""
 
     def _follow(self, publishers: list[Any]) -> None:
         offers = [info.qos_profile for info in publishers]
@@ -105,7 +104,7 @@ class SensorTopic:
         )
         same = (wanted.reliability, wanted.durability) == (self._qos.reliability, self._qos.durability)
         if self._subscription is None or (offers and not same and not self._fixed):
-            # The one before stays until the new one has heard something: what comes once could come in between.
+            # The old subscription stays until the new one has received a message, so that no message is lost.
             self._destroy(self._before)
             self._before, self._qos, self._twice = self._subscription, wanted, set()
             self._listen()

@@ -1,6 +1,6 @@
-"""Shapes in messages: solids, meshes, the plane that an object stands on, and things of a planning scene.
+"""Shapes in messages: solids, meshes, the support plane, and collision objects of a planning scene.
 
-The things come as `moveit_msgs/CollisionObject` and are obstacles of every later request.
+Collision objects arrive as `moveit_msgs/CollisionObject` and are obstacles of every later request.
 """
 
 from __future__ import annotations
@@ -23,17 +23,17 @@ from graspd_ros.error_codes import RequestError, bad_request
 from graspd_ros.request import FrameLookup, Request
 
 MOST_THINGS = 1000
-# How many dimensions each kind of solid has in the message.
+# Number of dimensions of each kind of solid.
 _SIZES = {SolidPrimitive.BOX: 3, SolidPrimitive.SPHERE: 1, SolidPrimitive.CYLINDER: 2, SolidPrimitive.CONE: 2}
 
 
 def mesh_shapes(shapes: Collection[Mesh], poses: Collection[Pose], owner: str) -> list[TriangleMesh]:
-    """Return meshes at their poses, if there are any. Raises RequestError, which names `owner`."""
+    """Return meshes at their poses, or at the origin without poses. Raises RequestError: invalid. It names `owner`."""
     return _placed("mesh", _mesh, shapes, poses, owner)
 
 
 def primitive_shapes(shapes: Collection[SolidPrimitive], poses: Collection[Pose], owner: str) -> list[TriangleMesh]:
-    """Return boxes, spheres, cylinders and cones at their poses. Raises RequestError, which names `owner`."""
+    """Return the meshes of primitives at their poses. Raises RequestError: invalid. It names `owner`."""
     return _placed("primitive", _primitive, shapes, poses, owner)
 
 
@@ -56,7 +56,8 @@ def _mesh(shape: Mesh, owner: str) -> TriangleMesh:
     vertices = np.array([[p.x, p.y, p.z] for p in shape.vertices]).reshape(-1, 3)
     faces = np.array([list(t.vertex_indices) for t in shape.triangles], dtype=np.int64).reshape(-1, 3)
     if not len(faces) or not np.isfinite(vertices).all() or faces.max() >= len(vertices):
-        raise bad_message(owner, f"meshes: {len(vertices)} vertices and {len(faces)} triangles that are no mesh")
+        told = f"meshes: {len(vertices)} vertices and {len(faces)} triangles"
+        raise bad_message(owner, f"{told}; valid: finite vertices, and triangles whose indices name them")
     return TriangleMesh(vertices, faces)
 
 
@@ -81,31 +82,31 @@ def _solid(kind: int, sizes: np.ndarray) -> Any:
     height, radius = sizes[SolidPrimitive.CYLINDER_HEIGHT], sizes[SolidPrimitive.CYLINDER_RADIUS]
     if kind == SolidPrimitive.CYLINDER:
         return trimesh.creation.cylinder(radius=radius, height=height)
-    # ROS centres a cone on half of its height.
+    # The origin of a ROS cone is at half of its height.
     cone = trimesh.creation.cone(radius=radius, height=height)
     cone.apply_translation([0.0, 0.0, -height / 2])
     return cone
 
 
 def bad_message(owner: str, message: str) -> RequestError:
-    """Return the error about a part of a message."""
+    """Return the error about an invalid part of the message of `owner`."""
     return bad_request(f"{owner}: {message}")
 
 
 def plane_of(surface: PlaneMessage, T_object_frame: Matrix | None = None) -> Plane | None:
-    """Return the support surface in the object's frame, None if its numbers are 0. Raises RequestError: no plane."""
+    """Return the support plane in the object's frame, None if all numbers are 0. Raises RequestError: no plane."""
     a, b, c, d = map(float, surface.coef)
     if not any((a, b, c, d)):
         return None
     length = float(np.linalg.norm([a, b, c]))
     if not (np.isfinite([a, b, c, d]).all() and length > 0):
-        raise bad_request(f"surface: {[a, b, c, d]} is no plane; its first three numbers are the normal")
+        raise bad_request(f"surface: {[a, b, c, d]} is no plane; valid: finite a, b, c, d with a normal a, b, c")
     plane = Plane(np.array([a, b, c]) / length, -d / length)
     return plane if T_object_frame is None else moved_plane(plane, T_object_frame)
 
 
 def with_support(load: Callable[[], Scene], plane: Plane | None) -> Callable[[], Scene]:
-    """Return a loader of the scene with the plane the object stands on. Its free side is the object's."""
+    """Return a loader that adds the support plane to the scene. Its normal points to the object's side."""
     if plane is None:
         return load
 
@@ -119,12 +120,12 @@ def with_support(load: Callable[[], Scene], plane: Plane | None) -> Callable[[],
 
 @dataclass(frozen=True, eq=False)
 class Thing:
-    """A thing of the planning scene.
+    """Collision object of the planning scene.
 
     Attributes:
-        frame: the frame of its pose.
-        T_frame_thing: its pose.
-        shapes: what it is made of, in its own frame [m].
+        frame: frame of the pose.
+        T_frame_thing: pose of the object in `frame` [m].
+        shapes: meshes in the object's own frame [m].
     """
 
     frame: str
@@ -133,9 +134,9 @@ class Thing:
 
 
 def changed_things(things: Mapping[str, Thing], message: Any) -> Mapping[str, Thing]:
-    """Return the things by id after a `moveit_msgs/CollisionObject`. Those given are not changed.
+    """Return a copy of the collision objects, by id, updated with a `moveit_msgs/CollisionObject`.
 
-    Raises RequestError if the message names no known thing, or has no usable shape or pose.
+    Raises RequestError if the id is unknown, or a shape, pose or operation is invalid.
     """
     name, owner, operation = message.id, f"collision object {message.id[:128]!r}", message.operation
     operations = {message.ADD: "ADD", message.REMOVE: "REMOVE", message.APPEND: "APPEND", message.MOVE: "MOVE"}
@@ -160,7 +161,7 @@ def _changed(there: Thing | None, message: Any, owner: str) -> Thing:
         raise bad_message(owner, "planes: not taken, since they have no end; give a box, or the request's surface")
     solids = primitive_shapes(message.primitives, message.primitive_poses, owner)
     shapes = (*solids, *mesh_shapes(message.meshes, message.mesh_poses, owner))
-    # MoveIt too has the appended shapes relative to the pose that the thing has.
+    # As in MoveIt, appended shapes are relative to the object's existing pose.
     if message.operation == message.APPEND and there is not None:
         return replace(there, shapes=(*there.shapes, *shapes))
     if not message.header.frame_id:
@@ -176,10 +177,9 @@ def _changed(there: Thing | None, message: Any, owner: str) -> Thing:
 
 
 def among_things(request: Request, lookup: FrameLookup) -> Request:
-    """Return the request with its `things` added to its scene. None of its other fields changes.
+    """Return the request with a loader that adds its collision objects (`things`) to the scene as obstacles.
 
-    `lookup` transforms between two frames at the time the object was seen. Raises TransformError if it does not know a
-    thing's frame.
+    `lookup` transforms between frames at the request's time. Raises TransformError: an object's frame is unknown.
     """
     settings, load = request.settings, request.load
     placed = {name: _thing_shapes(name, thing, request, lookup) for name, thing in request.things.items()}

@@ -1,6 +1,6 @@
-"""Transforms of /tf and /tf_static, with a wait for late ones, and the place of the arm that carries the hand.
+"""Transforms from /tf and /tf_static, with a wait for late ones, and the reach of the arm that carries the hand.
 
-tf2_msgs comes with ROS, or from `make setup`. Without it the node works, but knows no transforms.
+ROS and `make setup` install tf2_msgs. Without it the node works, but has no transforms.
 """
 
 from __future__ import annotations
@@ -29,14 +29,14 @@ if TYPE_CHECKING:
 
 TRANSFORM_PATIENCE = 1.0  # seconds that the worker waits for a transform
 ROBOT_PATIENCE = 10.0  # seconds that the start waits for the robot
-_POLL = 0.01  # seconds between two looks at the buffer
-_COMPLAIN_AGAIN = 10.0  # seconds between two log lines about transforms that make no sense
+_POLL = 0.01  # seconds between two lookups in the buffer
+_COMPLAIN_AGAIN = 10.0  # seconds between two log lines about invalid transforms
 
 
 class TransformListener:
-    """A buffer filled from /tf and /tf_static while the node lives. `available` is whether it can be.
+    """Subscriber that fills a buffer from /tf and /tf_static. `available` is False if tf2_msgs is not installed.
 
-    When time jumps back, as when a bag starts again under sim time, everything is forgotten.
+    When time jumps back, for example when a bag restarts under simulated time, the buffer is cleared.
     """
 
     def __init__(self, node: Node, buffer: TransformBuffer) -> None:
@@ -56,14 +56,14 @@ class TransformListener:
         self._jumps = node.get_clock().create_jump_callback(back, post_callback=self._on_jump)
 
     def lookup(self, target: str, source: str, stamp: Time) -> Matrix:
-        """Return `T_target_source` at a time, 0 for the newest. Raises TransformError if it is not known."""
+        """Return `T_target_source` at a time, 0 for the newest. Raises TransformError if it is unknown."""
         return self._buffer.lookup(target, source, nanoseconds(stamp) or None)
 
     def lookup_in_time(self, target: str, source: str, stamp: Time, stop: StopHook) -> Matrix:
-        """Return the same, and wait for it, because transforms come later than clouds.
+        """Return `T_target_source` and wait for it if necessary, because transforms arrive later than clouds.
 
-        It must not be called in the executor's thread, which has to receive them meanwhile. Raises the buffer's last
-        TransformError after `TRANSFORM_PATIENCE` or when `stop` is true.
+        Do not call it in the executor's thread, which must receive the transforms meanwhile. After `TRANSFORM_PATIENCE`
+        seconds, or when `stop` returns True, it raises the last TransformError.
         """
         end = time.monotonic() + TRANSFORM_PATIENCE
         while True:
@@ -89,10 +89,9 @@ class TransformListener:
 
 
 def reach_of(request: Request, lookup: FrameLookup, robot_description: str = "") -> Reach:
-    """Return the restriction to what the arm of the request's settings can reach, in the frame of the object.
+    """Return the restriction to grasps that the arm of the request's settings can reach, in the object's frame.
 
-    `lookup` transforms between two frames at the time the object was seen. `robot_description` is the URDF of a robot
-    that has the arm.
+    `lookup` transforms between frames at the request's time. `robot_description` is the URDF of a robot with the arm.
     """
     from graspd_core import Reach
 
@@ -104,7 +103,7 @@ def reach_of(request: Request, lookup: FrameLookup, robot_description: str = "")
     return Reach(arm, (x, y, z), (qw, qx, qy, qz))
 
 
-# What is known of an arm takes a tenth of a second to make, and is kept with it.
+# The tables of an arm take 0.1 s to compute and are stored with the arm.
 @lru_cache(maxsize=2)
 def _arm(name: str, robot_description: str) -> Arm:
     from graspd_core import load_arm
@@ -113,9 +112,9 @@ def _arm(name: str, robot_description: str) -> Arm:
 
 
 def heard_robot(node: Node, arm: str) -> str:
-    """Return the URDF on the topic robot_description, or at once an empty one if the arm is no part of a robot.
+    """Return the URDF from the topic robot_description, or "" at once if there is no arm or its file names a URDF.
 
-    To be called before the node is spun. Raises GraspdError if no URDF came in time, or one without the arm.
+    Call it before the node is spun. Raises GraspdError if no URDF arrives in time, or the URDF lacks the arm.
     """
     if not arm:
         return ""

@@ -2,7 +2,7 @@
 
 `ros2 launch graspd_ros graspd.launch.py points:=/camera/depth/color/points hand:=allegro_right output_frame:=base_link`
 
-An argument that is a parameter of the node overrides the parameter file only where it is given.
+An argument that is also a parameter of the node overrides the parameter file if it is given.
 """
 
 from launch import LaunchDescription
@@ -13,7 +13,7 @@ from launch_ros.actions import Node
 
 from graspd_core.paths import config_dir
 
-# What differs from robot to robot, by name: the default, and what it is.
+# Settings that differ between robots, by name: default and description.
 ARGUMENTS = {
     "points": ("points", "PointCloud2 topic to listen to"),
     "depth_image": ("depth/image_rect", "depth image topic to listen to"),
@@ -33,7 +33,7 @@ PARAMETERS = ("hand", "hand_prefix", "output_frame", "sensor_frame", "use_sim_ti
 
 
 def given(values: dict[str, str]) -> dict[str, str | bool]:
-    """Return the values that were given, of the types the node declares. The parameter file decides the others."""
+    """Return the non-empty values, converted to the parameters' types. The parameter file gives the others."""
     typed: dict[str, str | bool] = {name: value for name, value in values.items() if value}
     if "use_sim_time" in typed:
         typed["use_sim_time"] = values["use_sim_time"].lower() in ("true", "1")
@@ -68,7 +68,7 @@ def _node(context) -> list[Node]:
 
 
 def generate_launch_description() -> LaunchDescription:
-    """Return the description of the node, with arguments on the command line."""
+    """Return the launch description of the node with its arguments."""
     large_clouds = SetEnvironmentVariable(
         "FASTRTPS_DEFAULT_PROFILES_FILE",
         str(config_dir() / "fastdds.xml"),

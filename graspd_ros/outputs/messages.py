@@ -1,14 +1,13 @@
-"""Progress, answers, trajectories and markers as messages. No message carries a NaN.
+"""Progress, answers, trajectories and markers as messages. No message contains a NaN.
 
-Metrics that were not measured are left out. Other figures that are not finite are -1.
+Metrics that were not measured are omitted. Other non-finite numbers become -1.
 
-A trajectory has three points in time for the fingers, and the base's pose at each of them. Velocities are zero at every
-point. A controller that interpolates by cubics (as ros2_control's do, given positions and velocities) then moves all
-joints along straight lines in step with each other, as the trial did. Its greatest speed is 1.5 times the mean speed of
-each stage, and the times here allow for that.
+A trajectory has three points for the fingers. The base has one pose for each point. Velocities are zero at every point.
+A controller with cubic interpolation, such as ros2_control's, then moves all joints in step on straight lines, as the
+trial did. Its greatest speed is 1.5 times the mean speed of a stage. The stage times allow for this factor.
 
-Markers show in RViz the hand at its grasp, its contacts, the axes of its base link, and its quality. Their namespaces
-are the names of `PARTS`, so that each can be switched off. Their ids start at `IDS_OF_A_GRASP` times the rank. They
+RViz markers show the hand at its grasp, the contacts, the axes of the base link, and the quality. Each name of `PARTS`
+is a marker namespace that can be switched off. The ids of a grasp start at `IDS_OF_A_GRASP` times its rank. Markers
 stay until the next result deletes them.
 """
 
@@ -65,7 +64,7 @@ VERDICTS = {
     Verdict.VERIFIED: GraspMessage.VERIFIED,
     Verdict.FAILED: GraspMessage.FAILED,
 }
-# Outcomes that fall short of what was asked for, as codes.
+# Error codes of outcomes that do not fulfil the request.
 _SHORT = {
     Outcome.TOO_FEW: ErrorCode.NO_GRASP,
     Outcome.NO_CANDIDATES: ErrorCode.NO_GRASP,
@@ -73,12 +72,12 @@ _SHORT = {
     Outcome.CANCELLED: ErrorCode.CANCELLED,
 }
 
-# Greatest over mean speed of a cubic that starts and ends at rest.
+# Ratio of greatest to mean speed of a cubic that starts and ends at rest.
 _PEAK = 1.5
 IDS_OF_A_GRASP = 1000
 GEOMETRIES = ("visual", "collision")
-# What can be shown. Of the best grasps: the hand at the grasp, before it and where its squeeze aims at (faint), its
-# contacts, the axes of its base link, its figures. Of those that failed a trial: where they are, and why they failed.
+# Parts that markers can show. For the best grasps: the hand at grasp, pregrasp and squeeze (the last two faint),
+# contacts, axes of the base link, and figures. `rejected` shows position and reason of grasps that failed a trial.
 PARTS = ("hand", "pregrasp", "squeeze", "contacts", "axes", "text", "rejected")
 USUAL_PARTS = ("hand", "contacts", "axes", "text")
 _FAINT = 0.25
@@ -95,12 +94,12 @@ _TEXT_ABOVE = 0.12
 
 @dataclass(frozen=True)
 class Pace:
-    """How fast a real hand may be moved. A joint's own limit holds too."""
+    """Speed limits for a real hand. A joint's own limit applies too."""
 
-    joint_speed: float = 1.0  # greatest of a turning joint [rad/s]
-    base_speed: float = 0.05  # greatest of the hand's base, and of sliding joints [m/s]
-    base_turn: float = 0.5  # greatest turning speed of the base [rad/s]
-    shortest: float = 1.0  # least time of a stage, twice and a half the trial's own [s]
+    joint_speed: float = 1.0  # greatest speed of a revolute joint [rad/s]
+    base_speed: float = 0.05  # greatest speed of the hand's base and of prismatic joints [m/s]
+    base_turn: float = 0.5  # greatest angular speed of the base [rad/s]
+    shortest: float = 1.0  # least duration of a stage, 2.5 times that of the trial [s]
 
     def __post_init__(self) -> None:
         for name, value in vars(self).items():
@@ -110,9 +109,9 @@ class Pace:
 
 @dataclass(frozen=True)
 class AnswerEnding:
-    """The end of a request, as a GraspArray states it. The grasps of `result` are in the answer's frame.
+    """End of a request for a GraspArray. The grasps of `result` are in the answer's frame.
 
-    `mass` [kg] is that of the object in the trials, 0 without any. `mass_assumed` is whether the request gave none.
+    `mass` is the object's mass in the trials [kg], 0 without trials. `mass_assumed` is True if no mass was given.
     """
 
     status: int
@@ -124,7 +123,7 @@ class AnswerEnding:
 
 
 def ending_of(result: GraspResult) -> AnswerEnding:
-    """Return the ending of a run that nobody stopped."""
+    """Return the ending of a run from its outcome."""
     message = result.message or result.outcome.value
     if result.outcome is Outcome.SUCCEEDED:
         return AnswerEnding(GraspArray.SUCCEEDED, ErrorCode.NONE, message, result)
@@ -137,7 +136,7 @@ def ending_of(result: GraspResult) -> AnswerEnding:
 def array_message(
     ending: AnswerEnding, request_id: str, header: Header, elapsed: float, hand: HandModel, pace: Pace
 ) -> GraspArray:
-    """Return the answer to a request `elapsed` seconds after it. Raises FloatingPointError if a grasp holds a NaN."""
+    """Return the answer to a request that came `elapsed` seconds ago. Raises FloatingPointError: a grasp has a NaN."""
     message = GraspArray(
         header=header,
         request_id=request_id,
@@ -171,9 +170,9 @@ def grasp_message(
     *,
     mass: float | None = None,
 ) -> GraspMessage:
-    """Return one grasp, in the frame that the header names. Raises FloatingPointError if it holds a NaN.
+    """Return one grasp in the header's frame. Raises FloatingPointError if it contains a NaN.
 
-    `mass` is that of the object [kg], None if unknown. It decides how fast the object is lifted.
+    `mass` is the object's mass [kg], None if unknown. It determines the lift acceleration.
     """
     _check_finite(grasp, rank)
     pregrasp, closed, squeeze = (joint_message(posture, hand, header.stamp) for posture in _postures(grasp))
@@ -220,7 +219,7 @@ def grasp_message(
 
 
 def progress_message(progress: Progress, request_id: str, frame: str, stamp: Time, elapsed: float) -> GraspProgress:
-    """Return the progress of a request, `elapsed` seconds after it came."""
+    """Return the progress of a request that came `elapsed` seconds ago."""
     return GraspProgress(
         header=Header(frame_id=frame, stamp=stamp),
         request_id=request_id,
@@ -236,7 +235,7 @@ def progress_message(progress: Progress, request_id: str, frame: str, stamp: Tim
 
 
 def sentence(progress: Progress) -> str:
-    """Return a progress report for people."""
+    """Return a progress report as one line for people."""
     steps = f"{progress.step} of {progress.of}"
     said = {
         Stage.LOAD: "reading the object",
@@ -247,12 +246,12 @@ def sentence(progress: Progress) -> str:
 
 
 def fraction_of(progress: Progress) -> float:
-    """Return how much of its stage is done, 0 to 1, and 0 where it is unknown."""
+    """Return the fraction of the current stage that is done, 0 to 1. It is 0 if unknown."""
     return min(progress.step / progress.of, 1.0) if progress.of > 0 else 0.0
 
 
 def joint_message(posture: Posture, hand: HandModel, stamp: Time) -> JointState:
-    """Return the values of all movable joints, coupled ones too [rad] or [m], without velocities and efforts."""
+    """Return the positions of all movable joints, including coupled ones [rad] or [m]."""
     return JointState(
         header=Header(frame_id=hand.base_link, stamp=stamp),
         name=list(all_joint_names(hand)),
@@ -292,11 +291,10 @@ def _number(value: float, otherwise: float = UNMEASURED) -> float:
 
 
 def trajectory_of(grasp: Grasp, hand: HandModel, pace: Pace) -> JointTrajectory:
-    """Return pregrasp, grasp and squeeze, for a controller that starts on receipt (the stamp is zero) from any posture.
+    """Return the trajectory through pregrasp, grasp and squeeze. Its zero stamp means start on receipt, from anywhere.
 
-    It names the joints that a controller drives. A joint that follows another has no command of its own, and
-    controllers refuse joints that they do not know. Positions are within the joint limits. The last point is a target
-    that presses, so joints stop short of it.
+    It contains only the driven joints, because controllers refuse others. Coupled joints follow without a command.
+    Positions are within the joint limits. The last point is a target inside the object, which joints do not reach.
     """
     times = stage_times(grasp, hand, pace)
     return JointTrajectory(
@@ -307,15 +305,14 @@ def trajectory_of(grasp: Grasp, hand: HandModel, pace: Pace) -> JointTrajectory:
 
 
 def base_poses(grasp: Grasp, frame: str, stamp: Time) -> list[PoseStamped]:
-    """Return the base link's pose at each point of the trajectory. It moves straight and turns evenly in between."""
+    """Return the base link's pose at each trajectory point. It moves and rotates uniformly between the points."""
     return [PoseStamped(header=Header(frame_id=frame, stamp=stamp), pose=pose_of_posture(p)) for p in _postures(grasp)]
 
 
 def stage_times(grasp: Grasp, hand: HandModel, pace: Pace) -> tuple[float, float, float]:
-    """Return the seconds from the start until pregrasp, grasp and squeeze.
+    """Return the times of pregrasp, grasp and squeeze from the start of the trajectory [s].
 
-    The first is enough for any joint to come from anywhere within its limits. The base is assumed to be at the pregrasp
-    by then.
+    The first time lets every joint cross its whole range. The base is assumed to be at the pregrasp by then.
     """
     speed = _greatest_speeds(hand, pace)
     first = max(pace.shortest, _PEAK * float(np.max((hand.upper - hand.lower) / speed, initial=0.0)))
@@ -326,14 +323,14 @@ def stage_times(grasp: Grasp, hand: HandModel, pace: Pace) -> tuple[float, float
 def _stage_time(start: Posture, end: Posture, speed: np.ndarray, pace: Pace) -> float:
     joints = float(np.max(np.abs(end.joint_positions - start.joint_positions) / speed, initial=0.0))
     travel = float(np.linalg.norm(end.position - start.position)) / pace.base_speed
-    # A rotation is the same as its negative quaternion: the shorter way round.
+    # q and -q are the same rotation. Take the smaller angle.
     cosine = min(abs(float(start.quaternion_wxyz @ end.quaternion_wxyz)), 1.0)
     turn = 2 * math.acos(cosine) / pace.base_turn
     return max(pace.shortest, _PEAK * max(joints, travel, turn))
 
 
 def _greatest_speeds(hand: HandModel, pace: Pace) -> np.ndarray:
-    """Return those of the actuated joints [rad/s] or [m/s]. Joints that follow one are within their limits, too."""
+    """Return the speed limit of each actuated joint [rad/s] or [m/s], which also keeps its coupled joints in limits."""
     speed = np.minimum(np.where(hand.slides, pace.base_speed, pace.joint_speed), hand.velocity)
     for mimic in hand.mimics:
         own = pace.base_speed if hand.joint_kind[mimic.link] == "prismatic" else pace.joint_speed
@@ -346,17 +343,17 @@ def _postures(grasp: Grasp) -> tuple[Posture, Posture, Posture]:
 
 
 def _point(posture: Posture, hand: HandModel, at: float) -> JointTrajectoryPoint:
-    # Rounding may put a joint that rests on its limit a hair beyond it, which controllers refuse.
+    # Rounding may put a joint slightly beyond its limit, which controllers refuse.
     positions = np.clip(posture.joint_positions, hand.lower, hand.upper)
     still = [0.0] * len(positions)
     return JointTrajectoryPoint(positions=positions.tolist(), velocities=still, time_from_start=duration_of(at))
 
 
 def arm_trajectory(grasp: Grasp, path: ArmPath, pace: Pace) -> JointTrajectory:
-    """Return all waypoints of an arm, without velocities, so that controllers go through them without a stop.
+    """Return all waypoints of the arm without velocities, so that controllers pass them without stopping.
 
-    The arm is assumed to be at the retreat when it begins, so the first point comes after `pace.shortest`. Between two
-    stages time is divided evenly, enough for joints below `pace.joint_speed` and the hand below `pace.base_speed`.
+    The arm must start at the retreat, which is the point at `pace.shortest`. Points of a stage are evenly spaced in
+    time. Joints stay below `pace.joint_speed` and the hand below `pace.base_speed`.
     """
     from graspd_core.arms.arm_paths import LIFT
 
@@ -376,7 +373,7 @@ def arm_trajectory(grasp: Grasp, path: ArmPath, pace: Pace) -> JointTrajectory:
 def execution_message(
     grasp: Grasp, path: ArmPath, hand: HandModel, pace: Pace, mass: float | None = None
 ) -> GraspExecution:
-    """Return the motion of arm and hand from the retreat to the end of the lift, with the points of the gates."""
+    """Return the motion of arm and hand from retreat to the end of the lift, with the point index of each gate."""
     from graspd_core.arms.execution import GATES, ExecutionPace, execution_of
 
     own = ExecutionPace(pace.joint_speed, pace.base_speed, pace.base_speed, pace.shortest)
@@ -408,10 +405,9 @@ def result_markers(
     parts: Sequence[str] = USUAL_PARTS,
     solids: Sequence[Primitive] | None = None,
 ) -> MarkerArray:
-    """Return parts of the best `shown` grasps.
+    """Return the markers of the best `shown` grasps. `solids` draw the hand. If None, its collision solids are used.
 
-    The first marker deletes earlier ones, so no grasps leave an empty scene. `solids` are drawn as the hand (None: its
-    collision solids).
+    The first marker deletes all earlier ones, so that a result without grasps clears the display.
     """
     header = Header(frame_id=frame, stamp=stamp)
     markers = [Marker(header=header, action=Marker.DELETEALL)]
@@ -458,7 +454,7 @@ def _rejected(grasp: Grasp, rank: int) -> Iterator[Marker]:
 def _hand(
     hand: HandModel, solids: Sequence[Primitive], posture: Posture, colour: tuple[float, float, float]
 ) -> Iterator[Marker]:
-    """Yield the solids of the hand. A capsule is drawn as a cylinder and two balls."""
+    """Yield the markers of the hand's solids. A capsule is drawn as a cylinder and two spheres."""
     T_frame_base = matrix_of_posture(posture)
     rotations, translations = link_poses(hand, posture.joint_positions)
     for solid in solids:
@@ -481,14 +477,14 @@ def _hand(
                     yield _solid(Marker.SPHERE, ball, np.full(3, 2 * size[0]), colour)
 
 
-# Thousands of points take tens of milliseconds to make. Nobody changes them.
+# Making thousands of points takes tens of milliseconds. The lists are never modified.
 @lru_cache(maxsize=256)
 def _corners(mesh: Primitive) -> list[Point]:
     return [point_of(corner) for corner in mesh.vertices[mesh.faces.reshape(-1)]]
 
 
 def _contact(contact: Contact) -> Marker:
-    """Return an arrow that ends at the contact and points as the link presses, against the object's normal."""
+    """Return an arrow that ends at the contact. It points against the object's normal, as the link presses."""
     tip = np.array(contact.position)
     tail = tip + _ARROW_LENGTH * np.array(contact.normal)
     return _arrow(tail, tip, (0.1, 0.3, 0.9))
@@ -522,7 +518,7 @@ def _solid(kind: int, pose: Pose, size: np.ndarray, colour: tuple[float, float, 
 
 
 def _arrow(tail: np.ndarray, tip: np.ndarray, colour: tuple[float, float, float]) -> Marker:
-    # Points are in the header's frame. RViz wants the pose beside them to be a rotation all the same.
+    # The points are in the header's frame. RViz still needs a valid quaternion in the pose.
     marker = Marker(type=Marker.ARROW, scale=vector_of((0.004, 0.008, 0.01)), color=_colour(colour, 1.0))
     marker.pose.orientation.w = 1.0
     marker.points = [point_of(tail), point_of(tip)]

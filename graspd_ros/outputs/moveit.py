@@ -1,7 +1,7 @@
-"""Grasps as moveit_msgs/Grasp, for MoveIt's pick pipelines. A ROS installation or `make setup` brings moveit_msgs.
+"""Grasps as moveit_msgs/Grasp for MoveIt's pick pipelines. ROS or `make setup` installs moveit_msgs.
 
-MoveIt's `grasp_pose` is that of the end effector's parent link, which is the last link of the arm and no link of the
-hand. `T_parent_base` is the pose of the hand's base link in it.
+MoveIt's `grasp_pose` is the pose of the end effector's parent link, the last link of the arm. `T_parent_base` is the
+pose of the hand's base link in the parent link's frame.
 """
 
 from __future__ import annotations
@@ -21,12 +21,12 @@ from trajectory_msgs.msg import JointTrajectory
 from graspd_core.errors import ConfigError, GraspdError
 from graspd_ros.convert import Matrix, matrix_of_pose, nanoseconds, pose_of_matrix, set_nanoseconds, vector_of
 
-# A hand that comes this much of the way is near enough to go on, as MoveIt asks for a least distance.
+# MoveIt's `min_distance` as a fraction of `desired_distance`.
 _LEAST_APPROACH = 0.5
 
 
 class MoveItMissing(GraspdError):
-    """The error that moveit_msgs cannot be imported."""
+    """moveit_msgs cannot be imported."""
 
 
 def moveit_grasp(
@@ -43,30 +43,30 @@ def moveit_grasp(
     """Return the moveit_msgs/Grasp of a graspd_msgs/Grasp.
 
     Args:
-        grasp: as on ~/grasps.
-        retreat: direction to lift in, of any length, in `retreat_frame`. It is usually up.
+        grasp: a grasp from ~/grasps.
+        retreat: lift direction of any length in `retreat_frame`, usually up.
         retreat_frame: frame of `retreat`.
-        retreat_distance: how far to lift [m].
-        T_parent_base: pose of the hand's base link in the end effector's parent link. None: the mount in the hand's
-            description, or identity if it has no mount.
-        touch: names of what the hand may touch on its way and afterwards, which is the object.
-        effort: most that each joint of the trajectory may press with, in its order [N·m] or [N]. Empty: not stated.
-        messages: module with the message classes (None: moveit_msgs.msg).
+        retreat_distance: lift height [m].
+        T_parent_base: pose of the hand's base link in the end effector's parent link. If None, the mount in the hand's
+            description is used, or identity without a mount.
+        touch: names of the collision objects that the hand may touch, usually the grasped object.
+        effort: greatest effort per joint in the trajectory's order [N·m] or [N]. Empty leaves efforts out.
+        messages: module with the message classes. If None, `moveit_msgs.msg` is used.
 
     Raises:
         MoveItMissing: moveit_msgs is not installed.
-        ConfigError: a failed grasp, or a retreat without direction.
+        ConfigError: the grasp failed its trial, or `retreat` is zero or not finite.
     """
     if grasp.verdict == Grasp.FAILED:
         raise ConfigError(f"grasp {grasp.id!r}: it failed its trial ({grasp.reason}) and must not be executed")
     up = np.array(retreat, dtype=float)
     if not (np.isfinite(up).all() and up.any()):
-        raise ConfigError(f"retreat: {retreat}; it must be a direction")
+        raise ConfigError(f"retreat: {retreat}; valid: a finite direction that is not zero")
     messages = messages or _moveit_messages()
     first, *closing = deepcopy(grasp.trajectory.points)
     T_frame_grasp = T_frame_base = matrix_of_pose(grasp.grasp_pose)
     if waits := dict(zip(grasp.arrival_joints.name, grasp.arrival_joints.position, strict=True)):
-        # MoveIt's approach ends with the hand still open.
+        # At the end of MoveIt's approach the hand is still open.
         T_frame_base = matrix_of_pose(grasp.arrival_pose)
         first.positions = [waits[name] for name in grasp.trajectory.joint_names]
     way = T_frame_base[:3, 3] - matrix_of_pose(grasp.pregrasp_pose)[:3, 3]

@@ -1,7 +1,7 @@
-"""Outcomes of requests as messages: exactly one GraspArray for each, and events for clients without graspd_msgs.
+"""Outcomes of requests as messages: one GraspArray per request, and events for clients without graspd_msgs.
 
-Clouds that come without a request are the exception. Those that are replaced by a newer one before their turn are only
-counted. The node publishes its health and its counts since the start on /diagnostics.
+Only a cloud without a request that a newer cloud replaces gets no answer. It is counted. The node publishes its health
+and its counts since the start on /diagnostics.
 """
 
 from __future__ import annotations
@@ -55,10 +55,10 @@ _ENDS = {
     GraspArray.SUPERSEDED: "requests superseded",
     GraspArray.REFUSED: "requests refused",
 }
-# What is counted since the start, by the key that tells it.
+# Keys in /diagnostics of the counts since the start.
 ACCEPTED, RECEIVED, SUPERSEDED = "requests accepted", "clouds received", "clouds superseded"
 VERIFIED, FAILED = "grasps verified", "grasps failed"
-COUNT_PERIOD = 1.0  # seconds between two counts of superseded clouds, and between two complaints about clouds
+COUNT_PERIOD = 1.0  # seconds between two reports of superseded clouds, or of unusable clouds
 _REFUSALS = {
     Refusal.BUSY: ErrorCode.BUSY,
     Refusal.DUPLICATE: ErrorCode.DUPLICATE_ID,
@@ -76,20 +76,20 @@ SHOWN = {
     JointTrajectory: "~/trajectory",
     MarkerArray: "~/markers",
 }
-# Late joiners get the last of these.
+# Late subscribers get the last message of each.
 LATCHED = {GraspArray: "~/grasps", **SHOWN}
 
 
 @dataclass(frozen=True)
 class Health:
-    """The state of the node.
+    """State of the node.
 
     Attributes:
-        running: id of the request that is worked on, empty when idle.
-        waiting: requests that wait, of at most `queue_size`.
-        counts: since the start, by their keys in the message.
-        last_latency: seconds from the last answered request to its answer, None before the first.
-        last_first_verified: seconds from that request to its first verified grasp, None where there was none.
+        running: id of the running request. Empty when idle.
+        waiting: number of waiting requests, at most `queue_size`.
+        counts: counts since the start, by their keys in the message.
+        last_latency: time from the last planned request to its answer [s]. None before the first.
+        last_first_verified: planning time until the first verified grasp of that request [s]. None without one.
     """
 
     name: str
@@ -108,7 +108,7 @@ class Health:
 
 
 class Counters:
-    """Counts by name, and the last figures. Safe from any thread."""
+    """Thread-safe counts by name, and the figures of the last request."""
 
     def __init__(self) -> None:
         self._lock = threading.Lock()
@@ -120,7 +120,7 @@ class Counters:
             self._counts[key] += 1
 
     def answered(self, message: GraspArray) -> None:
-        """Count a request that got its answer, and its grasps."""
+        """Count an answered request and its grasps."""
         with self._lock:
             self._counts[_ENDS[message.status]] += 1
             self._counts[VERIFIED] += sum(grasp.verdict == GraspMessage.VERIFIED for grasp in message.grasps)
@@ -132,7 +132,7 @@ class Counters:
                 self._last["failed_in_a_row"] = 0
 
     def planned(self, result: GraspResult, latency: float) -> None:
-        """Count a run that ended `latency` seconds after its request came."""
+        """Store the times of a run that ended `latency` seconds after its request came."""
         with self._lock:
             self._last |= {"last_latency": latency, "last_first_verified": result.timing.first_verified}
 
@@ -147,7 +147,7 @@ class Counters:
 
 
 def health_message(health: Health, stamp: Time, memory: int) -> DiagnosticArray:
-    """Return one status, with a level for alarms, a message for people, and values for graphs.
+    """Return the node's diagnostic status: a level for alarms, a message for people, and values for plots.
 
     `memory` is the resident memory of the process and its children [bytes].
     """
@@ -163,9 +163,9 @@ def health_message(health: Health, stamp: Time, memory: int) -> DiagnosticArray:
 
 
 def resident_memory(pid: int | None = None) -> int:
-    """Return the memory of a process (None: this one) and its children in RAM [bytes], 0 where it is unknown.
+    """Return the resident memory of a process (None for this one) and its children [bytes]. 0 if unknown.
 
-    Memory that they share counts for each.
+    Shared memory counts once for each process.
     """
     process = Path("/proc", str(pid or os.getpid()))
     try:
@@ -180,7 +180,7 @@ def resident_memory(pid: int | None = None) -> int:
 def _words(file: Path) -> list[str]:
     try:
         return file.read_text().split()
-    except OSError:  # of a thread that has ended meanwhile
+    except OSError:  # the thread has ended meanwhile
         return []
 
 
@@ -224,13 +224,13 @@ def _seconds(value: float | None) -> str:
 
 
 class Publishers:
-    """One publisher for each type of message."""
+    """Set of publishers, one per message type."""
 
     def __init__(self, node: Node) -> None:
         self._node = node
         self._lock = threading.Lock()
         self._closed = False
-        # Latched: who is discovered after the start, or after a restart, still hears that the node is ready.
+        # Latched, so that late subscribers still receive `ready`.
         status = QoSProfile(depth=50, durability=DurabilityPolicy.TRANSIENT_LOCAL)
         self._publishers: dict[type, Any] = {
             String: node.create_publisher(String, "~/status", status),
@@ -259,9 +259,9 @@ class Publishers:
         self.publish(String(data=status_line(line)))
 
     def forget(self) -> None:
-        """Withhold earlier poses, joint values and markers from late joiners.
+        """Reset the latched poses, joint values and markers, so that late subscribers do not get old ones.
 
-        Answers stay, because readers find a new publisher only after a moment and would miss those published at once.
+        Answers stay latched. Subscribers need a moment to find a new publisher and would miss the first answers.
         """
         with self._lock:
             for kind in SHOWN:
@@ -274,7 +274,7 @@ class Publishers:
 
 
 class Responses:
-    """Publish what becomes of requests through `publishers`, and count it in `counters`."""
+    """Reporter of request outcomes. It publishes through `publishers` and counts in `counters`."""
 
     def __init__(self, node: Node, hand: HandModel) -> None:
         self.publishers = Publishers(node)
@@ -286,7 +286,7 @@ class Responses:
         self._superseded_told = self._complained = -float("inf")
 
     def forget(self) -> None:
-        """Reset the counts, and withhold everything but the last answer from late joiners."""
+        """Reset counters and latched topics. Only the last answer stays available to late subscribers."""
         self.publishers.publish(result_markers((), self._hand, "", self._now()))
         self.publishers.forget()
         self.counters.clear()
@@ -301,7 +301,7 @@ class Responses:
             self._accepted(request, admission.ahead)
 
     def not_made(self, request_id: str, source: str, error: Exception, listener: Listener | None = None) -> None:
-        """Answer a message that is no valid request."""
+        """Answer an invalid request message with status REFUSED."""
         code, message = code_of(error), sentence_of(error)
         if code is ErrorCode.INTERNAL:
             self.tell_error(request_id[:MOST_ID], source, error)
@@ -312,17 +312,17 @@ class Responses:
         self._publish(messages.array_message(ending, request_id[:MOST_ID], header, 0.0, self._hand, Pace()), listener)
 
     def cloud_not_taken(self, request_id: str, error: Exception) -> None:
-        """Report an unusable cloud that came without a request, at most once a second, as cameras repeat themselves."""
+        """Report an unusable cloud that came without a request, at most once a second."""
         if time.monotonic() - self._complained >= COUNT_PERIOD:
             self._complained = time.monotonic()
             self.not_made(request_id, "cloud", error)
 
     def thing_not_taken(self, error: Exception) -> None:
-        """Report an unusable message about a thing of the planning scene, which changes nothing."""
+        """Report an invalid collision-object message. The planning scene stays unchanged."""
         self._refused("", "collision_objects", code_of(error), sentence_of(error))
 
     def images_not_taken(self, told: str) -> None:
-        """Report why none of the depth images that come is used."""
+        """Report why no incoming depth image is used."""
         self._refused("", "sensors", ErrorCode.NO_CLOUD, told)
 
     def _refused(self, request_id: str, source: str, code: ErrorCode, message: str) -> None:
@@ -337,13 +337,13 @@ class Responses:
             self._report(request, GraspProgress(header=header, request_id=request.id, stage="queued", message=told))
 
     def started(self, request: Request) -> None:
-        """Report that the worker begins a request. A waiting cloud is reported only now."""
+        """Report that the worker starts an `only_newest` request. Other requests were reported on submission."""
         if request.only_newest:
             self._tell_superseded(request.id)
             self._accepted(request, 0)
 
     def progress_hook(self, request: Request) -> ProgressHook:
-        """Return a hook that publishes the request's progress, not too often."""
+        """Return a hook that publishes progress at most at `progress_rate`, and passes each grasp to the listener."""
         lowest, last, period = math.inf, -math.inf, 1 / request.settings.progress_rate
 
         def tell(progress: Progress) -> None:
@@ -374,13 +374,13 @@ class Responses:
             request.listener.progressed(message)
 
     def finished(self, request: Request, report: Report[Planned]) -> None:
-        """Answer a request that was taken and has ended. Never raises."""
+        """Answer an accepted request that has ended. Never raises."""
         try:
             self._finished(request, report)
-        except Exception as error:  # whatever is wrong with a result, its client is not left waiting
+        except Exception as error:  # the client must get an answer even if the result is invalid
             try:
                 self._finished(request, Report(WorkerEnding.FAILED, error=error))
-            except Exception as again:  # and the worker's thread goes on
+            except Exception as again:  # the worker's thread must go on
                 self._log().error(f"{request.id}: not answered:\n{''.join(traceback.format_exception(again))}")
 
     def _finished(self, request: Request, report: Report[Planned]) -> None:
@@ -404,7 +404,7 @@ class Responses:
 
     def _result(self, request: Request, planned: Planned) -> None:
         result, hand = planned.result, self._hand
-        # Everything is made before anything is published: a result that cannot be told is an error as a whole.
+        # Make all messages before publishing any, so that an invalid result is reported as an error only.
         ending = dataclasses.replace(messages.ending_of(result), **_weight(planned))
         answer = self._answer(request, ending)
         event = {**result_event(result), **_weight(planned)}
@@ -427,10 +427,7 @@ class Responses:
         self._publish(answer, request.listener)
 
     def drawn(self, settings: Settings) -> Sequence[Primitive]:
-        """Return the solids that markers draw the hand with.
-
-        The first use reads them, for seconds if they are large.
-        """
+        """Return the solids with which markers draw the hand. The first call may read large ones for seconds."""
         if settings.marker_geometry != "visual":
             return self._hand.primitives
         if self._visuals is None:
@@ -453,11 +450,11 @@ class Responses:
         if listener is not None:
             try:
                 listener.ended(message)
-            except Exception as error:  # the answer is out: it must not be followed by another
+            except Exception as error:  # the answer is already published. There must be no second one
                 self._log().error(f"{message.request_id}: {''.join(traceback.format_exception(error))}")
 
     def nothing_to_cancel(self, request_id: str) -> None:
-        """Report a cancel that found no request, which is common and no fault."""
+        """Report a cancel without a matching request. This is common and harmless."""
         message = f"cancel: no request {request_id!r} is waiting or running"
         self.publishers.tell("error", request_id, "cancel", kind="NotFound", code=ErrorCode.NOT_FOUND, message=message)
         self._log().debug(message)
@@ -471,7 +468,7 @@ class Responses:
         self._log().error(f"{request_id or source}: {message}{detail}")
 
     def _tell_superseded(self, request_id: str) -> None:
-        """Report how many clouds were replaced by newer ones, at most once a second and once a request."""
+        """Publish the number of superseded clouds since the last report, and reset it."""
         count, self._superseded = self._superseded, 0
         if count:
             self._superseded_told = time.monotonic()
@@ -494,19 +491,19 @@ def _pace(request: Request) -> Pace:
 
 
 def presentable(result: GraspResult) -> Grasp | None:
-    """Return the best grasp if it is as certain as was asked for, else None, so that no worse one is published."""
+    """Return the best grasp if it is usable. Otherwise return None, so that no uncertain grasp is published."""
     best = result.tried[0] if result.tried else None
     return best if best is not None and best.usable else None
 
 
 def progress_event(progress: Progress) -> dict[str, Any]:
-    """Return a progress report. `fraction` is that of its stage."""
+    """Return a progress report as a JSON-ready event. `fraction` refers to the current stage."""
     told = {name: value for name, value in vars(progress).items() if name != "found"}
     return {**told, "fraction": messages.fraction_of(progress)}
 
 
 def result_event(result: GraspResult) -> dict[str, Any]:
-    """Return outcome, counts, timing and the best grasp's figures. `best` is null when no grasp may be published."""
+    """Return outcome, counts, timing and the best grasp's figures. `best` is None if no grasp may be published."""
     best = presentable(result)
     return {
         "outcome": result.outcome.name.lower(),
@@ -534,7 +531,7 @@ def _summary(grasp: Grasp) -> dict[str, Any]:
 
 
 def status_line(event: dict[str, Any]) -> str:
-    """Return one JSON object on one line. Numbers that JSON does not know become null."""
+    """Return an event as one line of JSON. Non-finite numbers become null."""
     return json.dumps(_finite(event), allow_nan=False)
 
 

@@ -92,7 +92,7 @@ def test_an_end_in_something_and_a_walled_in_goal_are_told_by_name():
     mover = mover_of("ur5e_like", boxes=(block,))
     away = arm.seed.copy()
     away[0] += 1.5
-    with pytest.raises(NoMotionError, match=r"ur5e_like is \d+ mm deep in something at its goal; valid: clear"):
+    with pytest.raises(NoMotionError, match=r"ur5e_like penetrates an obstacle by \d+ mm at its goal; valid: a goal"):
         find_path(mover, away, arm.seed)
     # A wall from the floor to above all of the arm.
     start, goal = arm.seed.copy(), arm.seed.copy()
@@ -100,7 +100,7 @@ def test_an_end_in_something_and_a_walled_in_goal_are_told_by_name():
     way = tip[:2] / np.linalg.norm(tip[:2])
     reach, height = np.meshgrid(np.linspace(0.13, 1.4, 150), np.linspace(0.02, 1.6, 150))
     wall = np.stack([reach.ravel() * way[0], reach.ravel() * way[1], height.ravel()], 1)
-    with pytest.raises(NoMotionError, match=r"no clear way of ur5e_like was found in 0\.3 s"):
+    with pytest.raises(NoMotionError, match=r"no collision-free path of ur5e_like was found in 0\.3 s"):
         find_path(mover_of("ur5e_like", wall), start, goal, seconds=0.3)
 
 

@@ -95,8 +95,8 @@ def test_an_integer_is_taken_where_a_number_is_meant_and_doubts_are_told(started
     assert "[WARN]" not in "".join(capfd.readouterr())
     started("num_grasp:=3", "nothing_like_it:=1", "roi_min:=[20.0, 0.0, 0.0]", "mesh_roots:=[/no/such/place]")
     told = "".join(capfd.readouterr())
-    assert "parameter num_grasp: there is none; is num_grasps meant?" in told
-    assert "parameter nothing_like_it: there is none; it is ignored" in told
+    assert "unknown parameter 'num_grasp'; did you mean 'num_grasps'?" in told
+    assert "unknown parameter 'nothing_like_it'; it is ignored" in told
     assert "is above roi_max" in told
     assert "mesh_roots: '/no/such/place' is no directory" in told
 
@@ -125,7 +125,7 @@ def test_what_is_warned_of_at_the_start_is_warned_of_while_the_node_runs(started
     for name, value, told in (
         ("roi_max", [-20.0, 1.0, 1.0], "roi_max=[-20.0, 1.0, 1.0]: no point lies in the workspace"),
         ("mesh_roots", ["/no/such/place"], "mesh_roots: '/no/such/place' is no directory"),
-        ("sensor_frame", "camera", "parameter sensor_frame: /tf knows no frame 'camera' by now; known: base_link, cam"),
+        ("sensor_frame", "camera", "parameter sensor_frame: frame 'camera' is not in /tf yet; known: base_link, cam"),
     ):
         (result,) = node.set_parameters([Parameter(name, value=value)])
         assert result.successful

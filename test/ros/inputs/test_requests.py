@@ -296,7 +296,7 @@ def test_what_was_lost_and_which_object_it_was_of_reach_the_worker(tmp_path):
     again = request(tmp_path, object_pose=Pose(position=Point(z=2.0)))
     assert again.object_key == asked.object_key != ""
     assert request(tmp_path, mesh_scale=2.0).object_key != asked.object_key
-    assert "exclude: 257 ids, 0 poses; valid: 256" in str(refusal(exclude=["a/0"] * 257))
+    assert "exclude: 257 ids, 0 poses; valid: at most 256 together" in str(refusal(exclude=["a/0"] * 257))
     with pytest.raises(RequestError, match="exclude_poses: position"):
         request(tmp_path, exclude_poses=[PoseStamped(pose=FAR)])
 

@@ -163,8 +163,8 @@ def test_an_image_takes_the_last_calibration_of_its_frame_and_size():
     assert pairs.doubt() == ""
     now[0] = UNPAIRED
     assert pairs.doubt() == (
-        "depth images: 1 and 2 CameraInfos came, and none of them pairs; the last image is 64 x 48 in 'camera', "
-        "a CameraInfo of its frame and size is needed, and the last one is 64 x 48 in 'elsewhere'"
+        "depth images: 1 images and 2 CameraInfos received, but no two match; last image: 64 x 48 in 'camera', "
+        "last CameraInfo: 64 x 48 in 'elsewhere'; valid: a CameraInfo of the same frame and size"
     )
     # Once, without a stamp, and long before or after: it holds for all images.
     own = calibration(stamp=0)
@@ -184,8 +184,8 @@ def test_images_without_any_calibration_are_counted():
     for _ in range(200):
         assert pairs.add(image(np.ones((48, 64)), "16UC1")) is None
         now[0] += 0.2
-    assert pairs.doubt().startswith("depth images: 200 and 0 CameraInfos came")
-    assert pairs.doubt().endswith("and none has come")
+    assert pairs.doubt().startswith("depth images: 200 images and 0 CameraInfos received")
+    assert pairs.doubt().endswith("last CameraInfo: none; valid: a CameraInfo of the same frame and size")
     # Of binned and cropped images the size counts that they are sent with; one without a frame is of any.
     binned = calibration(128, 96, binning_x=2, binning_y=2)
     binned.header.frame_id = ""

@@ -195,6 +195,6 @@ def test_a_publisher_that_sends_nothing_or_another_type_is_told(node, publish, m
     publish("PointCloud2", "/points", "BEST_EFFORT", count=0)
     publish("CompressedImage", "/depth/image_rect", "BEST_EFFORT", count=0, asked="NOBODY")
     silent, other = watch(node, [clouds, images], all)
-    assert silent.startswith("/points: somebody publishes for ")
-    assert silent.endswith("and nothing has come")
-    assert other == "/depth/image_rect: somebody publishes sensor_msgs/msg/CompressedImage, this node hears Image"
+    assert silent.startswith("/points: a publisher has existed for ")
+    assert silent.endswith("but no message has arrived")
+    assert other == "/depth/image_rect: publishers have type sensor_msgs/msg/CompressedImage, this node needs Image"
