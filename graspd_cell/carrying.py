@@ -50,7 +50,10 @@ def straight(mover: Mover, q: Joints, way: Float[np.ndarray, "3"]) -> Float[np.n
 
 
 def held_balls(mover: Mover, q: Joints, surface: Points) -> Balls:
-    """Return the carried balls, tip frame, and those of an object with surface points [m], base frame, at `q`."""
+    """Return the mover's carried balls and the balls of one more object, all in the tip frame.
+
+    `surface` has the object's surface points [m] in the base frame. The arm is at joint values `q`.
+    """
     pose = tip_pose(mover, q)
     local = balls_about((surface - pose[:3, 3]) @ pose[:3, :3])
     at, radius = (np.concatenate(both) for both in ((mover.carried.at, local.at), (mover.carried.radius, local.radius)))

@@ -389,7 +389,7 @@ class Picker:
 
     def _stop_if_cancelled(self) -> None:
         if self._cancelled():
-            raise Cancelled("the picker was cancelled; the arm is still")
+            raise Cancelled("the picker was cancelled; the arm does not move")
 
 
 def summary(attempts: Sequence[Attempt]) -> str:

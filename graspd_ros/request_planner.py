@@ -93,7 +93,7 @@ class RecentRuns:
         self._runs: OrderedDict[str, _Run] = OrderedDict()
 
     def keep(self, request: Request, planned: Planned) -> None:
-        """Store a result in its planning frame."""
+        """Store a result under the id of its request, so that later requests can exclude its grasps."""
         self._runs[request.id] = _Run(request.object_key, request.frame, request.T_frame_object, planned)
         while len(self._runs) > MOST_RUNS:
             self._runs.popitem(last=False)

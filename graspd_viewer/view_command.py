@@ -52,7 +52,7 @@ def run(options: argparse.Namespace) -> int:
     from graspd_viewer.viewer import Viewer
 
     if options.path is None and (options.object or options.hand):
-        raise ConfigError("--object and --hand belong to a grasps.json; without one they are chosen on the page")
+        raise ConfigError("--object, --hand: no grasps.json is given; give its path, or choose both on the page")
     session = options.path and open_grasps(options.path, object_source=options.object, hand=options.hand)
     viewer = Viewer(host=options.host, port=options.port)
     try:

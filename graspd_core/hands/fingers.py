@@ -23,7 +23,7 @@ _UPRIGHT = 0.5
 
 @dataclass(frozen=True, eq=False)
 class Fingers:
-    """The fingers at straight joints.
+    """Geometry of the fingers of a hand whose joints are straight.
 
     Attributes:
         points: fingertips in the frames of their links [m].

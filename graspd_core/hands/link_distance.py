@@ -236,7 +236,10 @@ def pair_distance(
 
 
 def local_distance(solids: CollisionTensors, local: _Places, which: Int[Tensor, "*batch"]) -> _Distances:
-    """Return the signed distance [m] of each point to its own solid `which`. Points are in that solid's frame."""
+    """Return the signed distance [m] of each point to one solid.
+
+    `which` is the index of each point's solid. `local` has each point in the frame of its solid.
+    """
     return _distance(local, solids.core[which], solids.radius[which], solids.is_round[which])
 
 

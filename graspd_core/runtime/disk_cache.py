@@ -35,7 +35,10 @@ _written = itertools.count(1)
 
 
 def remember(key: str, build: Callable[[], Arrays], valid: Callable[[Arrays], bool]) -> Arrays:
-    """Return the arrays of `key`. If none are stored or `valid`, build and store them. Do not modify the arrays."""
+    """Return the arrays of `key`, from memory, from the file, or from `build`.
+
+    If there is no file, or `valid` rejects its arrays, they are built and stored. Do not modify the returned arrays.
+    """
     with _lock:
         if key in _memory:
             _memory.move_to_end(key)

@@ -143,7 +143,7 @@ def changed_things(things: Mapping[str, Thing], message: Any) -> Mapping[str, Th
     if operation == message.REMOVE and not name:
         return {}
     if not name:
-        raise bad_message(owner, "id: empty; every thing needs one, but REMOVE, which then removes all")
+        raise bad_message(owner, "id: empty; valid: a name; REMOVE alone may have none, and then removes all objects")
     if operation not in operations:
         raise bad_message(owner, f"operation: {operation[0]}; valid: ADD=0, REMOVE=1, APPEND=2, MOVE=3")
     there = things.get(name)

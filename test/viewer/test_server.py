@@ -154,7 +154,7 @@ def test_a_file_is_called_by_its_visitors_name_and_read_from_nowhere_else(monkey
         (["view", "missing.json"], "missing.json"),
         (["view", "--host", "999.1.1.1"], "host: '999.1.1.1'"),
         (["view", "--port", "99999"], "port: 99999; valid: 0 to 65535"),
-        (["view", "--object", "shape:box"], "belong to a grasps.json"),
+        (["view", "--object", "shape:box"], "no grasps.json is given"),
         (["view", "missing.json", "--html", "x.html"], "--html x.html"),
     ],
 )

@@ -120,11 +120,11 @@ _HEAVIEST = 1e3
 
 
 def read_urdf(path: Path, root: ET.Element | None = None) -> HandModel:
-    """Read the hand of a URDF, without candidates.
+    """Read a hand from a URDF. Contact candidates are not set.
 
-    Postures are mid-range, the palm is at the base's origin. A missing or zero effort or velocity becomes infinite.
-    These changes give a warning: `continuous` joints are limited to ±π. A link without collision shapes gets its visual
-    shapes. A `world` link or a floating joint above the base is dropped.
+    All postures have joints at mid-range. The palm is at the base's origin. A missing or zero effort or velocity
+    becomes infinite. The following changes add a warning. A `continuous` joint is limited to ±π. A link without
+    collision shapes gets its visual shapes. A `world` link or a floating joint above the base is dropped.
 
     Args:
         path: path of the file.

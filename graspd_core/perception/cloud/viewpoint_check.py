@@ -1,9 +1,9 @@
 """Check whether a cloud can have been seen from the given position of its camera.
 
 An organised cloud shows this itself: a homography maps the pixels of a pinhole camera to the lines of sight, and depth
-errors only move points along these lines. Without pixels, the check is that a camera sees no surface through another
-and none from behind. From a wrong position, other points surround and hide some points, and a part of each curved
-surface faces away.
+errors only move points along these lines. Without pixels, two things are checked. A camera sees no surface through
+another surface, and no surface from behind. If the given position is wrong, points around some points seem to hide
+them, and a part of each curved surface seems to face away from the camera.
 """
 
 from __future__ import annotations
