@@ -16,7 +16,7 @@ from graspd_core.optimize.plan_config import PlanConfig, load_preset, method_row
 VERIFIED, BATCH = 8, 32
 # Grasps of a raw cell in the studies `hands` and `decades`.
 HAND_COUNT = 8
-# Presets that users plan with.
+# Shipped presets that users plan with. A preset of their own is planned with too.
 PLANNED = ("fast", "balanced", "accurate")
 # Variant of `balanced` with the same effort in every round, for comparison.
 STEADY = "balanced_steady"
@@ -68,8 +68,8 @@ def main_suite(request: Request) -> tuple[Cell, ...]:
     names = (name for name in preset_names() if name != _RANKED)
     defaults = [name for name in names if not request.quick or name in _QUICK_PRESETS]
     presets = {name: load_preset(name) for name in request.presets or defaults}
-    planned = {name: config for name, config in presets.items() if name in PLANNED}
-    if "balanced" in planned:
+    planned = {name: config for name, config in presets.items() if name in PLANNED or name not in preset_names()}
+    if "balanced" in planned and not request.presets:
         planned[STEADY] = override(planned["balanced"], {"rounds.first_budget": 1.0, "rounds.growth": 1.0})
     trials = _trials(request, USUAL)
     cells: list[Cell] = []

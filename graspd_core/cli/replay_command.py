@@ -143,6 +143,8 @@ def _planned(
         print_note(f"{job.label}: {warning}")
     with Reporter() as reporter:
         result = plan_grasps(scene, hand, preset=config, progress=reporter, deadline=deadline.left(), **request)
+    for warning in result.warnings[len(scene.object.warnings) + len(hand.named_warnings) :]:
+        print_note(f"{job.label}: {warning}")
     if options.out:
         path = options.out if options.out.suffix == ".json" else options.out / f"{job.name}.json"
         save_result(path, result, scene.object, hand, config)

@@ -92,7 +92,8 @@ def run(options: argparse.Namespace) -> int:
         print(summary(result, options.count, 0))
         answer(not_loaded_document(result))
         return exit_status(result)
-    for warning in (*scene.object.warnings, *hand.named_warnings):
+    known = (*scene.object.warnings, *hand.named_warnings)
+    for warning in known:
         print_note(warning)
     page_of_run = nullcontext(Watched())
     if options.view:
@@ -101,6 +102,8 @@ def run(options: argparse.Namespace) -> int:
         with Reporter() as reporter, Interrupt() as interrupt:
             hooks = {"progress": page.progress(reporter), "watch": page.watch, "stop": interrupt.came}
             result = plan_grasps(scene, hand, preset=config, deadline=deadline.left(), **hooks, **request)
+        for warning in result.warnings[len(known) :]:
+            print_note(warning)
         _report(options, result, scene, hand, config)
         page.show(result)
     return exit_status(result)

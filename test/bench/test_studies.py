@@ -19,6 +19,7 @@ from graspd_bench.run_studies import Job, make_plan, run_job, studies_of
 from graspd_bench.studies.human_hand import SOFTNESS
 from graspd_bench.study import Request
 from graspd_bench.study_registry import STUDIES
+from graspd_bench.suites import main_suite
 from graspd_bench.tables import sourced, written
 from graspd_core.cli import main
 from graspd_core.cli.running import EXIT_BAD_INPUT, EXIT_INTERRUPTED, EXIT_OK
@@ -120,6 +121,14 @@ def test_what_needs_the_user_s_files_says_so():
 
 
 GRASPD = [sys.executable, "-m", "graspd_core.cli", "bench"]
+
+
+def test_a_preset_of_ones_own_is_planned_with_and_nothing_else_that_was_not_asked_for(tmp_path: Path):
+    (tmp_path / "own.yaml").write_text("rounds: {growth: 1.5}\n")
+    presets = ("balanced", "random_closure", str(tmp_path / "own.yaml"))
+    cells = main_suite(Request(presets=presets, objects=("shape:box",)))
+    assert [cell.name for cell in cells if cell.kind == "verified"] == ["balanced", "own"]
+
 
 # Two cells of a few seconds, whose method does next to nothing.
 SMALL = ["--presets", "random_closure", "--objects", "shape:sphere", "--count", "2", "--trials", "standard"]
