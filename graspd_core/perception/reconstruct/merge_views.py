@@ -186,8 +186,8 @@ def is_unposed(view: PointCloud, axis_known: bool = False) -> bool:
 def is_all_round(view: PointCloud) -> bool:
     """Return True if points enclose a body.
 
-    Then normals n and positions p have mean n = 0 and mean n pᵀ = volume / area, by the divergence theorem. One side of
-    a body has mean n = 0 only by chance, and then fails the second test.
+    Then normals n and positions p have mean n = 0 and mean n pᵀ = volume / area · I, by the divergence theorem. One
+    side of a body has mean n = 0 only by chance, and then fails the second test.
     """
     points = view.points[measured(view.points, view.viewpoint)]
     if len(points) < MIN_POINTS:
