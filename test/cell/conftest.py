@@ -23,6 +23,12 @@ from graspd_core.se3 import SE3
 PAIRS = (("ur5e_like", "allegro_right"), ("panda_like", "leap_right"), ("ur5e_like", "parallel_gripper"))
 
 
+@pytest.fixture(scope="session")
+def domain(claim_domain: Callable[[], int]) -> int:
+    """A domain of the cell's tests: transforms that tests of the node keep would be heard in theirs."""
+    return claim_domain()
+
+
 @lru_cache(maxsize=8)
 def _world(arm: str, hand: str, names: tuple[str, ...], height: float) -> CellWorld:
     model = load_arm(arm)
