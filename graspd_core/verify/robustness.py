@@ -18,7 +18,14 @@ from functools import lru_cache, partial
 from itertools import islice
 from typing import TypeVar
 
-from graspd_core.config.planning_config import DOUBTED_SHARE, LEAST_LIGHT, MASS_ASSUMED, MASS_KNOWN, HeldShares
+from graspd_core.config.planning_config import (
+    DOUBTED_SHARE,
+    LEAST_LIGHT,
+    MASS_ASSUMED,
+    MASS_KNOWN,
+    HeldShares,
+    share_as_light,
+)
 from graspd_core.errors import GraspdError
 from graspd_core.hands.model import HandModel
 from graspd_core.mesh.convex_parts import convex_parts
@@ -230,11 +237,18 @@ def hypotheses_of(
     return Hypotheses(tuple(stages), surest, waited_for)
 
 
-def less_sure(hypotheses: Hypotheses, share: float, most: float) -> Hypotheses:
-    """Scale all probabilities by `share`, the probability that the object weighs at most `most` [kg]."""
+def less_sure(hypotheses: Hypotheses, most: float, heavy: float) -> Hypotheses:
+    """Scale all probabilities by the probability that the object weighs at most the payload `most` [kg].
+
+    `heavy` is the heavy end of what the object's volume allows [kg]. If too many such objects weigh more than `most`,
+    the checks return this as a doubt. Checks that have doubts are returned unchanged.
+    """
+    if hypotheses.doubts:
+        return hypotheses
+    share = share_as_light(most, heavy)
     if share < LEAST_LIGHT:
-        told = f"the hand lifts {most:.2g} kg, and most objects of this volume weigh more"
-        return Hypotheses((), share * MASS_KNOWN.likeliest, doubts=(told,))
+        doubt = f"the grasp lifts {most:.2g} kg, and too many objects of this volume weigh more"
+        return Hypotheses((), share * MASS_KNOWN.likeliest, doubts=(doubt,))
     stages = tuple(replace(stage, though_failed=share * stage.though_failed) for stage in hypotheses.stages)
     return replace(hypotheses, stages=stages, probability=share * hypotheses.probability)
 

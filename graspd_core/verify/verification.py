@@ -18,7 +18,6 @@ import numpy as np
 import torch
 
 from graspd_core.config import VERIFICATIONS, CertaintyConfig, RobustConfig
-from graspd_core.config.planning_config import share_as_light
 from graspd_core.errors import ConfigError
 from graspd_core.hands.model import HandModel
 from graspd_core.perception.scene import Scene, moved_grasp, near_scene, object_parts
@@ -61,12 +60,19 @@ _NOISE = 0x6E6F697365
 
 @dataclass(frozen=True)
 class VerificationContext:
-    """Worlds, metrics and robustness checks of a run. `metrics` builds its context. It is None without metrics."""
+    """Worlds, metrics and robustness checks of a run.
+
+    Attributes:
+        metrics: builds the context of the metrics. None without metrics.
+        friction: whether to measure the least friction.
+        heavy: the assumed mass [kg], if the trials use a lower one. None otherwise.
+    """
 
     trials: TrialContext
     metrics: Callable[[], MetricsContext] | None
     hypotheses: Hypotheses | None = None
     friction: bool = False
+    heavy: float | None = None
 
     @property
     def mass(self) -> float:
@@ -128,17 +134,17 @@ def lighter(
 ) -> VerificationContext:
     """Return the context with a lower object `mass` [kg] than the assumed one.
 
-    Grasps then have a lower probability. `most` is the greatest payload of any grasp [kg]. If most objects of this
-    volume weigh more, no grasp can be verified.
+    A grasp then has a lower probability, because the object may weigh more than its payload. `most` is the greatest
+    payload of any grasp [kg]. If it is too low for a verified grasp, no robustness check runs.
     """
     trials, others = context.trials, [world.altered(mass) for world in ahead.others]
     around = trials.around and altered(trials.around, mass=mass)
     trials = replace(trials, alone=altered(trials.alone, mass=mass), around=around)
     known = replace(scene, object=replace(scene.object, mass_assumed=False))
     hypotheses = hypotheses_of(known, others, trials, certainty.probability)
-    if hypotheses is not None and not hypotheses.doubts:
-        hypotheses = less_sure(hypotheses, share_as_light(most, scene.object.mass), most)
-    return replace(context, trials=trials, hypotheses=hypotheses)
+    if hypotheses is not None and (doubted := less_sure(hypotheses, most, scene.object.mass)).doubts:
+        hypotheses = doubted
+    return replace(context, trials=trials, hypotheses=hypotheses, heavy=scene.object.mass)
 
 
 def payloads(context: VerificationContext, grasps: Sequence[Grasp], stop: StopHook) -> list[float]:
@@ -289,9 +295,13 @@ def _at_once(threads: int, stage: HypothesisStage, grasp: Grasp, stop: StopHook)
 
 def _all_trials(context: VerificationContext, hold_under: HoldUnder, grasp: Grasp, stop: StopHook) -> Grasp:
     results = grasp_trials(context.trials, grasp, stop)
-    if not results[-1].passed or context.hypotheses is None:
+    hypotheses, trials = context.hypotheses, context.trials
+    if not results[-1].passed or hypotheses is None:
         return replace(grasp, trials=results)
-    under, probability = try_hypotheses(context.hypotheses, grasp, stop, hold_under)
+    if context.heavy is not None:
+        most = payload(trials.alone, grasp, trials.protocol, least=context.mass, held=True, stop=stop)
+        hypotheses = less_sure(hypotheses, most, context.heavy)
+    under, probability = try_hypotheses(hypotheses, grasp, stop, hold_under)
     return replace(grasp, trials=(*results, under), probability=probability)
 
 

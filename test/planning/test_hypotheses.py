@@ -31,6 +31,7 @@ from graspd_core.types import HYPOTHESES, Grasp, GraspResult, Posture, StopHook,
 from graspd_core.verify import robustness as hypotheses
 from graspd_core.verify import verification
 from graspd_core.verify.hold_trial import hold_trial
+from graspd_core.verify.limits import payload
 from graspd_core.verify.robustness import (
     Hypotheses,
     Hypothesis,
@@ -40,6 +41,7 @@ from graspd_core.verify.robustness import (
     begin_other_shapes,
     begin_other_worlds,
     hypotheses_of,
+    less_sure,
     try_hypotheses,
 )
 from graspd_core.verify.run_clock import Run
@@ -267,15 +269,32 @@ def test_at_less_than_the_assumed_mass_a_grasp_is_less_sure():
     share = share_as_light(0.5, 1.0)
     assert LEAST_LIGHT < share < 1.0
     assert half.hypotheses is not None
-    assert half.hypotheses.probability == pytest.approx(share * MASS_KNOWN.shapes)
-    assert half.hypotheses.stages[0].though_failed == pytest.approx(share * MASS_KNOWN.fails_places)
-    # Most things of this volume are heavier than a tenth of the heavy end: no grasp of it is verified.
+    own = less_sure(half.hypotheses, 0.5 * heavy, heavy)
+    assert own.probability == pytest.approx(share * MASS_KNOWN.shapes)
+    assert own.stages[0].though_failed == pytest.approx(share * MASS_KNOWN.fails_places)
+    # Most objects of this volume are heavier than a tenth of the heavy end: no grasp is verified.
     tenth = verification.lighter(seen, ahead, context, CertaintyConfig(), 0.08 * heavy, 0.1 * heavy)
     assert tenth.hypotheses is not None
     result, probability = try_hypotheses(tenth.hypotheses, GRASP, lambda: False)
     assert not result.passed
-    assert "most objects of this volume weigh more" in result.reason
+    assert "too many objects of this volume weigh more" in result.reason
     assert probability == pytest.approx(share_as_light(0.1, 1.0) * MASS_KNOWN.likeliest)
+
+
+def test_a_grasp_is_as_sure_as_objects_are_lighter_than_its_own_payload():
+    seen, hand = seen_from(), load_hand("allegro_right")
+    worlds = build_worlds(seen, hand, object_parts(seen.object), PROTOCOLS["standard"])
+    grasps = tuple(replace(grasp, trials=()) for grasp in planned().tried if grasp.verdict is not Verdict.FAILED)
+    payloads = {id(grasp.grasp): payload(worlds.alone, grasp, worlds.protocol) for grasp in grasps}
+    heavy = 1.5 * max(payloads.values())
+    context = verification.VerificationContext(worlds, None, Hypotheses((), PASSED), heavy=heavy)
+    tried = verification.run_trials(Run(0.0, None, None, None), context, grasps, len(grasps), 0).grasps
+    for grasp in tried:
+        share = share_as_light(payloads[id(grasp.grasp)], heavy)
+        verified = grasp.verdict is Verdict.VERIFIED
+        assert verified or share < 1.1 * LEAST_LIGHT
+        assert grasp.probability == pytest.approx(share * (PASSED if verified else MASS_KNOWN.likeliest), rel=0.1)
+    assert {grasp.verdict for grasp in tried} == {Verdict.VERIFIED, Verdict.UNVERIFIED}
 
 
 def test_what_is_tried_at_less_mass_begins_with_the_strongest():
