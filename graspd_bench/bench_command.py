@@ -69,7 +69,7 @@ def run(options: argparse.Namespace) -> int:
     from graspd_core.io.grasps_json import check_writable
 
     if options.processes < 1:
-        raise ConfigError(f"processes: {options.processes}; at least 1")
+        raise ConfigError(f"processes: {options.processes}; valid: 1 or more")
     words = list(options.studies)
     # The word after `dexgraspbench` is the folder of its checkout, not a study.
     after = words.index("dexgraspbench") + 1 if "dexgraspbench" in words else len(words)

@@ -420,7 +420,7 @@ def timed(arm: Arm, path: Path, speeds: Speeds) -> JointMotion:
         limits, toppra.SplineInterpolator(along, rows), parametrizer="ParametrizeConstAccel"
     ).compute_trajectory()
     if trajectory is None:
-        raise NoMotionError(f"motion: toppra found no times for a path of {len(rows)} rows of {arm.name}")
+        raise NoMotionError(f"motion: toppra found no timing for a path of {len(rows)} rows of {arm.name}")
     times = np.linspace(0.0, trajectory.duration, max(2, 1 + int(np.ceil(trajectory.duration / _PERIOD))))
     # The spline may exceed a limit that the path touches.
     rows = np.clip(trajectory(times)[1:], arm.lower, arm.upper)

@@ -277,7 +277,7 @@ class Picker:
         goal = release_posture(mover, up[-1], risen, self._layout.place, self._picked)
         if goal is None:
             raise NoMotionError(
-                f"motion: no posture of {self._arm.name} holds the thing above {self._layout.place.name}"
+                f"motion: no posture of {self._arm.name} holds the object above {self._layout.place.name}"
             )
         path = find_path(mover, up[-1], goal)
         there = np.linalg.inv(tip_pose(mover, up[-1])), tip_pose(mover, goal)

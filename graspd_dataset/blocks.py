@@ -150,7 +150,7 @@ class DatasetRequest:
     def __post_init__(self) -> None:
         check_request(count=self.block, seed=self.seed, verify=self.verify, deadline=None, device="cpu")
         if self.per_object < 1:
-            raise ConfigError(f"per-object: {self.per_object} grasps; at least 1")
+            raise ConfigError(f"per-object: {self.per_object} grasps; valid: 1 or more")
         if self.measure not in MEASURED:
             raise ConfigError(f"measure: {self.measure!r}; valid: {', '.join(MEASURED)}")
         number, low, high = self.random_scales

@@ -85,9 +85,9 @@ def _make(options: argparse.Namespace) -> int:
     from graspd_dataset.run_dataset import begin_run, missing_blocks, with_unrecorded, write_run
 
     if not options.out:
-        raise ConfigError("--out is missing: a directory or s3://bucket/path")
+        raise ConfigError("--out is missing; give a directory or s3://bucket/path")
     if options.workers is not None and options.workers < 1:
-        raise ConfigError(f"workers: {options.workers}; at least 1")
+        raise ConfigError(f"workers: {options.workers}; valid: 1 or more")
     request, store = _request(options), DatasetStore(options.out)
     limits = Limits(options.patience, options.memory)
     blocks = blocks_of(request)
@@ -109,7 +109,7 @@ def _make(options: argparse.Namespace) -> int:
     write_run(store, with_unrecorded(store, record))
     _finish(store)
     if interrupt.came():
-        print_error(f"interrupted; the same command goes on, {store.shown} keeps what is done")
+        print_error(f"interrupted; the same command continues, {store.shown} keeps finished blocks")
         return EXIT_INTERRUPTED
     return EXIT_FAULTS if lines.wrong else EXIT_OK
 
@@ -249,7 +249,7 @@ def _merge(options: argparse.Namespace, stores: list[DatasetStore]) -> int:
     from graspd_dataset.merge_datasets import merge
 
     if not options.out:
-        raise ConfigError("--out is missing: where the merged data set goes")
+        raise ConfigError("--out is missing; give the directory of the merged data set")
     out = DatasetStore(options.out)
     with busy("merge"):
         copied, common = merge(stores, out)
@@ -278,7 +278,7 @@ def _export(options: argparse.Namespace, stores: list[DatasetStore]) -> int:
     from graspd_dataset.export_grasps import export
 
     if not options.out:
-        raise ConfigError("--out is missing: the folder that is written")
+        raise ConfigError("--out is missing; give the folder to write")
     with busy("export"):
         files, grasps = export(stores[0], options.to, Path(options.out))
     print(f"{options.out}: {grasps} grasps of {files} pairs of hand and object")

@@ -104,7 +104,7 @@ def joints_by_name(values: Any, hand: HandModel, where: str) -> Float[np.ndarray
         raise FormatError(f"{where}: {shown(values)}; expected joint values by name")
     names = all_joint_names(hand)
     if strange := [name for name in values if name not in names]:
-        raise FormatError(f"{where}: joint {shown(strange[0])} is not of {hand.name}; valid: {', '.join(names)}")
+        raise FormatError(f"{where}: {shown(strange[0])} is no joint of {hand.name}; valid: {', '.join(names)}")
     if missing := [name for name in hand.joint_names if name not in values]:
         raise FormatError(f"{where}: joint {missing[0]!r} of {hand.name} is missing")
     joints = np.array([float(numbers_of(values[name], (), f"{where}: {name}")) for name in hand.joint_names])
@@ -120,7 +120,7 @@ def checked_order(order: Sequence[str], hand: HandModel) -> tuple[str, ...]:
     names = all_joint_names(hand)
     for name in order:
         if name not in names or list(order).count(name) > 1:
-            fault = "occurs twice" if name in names else f"is not of {hand.name}"
+            fault = "occurs twice" if name in names else f"is no joint of {hand.name}"
             raise ConfigError(f"joint order: {name!r} {fault}; valid: {', '.join(names)}")
     if missing := [name for name in hand.joint_names if name not in order]:
         raise ConfigError(f"joint order: {missing[0]!r} of {hand.name} is missing")
@@ -316,7 +316,7 @@ def read_graspgen(path: Path, text: bytes, hand: HandModel, mesh: str | None) ->
         where = f"{path}: grasp {number}"
         if not isinstance(good, bool):
             raise FormatError(f"{where}: object_in_gripper: {shown(good)}; expected true or false")
-        refused = "" if good else "its own file says that it did not hold"
+        refused = "" if good else "its file says that it did not hold"
         found.append(ImportedGrasp(where, mesh, scale, _open_at(pose, hand, where), closed=False, refused=refused))
     return found
 

@@ -197,7 +197,7 @@ def _file_faults(path: str, table: Any, told: dict[str, Any], meshes: set[str]) 
     if target not in meshes:
         yield f"objects/{target}.parquet is missing"
     if table["row"].to_pylist() != list(range(table.num_rows)):
-        yield "rows are missing or not in their order"
+        yield "rows are missing or out of order"
     for name in _POSTURES:
         values = np.array(table[name].to_pylist())
         if not np.isfinite(values).all():

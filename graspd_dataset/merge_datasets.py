@@ -66,7 +66,7 @@ def sample(store: DatasetStore, count: int, seed: int, verdict: str | None = Non
     import pyarrow as pa
 
     if count < 1:
-        raise ConfigError(f"count: {count} rows; at least 1")
+        raise ConfigError(f"count: {count} rows; valid: 1 or more")
     drawn: list[tuple[int, str, int]] = []
     # The first pass reads two columns and draws rows. The second pass reads the files that hold drawn rows.
     for path, _, table, told in tables_of(store, ("row", "verdict")):

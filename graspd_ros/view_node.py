@@ -136,7 +136,7 @@ def grasp_of(message: Any, joint_names: tuple[str, ...]) -> Grasp:
             raise ValueError(f"no value for joint {missing[0]}")
         made = array_of(pose.position), wxyz_of(pose.orientation), np.array([values[name] for name in joint_names])
         if not all(np.isfinite(numbers).all() for numbers in made) or not 0.9 < np.linalg.norm(made[1]) < 1.1:
-            raise ValueError("a posture that is not finite, or no unit quaternion")
+            raise ValueError("a posture has a number that is not finite, or a quaternion that is not of unit length")
         return Posture(*made)
 
     def moved(value: float) -> float:

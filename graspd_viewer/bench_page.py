@@ -61,7 +61,7 @@ def bench_page(folder: Path, *, served: bool = False) -> tuple[str, dict[str, Re
         raw = [r for r in records if r.get("kind") == "raw" and not r["error"] and is_preset(r["name"])]
         data, runs = {**page_data(raw), "served": served}, {record["key"]: record for record in raw}
     except (KeyError, TypeError, AttributeError) as error:
-        raise FormatError(f"{folder / 'results.json'}: a record lacks or mistakes {error}") from None
+        raise FormatError(f"{folder / 'results.json'}: a record has no valid {error}") from None
     if not data["panels"]:
         raise FormatError(f"{folder}: holds no raw grasps of a preset; `graspd bench` measures them")
     # Only the sequence `</` could end the script element early.
@@ -155,9 +155,7 @@ def serve_page(page: str, host: str, port: int, open_run: Callable[[str], int | 
     try:
         server = ThreadingHTTPServer((host, port), handler)
     except (OSError, OverflowError) as error:
-        raise ConfigError(
-            f"{host}:{port} cannot be listened on ({error}); choose another with --host and --port"
-        ) from None
+        raise ConfigError(f"{host}:{port}: cannot listen ({error}); choose another with --host and --port") from None
     thread = threading.Thread(target=server.serve_forever, name="graspd-page", daemon=True)
     thread.start()
     try:

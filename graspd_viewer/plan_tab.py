@@ -234,7 +234,7 @@ class PlanTab:
             friction, count, angle = float(self._friction.value), int(self._count.value), float(self._angle.value)
         except (TypeError, ValueError, OverflowError):
             given = shown((self._friction.value, self._count.value, self._angle.value))
-            raise ConfigError(f"friction, count or angle: {given}") from None
+            raise ConfigError(f"friction, count, angle: {given}; valid: three numbers") from None
         request = PlanRequest(
             shape=self._object.value if sent is None else next(iter(SHAPES)),
             upload=sent, units=self._units.value, alone=bool(self._alone.value), hand=self._hand.value,

@@ -95,7 +95,7 @@ def start_server(host: str, port: int) -> Any:
         with socket.socket(family) as probe:
             probe.bind((host, 0))
     except OSError as error:
-        raise ConfigError(f"host: {host!r}: {error.strerror or error}; 127.0.0.1 for this machine alone") from None
+        raise ConfigError(f"host: {host!r}: {error.strerror or error}; use 127.0.0.1 for this machine alone") from None
     with quiet():
         server = viser.ViserServer(host=host, port=port, label="graspd", verbose=False)
     _refuse_strangers(server, host)
@@ -136,7 +136,7 @@ def _refuse_strangers(server: Any, host: str) -> None:
         raw = websockets._live_connections.get(connection.client_id)
         headers = raw.request.headers if raw is not None else {}
         if raw is not None and not may_connect(headers.get("Origin"), headers.get("Host"), host):
-            await raw.close(1008, "graspd: a page of another site")
+            await raw.close(1008, "graspd: pages of other sites are refused")
 
     websockets.on_client_connect(look)
 

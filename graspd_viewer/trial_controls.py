@@ -66,7 +66,7 @@ def record_trial(context: TrialContext, grasp: Grasp, name: str) -> Recording:
     """Run and record one trial of a grasp. Raises ConfigError: the trial is unknown or does not apply to the scene."""
     names = [row.name for row in TRIALS.values() if row.applies(context)]
     if name not in names:
-        raise ConfigError(f"trial {shown(name)}: valid for this scene: {', '.join(names)}")
+        raise ConfigError(f"trial {shown(name)}; valid for this scene: {', '.join(names)}")
     recorder = _Recorder(context, name)
     # Use separate simulation data, because a parallel run may use the shared spare data.
     worlds = {

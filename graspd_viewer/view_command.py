@@ -47,7 +47,7 @@ def run(options: argparse.Namespace) -> int:
     if options.path is not None and options.path.is_dir():
         return _view_benchmark(options)
     if options.html is not None:
-        raise ConfigError(f"--html {options.html}: of a benchmark's folder; `graspd synthesize --html` draws a grasp")
+        raise ConfigError(f"--html {options.html} needs a benchmark's folder; `graspd synthesize --html` draws a grasp")
     from graspd_viewer.session import open_grasps
     from graspd_viewer.viewer import Viewer
 

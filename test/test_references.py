@@ -1,4 +1,7 @@
-"""What pages, docstrings and comments name in backticks exists: files, modules, functions, fields, settings."""
+"""What pages, docstrings and comments name in backticks exists: files, modules, functions, fields, settings.
+
+`messages.txt` has all errors and warnings, to be read as a whole: `python test/test_references.py` writes it.
+"""
 
 import ast
 import io
@@ -31,6 +34,14 @@ PATH = re.compile(r"[\w.{},-]+(/[\w.{},-]+)+/?|[\w{},-]+\.(py|md|hpp|cpp|yaml|to
 # On a page a word may be anybody's if it has no underscore.
 PAGE_WORD, WORD = re.compile(r"[A-Za-z]\w*_\w+"), re.compile(r"[A-Za-z]\w+")
 SETTINGS = re.compile(r"(Config|Settings)$")
+MESSAGES = Path(__file__).with_name("messages.txt")
+# A text is a message by the name of the call, function or variable that it is in, or by its own words.
+TROUBLE = re.compile(
+    r"warn|doubt|error|bad_|wrong|fault|refus|reason|why|hint|advice|remedy|told|torn|fail|lost|_log|REMEDY|changed",
+)
+TROUBLE_WORDS = re.compile(
+    r"valid|did you mean|not installed|missing|; give|\bis no\b|^(cloud|target|parameter|transform|\{[^{}]*\}): "
+)
 
 Members = dict[str, set[str]]
 
@@ -193,6 +204,57 @@ def prose_of(source: str) -> str:
     return "\n".join([str(node.value) for node in docstrings(ast.parse(source))] + comments)
 
 
+def text_of(node: ast.Constant | ast.JoinedStr) -> str:
+    """Return the text of a string, with the code of what is put into it in braces."""
+    if isinstance(node, ast.Constant):
+        return str(node.value)
+    found = ""
+    for part in node.values:
+        if isinstance(part, ast.FormattedValue):
+            # Versions of Python print a nested f-string differently.
+            nested = any(isinstance(inner, ast.JoinedStr) for inner in ast.walk(part.value))
+            found += "{…}" if nested else f"{{{ast.unparse(part.value)}}}"
+        elif isinstance(part, ast.Constant):
+            found += str(part.value)
+    return found
+
+
+def texts_in(node: ast.AST | None) -> Iterator[ast.Constant | ast.JoinedStr]:
+    """Yield the strings of a tree. A string within a formatted one is part of that."""
+    if isinstance(node, ast.JoinedStr) or (isinstance(node, ast.Constant) and isinstance(node.value, str)):
+        yield node
+    elif node is not None:
+        for child in ast.iter_child_nodes(node):
+            yield from texts_in(child)
+
+
+def is_trouble(node: ast.AST) -> bool:
+    """Return whether a statement or a call is about an error or a warning."""
+    if isinstance(node, ast.Call):
+        return bool(TROUBLE.search(ast.unparse(node.func)))
+    if isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef):
+        return bool(TROUBLE.search(node.name))
+    if isinstance(node, ast.Assign | ast.AugAssign | ast.AnnAssign):
+        targets = node.targets if isinstance(node, ast.Assign) else [node.target]
+        return any(TROUBLE.search(ast.unparse(target)) for target in targets)
+    return isinstance(node, ast.Raise) or (isinstance(node, ast.keyword) and bool(TROUBLE.search(node.arg or "")))
+
+
+def messages_of(source: str) -> set[str]:
+    """Return the errors and warnings of a module: texts of three words or more."""
+    module = ast.parse(source)
+    prose = set(map(id, docstrings(module)))
+    marked = {id(text) for node in ast.walk(module) if is_trouble(node) for text in texts_in(node)}
+    texts = [text for text in texts_in(module) if id(text) not in prose]
+    kept = [text_of(text) for text in texts if id(text) in marked or TROUBLE_WORDS.search(text_of(text))]
+    return {" ".join(text.split()) for text in kept if len(text.split()) >= 3}
+
+
+def all_messages() -> str:
+    modules = {path: text for path, text in sources().items() if path.endswith(".py") and path.startswith(PACKAGES)}
+    return "".join(sorted(f"{path}: {text}\n" for path, source in modules.items() for text in messages_of(source)))
+
+
 @lru_cache
 def sources() -> dict[str, str]:
     places = [path for folder in (*PACKAGES, *FOLDERS) for path in (ROOT / folder).rglob("*")]
@@ -274,3 +336,17 @@ def test_the_checker_sees_a_setting_that_no_configuration_has():
 
 def test_the_checker_reads_docstrings_and_comments_alone():
     assert prose_of('"""A `b`."""\nx = "`c`"  # `d`\n').split() == ["A", "`b`.", "#", "`d`"]
+
+
+def test_the_list_of_messages_is_that_of_the_code():
+    assert MESSAGES.read_text() == all_messages(), "write it anew: python test/test_references.py"
+
+
+def test_the_list_has_what_is_raised_and_warned_of():
+    source = 'def f(x):\n    """One two three."""\n    raise A(f"{x.y}: no such file")\n'
+    source += 'warnings.append("it is odd")\nprint("all is well")\nprint("x: 3 is not valid")\n'
+    assert messages_of(source) == {"{x.y}: no such file", "it is odd", "x: 3 is not valid"}
+
+
+if __name__ == "__main__":
+    MESSAGES.write_text(all_messages())

@@ -109,9 +109,9 @@ def faults(case: Case, ending: StressEnding) -> tuple[str, ...]:
     if not ending.finite:
         wrong.append("a number of the result is not finite")
     if ending.ending != GRASP and not ending.message:
-        wrong.append("the user is told nothing")
+        wrong.append("the user gets no message")
     if case.told not in ending.message:
-        wrong.append(f"the user does not read {case.told!r}")
+        wrong.append(f"the message lacks {case.told!r}")
     return tuple(wrong)
 
 

@@ -224,7 +224,7 @@ def _reasons(records: Sequence[Record]) -> str:
 
 
 # Words by which reasons are grouped, whatever link or joint they name. The first that occurs counts.
-_KINDS = ("limit on the way", "limit", "in the table", "in the object", "against the hand", "against", "jump")
+_KINDS = ("limit on the path", "limit", "in the table", "in the object", "against the hand", "against", "jump")
 
 
 def measure_arm(arm: Arm, poses: int) -> Record:

@@ -264,7 +264,7 @@ def load_arm(name_or_path: str | Path, robot_description: str = "") -> Arm:
     if not from_robot_description(entries):
         return _make_arm(entries, urdf, read_xml(urdf), str(path))
     if not robot_description:
-        told = "only the node has it, through its parameter arm; elsewhere give the path of a URDF"
+        told = "known only to the node with the parameter arm; elsewhere give the path of a URDF"
         raise ConfigError(f"{path}.urdf: {ROBOT_DESCRIPTION}: {told}")
     return _make_arm(entries, urdf, parse_xml(urdf, robot_description), str(path))
 
@@ -326,7 +326,7 @@ def _keep_chain(root: ET.Element, base: str, tip: str, where: str) -> None:
     while chain[-1] != base and chain[-1] in above and above[chain[-1]] not in chain:
         chain.append(above[chain[-1]])
     if base and chain[-1] != base:
-        raise ConfigError(f"{where}.base: {base!r} is not above the tip {tip!r}; above it: {', '.join(chain[1:])}")
+        raise ConfigError(f"{where}.base: {base!r} is not above the tip {tip!r}; valid: {', '.join(chain[1:])}")
     kept, waiting = set(chain), chain[1:]
     while waiting:
         parent = waiting.pop()

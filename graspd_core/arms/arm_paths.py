@@ -162,8 +162,8 @@ def _why_lost(task: ArmTask, ways: SE3, followed: _Followed, best: Sequence[int]
         told = why_unreached(task.arm, ways[list(rows), list(waypoints)], torch.stack(starts))
         for (grasp, waypoint, _), reason in zip(unreached, told, strict=True):
             on_way = waypoint != STAGE_ROWS[2]
-            missed = "without a way of the arm that goes on" if on_way else "whose posture of the arm was not found"
-            reasons[grasp] = (f"{reason} on the way" if on_way else reason) if reason else missed
+            missed = "without a continuous arm path" if on_way else "without a computed arm posture"
+            reasons[grasp] = (f"{reason} on the path" if on_way else reason) if reason else missed
     return reasons
 
 

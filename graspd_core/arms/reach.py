@@ -87,8 +87,8 @@ class BoundReach(BoundRestriction):
             hits = hits_of_support(task.arm, task.scene, task.base, (table.start, table.end))
             above = support.offset - float(support.normal @ task.base.translation.numpy())
             return (
-                f"every posture of {task.arm.name} has its {hits.what[int((hits.depth > 0).sum(0).argmax())]}, whose "
-                f"surface is {above:.2f} m above the arm's base; raise the base, or check where it stands"
+                f"every posture of {task.arm.name} has {hits.what[int((hits.depth > 0).sum(0).argmax())]}; the table "
+                f"is {above:.2f} m above the arm's base; raise the base, or correct its pose"
             )
         longest = float(start_table(task.arm).features[:, :3].norm(dim=-1).max())
         longest += float(tip_hand(task.arm, task.hand).translation.norm())
@@ -98,7 +98,7 @@ class BoundReach(BoundRestriction):
             return ""
         return (
             f"the object is {away:.2f} m from the base of {task.arm.name}, whose reach with {task.hand.name} "
-            f"is {longest:.2f} m"
+            f"is {longest:.2f} m; move the base or the object"
         )
 
     def why_none(self, others: BoundRestrictions) -> str:

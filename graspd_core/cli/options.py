@@ -77,7 +77,7 @@ def planning_options(options: argparse.Namespace) -> tuple[PlanConfig, dict[str,
     request = {key: getattr(options, key) for key in ("count", "seed", "verify", "device")}
     check_request(**request, deadline=options.deadline)
     if options.threads < 1:
-        raise ConfigError(f"threads: {options.threads}; at least 1")
+        raise ConfigError(f"threads: {options.threads}; valid: 1 or more")
     torch.set_num_threads(options.threads)
     config = load_preset(options.preset)
     if options.method:
@@ -194,7 +194,7 @@ def check_bag_options(options: argparse.Namespace) -> None:
     for name in ("every", "limit"):
         value = getattr(options, name)
         if value is not None and value < 1:
-            raise ConfigError(f"{name}: {value} clouds; at least 1")
+            raise ConfigError(f"{name}: {value} clouds; valid: 1 or more")
 
 
 def bag_views(path: Path, options: argparse.Namespace) -> Iterator[tuple[BagFrame, PointCloud | str]]:
@@ -215,7 +215,7 @@ def bag_views(path: Path, options: argparse.Namespace) -> Iterator[tuple[BagFram
             transforms = transforms or read_transforms(path)
             if name.removeprefix("/") not in transforms.frames():
                 known = ", ".join(transforms.frames())
-                raise BagError(f"{path}: no frame {name!r}; its transforms know: {known}")
+                raise BagError(f"{path}: no frame {name!r}; frames of its transforms: {known}")
         try:
             seen = frame.view(transforms, options.frame, place)
             if place == ORIGIN and frame.frame not in told and (doubt := frame_doubt(frame.frame, frame.view().points)):
@@ -322,7 +322,7 @@ def _steering(options: argparse.Namespace) -> tuple[Steering, ...]:
 
 def _refuse_alone(name: str, value: float | None, other: str) -> None:
     if value is not None:
-        raise ConfigError(f"--{name}: it needs --{other}; give both or neither")
+        raise ConfigError(f"--{name} needs --{other}; give both or neither")
 
 
 def _region(words: list[str]) -> Region:

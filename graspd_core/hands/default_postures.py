@@ -149,10 +149,10 @@ def default_palm(hand: HandModel) -> HandModel:
     """Return the hand with guessed palm centre, palm normal and approach, and with a warning about the guess."""
     fingers = find_fingers(hand)
     normal = fingers.bend if fingers.mates.any() else _along(hand, fingers)
-    warnings = [*hand.warnings, "palm guessed; name it in a hand description if it is wrong"]
+    warnings = [*hand.warnings, "palm guessed; if it is wrong, set it in a hand description"]
     if len(fingers.wrist):
         names = ", ".join(hand.joint_names[joint] for joint in fingers.wrist)
-        warnings.append(f"joints that carry the palm, left at zero: {names}; grasps are those of the palm there")
+        warnings.append(f"joints between base and palm stay at zero: {names}; a grasp is for that pose of the palm")
     return replace(
         hand, palm_center=_center(hand, fingers, normal), palm_normal=normal, approach=normal, warnings=tuple(warnings)
     )
@@ -182,7 +182,7 @@ def default_postures(hand: HandModel, which: tuple[str, ...] = ("open", "closed"
     goal = FingertipGoal(ball, wide, closed, apart, weights, ball_fixed=True)
     opened, _ = around_ball(hand, fingers, goal, surface)
     guessed = {f"{name}_posture": posture for name, posture in (("open", opened), ("closed", closed)) if name in which}
-    text = f"{' and '.join(which)} posture guessed; name them in a hand description if they are wrong"
+    text = f"{' and '.join(which)} posture guessed; if it is wrong, set it in a hand description"
     return replace(hand, **guessed, warnings=(*hand.warnings, text))
 
 

@@ -148,7 +148,7 @@ def _open_linkages(
             beside = abs(apart @ axis) < _LEVEL and 0.0 < np.linalg.norm(apart) < _SIDE_BY_SIDE
             if abs(axis @ along) > _PARALLEL and beside:
                 names = " and ".join(repr(hand.link_joint_names[link]) for link in (other, one))
-                told = "stand side by side like those of a closed linkage, and move freely"
+                told = "look like those of a closed linkage, but move independently"
                 return (f"joints {names} {told}; couple such joints with <mimic>",)
     return ()
 

@@ -100,7 +100,7 @@ def read_transforms(path: str | Path) -> TransformBuffer:
     with _opened(path) as reader:
         connections = [c for c in reader.connections if c.msgtype == TRANSFORMS]
         if not any(c.msgcount for c in connections):
-            raise BagError(f"{path}: holds no transforms (/tf, /tf_static), so nothing can be put into another frame")
+            raise BagError(f"{path}: holds no transforms (/tf, /tf_static), so no other frame can be used")
         for connection, _, raw in _messages(path, reader, connections):
             message = _decode(path, reader, connection, raw)
             add_transforms(buffer, message, static=connection.topic.endswith("tf_static"))

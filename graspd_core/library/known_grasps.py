@@ -136,7 +136,7 @@ def _with_hand(
     if same:
         return same
     hands = sorted({entry.hand for entry in entries})
-    told = f"for {', '.join(hands)}, not for {hand.name}" if hand.name not in hands else "for another make of this hand"
+    told = f"for {', '.join(hands)}, not for {hand.name}" if hand.name not in hands else "for another form of this hand"
     raise ConfigError(f"{what}: in the library {library.path} {told}; `graspd library build --hand` adds it")
 
 
@@ -152,8 +152,8 @@ def _held_entry(
 
 def _changed(library: GraspLibrary, entry: LibraryEntry) -> MeshError:
     return MeshError(
-        f"{entry.source}: the mesh has changed since {entry.name} came into the library {library.path}; build it again "
-        f"with `graspd library build {entry.source} --out {library.path}`, or put the old file back"
+        f"{entry.source}: the mesh has changed since {entry.name} was added to the library {library.path}; build it "
+        f"again with `graspd library build {entry.source} --out {library.path}`, or put the old file back"
     )
 
 
@@ -256,7 +256,7 @@ def known_or_planned(
     try:
         add_planned(library, scene, hand, config, planned, verify, name)
     except FormatError as error:
-        warnings = (*warnings, f"{error}; what was planned is not kept")
+        warnings = (*warnings, f"{error}; the grasps are not stored")
     new = wanted([grasp for grasp in planned.tried if grasp.usable])
     outcome = planned.outcome
     if outcome in (Outcome.SUCCEEDED, Outcome.NO_CANDIDATES) and found + len(new):
@@ -313,7 +313,7 @@ def _held(
     for index in np.argsort(gaps < NEAR, kind="stable"):
         grasp, gap = grasps[index], gaps[index]
         if gap < -_DEEP:
-            yield grasp, "with a link in what stands about the object"
+            yield grasp, "with a link inside the support or an obstacle"
         elif gap >= NEAR:
             yield grasp, ""
         else:
@@ -321,7 +321,7 @@ def _held(
                 return
             worlds = trial_context(scene, hand, "standard" if verify == "none" else verify)
             tried = replace(grasp, trials=grasp_trials(worlds, near[index], stop))
-            yield tried, "" if tried.verdict is Verdict.VERIFIED else "that did not hold beside what stands near"
+            yield tried, "" if tried.verdict is Verdict.VERIFIED else "that failed near the support or an obstacle"
 
 
 def clearance(scene: Scene, hand: HandModel, grasps: Sequence[Grasp]) -> Float[np.ndarray, "grasps"]:

@@ -164,7 +164,7 @@ def read_mesh(path: str | Path, *, scale: float = 1.0) -> tuple[TriangleMesh, tu
     warnings += _strays_told(str(path), named - len(vertices))
     torn = text and not text.endswith((b"\n", b"\r")) and np.ptp(mesh.vertices, axis=0).max() < 1e6
     if torn and not topology.is_closed(TriangleMesh(*topology.merge_vertices(mesh))):
-        warnings += (f"{path}: the last line has no end and the surface is not closed: the file may be cut off",)
+        warnings += (f"{path}: the last line has no line end and the surface is not closed: the file may be cut off",)
     return TriangleMesh(mesh.vertices * scale, mesh.faces), warnings
 
 
@@ -197,7 +197,7 @@ def check_mesh(
     Args:
         most_faces: meshes with more faces are simplified to about this many. None never simplifies.
         scale: factor that the file's coordinates were multiplied by. Advice on the unit refers to it.
-        dusty: whether to drop tiny pieces that float clear of the rest.
+        dusty: whether to drop tiny pieces that touch nothing else.
 
     Raises:
         MeshError: no usable faces, vertices of faces that are not finite, or a longest side outside 2 mm to 2 m.
@@ -219,11 +219,11 @@ def check_mesh(
         # Dropped first, because the size and the holes reported below could be those of the small pieces.
         mesh, small = drop_small_components(mesh)
         if small:
-            warnings.append(f"{source}: dropped {small} tiny pieces that float clear of the rest")
+            warnings.append(f"{source}: dropped {small} tiny pieces that touch nothing else")
     faces = mesh.faces
     if not topology.is_oriented(faces):
         faces = topology.orient(mesh.vertices, faces)
-        warnings.append(f"{source}: neighbouring faces disagreed on their winding; it was made consistent")
+        warnings.append(f"{source}: neighbouring faces had opposite winding; it was made consistent")
     used, compact = np.unique(faces, return_inverse=True)
     clean = TriangleMesh(mesh.vertices[used], compact.reshape(-1, 3))
     # Simplifying can tear a surface. That is no defect of the input, and the winding number tolerates it.

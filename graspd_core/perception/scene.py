@@ -217,7 +217,7 @@ def build_scene(
     clean, found = check_mesh(mesh, source, MAX_FACES, scale=scale, dusty=confidence is None)
     bodies, gap = bodies_apart(clean) if confidence is None else (1, 0.0)
     if bodies > 1:
-        found += (f"{source}: {bodies} bodies, {1000 * gap:.0f} mm apart; they are grasped as one rigid thing",)
+        found += (f"{source}: {bodies} bodies, {1000 * gap:.0f} mm apart; they are grasped as one rigid object",)
     model = _object_model(clean, source, mass, friction, scale, warnings + found, confidence is not None)
     if ahead is not None:
         ahead(model)
@@ -227,7 +227,7 @@ def build_scene(
     sdf = moved_sdf(sdf, far) if far.any() else sdf
     if not is_solid(sdf):
         cell = float(sdf.spacing) * 1000
-        note = f"{source}: encloses nothing that a grid of {cell:.1f} mm cells can see; it counts as a sheet"
+        note = f"{source}: no point of the grid of {cell:.1f} mm lies inside; it counts as a sheet"
         model = ObjectModel(**{**vars(model), "warnings": (*model.warnings, note)})
     sdf = sdf.to(device, sdf.field.dtype)
     known = None if confidence is None else confidence_grid(mesh.vertices, confidence, sdf)

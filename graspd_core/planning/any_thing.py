@@ -32,7 +32,7 @@ from graspd_core.types import Grasp, GraspResult, Plane, Posture, TriangleMesh, 
 # Two grasps are alike if their bases differ by less than this distance [m] and this angle [rad].
 LIKE_DISTANCE, LIKE_TURN = 0.015, 0.26
 # Why an object is skipped.
-OUT_OF_TRIES = "tried in vain too often"
+OUT_OF_TRIES = "failed too often"
 # An object within this distance of an earlier failure's place is the same object [m].
 _SAME_PLACE = 0.04
 # Least probability of a likely grasp.
@@ -128,7 +128,7 @@ def plan_any_thing(
     seen = [p for p in find_things(views, settings and settings.segmentation) if not _is_solid(p, solids or {})]
     for points, failed in _in_order(seen, failures):
         if over or len(failed) >= tries:
-            told = OUT_OF_TRIES if len(failed) >= tries else "not looked at"
+            told = OUT_OF_TRIES if len(failed) >= tries else "not planned for"
             things.append(ThingPlan(points, reason=told, looked_at=False))
             continue
         scene = _scene_among(views, points, settings, surface, solids)
@@ -193,7 +193,7 @@ def _thing_plan(
         reason = result.message or next((g.reason for g in result.tried if g.reason), "") or result.outcome.value
         return ThingPlan(points, scene, result, None, reason)
     best = max(left, key=lambda grasp: (grasp.verdict is Verdict.VERIFIED, grasp.probability or 0.0))
-    reason = "" if best.verdict is Verdict.VERIFIED else result.message or "no grasp is sure enough"
+    reason = "" if best.verdict is Verdict.VERIFIED else result.message or "no grasp passes the robustness checks"
     return ThingPlan(points, scene, result, best, reason)
 
 

@@ -175,7 +175,7 @@ def _why_few(run: Run, scene: Scene, bound: BoundRestrictions, found: RoundsResu
     if told or result.outcome is not Outcome.TOO_FEW:
         return told
     if bare := sum(not grasp.trials and not grasp.contacts for grasp in result.tried):
-        return f"{bare} of {len(result.tried)} untried candidates touch the object nowhere"
+        return f"{bare} of {len(result.tried)} untried candidates do not touch the object"
     told = why_trials_failed(scene, result.tried)
     if found.good or found.context is None:
         return told
@@ -188,7 +188,7 @@ def _less_sure(scene: Scene, far: Float[np.ndarray, "3"], result: GraspResult) -
     held = sum(grasp.verdict is Verdict.UNVERIFIED for grasp in result.tried)
     if scene.evidence is None or not held:
         return result
-    told, view = f"{held} grasps hold on the likeliest shape, none is sure enough", None
+    told, view = f"{held} grasps hold on the likeliest shape, none is robust enough", None
     if scene.evidence.doubts:
         told += f": {scene.evidence.doubts[0]}"
     elif scene.evidence.hidden:

@@ -42,9 +42,7 @@ def enough_memory(asked: str) -> Iterator[None]:
         yield
     except (MemoryError, RuntimeError) as error:
         if isinstance(error, MemoryError) or any(words in str(error) for words in _TORCH_SAYS):
-            raise ResourceError(
-                f"{asked}: not enough memory; ask for fewer grasps, or a preset of less effort"
-            ) from None
+            raise ResourceError(f"{asked}: not enough memory; ask for fewer grasps, or use a faster preset") from None
         raise
 
 

@@ -121,7 +121,7 @@ class Steering:
         if not np.isfinite(self.roll):
             raise ConfigError(f"roll: {self.roll} rad; valid: a finite number")
         if self.approach_direction is None or self.approach_angle >= np.pi / 2:
-            raise ConfigError("roll: it needs approach_direction, and approach_angle below pi/2 (90 degrees)")
+            raise ConfigError("roll: needs approach_direction, and approach_angle below pi/2 (90 degrees)")
         if self.roll_zero is not None:
             zero, along = numbers("roll_zero", self.roll_zero, 3), np.array(self.approach_direction, dtype=float)
             if not np.linalg.norm(np.cross(zero, along)) > _PARALLEL * np.linalg.norm(zero) * np.linalg.norm(along):
@@ -266,10 +266,10 @@ def _part_of_object(scene: Scene, region: Region, avoid: Sequence[Box]) -> Float
     if len(inside) == 0:
         low, high = (" ".join(f"{v:.3f}" for v in corner) for corner in (points.min(0), points.max(0)))
         raise ConfigError(
-            f"region: no part of the object lies in it; the object goes from ({low}) to ({high}) m and is "
+            f"region: no part of the object lies inside; the object extends from ({low}) to ({high}) m and is "
             f"{region.distance(points).min():.3f} m away"
         )
     for number, box in enumerate(avoid):
         if (box.distance(inside) <= 0.0).all():
-            raise ConfigError(f"region: avoid box {number} covers all of it on the object; valid: a part outside")
+            raise ConfigError(f"region: avoid box {number} covers its whole part of the object; move one of them")
     return inside[:: len(inside) // _MOST_PLACES + 1]

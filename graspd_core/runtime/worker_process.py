@@ -93,7 +93,7 @@ class WorkerProcess:
                     raise
             else:
                 # The function is not run in place, because it could kill this process too.
-                raise MemoryError(f"{work.__name__}: the worker process died twice")
+                raise MemoryError(f"{work.__name__}: the worker process died twice, perhaps for lack of memory")
         failed, answer = pickle.loads(told)
         if failed:
             raise answer

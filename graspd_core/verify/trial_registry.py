@@ -46,7 +46,7 @@ class Trial:
 
 def _lift(context: TrialContext, grasp: Grasp, stop: StopHook) -> TrialResult:
     if context.around is None:
-        raise ValueError("the lift trial needs a support or obstacles")
+        raise ValueError("the lift trial needs a scene with a support or obstacles")
     return lift_trial(context.around, context.hand, grasp, context.protocol, stop=stop)
 
 

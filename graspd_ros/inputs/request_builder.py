@@ -164,7 +164,7 @@ def check_request(message: GraspRequest, hand: str) -> None:
     """Raise RequestError if a field is invalid on its own. `source_of` checks the source."""
     if message.id and not _ID.fullmatch(message.id):
         shown = message.id[:MOST_ID]
-        raise bad_request(f"id: {shown!r} may hold letters, digits and _.:@+- only, at most {MOST_ID} of them")
+        raise bad_request(f"id: {shown!r}; valid: at most {MOST_ID} letters, digits and _.:@+-")
     if message.hand not in ("", hand):
         told = f"hand: {message.hand[:MOST_ID]!r} is not loaded; this node plans for {hand}"
         raise RequestError(ErrorCode.WRONG_HAND, told)
@@ -189,7 +189,7 @@ def check_request(message: GraspRequest, hand: str) -> None:
             raise bad_request(f"target_point: {told}")
     _check_camera_and_mask(message)
     if message.source not in (GraspRequest.MESH, GraspRequest.KNOWN) and any(message.surface.coef):
-        raise bad_request(f"surface: with source {message.source}, whose cloud shows it; valid with MESH=1 and KNOWN=4")
+        raise bad_request(f"surface: given with source {message.source}, a cloud; valid with MESH=1 and KNOWN=4")
     if message.known_object and (message.source != GraspRequest.KNOWN or message.mesh_uri):
         told = f"source {message.source}" if message.source != GraspRequest.KNOWN else "mesh_uri too"
         name = message.known_object[:MOST_ID]
@@ -204,7 +204,7 @@ def _check_camera_and_mask(message: GraspRequest) -> None:
         near(message.view_point, "view_point")
     if message.target_mask.height and (message.use_target_point or message.alone):
         other = "target_point" if message.use_target_point else "alone"
-        raise bad_request(f"target_mask: {other} is given too; give one of target_point, target_mask and alone")
+        raise bad_request(f"target_mask: {other} is given too; give only one of target_point, target_mask, alone")
     _check_mask_source(message, "target_mask", message.target_mask.height)
 
 
@@ -266,7 +266,7 @@ def steering_of(message: GraspRequest, T_object_header: Matrix) -> Steering:
 def _check(message: GraspRequest) -> None:
     """Refuse constraints that need another field, and constraints given twice."""
     if message.approach_angle and not _direction(message):
-        raise bad_request("approach_angle: it needs approach_direction")
+        raise bad_request("approach_angle: needs approach_direction")
     if (message.roll or message.roll_tolerance) and not message.use_roll:
         raise bad_request("roll: use_roll is false; set it true to ask for a roll")
     if message.region_mask.height and message.region.dimensions:
@@ -400,7 +400,7 @@ def _from_mesh(given: SourceInput) -> Request:
 def _from_known(given: SourceInput) -> Request:
     message, settings = given.message, given.settings
     if not settings.grasp_library:
-        raise bad_request("source: KNOWN=4, and the parameter grasp_library names no library")
+        raise bad_request("source: KNOWN=4 needs a library; set the parameter grasp_library")
     if not message.known_object:
         found = _from_mesh(given)
         return replace(found, known=found.known and replace(found.known, required=True))
@@ -427,7 +427,7 @@ def _from_latest_cloud(given: SourceInput) -> Request:
 def _from_views(given: SourceInput) -> Request:
     views, settings = given.builder.views, given.settings
     if not views.clouds:
-        raise RequestError(ErrorCode.NO_CLOUD, "no view is kept: call ~/add_view while clouds come")
+        raise RequestError(ErrorCode.NO_CLOUD, "no view is kept; call ~/add_view while clouds arrive")
     point = _target(given, views.frame)
     target = None if point is None else Target(point=point)
     return given.request(views.frame, views.stamp, lambda: seen.scene_of_views(views.clouds, settings, target))
@@ -485,12 +485,12 @@ def resolve_mesh(uri: str, roots: Sequence[str]) -> Path:
     """
     uri = uri.strip()
     if len(uri) > MOST_PATH:
-        raise MeshError(f"the mesh path is {len(uri)} characters long; at most {MOST_PATH} are looked at")
+        raise MeshError(f"the mesh path is {len(uri)} characters long; at most {MOST_PATH} are allowed")
     if not uri:
         raise MeshError(f"the mesh path is empty; give {_FORMS}")
     allowed = _allowed_roots(roots)
     if not allowed:
-        raise MeshError(f"{uri}: no mesh may be read, since mesh_roots {list(roots)} names no directory")
+        raise MeshError(f"{uri}: mesh_roots {list(roots)} allows no directory; set that parameter")
     try:
         path = (allowed[0] / _local_path(uri)).resolve()
         if not any(path.is_relative_to(root) for root in allowed):

@@ -87,7 +87,7 @@ class SensorFrame:
         age = (now - (nanoseconds(self.stamp) or self.arrived)) * 1e-9
         if not limit or -limit <= age <= limit:
             return
-        told, hint = f"is {age:.1f} s old", "a bag's needs use_sim_time, or cloud_max_age 0"
+        told, hint = f"is {age:.1f} s old", "for a bag set use_sim_time, or cloud_max_age 0"
         if age < 0:
             told = f"has a stamp {-age:.1f} s in the future"
             hint = "its clock is not the node's, or use_sim_time is set for one of them only"

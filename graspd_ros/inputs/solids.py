@@ -148,24 +148,24 @@ def changed_things(things: Mapping[str, Thing], message: Any) -> Mapping[str, Th
         raise bad_message(owner, f"operation: {operation[0]}; valid: ADD=0, REMOVE=1, APPEND=2, MOVE=3")
     there = things.get(name)
     if there is None and operation in (message.REMOVE, message.MOVE):
-        raise bad_message(owner, f"{operations[operation]}: there is none; there are: {', '.join(things) or 'none'}")
+        raise bad_message(owner, f"{operations[operation]}: unknown id; known: {', '.join(things) or 'none'}")
     if operation == message.REMOVE:
         return {other: thing for other, thing in things.items() if other != name}
     if there is None and len(things) >= MOST_THINGS:
-        raise bad_message(owner, f"{MOST_THINGS} things are kept already; REMOVE some")
+        raise bad_message(owner, f"{MOST_THINGS} collision objects are kept already; REMOVE some")
     return {**things, name: _changed(there, message, owner)}
 
 
 def _changed(there: Thing | None, message: Any, owner: str) -> Thing:
     if message.planes:
-        raise bad_message(owner, "planes: not taken, since they have no end; give a box, or the request's surface")
+        raise bad_message(owner, "planes: not supported, since they are infinite; give a box, or the request's surface")
     solids = primitive_shapes(message.primitives, message.primitive_poses, owner)
     shapes = (*solids, *mesh_shapes(message.meshes, message.mesh_poses, owner))
     # As in MoveIt, appended shapes are relative to the object's existing pose.
     if message.operation == message.APPEND and there is not None:
         return replace(there, shapes=(*there.shapes, *shapes))
     if not message.header.frame_id:
-        raise bad_message(owner, "header.frame_id: empty; name the frame of its pose")
+        raise bad_message(owner, "header.frame_id: empty; give the frame of the pose")
     frame, T = message.header.frame_id, pose_matrix(message.pose, f"{owner}: pose")
     if message.operation == message.MOVE and there is not None:
         if shapes:

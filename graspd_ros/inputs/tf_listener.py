@@ -46,7 +46,7 @@ class TransformListener:
             from tf2_msgs.msg import TFMessage  # pyright: ignore[reportMissingImports]
         except ImportError:
             self.available = False
-            node.get_logger().info("tf2_msgs is not installed: /tf is not heard, results stay in their input's frame")
+            node.get_logger().info("tf2_msgs is not installed: /tf is not read, results stay in the frame of the input")
             return
         self.available = True
         latched = QoSProfile(depth=100, durability=DurabilityPolicy.TRANSIENT_LOCAL)

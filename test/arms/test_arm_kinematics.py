@@ -224,7 +224,7 @@ def test_an_arm_is_cut_out_of_a_robot(tmp_path: Path):
     [
         ({"tip": "gripper"}, r"cell.yaml.tip: no link 'gripper' in the URDF; links: world, pedestal, a, camera"),
         ({"base": "floor"}, r"cell.yaml.base: no link 'floor' in the URDF; links: world"),
-        ({"base": "camera"}, r"cell.yaml.base: 'camera' is not above the tip 'flange'; above it: a, pedestal, world"),
+        ({"base": "camera"}, r"cell.yaml.base: 'camera' is not above the tip 'flange'; valid: a, pedestal, world"),
         ({"tip": None}, r"cell.yaml: tip is missing; keys: urdf, tip, base"),
         ({"urdf": None}, r"cell.yaml: urdf is missing"),
         ({"urdf": "other.urdf"}, r"other.urdf: cannot be read: No such file"),
@@ -316,7 +316,7 @@ def test_an_arm_is_taken_out_of_a_robot_that_the_caller_brings(tmp_path):
     arm, plain = load_arm(path, ROBOT), load_arm(write(tmp_path))
     assert (arm.joint_names, arm.chain.link_names) == (plain.joint_names, plain.chain.link_names)
     path = write(tmp_path, urdf="robot_description")
-    with pytest.raises(ConfigError, match=r"cell.yaml.urdf: robot_description: only the node has it"):
+    with pytest.raises(ConfigError, match=r"cell.yaml.urdf: robot_description: known only to the node"):
         load_arm(path)
     with pytest.raises(GraspdError, match=r"robot_description: not well-formed XML"):
         load_arm(path, "<robot>")

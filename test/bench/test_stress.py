@@ -93,7 +93,7 @@ def test_the_table_shows_what_came_of_each_case_and_the_summary_every_fault():
     told = summary({BOX: GRASPED, NAN: wrong})
     assert told.startswith("2 cases, 4 faults. mesh: 1 of 1 (100%) with something to grasp end in a verified grasp.")
     assert "2 of 3 verified grasps hold in a second trial." in told
-    for fault in ("ended in grasp, not in MeshError", "planned 30.0 s at", "1 of 1 verified", "the user does not read"):
+    for fault in ("ended in grasp, not in MeshError", "planned 30.0 s at", "1 of 1 verified", "the message lacks"):
         assert f"* `nan-vertices`: {fault}" in told
     table = stress_table({BOX: GRASPED, NAN: wrong})
     assert f"| `open-box` | {BOX.about} | grasp | 0.5 | 2.4 | 400 | 2/3 | 2 | – | open \\| closed |" in table

@@ -136,7 +136,7 @@ BAD: list[tuple[list[str], str]] = [
     (["--presets", "best"], "unknown preset 'best'; valid: accurate, "),
     (["--suite", "tall"], "unknown suite 'tall'; did you mean 'all'?"),
     (["--trials", "standard,gentle"], "unknown trial 'gentle'; valid: standard, hard, "),
-    (["--processes", "0"], "processes: 0; at least 1"),
+    (["--processes", "0"], "processes: 0; valid: 1 or more"),
     (["--compare", "nowhere.json"], "nowhere.json: No such file"),
     (["--cases", "empty"], "cases: not used by main; valid: "),
     (["stress", "--cases", "broken"], "unknown case 'broken'; valid: "),

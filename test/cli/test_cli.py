@@ -50,9 +50,9 @@ BAD_OPTIONS: list[tuple[list[str], str]] = [
     (["--scale", "2", "--units", "mm"], "not allowed with argument"),
     (["--verify", "gently"], "invalid choice: 'gently' (choose from"),
     (["--picture", "grasp.jpg"], "--picture grasp.jpg; valid: a file name that ends in .png"),
-    (["--threads", "0"], "threads: 0; at least 1"),
-    (["--approach-angle", "20"], "--approach-angle: it needs --approach"),
-    (["--roll-tolerance", "20"], "--roll-tolerance: it needs --roll"),
+    (["--threads", "0"], "threads: 0; valid: 1 or more"),
+    (["--approach-angle", "20"], "--approach-angle needs --approach"),
+    (["--roll-tolerance", "20"], "--roll-tolerance needs --roll"),
     (["--region", "cube", "0"], "--region: cube 0; valid: box X Y Z SX SY SZ"),
     (["--region", "box", "0", "0", "0"], "--region: box 0 0 0; valid: box X Y Z SX SY SZ, sphere X Y Z R, or FILE [R]"),
     (["--region", "sphere", "0", "0", "0", "wide"], "--region: sphere 0 0 0 wide; valid: box"),
@@ -405,7 +405,7 @@ def test_where_the_camera_of_a_cloud_stood_can_be_said_and_is_checked(tmp_path, 
     assert main(["replay", str(tmp_path / "bag"), *to]) == EXIT_BAD_INPUT
     assert "refused: cloud: its camera did not stand at the origin of its frame" in capsys.readouterr().out
     assert main(["replay", str(tmp_path / "bag"), "--sensor-frame", "elbow", *to]) == EXIT_BAD_INPUT
-    assert "no frame 'elbow'; its transforms know: " in the_line(capsys)
+    assert "no frame 'elbow'; frames of its transforms: " in the_line(capsys)
 
 
 def test_a_long_recording_is_not_fused_whole(bags, capsys, monkeypatch, quick):
@@ -436,8 +436,8 @@ def test_a_target_that_is_not_there_is_an_answer_and_no_bad_input(bags, capsys, 
 @pytest.mark.parametrize(
     ("options", "culprit"),
     [
-        (["--every", "0"], "every: 0 clouds; at least 1"),
-        (["--limit", "0"], "limit: 0 clouds; at least 1"),
+        (["--every", "0"], "every: 0 clouds; valid: 1 or more"),
+        (["--limit", "0"], "limit: 0 clouds; valid: 1 or more"),
         (["--out", "one.json"], "one.json: one file for many clouds; give a directory, or --limit 1, or --fuse"),
         (["--target", "0", "0", "0", "--alone"], "not allowed with argument"),
     ],

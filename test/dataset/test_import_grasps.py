@@ -80,7 +80,7 @@ def test_a_pose_alone_is_closed_and_pressed(exported, tmp_path: Path, graspd, ca
     assert graspd("import", folder / "graspgen", *words) == 0
     document, back = json.loads(out.read_text()), load_grasps(out)
     failed = sum(row["verdict"] == "failed" for row in rows)
-    assert document["refused"].get("its own file says that it did not hold", 0) == failed
+    assert document["refused"].get("its file says that it did not hold", 0) == failed
     assert len(back) + sum(document["refused"].values()) == len(rows)
     ours = {tuple(np.round(row["grasp_position"], 7)): row for row in rows}
     for grasp in back:
@@ -291,7 +291,7 @@ def test_isaac_joints_go_by_name(exported, tmp_path: Path):
     joints = next(iter(document["grasps"].values()))["cspace_position"]
     name, value = joints.popitem()
     other = tmp_path / "a.yaml"
-    for more, message in ((None, f"joint '{name}' of allegro_right is missing"), ("LFJ5", "joint 'LFJ5' is not of")):
+    for more, message in ((None, f"joint '{name}' of allegro_right is missing"), ("LFJ5", "'LFJ5' is no joint of")):
         joints.update({more: 0.0} if more else {})
         other.write_text(yaml.safe_dump(document))
         with pytest.raises(FormatError, match=message):
@@ -316,7 +316,7 @@ def test_an_order_that_is_not_known_or_does_not_fit_is_refused(exported, tmp_pat
     folder, _ = exported
     for words, message in (
         (("--hand", "leap_right"), "joint order: not known for leap_right, and npy files have no names; give one: "),
-        (("--hand", "allegro_right", "--joint-order", "a,b"), "joint order: 'a' is not of allegro_right; valid: "),
+        (("--hand", "allegro_right", "--joint-order", "a,b"), "joint order: 'a' is no joint of allegro_right; valid: "),
         (("--hand", "allegro_right", "--joint-order", HAND.joint_names[0]), "of allegro_right is missing"),
     ):
         assert graspd("import", folder / "dexgraspbench", *words, "--out", tmp_path) == 2

@@ -183,7 +183,7 @@ CLOUDS = (
         BOX,
         "atenpas/gpd/issues/106",
         {"target": middle(stage(*PAIR).truth)},
-        "without what touches it",
+        "the target touches another object",
     ),
     Situation(
         "a target in the thing that touches it",
@@ -191,7 +191,7 @@ CLOUDS = (
         CYLINDER,
         "atenpas/gpd/issues/30",
         {"target": middle(stage(*PAIR).obstacles[0])},
-        "without what touches it",
+        "the target touches another object",
     ),
     Situation(
         "two things that touch",
@@ -199,7 +199,7 @@ CLOUDS = (
         BOX + CYLINDER,
         "atenpas/gpd/issues/59",
         {},
-        "may be 2 things that touch",
+        "may be 2 objects that touch",
         near=0.4,
     ),
     Situation(

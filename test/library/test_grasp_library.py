@@ -278,7 +278,7 @@ def test_a_library_that_cannot_be_written_costs_no_grasp(library, scene, hand, m
     monkeypatch.setattr(GraspLibrary, "add", refuse)
     result = known_or_planned(library, scene, hand, count=5, preset="fast")
     assert result.outcome is Outcome.SUCCEEDED
-    assert result.warnings[-1] == "known.grasps: the library cannot be used: disk is full; what was planned is not kept"
+    assert result.warnings[-1] == "known.grasps: the library cannot be used: disk is full; the grasps are not stored"
 
 
 def test_restrictions_are_kept(library: GraspLibrary, scene: Scene, hand: HandModel, planned: GraspResult):
@@ -317,7 +317,7 @@ def test_only_what_comes_near_something_is_tried_again(library, scene, hand, pla
         result = known_grasps(library, about, hand, count=4)
         assert len(tried) == int(((gaps < NEAR) & (gaps >= -0.005)).sum())
         inside = int((gaps < -0.005).sum())
-        assert result.refused.get("with a link in what stands about the object", 0) == inside
+        assert result.refused.get("with a link inside the support or an obstacle", 0) == inside
         assert len(result.grasps) + sum(result.refused.values()) == 4
         # What was tried again has the trial of the scene too.
         assert {len(grasp.trials) for grasp in result.grasps} <= {1, 2}
@@ -391,7 +391,7 @@ def test_a_mesh_that_changed_is_told(library: GraspLibrary, hand: HandModel, bal
         lambda: entry_by_name(library, hand, "ball", PHYSICS),
         lambda: entry_by_file(library, hand, ball, 1.0, PHYSICS),
     ):
-        with pytest.raises(MeshError, match=r"ball\.obj: the mesh has changed since ball came into the library"):
+        with pytest.raises(MeshError, match=r"ball\.obj: the mesh has changed since ball was added to the library"):
             look()
 
 

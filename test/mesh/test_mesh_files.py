@@ -352,7 +352,7 @@ def test_an_obj_cut_off_within_a_number_is_doubted_and_one_without_its_last_newl
     assert read_mesh(path)[1] == ()
     path.write_bytes(whole[: whole.rindex(b"f ", 0, -200)] + b"f 1 2 3")
     *_, warning = read_mesh(path)[1]
-    assert "the last line has no end and the surface is not closed: the file may be cut off" in warning
+    assert "the last line has no line end and the surface is not closed: the file may be cut off" in warning
 
 
 # A square of 2 x 2 and a triangle, in centimetres, in a node that is turned, moved and scaled within another.

@@ -66,7 +66,7 @@ def test_bodies_apart_are_counted_and_the_gap_is_theirs():
 def test_a_scene_tells_of_bodies_apart():
     pair = joined(block((0.06,) * 3), block((0.06,) * 3, (0.16, 0, 0)))
     assert load_scene(pair, mass=0.1, resolution=16).object.warnings == (
-        "mesh: 2 bodies, 100 mm apart; they are grasped as one rigid thing",
+        "mesh: 2 bodies, 100 mm apart; they are grasped as one rigid object",
     )
     # What was reconstructed from a cloud is one thing already.
     assert build_scene(pair, confidence=np.ones(len(pair.vertices)), mass=0.1, resolution=16).object.warnings == ()
@@ -121,7 +121,7 @@ def test_a_scene_names_its_small_components_and_is_as_large_as_the_body():
 def test_what_small_components_look_like_is_not_said_of_the_body():
     speck = TriangleMesh(np.array([[1.0, 0, 0], [1.0, 0.001, 0], [1.0, 0, 0.001]]), np.array([[0, 1, 2]]))
     scene = build_scene(joined(BOX, speck), mass=0.1, resolution=16)
-    assert scene.object.warnings == ("mesh: dropped 1 tiny pieces that float clear of the rest",)
+    assert scene.object.warnings == ("mesh: dropped 1 tiny pieces that touch nothing else",)
 
 
 def test_a_reconstruction_is_left_alone():

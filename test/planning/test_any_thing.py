@@ -34,7 +34,7 @@ def test_the_first_verified_grasp_ends_the_search_and_all_things_are_told(first:
     assert best.reason == ""
     # The price is that of one thing wherever the first has a grasp.
     assert sum(thing.looked_at for thing in first) == 1
-    assert first[1].reason == "not looked at"
+    assert first[1].reason == "not planned for"
 
 
 @pytest.mark.parametrize("enough", [1, 2])

@@ -346,7 +346,7 @@ def test_what_speaks_against_a_scene_leaves_no_grasp_verified(monkeypatch):
         assert len(held) == 3
         assert not any(grasp.verdict is Verdict.VERIFIED for grasp in result.tried)
         assert all((grasp.probability, grasp.reason) == (DOUBTED_SHARE, "are its numbers metres?") for grasp in held)
-        assert "none is sure enough: are its numbers metres?" in result.message
+        assert "none is robust enough: are its numbers metres?" in result.message
 
 
 def test_seen_all_round_only_place_and_friction_are_in_doubt(monkeypatch):
@@ -395,7 +395,7 @@ def test_where_no_grasp_is_sure_enough_the_result_says_so_and_where_to_look_from
     assert result.tried
     assert not any(grasp.usable for grasp in result.tried)
     assert result.tried[0].verdict is Verdict.UNVERIFIED
-    assert "none is sure enough" in result.message
+    assert "none is robust enough" in result.message
     assert ("was guessed" in result.message) == (result.next_view is not None) == hidden
 
 

@@ -245,5 +245,5 @@ def test_a_candidate_that_touches_nothing_is_no_grasp_where_no_trial_is_asked_fo
     assert off
     assert not any(grasp.usable for grasp in off)
     assert all(grasp.usable for grasp in result.tried if grasp.contacts)
-    told = f"{len(off)} of {len(result.tried)} untried candidates touch the object nowhere"
+    told = f"{len(off)} of {len(result.tried)} untried candidates do not touch the object"
     assert (result.outcome, result.message) == (Outcome.TOO_FEW, told)

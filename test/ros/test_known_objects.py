@@ -151,7 +151,7 @@ def test_a_direction_and_a_surface_are_kept(folder: Path, hand: HandModel):
     ("fields", "settings", "error", "told"),
     [
         (known(known_object="bell"), {}, ConfigError, "'bell' is not in the library known.grasps; it has ball"),
-        (known(), {"grasp_library": ""}, GraspdError, "KNOWN=4, and the parameter grasp_library names no library"),
+        (known(), {"grasp_library": ""}, GraspdError, "KNOWN=4 needs a library; set the parameter grasp_library"),
         (known(), {"verify": "hard"}, ConfigError, "ball: not with any mass, friction 0.6, hard trials"),
         (known(mesh_uri="ball.obj"), {}, GraspdError, "known_object: 'ball' with mesh_uri too; valid with KNOWN=4"),
         (
@@ -164,7 +164,7 @@ def test_a_direction_and_a_surface_are_kept(folder: Path, hand: HandModel):
             {"source": GraspRequest.LATEST_CLOUD, "surface": Plane(coef=[0.0, 0.0, 1.0, 0.0])},
             {},
             GraspdError,
-            "surface: with source 2, whose cloud shows it; valid with MESH=1 and KNOWN=4",
+            "surface: given with source 2, a cloud; valid with MESH=1 and KNOWN=4",
         ),
         (known(surface=Plane(coef=[0.0, 0.0, 0.0, 1.0])), {}, GraspdError, "surface: .* is no plane"),
     ],
@@ -179,7 +179,7 @@ def test_a_mesh_that_changed_and_a_library_that_was_torn_are_told(built: Path, f
     mesh, node = make_shape("sphere"), Node(hand)
     save_mesh(built / "ball.obj", TriangleMesh(mesh.vertices * 1.1, mesh.faces))
     try:
-        with pytest.raises(MeshError, match=r"ball\.obj: the mesh has changed since ball came into the library"):
+        with pytest.raises(MeshError, match=r"ball\.obj: the mesh has changed since ball was added to the library"):
             node.answer(**known())
     finally:
         save_mesh(built / "ball.obj", mesh)

@@ -66,7 +66,7 @@ def test_later_requests_keep_clear_of_the_scene_and_bad_messages_do_no_harm(clie
     assert farthest(ask("free", **there)) > WALL
     things.publish(CollisionObject(id="cup", operation=CollisionObject.REMOVE))
     told = client.event(event="refused", source="collision_objects")
-    assert told["message"] == "collision object 'cup': REMOVE: there is none; there are: none"
+    assert told["message"] == "collision object 'cup': REMOVE: unknown id; known: none"
     client.forget()
     things.publish(CollisionObject(header=Header(frame_id="shelf"), id="torn", meshes=[Mesh()]))
     assert "'torn': meshes: 0 vertices" in client.event(event="refused", source="collision_objects")["message"]
@@ -146,12 +146,12 @@ def test_things_are_added_replaced_extended_moved_and_removed():
 
 
 BAD = {
-    "collision object 'cup': REMOVE: there is none; there are: wall": message(CollisionObject.REMOVE, "cup"),
-    "collision object 'cup': MOVE: there is none; there are: wall": message(CollisionObject.MOVE, "cup"),
+    "collision object 'cup': REMOVE: unknown id; known: wall": message(CollisionObject.REMOVE, "cup"),
+    "collision object 'cup': MOVE: unknown id; known: wall": message(CollisionObject.MOVE, "cup"),
     "collision object '': id: empty": message(name="", **crate()),
     "operation: 7; valid: ADD=0, REMOVE=1, APPEND=2, MOVE=3": message(b"\x07", **crate()),
     "'wall': meshes: 0 vertices and 0 triangles": message(meshes=[Mesh()]),
-    "'wall': planes: not taken": message(planes=[Plane()], **crate()),
+    "'wall': planes: not supported": message(planes=[Plane()], **crate()),
     "'wall': no primitives and no meshes": message(),
     "'wall': header.frame_id: empty": message(frame="", **crate()),
     "'wall': pose: position [nan, 0.0, 0.0]": message(**crate(), pose=Pose(position=Point(x=np.nan))),
@@ -176,7 +176,7 @@ def test_a_message_that_cannot_be_meant_is_refused_by_name(culprit: str):
 def test_there_is_an_end_of_things():
     wall = changed_things({}, message(**crate()))["wall"]
     many = {str(number): wall for number in range(MOST_THINGS)}
-    with pytest.raises(GraspdError, match="1000 things are kept already"):
+    with pytest.raises(GraspdError, match="1000 collision objects are kept already"):
         changed_things(many, message(**crate()))
     assert changed_things(many, message(name="7", **crate()))
 

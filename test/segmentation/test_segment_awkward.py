@@ -77,12 +77,12 @@ def test_an_object_at_the_border_of_the_picture_is_told():
 
 def test_a_view_that_shows_nothing_is_told():
     blind = PointCloud(np.full((50, 3), np.nan), np.array([0.5, 0.0, 0.5]))
-    assert any("of 2 views these show nothing near enough: 2" in w for w in segment([view_of_box(), blind]).warnings)
+    assert any("of 2 views these show nothing within range: 2" in w for w in segment([view_of_box(), blind]).warnings)
 
 
 def test_what_is_too_large_is_said_to_be_so_and_a_box_says_which_part_is_meant():
     small = SegmentationConfig(largest_object=0.03)
-    with pytest.raises(NoObjectError, match=r"one thing is seen, .*, 0\.1\d m long: larger than .*=0.03 m; a box"):
+    with pytest.raises(NoObjectError, match=r"one object is seen, .*, 0\.1\d m long: larger than .*=0.03 m; a box"):
         segment([view_of_box()], settings=small)
     meant = Target(box=(np.array([-0.03, -0.03, 0.0]), np.array([0.03, 0.03, 0.2])))
     assert np.abs(segment([view_of_box()], target=meant, settings=small).views[0].points[:, :2]).max() < 0.04

@@ -29,7 +29,7 @@ CYLINDER_BESIDE = tabletop("box", obstacles=[("cylinder", 0.064, 0.0)])
 def test_two_that_touch_are_told_where_the_seam_is_seen(azimuth):
     view = view_of(CYLINDER_BESIDE, azimuth)
     (doubt,) = segment([view]).warnings
-    assert doubt.startswith("cloud: the object may be 2 things that touch, about (")
+    assert doubt.startswith("cloud: the object may be 2 objects that touch, about (")
     said = np.array(re.findall(r"-?\d+\.\d+", doubt), dtype=float).reshape(2, 3)
     for mesh in (CYLINDER_BESIDE.truth, CYLINDER_BESIDE.obstacles[0]):
         assert np.linalg.norm(said - 0.5 * (mesh.vertices.min(0) + mesh.vertices.max(0)), axis=1).min() < 0.04
@@ -51,7 +51,7 @@ def test_a_target_on_one_side_of_the_seam_means_that_side(azimuth):
         assert len(seen.views[0].points) > 500
         # What is on the other side of the seam is in the way.
         assert any(np.mean(side * (thing[:, 0] - border) < 0.004) > 0.95 for thing in seen.obstacles)
-        assert any("without what touches it" in doubt for doubt in seen.warnings)
+        assert any("the target touches another object" in doubt for doubt in seen.warnings)
         box = (mesh.vertices.min(0) - 0.002, mesh.vertices.max(0) + 0.002)
         assert np.mean(side * (segment([view], target=Target(box=box)).views[0].points[:, 0] - border) > -0.006) > 0.97
 
@@ -78,7 +78,7 @@ def test_a_target_in_the_middle_of_one_of_two_that_stand_flush_is_doubted(azimut
     stage = side_by_side("box", "box")
     seen = segment([view_of(stage, azimuth)], target=middle_of(stage))
     assert np.mean(seen.views[0].points[:, 0] > stage.truth.vertices[:, 0].max()) > 0.2
-    assert "off the middle of what was taken for it" in seen.beside
+    assert "from the middle of the segment" in seen.beside
     scene = scene_from_views([view_of(stage, azimuth)], target=middle_of(stage), resolution=16)
     assert scene.evidence is not None
     assert scene.evidence.doubts == (seen.beside,)
@@ -104,7 +104,7 @@ def test_most_that_touch_are_told_where_both_were_taken():
             seen = segment([view_of(stage, azimuth)])
             beyond = np.mean(seen.views[0].points[:, 0] > border)
             if 0.1 < beyond < 0.9:
-                told.setdefault(pair, []).append(any("2 things that touch" in doubt for doubt in seen.warnings))
+                told.setdefault(pair, []).append(any("2 objects that touch" in doubt for doubt in seen.warnings))
     # Boxes that stand flush show neither seam nor waist.
     assert not any(told.pop(("box", "box")))
     assert len(told) == 9

@@ -101,7 +101,7 @@ def wrist_loop(data: ManoData) -> Int[np.ndarray, "loop"]:
     edges = np.concatenate([data.faces[:, [0, 1]], data.faces[:, [1, 2]], data.faces[:, [2, 0]]])
     present = set(map(tuple, edges.tolist()))
     if len(present) != len(edges):
-        raise HandError(f"{data.path}: f: faces that are wound against each other, or an edge of three faces")
+        raise HandError(f"{data.path}: f: faces of opposite winding, or an edge of three faces")
     after = {a: b for a, b in present if (b, a) not in present}
     if not after:
         return np.zeros(0, dtype=np.int64)

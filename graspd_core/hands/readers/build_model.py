@@ -231,7 +231,7 @@ def _settled(
     """Return the joints with usable limits, the remaining couplings, and a warning for each change.
 
     Limits of actuated joints are reduced to what their coupled joints allow, and to one turn. A joint that cannot move
-    becomes fixed, together with the joints coupled to it. Raises HandError: a joint slides by more than 2 m.
+    becomes fixed, together with the joints coupled to it. Raises HandError: a joint has a travel of more than 2 m.
     """
     moving = [joint for joint in joints if joint.kind != "fixed"]
     followers = [joint for joint in moving if joint.name in couplings]
@@ -248,12 +248,12 @@ def _settled(
             leaders[coupling.leader] = narrow
         else:
             leaders[coupling.leader] = replace(leaders[coupling.leader], velocity=narrow.velocity)
-            warnings.append(f"coupled joint {follower.name!r}: its limits leave no room to move, and were not kept")
+            warnings.append(f"coupled joint {follower.name!r}: its limits leave no range, and are ignored")
     for name, joint in leaders.items():
         leaders[name] = _finite(path, joint)
         if leaders[name] is not joint:
             turn = f"[{leaders[name].lower:.3g}, {leaders[name].upper:.3g}]"
-            warnings.append(f"joint {name!r} turns without end: kept to {turn} rad")
+            warnings.append(f"joint {name!r} has no limits: restricted to {turn} rad")
     for follower in followers:
         leader, multiplier, _ = couplings[follower.name]
         slide = abs(multiplier) * (leaders[leader].upper - leaders[leader].lower)
@@ -262,7 +262,7 @@ def _settled(
     still = {name: joint.lower for name, joint in leaders.items() if joint.upper - joint.lower < _STILL}
     at_zero = " at 0, which is what a <limit> without lower and upper means"
     warnings += [
-        f"joint {name!r} cannot move: its limits coincide{at_zero if value == 0 else ''}; welded"
+        f"joint {name!r} cannot move: its limits coincide{at_zero if value == 0 else ''}; taken as fixed"
         for name, value in still.items()
     ]
     left = {name: coupling for name, coupling in couplings.items() if coupling.leader not in still}
@@ -288,7 +288,7 @@ def _narrowed(leader: JointSpec, follower: JointSpec, coupling: Coupling) -> Joi
 
 
 def _finite(path: Path, joint: JointSpec) -> JointSpec:
-    """Return the joint, limited to one turn if it rotates endlessly. Raises HandError: it slides by more than 2 m."""
+    """Return the joint, limited to one turn if it rotates endlessly. Raises HandError: its travel is more than 2 m."""
     reach = joint.upper - joint.lower
     if joint.kind == "prismatic" and not reach <= _LONGEST_SLIDE:
         raise _too_long(path, joint.name, reach)
@@ -308,7 +308,7 @@ def _welded(joint: JointSpec, value: float) -> JointSpec:
 
 def _too_long(path: Path, joint: str, slide: float) -> HandError:
     return HandError(
-        f"{path}: joint {joint!r} slides by {slide:g} m; valid: limits that allow at most {_LONGEST_SLIDE:g} m"
+        f"{path}: joint {joint!r} has a travel of {slide:g} m; valid: limits that allow at most {_LONGEST_SLIDE:g} m"
     )
 
 

@@ -64,7 +64,7 @@ def missing_packages(urdf: Path, meshes: Iterable[ET.Element]) -> tuple[str, ...
     named = {rest.partition("/")[0] for scheme, rest in addresses if scheme in ("package", "model")}
     parents = urdf.resolve().parents
     lost = sorted(name for name in named if not any(map(_folder_exists, _package_folders(name, parents))))
-    return tuple(f"package {name!r} was not found: its meshes are those beside the file or above it" for name in lost)
+    return tuple(f"package {name!r} was not found; meshes are searched beside the file and above it" for name in lost)
 
 
 def _folder_exists(path: Path) -> bool:

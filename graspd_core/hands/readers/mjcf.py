@@ -191,7 +191,7 @@ def read_mjcf(path: Path, root: ET.Element | None = None) -> HandModel:
         parts.links.append(LinkSpec("world"))
     _read_body(parts, base, "world" if hangs else None)
     if parts.spec.tendons:
-        warnings.append("tendons are not read: joints that they couple move by themselves")
+        warnings.append("tendons are not read: joints that they couple move independently")
     if parts.shown:
         warnings.append(f"no colliding geom, so the visual ones are taken: {', '.join(parts.shown)}")
     efforts, couplings = _efforts(parts), resolved_couplings(path, _couplings(parts))

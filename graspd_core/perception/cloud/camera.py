@@ -94,7 +94,7 @@ class PinholeCamera:
                 "valid: finite numbers, fx and fy above 0"
             )
         if len(self.distortion) > 8:
-            raise CloudError(f"camera: {len(self.distortion)} distortion coefficients; at most 8 are understood")
+            raise CloudError(f"camera: {len(self.distortion)} distortion coefficients; valid: at most 8")
 
 
 def camera_from_calibration(

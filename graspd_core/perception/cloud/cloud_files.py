@@ -123,7 +123,7 @@ def read_pcd_points(path: Path) -> Points | None:
 def _refuse_false_sizes(packed: bytes, needed: int) -> None:
     size, unpacked = np.frombuffer(packed[:8].ljust(8, b"\0"), "<u4").tolist()
     if unpacked != needed or size > len(packed) - 8 or unpacked > _DENSEST * size:
-        there = f"{size} bytes that unpack to {unpacked}, {max(len(packed) - 8, 0)} are there"
+        there = f"{size} bytes that unpack to {unpacked}, but it has {max(len(packed) - 8, 0)}"
         raise ValueError(f"its header promises points of {needed} bytes, its data {there}")
 
 
@@ -329,7 +329,7 @@ def read_numpy(path: Path) -> dict[str, np.ndarray]:
     except Exception as error:
         told = _first_line(error)
         if "allow_pickle" in told:
-            told = "it holds a pickled object of Python, which is not loaded for safety: np.savez(path, points=points)"
+            told = "it holds a pickled Python object, which is not loaded for safety; use np.savez(path, points=points)"
         raise CloudError(f"{path}: not readable as numbers ({told})") from error
 
 

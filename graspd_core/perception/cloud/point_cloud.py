@@ -245,7 +245,7 @@ def _check_order(layout: CloudLayout, points: Float[np.ndarray, "height width 3"
         swapped = some.astype(kind).byteswap().astype(float)
     if _odd_share(swapped) < 0.01:
         said, other = ("true", "false") if layout.is_bigendian else ("false", "true")
-        raise CloudError(f"is_bigendian={said}, but the cloud's numbers are lengths only with is_bigendian={other}")
+        raise CloudError(f"is_bigendian={said}, but the coordinates are plausible only with is_bigendian={other}")
 
 
 def _odd_share(numbers: Float[np.ndarray, "n"]) -> float:

@@ -211,13 +211,13 @@ def _doubts(parted: _Parted, chosen: Mask, crowded: bool) -> tuple[str, ...]:
     doubts = []
     if scene.size > 0.5 * settings.gap:
         doubts.append(
-            f"cloud: {len(scene.points)} points thinned by {1e3 * scene.size:.1f} mm; finer gaps are not seen"
+            f"cloud: {len(scene.points)} points thinned to one per {1e3 * scene.size:.1f} mm; finer gaps are not seen"
         )
     blind = [str(k) for k, rows in enumerate(scene.rows, 1) if len(rows) == 0]
     if blind:
-        doubts.append(f"cloud: of {len(scene.rows)} views these show nothing near enough: {', '.join(blind)}")
+        doubts.append(f"cloud: of {len(scene.rows)} views these show nothing within range: {', '.join(blind)}")
     if ground.support is None and crowded:
-        doubts.append("cloud: no support is seen under the object; what is behind it in the image may be taken as part")
+        doubts.append("cloud: no support is seen under the object; what is behind it in the image may be taken for it")
     # Without surroundings, the object itself is the outline of the view.
     surrounded = ground.support is not None or len(ground.background) > 0
     for k in range(len(scene.rows) if surrounded else 0):
@@ -248,10 +248,10 @@ def _touching(scene: VoxelScene, chosen: Mask, part: Labels) -> tuple[str, ...]:
         return ()
     places = " and ".join("({:.3f}, {:.3f}, {:.3f})".format(*scene.mean[mine].mean(0)) for mine in apart or parts)
     if apart:
-        return (f"cloud: the target is taken without what touches it, about {places} m, up to the seam between them",)
+        return (f"cloud: the target touches another object, about {places} m; it ends at the seam between them",)
     return (
-        f"cloud: the object may be {len(parts)} things that touch, about {places} m; "
-        "a point, a box or a mask as target says which is meant",
+        f"cloud: the object may be {len(parts)} objects that touch, about {places} m; "
+        "give a point, a box or a mask as target",
     )
 
 
@@ -277,7 +277,7 @@ def _beside(parted: _Parted, chosen: Mask, point: Vector) -> str:
     if abs(across) <= _MOST_ASIDE and along >= -_MOST_AHEAD:
         return ""
     aside = 0.5e3 * max(high - low) * max(abs(across), -along)
-    return f"the target is {aside:.0f} mm off the middle of what was taken for it: things that touch may be one"
+    return f"the target is {aside:.0f} mm from the middle of the segment: two touching objects may be taken for one"
 
 
 def _cut_off(scene: VoxelScene, chosen: Mask, settings: SegmentationConfig) -> bool:

@@ -136,7 +136,7 @@ def seen(scene: VoxelScene, label: Labels) -> str:
     if many == 0:
         return "no object is seen"
     places = [_place(scene.mean[label == k].mean(0)) for k in range(min(many, MAX_LISTED_THINGS))]
-    told = f"{many} things are seen, the largest" if many > 1 else "one thing is seen,"
+    told = f"{many} objects are seen, the largest" if many > 1 else "one object is seen,"
     return f"{told} about {', '.join(places)} m"
 
 

@@ -389,7 +389,7 @@ def test_a_mesh_that_is_not_open_at_one_place_is_refused(model: dict[str, Any], 
     apart = int(np.flatnonzero((model["f"] == model["v_template"][:, 0].argmin()).any(1))[0])
     for faces, message in (
         (np.delete(model["f"], apart, axis=0), "the boundary is not one loop"),
-        (np.concatenate([model["f"], model["f"][:1]]), "wound against each other"),
+        (np.concatenate([model["f"], model["f"][:1]]), "faces of opposite winding"),
     ):
         with pytest.raises(HandError, match=message):
             load_mano(write(tmp_path / "hand.pkl", {**model, "f": faces}))

@@ -71,7 +71,7 @@ def test_a_package_is_found_where_ros_says(workspace, variable, folder, monkeypa
 def test_a_mesh_taken_from_beside_the_file_is_warned_of(workspace: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Its package is nowhere, but the path in it exists beside the URDF: perhaps another hand's mesh."""
     found = _read(workspace, "package://lost/meshes/wedge one.obj")
-    assert "package 'lost' was not found: its meshes are those beside the file or above it" in found.warnings
+    assert "package 'lost' was not found; meshes are searched beside the file and above it" in found.warnings
     monkeypatch.setenv("ROS_PACKAGE_PATH", str(workspace / "opt/share/far"))
     assert _read(workspace, "package://far/m/wedge.obj").warnings == _read(workspace, "meshes/wedge one.obj").warnings
 

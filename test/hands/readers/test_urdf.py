@@ -82,8 +82,8 @@ def test_sloppy_xml_is_read(tmp_path: Path, text: bytes) -> None:
     ("old", "new", "warning"),
     [
         ("<collision>", "<visual>", r"the <visual> is taken: palm"),
-        ('type="revolute"', 'type="continuous"', r"joint 'hinge' turns without end: kept to \[-3.14, 3.14\] rad"),
-        ('upper="1"', 'upper="1e9"', r"joint 'hinge' turns without end: kept to \[-0.5, "),
+        ('type="revolute"', 'type="continuous"', r"joint 'hinge' has no limits: restricted to \[-3.14, 3.14\] rad"),
+        ('upper="1"', 'upper="1e9"', r"joint 'hinge' has no limits: restricted to \[-0.5, "),
         (
             "</robot>",
             '<link name="world"/><joint name="w" type="fixed"><parent link="world"/><child link="palm"/></joint>'
@@ -99,7 +99,7 @@ def test_sloppy_xml_is_read(tmp_path: Path, text: bytes) -> None:
             "</robot>",
             '<link name="x"/><joint name="stuck" type="revolute"><parent link="palm"/><child link="x"/>'
             '<limit lower="0.3" upper="0.3"/></joint></robot>',
-            r"joint 'stuck' cannot move: its limits coincide; welded",
+            r"joint 'stuck' cannot move: its limits coincide; taken as fixed",
         ),
         (
             "</robot>",
@@ -181,7 +181,7 @@ MIMIC = '<mimic joint="outer_knuckle_joint"/>'
         (f'<robot name="two"><link name="torso"/>{TWINS}</robot>', "fingers hang from 'left_palm' and 'right_palm'"),
         (
             f'<robot name="open"><link name="palm">{BOX}</link>{KNUCKLES.format("", "", "")}</robot>',
-            "joints 'outer_knuckle_joint' and 'inner_knuckle_joint' stand side by side like those of a closed linkage",
+            "joints 'outer_knuckle_joint' and 'inner_knuckle_joint' look like those of a closed linkage",
         ),
     ],
     ids=["degrees", "effort", "two hands", "open linkage"],
@@ -400,7 +400,7 @@ def test_a_follower_in_another_unit_is_refused(tmp_path: Path) -> None:
         "rail", "base", "d", kind="prismatic", mimic=follows("first", multiplier=50), limit=LIMIT.format(-50, 50, 1, 9)
     )
     millimetres = robot(joint("first", "base", "a"), slide, joint("b", "a", "b"), joint("c", "a", "c"))
-    with pytest.raises(HandError, match=r"linkage.urdf: joint 'rail' slides by 100 m; .* at most 2 m"):
+    with pytest.raises(HandError, match=r"linkage.urdf: joint 'rail' has a travel of 100 m; .* at most 2 m"):
         read_urdf(write(tmp_path, millimetres))
 
 

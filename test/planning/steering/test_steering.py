@@ -158,8 +158,8 @@ def test_what_cannot_be_met_says_which_wish_refused_the_rest(bottle, hand):
         (partial(Steering, (0, 0, 1), approach_angle=np.nan), "approach_angle: nan"),
         (partial(Steering, (0, 0, 1), roll=np.inf), "roll: inf"),
         (partial(Steering, (0, 0, 1), roll=0, roll_tolerance=-1), "roll_tolerance: -1"),
-        (partial(Steering, (0, 0, 1), approach_angle=2.0, roll=0), "roll: it needs .*below pi/2"),
-        (partial(Steering, roll=0.0), "roll: it needs approach_direction"),
+        (partial(Steering, (0, 0, 1), approach_angle=2.0, roll=0), "roll: needs .*below pi/2"),
+        (partial(Steering, roll=0.0), "roll: needs approach_direction"),
         (partial(Steering, (0, 0, 1), roll=0.0, roll_zero=(0, 0, 2)), "roll_zero: .*not along"),
         (partial(Box, (0, 0), (1, 1, 1)), "box center: .*3 finite numbers"),
         (partial(Box, (0, 0, np.nan), (1, 1, 1)), "box center"),
@@ -179,11 +179,11 @@ def test_a_wish_that_makes_no_sense_and_what_is_no_region_are_refused(make, said
 
 def test_a_region_off_the_object_or_in_an_avoided_box_is_refused(bottle, hand):
     with pytest.raises(
-        ConfigError, match=r"region: no part of the object lies in it; the object goes from .* 0.9\d+ m"
+        ConfigError, match=r"region: no part of the object lies inside; the object extends from .* 0.9\d+ m"
     ):
         plan(bottle, hand, Steering(region=Sphere((1.1, 0.0, 0.0), 0.1)))
     both = Steering(region=Sphere((0.0, 0.0, 0.0), 1.0), avoid=[Box((1, 1, 1), (1, 1, 1)), Box((0, 0, 0), (2, 2, 2))])
-    with pytest.raises(ConfigError, match="region: avoid box 1 covers all of it on the object"):
+    with pytest.raises(ConfigError, match="region: avoid box 1 covers its whole part of the object"):
         plan(bottle, hand, both)
 
 
