@@ -14,6 +14,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -173,13 +174,15 @@ def _cloud(path: Path) -> Any:
 
 def _layout(path: Path) -> Any:
     """Width, height, step of a point and of a row, byte order and three fields, then the data."""
-    from graspd_core.perception.cloud.point_cloud import CloudLayout, points_from_layout
+    from graspd_core.io.messages import points_from_message
 
     data = path.read_bytes().ljust(LAYOUT_HEAD.size, b"\0")
     width, height, point, row, big, *places = LAYOUT_HEAD.unpack_from(data)
-    body = data[LAYOUT_HEAD.size :]
-    fields = {name: (places[2 * i], places[2 * i + 1]) for i, name in enumerate("xyz")}
-    points = points_from_layout(CloudLayout(width, height, point, row, bool(big & 1), fields, memoryview(body)))
+    fields = [
+        SimpleNamespace(name=name, offset=places[2 * i], datatype=places[2 * i + 1]) for i, name in enumerate("xyz")
+    ]
+    sizes = {"width": width, "height": height, "point_step": point, "row_step": row, "is_bigendian": bool(big & 1)}
+    points = points_from_message(SimpleNamespace(data=data[LAYOUT_HEAD.size :], fields=fields, **sizes))
     finite(points)
     return points
 

@@ -1,5 +1,7 @@
 """Cameras and their images: the lens can be undone, every encoding comes back as metres, clouds lie on the thing."""
 
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 from hypothesis import given
@@ -7,13 +9,13 @@ from hypothesis import strategies as st
 
 from graspd_bench.rendering.render import look_at, render_depth
 from graspd_core.errors import CloudError
+from graspd_core.io.messages import depth_from_message
 from graspd_core.mesh.shapes import SPHERE_RADIUS, make_shape
 from graspd_core.perception.cloud.camera import (
     PinholeCamera,
     camera_from_calibration,
     camera_rays,
     cloud_from_depth,
-    depth_from_bytes,
     depth_in_metres,
     distort,
     project,
@@ -142,7 +144,9 @@ def test_any_layout_comes_back_in_metres(encoding, order, padding, height, width
     millimetres = np.random.default_rng(seed).integers(0, 2**16, (height, width))
     pixels = millimetres.astype("u2") if encoding != "32FC1" else (millimetres / 1000).astype("f4")
     data, step = as_bytes(pixels, order, padding)
-    depth = depth_from_bytes(data, width=width, height=height, step=step, encoding=encoding, is_bigendian=order == ">")
+    sizes = {"width": width, "height": height, "step": step}
+    image = SimpleNamespace(data=data, encoding=encoding, is_bigendian=order == ">", **sizes)
+    depth = depth_from_message(image)
     assert depth == pytest.approx(millimetres / 1000, rel=1e-6)
 
 
@@ -166,7 +170,7 @@ def test_the_cloud_lies_on_the_object_in_the_frame_asked_for(camera):
     assert cloud.forward == pytest.approx(-cloud.viewpoint / np.linalg.norm(cloud.viewpoint))
 
 
-GOOD = {"width": 4, "height": 3, "step": 8, "encoding": "16UC1"}
+GOOD = {"width": 4, "height": 3, "step": 8, "encoding": "16UC1", "is_bigendian": False, "data": bytes(24)}
 
 
 @pytest.mark.parametrize(
@@ -182,7 +186,7 @@ GOOD = {"width": 4, "height": 3, "step": 8, "encoding": "16UC1"}
 )
 def test_a_broken_image_is_refused_by_name(changes, culprit):
     with pytest.raises(CloudError) as refused:
-        depth_from_bytes(memoryview(bytes(24)), **{**GOOD, **changes})
+        depth_from_message(SimpleNamespace(**{**GOOD, **changes}))
     assert culprit in str(refused.value)
     assert "\n" not in str(refused.value)
 
@@ -202,5 +206,6 @@ def test_a_camera_image_is_converted_without_looking_at_each_pixel(bytecodes, en
     pixels = np.random.default_rng(0).integers(300, 2000, (480, 640)).astype("u2")
     pixels[::4, ::3] = 0
     data = memoryview((pixels if encoding == "16UC1" else (pixels / 1000).astype("f4")).tobytes())
-    layout = {"width": 640, "height": 480, "step": len(data) // 480, "encoding": encoding}
-    assert bytecodes(lambda: cloud_from_depth(depth_from_bytes(data, **layout), camera)) < 480 * 640 / 10
+    sizes = {"width": 640, "height": 480, "step": len(data) // 480}
+    image = SimpleNamespace(data=data, encoding=encoding, is_bigendian=False, **sizes)
+    assert bytecodes(lambda: cloud_from_depth(depth_from_message(image), camera)) < 480 * 640 / 10

@@ -1,6 +1,6 @@
-"""Clouds: refused, cleaned and moved; their layouts as bytes. Messages: test/ros/inputs/test_sensor_frames.py."""
+"""Clouds: refused, cleaned and moved; any layout of their messages. More: test/ros/inputs/test_sensor_frames.py."""
 
-from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -9,15 +9,13 @@ from hypothesis import strategies as st
 
 from graspd_bench.rendering.render import look_at
 from graspd_core.errors import CloudError
+from graspd_core.io.messages import pixels_from_message, points_from_message
 from graspd_core.mesh.mesh_files import surface_samples
 from graspd_core.mesh.shapes import make_shape
 from graspd_core.perception.cloud.point_cloud import (
-    CloudLayout,
     PointCloud,
     clean_cloud,
     least_axes,
-    organised_points,
-    points_from_layout,
     transform_cloud,
 )
 from graspd_core.perception.reconstruct.reconstruct import reconstruct
@@ -45,7 +43,7 @@ def test_hopeless_clouds_are_named(entry, views, complaint):
 def test_cleaning_drops_nan_and_strays_and_thins():
     points, _ = surface_samples(make_shape("box"), 20_000, 0)
     strays = np.array([[0.5, 0, 0], [0, -0.4, 0.2], [np.nan, 0, 0]])
-    clean = clean_cloud(np.vstack([points, strays]), ORIGIN).points
+    clean = clean_cloud(np.vstack([points, strays]))
     assert np.isfinite(clean).all()
     assert np.abs(clean).max() < 0.05
     assert 1000 < len(clean) < 15_000
@@ -54,11 +52,11 @@ def test_cleaning_drops_nan_and_strays_and_thins():
 @pytest.mark.parametrize("far", [1e7, 1e300])
 def test_one_point_far_away_does_not_spoil_the_others(far):
     points, _ = surface_samples(make_shape("box"), 3000, 0)
-    clean = clean_cloud(np.vstack([points, [[far, 0, 0]]]), ORIGIN).points
+    clean = clean_cloud(np.vstack([points, [[far, 0, 0]]]))
     assert np.abs(clean).max() < 0.05
-    np.testing.assert_array_equal(clean, clean_cloud(points, ORIGIN).points)
+    np.testing.assert_array_equal(clean, clean_cloud(points))
     with pytest.raises(CloudError, match="too far apart"):
-        clean_cloud(points * 1e300, ORIGIN)
+        clean_cloud(points * 1e300)
 
 
 def test_a_cloud_moves_with_its_camera():
@@ -85,8 +83,13 @@ def test_along_the_least_axis_points_spread_as_little_as_along_any(scales):
     assert (along - values[:, 0] <= 1e-7 * values[:, 2]).all()
 
 
-def layout_of(points: np.ndarray, code: str, step: int, row_padding: int) -> CloudLayout:
-    """Coordinates one after the other at the end of each point; what comes before them, and the padding, is junk."""
+def fields_of(places: dict[str, tuple[int, int]]) -> list[SimpleNamespace]:
+    """PointFields of these names, offsets and types."""
+    return [SimpleNamespace(name=name, offset=offset, datatype=kind) for name, (offset, kind) in places.items()]
+
+
+def message_of(points: np.ndarray, code: str, step: int, row_padding: int) -> SimpleNamespace:
+    """A PointCloud2: coordinates one after the other at the end of each point; what lies before and between is junk."""
     height, width, _ = points.shape
     size, row_step = int(code[2]), width * step + row_padding
     data = np.random.default_rng(1).integers(0, 256, height * row_step, dtype=np.uint8)
@@ -95,7 +98,15 @@ def layout_of(points: np.ndarray, code: str, step: int, row_padding: int) -> Clo
         np.ndarray((height, width), code, data, first + axis * size, (row_step, step))[...] = points[..., axis]
     number = {4: 7, 8: 8}[size]
     fields = {"rgb": (0, 6), **{name: (first + axis * size, number) for axis, name in enumerate("xyz")}}
-    return CloudLayout(width, height, step, row_step, code[0] == ">", fields, memoryview(data.tobytes()))
+    return SimpleNamespace(
+        width=width,
+        height=height,
+        point_step=step,
+        row_step=row_step,
+        is_bigendian=code[0] == ">",
+        fields=fields_of(fields),
+        data=data.tobytes(),
+    )
 
 
 layouts = st.tuples(st.sampled_from(["<f4", ">f4", "<f8", ">f8"]), st.integers(24, 40), st.integers(0, 9))
@@ -106,14 +117,14 @@ def test_organised_clouds_keep_their_places(layout, height, width, seed):
     rng = np.random.default_rng(seed)
     points = rng.normal(size=(height, width, 3)).astype("f4").astype(float)
     points[rng.random((height, width)) < 0.3] = rng.choice([np.nan, np.inf, -np.inf])
-    made = layout_of(points, *layout)
-    np.testing.assert_array_equal(organised_points(made), points)
+    made = message_of(points, *layout)
+    np.testing.assert_array_equal(pixels_from_message(made), points)
     finite = np.isfinite(points).all(-1)
     if finite.any():
-        np.testing.assert_array_equal(points_from_layout(made), points[finite])
+        np.testing.assert_array_equal(points_from_message(made), points[finite])
     else:
         with pytest.raises(CloudError, match=f"all {height * width} are NaN or infinite"):
-            points_from_layout(made)
+            points_from_message(made)
 
 
 def test_one_coordinate_that_is_not_finite_drops_the_point():
@@ -124,7 +135,7 @@ def test_one_coordinate_that_is_not_finite_drops_the_point():
     points[0, 3] = np.inf, -np.inf, 0
     # The largest of finite numbers are finite.
     points[0, 4] = np.finfo(np.float64).max
-    kept = points_from_layout(layout_of(points, "<f8", 24, 0))
+    kept = points_from_message(message_of(points, "<f8", 24, 0))
     np.testing.assert_array_equal(kept, points[0, 4:])
 
 
@@ -144,9 +155,10 @@ def test_one_coordinate_that_is_not_finite_drops_the_point():
     ],
 )
 def test_contradictions_are_named(change, culprit):
-    good = layout_of(np.ones((2, 3, 3)), "<f4", 24, 0)
+    good = message_of(np.ones((2, 3, 3)), "<f4", 24, 0)
+    made = {key: fields_of(value) if key == "fields" else value for key, value in change.items()}
     with pytest.raises(CloudError) as refused:
-        points_from_layout(replace(good, **change))
+        points_from_message(SimpleNamespace(**{**vars(good), **made}))
     assert culprit in str(refused.value)
     assert "\n" not in str(refused.value)
 
@@ -155,5 +167,5 @@ def test_contradictions_are_named(change, culprit):
 def test_a_camera_image_is_converted_without_looking_at_each_point(bytecodes, code, step):
     points = np.random.default_rng(0).normal(size=(480, 640, 3))
     points[::3, ::2] = np.nan
-    layout = layout_of(points, code, step, 0)
-    assert bytecodes(lambda: points_from_layout(layout)) < 480 * 640 / 10
+    message = message_of(points, code, step, 0)
+    assert bytecodes(lambda: points_from_message(message)) < 480 * 640 / 10

@@ -7,8 +7,6 @@ An object that reaches the border of an image may continue beyond it.
 
 from __future__ import annotations
 
-import io
-import struct
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import lru_cache
@@ -51,11 +49,6 @@ _REMEDIES = {
     "rgb": "it is a colour picture: name the depth image's topic",
     "bgr": "it is a colour picture: name the depth image's topic",
 }
-# A `compressedDepth` CompressedImage begins with its format as int32 and two quantisation numbers as float32. A PNG
-# begins with 8 fixed bytes, and its width and height are at byte 16.
-_QUANTISED = struct.Struct("<iff")
-_PNG, _PNG_SIZES = b"\x89PNG\r\n\x1a\n", struct.Struct(">II")
-_MOST_PIXELS = 2**26
 # Depth in mm that was cut to 8 bits has this greatest value [m] at more than this fraction of the pixels.
 _MOST_OF_8_BITS, _CUT_SHARE = 0.255, 0.2
 # A principal point this far off the middle (relative), by the same factor across and down within this tolerance, is of
@@ -228,90 +221,12 @@ def depth_in_metres(image: UInt16[np.ndarray, "height width"] | DepthImage, enco
     Raises:
         CloudError: the encoding is not one of depth, or the pixels are not of the encoding's type.
     """
-    kind, unit = _encoding(encoding)
+    kind, unit = depth_encoding(encoding)
     if image.dtype.kind != kind[0] or (kind[0] == "u" and image.dtype.itemsize != 2):
         raise CloudError(f"depth image: pixels are {image.dtype}, but encoding {encoding} holds {np.dtype(kind)}")
     if kind[0] == "u":
         return image.astype(np.float32) * np.float32(unit)
     return np.where(np.isfinite(image) & (image > 0), image, image.dtype.type(0))
-
-
-def depth_from_bytes(
-    data: memoryview, *, width: int, height: int, step: int, encoding: str, is_bigendian: bool = False
-) -> DepthImage:
-    """Return depth [m] from the bytes of an Image message, whose rows have `step` bytes with or without padding.
-
-    Raises CloudError if the encoding is not one of depth, the image is empty, or its sizes disagree.
-    """
-    if width == 0 or height == 0:
-        raise CloudError(f"the depth image is empty: width={width}, height={height}")
-    dtype = np.dtype((">" if is_bigendian else "<") + _encoding(encoding)[0])
-    row = width * dtype.itemsize
-    if step < row:
-        raise CloudError(f"depth image: step={step} is smaller than width={width} pixels of {dtype.itemsize} bytes")
-    needed = (height - 1) * step + row
-    if data.nbytes < needed:
-        raise CloudError(
-            f"depth image: {data.nbytes} bytes, but height={height}, step={step} and width={width} need {needed}"
-        )
-    pixels = np.ndarray((height, width), dtype, data, 0, (step, dtype.itemsize))
-    return depth_in_metres(pixels.astype(dtype.newbyteorder("=")), encoding)
-
-
-def size_of_compressed(data: memoryview) -> tuple[int, int]:
-    """Return width and height [pixels] of the PNG in a CompressedImage. Raises CloudError if there is no usable PNG."""
-    at = _png_begins(data) + 16
-    if len(data) < at + _PNG_SIZES.size:
-        raise CloudError(f"depth image: its PNG is cut off, the message has {len(data)} bytes")
-    width, height = _PNG_SIZES.unpack_from(data, at)
-    if width * height > _MOST_PIXELS:
-        raise CloudError(f"depth image: a PNG of {width} x {height} pixels; at most {_MOST_PIXELS} are read")
-    return width, height
-
-
-def depth_from_compressed(data: memoryview, told: str) -> DepthImage:
-    """Return depth [m] of a sensor_msgs/CompressedImage of `compressedDepth`, or of a plain PNG of 16 bits.
-
-    For 32FC1, pixels v hold quantised inverse depth. Depth is a / (v - b), with a and b stored before the PNG.
-
-    Args:
-        data: the message's bytes.
-        told: the message's `format`: an encoding and "compressedDepth png".
-
-    Raises:
-        CloudError: the format is not one of depth, or the bytes do not fit it.
-    """
-    from PIL import Image
-
-    encoding = told.partition(";")[0].strip() if ";" in told else "16UC1"
-    kind, unit = _encoding(encoding)
-    size_of_compressed(data)
-    begins = _png_begins(data)
-    try:
-        with Image.open(io.BytesIO(data[begins:])) as picture:
-            mode, pixels = picture.mode, np.asarray(picture)
-    except Exception as error:  # for a broken file, the library may raise any exception
-        raise CloudError(f"depth image: a broken PNG ({error})") from None
-    if not mode.startswith("I"):
-        raise CloudError(f"depth image: format {told[:64]!r} holds a PNG of mode {mode}; one of 16 bits is depth")
-    if kind[0] == "u":
-        return depth_in_metres(pixels.astype(np.uint16), encoding)
-    if not begins:
-        raise CloudError(f"depth image: format {told[:64]!r} without the {_QUANTISED.size} bytes of its quantisation")
-    _, a, b = _QUANTISED.unpack_from(data)
-    with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
-        depth = unit * np.float32(a) / (pixels.astype(np.float32) - np.float32(b))
-    return depth_in_metres(np.where(pixels > 0, depth, np.float32(0)).astype(np.float32), "32FC1")
-
-
-def _png_begins(data: memoryview) -> int:
-    for at in (_QUANTISED.size, 0):
-        if bytes(data[at : at + len(_PNG)]) == _PNG:
-            return at
-    raise CloudError(
-        "depth image: a CompressedImage without a PNG; valid: compressedDepth of format png (rvl is not read, jpeg is "
-        "no depth)"
-    )
 
 
 def cloud_from_depth(
@@ -363,7 +278,8 @@ def _check_image(depth: Float[np.ndarray, "pixels"], camera: PinholeCamera) -> N
         )
 
 
-def _encoding(name: str) -> tuple[str, float]:
+def depth_encoding(name: str) -> tuple[str, float]:
+    """Return the NumPy type of a pixel and the metres per unit. Raises CloudError: the encoding is not one of depth."""
     if name not in ENCODINGS:
         remedy = next((f"; {said}" for begins, said in _REMEDIES.items() if name.startswith(begins)), "")
         raise CloudError(f"depth image: encoding {name[:64]!r} is no depth; valid: {', '.join(ENCODINGS)}{remedy}")

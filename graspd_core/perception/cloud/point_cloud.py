@@ -1,8 +1,7 @@
-"""Point clouds [m] of one camera: transforming, cleaning, and reading from the bytes of a PointCloud2."""
+"""Point clouds [m] of one camera: transforming and cleaning."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -22,8 +21,6 @@ MIN_POINTS = 50
 MAX_DISTANCE_IN_SIZES = 1e3
 # Points this near to the camera [m] are not measured. Some drivers send them for missing depth.
 CAMERA_PLACE_TOLERANCE_M = 1e-5
-# Count of numbers that are checked for the byte order.
-_SOME_NUMBERS = 5000
 
 
 @dataclass(frozen=True)
@@ -115,8 +112,8 @@ def least_axes(spreads: Float[np.ndarray, "n 3 3"]) -> Points:
     return found
 
 
-def clean_cloud(points: Points, viewpoint: Vector) -> PointCloud:
-    """Drop points that are not finite, thin the rest to an even density, and drop outliers.
+def clean_cloud(points: Points) -> Points:
+    """Drop points [m] that are not finite, thin the rest to an even density, and drop outliers.
 
     Raises CloudError if the cloud is empty or all NaN, or if fewer than 50 points are left.
     """
@@ -147,138 +144,9 @@ def clean_cloud(points: Points, viewpoint: Vector) -> PointCloud:
     kept, _ = thinned.remove_statistical_outlier(nb_neighbors=20, std_ratio=2.5)
     result = np.asarray(kept.points)
     _refuse_few(len(result), len(points), "plausible")
-    return PointCloud(result, np.asarray(viewpoint, dtype=float))
+    return result
 
 
 def _refuse_few(left: int, given: int, kind: str) -> None:
     if left < MIN_POINTS:
         raise CloudError(f"cloud: only {left} {kind} points of {given}; at least {MIN_POINTS} are needed")
-
-
-# Type numbers of sensor_msgs/PointField, with their names and NumPy types.
-FIELD_TYPES = {
-    1: ("INT8", "i1"),
-    2: ("UINT8", "u1"),
-    3: ("INT16", "i2"),
-    4: ("UINT16", "u2"),
-    5: ("INT32", "i4"),
-    6: ("UINT32", "u4"),
-    7: ("FLOAT32", "f4"),
-    8: ("FLOAT64", "f8"),
-}
-
-
-@dataclass(frozen=True)
-class CloudLayout:
-    """The content of a PointCloud2 message.
-
-    Attributes:
-        width, height: points per row, and number of rows. With height 1 the cloud is not organised as an image.
-        point_step, row_step: bytes from one point, or one row, to the next.
-        is_bigendian: whether the bytes are in big-endian order.
-        fields: for each field, its byte offset within a point and its type number (`FIELD_TYPES`).
-        data: the bytes of all points.
-    """
-
-    width: int
-    height: int
-    point_step: int
-    row_step: int
-    is_bigendian: bool
-    fields: Mapping[str, tuple[int, int]]
-    data: memoryview
-
-
-def points_from_layout(layout: CloudLayout) -> Points:
-    """Return the finite points of a cloud, in row order, in the cloud's own frame and unit.
-
-    The cloud may be organised or not, padded, of float32 or float64, in either byte order, with fields at any offset.
-    Raises CloudError if it is empty, x, y or z are missing or not floats, sizes disagree, or no point is finite.
-    """
-    return finite_points(organised_points(layout))
-
-
-def finite_points(pixels: Float[np.ndarray, "height width 3"]) -> Points:
-    """Return the finite points of an organised cloud, in row order. Raises CloudError if there are none."""
-    points = pixels.reshape(-1, 3)
-    # Computed column by column, which is three times as fast as `isfinite(points).all(1)`.
-    finite = np.isfinite(points[:, 0]) & np.isfinite(points[:, 1]) & np.isfinite(points[:, 2])
-    kept = points[finite] if not finite.all() else points
-    if len(kept) == 0:
-        raise CloudError(f"the cloud has no finite point: all {len(points)} are NaN or infinite")
-    return kept
-
-
-def organised_points(layout: CloudLayout) -> Float[np.ndarray, "height width 3"]:
-    """Return all points of a cloud as an image, NaN and infinity too. Raises CloudError like `points_from_layout`."""
-    width, height = layout.width, layout.height
-    if width == 0 or height == 0:
-        raise CloudError(f"the cloud is empty: width={width}, height={height}")
-    layout = _with_rows(layout)
-    _check_sizes(layout)
-    # Fields are checked before memory is allocated, because a message's sizes can ask for any amount of it.
-    places = [_place_of(layout, name) for name in "xyz"]
-    points = np.empty((height, width, 3))
-    for axis, (dtype, offset) in enumerate(places):
-        strides = (layout.row_step, layout.point_step)
-        # Signalling NaNs stay NaN. NumPy would warn of them.
-        with np.errstate(invalid="ignore"):
-            points[..., axis] = np.ndarray((height, width), dtype, layout.data, offset, strides)
-    _check_order(layout, points)
-    return points
-
-
-def _with_rows(layout: CloudLayout) -> CloudLayout:
-    """Correct a `row_step` that a driver set to 0 or to the size of all rows, if the size of the data shows it."""
-    row = layout.width * layout.point_step
-    unset = layout.row_step in (0, layout.data.nbytes) and layout.data.nbytes == layout.height * row
-    return replace(layout, row_step=row) if unset else layout
-
-
-def _check_order(layout: CloudLayout, points: Float[np.ndarray, "height width 3"]) -> None:
-    """Raise CloudError if the numbers of a cloud are plausible lengths only in the other byte order."""
-    some = points.reshape(-1)[:: 1 + points.size // _SOME_NUMBERS]
-    if _odd_share(some) < 0.5:
-        return
-    kind = np.dtype("f4" if layout.fields["x"][1] == 7 else "f8")
-    with np.errstate(over="ignore", invalid="ignore"):
-        swapped = some.astype(kind).byteswap().astype(float)
-    if _odd_share(swapped) < 0.01:
-        said, other = ("true", "false") if layout.is_bigendian else ("false", "true")
-        raise CloudError(f"is_bigendian={said}, but the coordinates are plausible only with is_bigendian={other}")
-
-
-def _odd_share(numbers: Float[np.ndarray, "n"]) -> float:
-    """Return the fraction of the finite, non-zero numbers that are not plausible as lengths in any unit."""
-    size = np.abs(numbers[np.isfinite(numbers) & (numbers != 0)])
-    return float(((size < 1e-6) | (size > 1e9)).mean()) if len(size) else 0.0
-
-
-def _check_sizes(layout: CloudLayout) -> None:
-    row = layout.width * layout.point_step
-    if layout.row_step < row:
-        raise CloudError(
-            f"row_step={layout.row_step} is smaller than width*point_step={layout.width}*{layout.point_step}={row}"
-        )
-    needed = (layout.height - 1) * layout.row_step + row
-    if layout.data.nbytes < needed:
-        raise CloudError(
-            f"data holds {layout.data.nbytes} bytes, but height={layout.height}, row_step={layout.row_step}, "
-            f"width={layout.width} and point_step={layout.point_step} need {needed}"
-        )
-
-
-def _place_of(layout: CloudLayout, name: str) -> tuple[np.dtype, int]:
-    """Return the NumPy type and the byte offset of a coordinate within a point."""
-    if name not in layout.fields:
-        raise CloudError(f"the cloud has no field {name!r}; it has: {', '.join(layout.fields) or 'none'}")
-    offset, number = layout.fields[name]
-    kind, code = FIELD_TYPES.get(number, (str(number), ""))
-    if not kind.startswith("FLOAT"):
-        raise CloudError(f"field {name!r} is {kind}; it must be FLOAT32 or FLOAT64")
-    dtype = np.dtype((">" if layout.is_bigendian else "<") + code)
-    if offset + dtype.itemsize > layout.point_step:
-        raise CloudError(
-            f"field {name!r} ends at byte {offset + dtype.itemsize}, beyond point_step={layout.point_step}"
-        )
-    return dtype, offset
