@@ -19,93 +19,109 @@ class WrenchHull {
     bool build() {
         int simplex[D + 1];
         if (!first_simplex(simplex)) return false;
+        facets_.reserve(ROOM);
         for (int i : simplex)
             for (int d = 0; d < D; d++) middle_[d] += at(i)[d] / (D + 1);
-        std::vector<bool> used(count_, false);
         for (int i = 0; i <= D; i++) {
-            used[simplex[i]] = true;
-            Facet facet;
+            made_.push_back(add());
             for (int j = 0, k = 0; j <= D; j++)
-                if (j != i) facet.neighbor[k] = j, facet.vertex[k++] = uint8_t(simplex[j]);
-            if (!set_first_plane(add(facet))) return false;
+                if (j != i) facets_[i].neighbor[k] = j, facets_[i].vertex[k++] = uint8_t(simplex[j]);
+            if (!set_first_plane(facets_[i])) return false;
         }
-        for (int i = 0; i < count_ && !broken_; i++)
-            if (!used[i]) insert(i);
+        for (int i = 0; i < count_; i++)
+            if (std::find(simplex, simplex + D + 1, i) == simplex + D + 1) find_above(i);
+        // The farthest point first: fewer facets are made that give way later.
+        while (!outside_.empty() && !broken_) {
+            const auto next = std::max_element(outside_.begin(), outside_.end(),
+                                               [](const Outside& a, const Outside& b) { return a.height < b.height; });
+            const Outside farthest = *next;
+            outside_.erase(next);
+            insert(farthest.point, farthest.facet);
+        }
         return !broken_;
     }
 
     // Of the facet nearest the origin: its outward unit normal, and its distance, negative where the origin is outside.
     double nearest(double* normal) const {
-        int best = -1;
-        for (int f = 0; f < int(facets_.size()); f++)
-            if (alive(f) && (best < 0 || plane_[D][f] < plane_[D][best])) best = f;
-        for (int d = 0; d < D; d++) normal[d] = plane_[d][best];
-        return plane_[D][best];
+        const Facet* best = nullptr;
+        for (const Facet& facet : facets_)
+            if (alive(facet) && (!best || facet.plane[D] < best->plane[D])) best = &facet;
+        std::copy(best->plane, best->plane + D, normal);
+        return best->plane[D];
     }
 
-    // The volume. `error` is the largest distance of a vertex from the plane of its facet.
+    // The volume. `error` is the largest distance of a vertex from the plane of its facet, infinite where facets fold.
     double volume(double* error) const {
-        double sum = *error = 0;
-        for (int f = 0; f < int(facets_.size()); f++) {
-            if (!alive(f)) continue;
-            double rows[D][D];
+        double sum = *error = 0, rows[D][D][BATCH] = {};
+        int filled = 0;
+        for (const Facet& facet : facets_) {
+            if (!alive(facet)) continue;
             for (int i = 0; i < D; i++) {
-                const double* p = at(facets_[f].vertex[i]);
-                *error = std::max(*error, std::fabs(height(f, p)));
-                for (int d = 0; d < D; d++) rows[i][d] = p[d] - middle_[d];
+                const double* p = at(facet.vertex[i]);
+                *error = std::max(*error, dented(facet, i) ? INFINITY : std::fabs(height(facet, p)));
+                for (int d = 0; d < D; d++) rows[i][d][filled] = p[d] - middle_[d];
             }
-            sum += std::fabs(determinant(rows));
+            if (++filled < BATCH) continue;
+            sum += sum_of_determinants(rows, filled);
+            filled = 0;
         }
-        return sum / FACTORIAL;
+        return (sum + sum_of_determinants(rows, filled)) / FACTORIAL;
     }
 
    private:
+    // Its outward unit normal and offset, how far the point that comes now is above it, and which point that was.
     // Vertices stand in the order in which they came. Neighbor k lies across the ridge without vertex k.
     struct Facet {
+        double plane[D + 1], height;
+        int32_t neighbor[D], looked;
         uint8_t vertex[D];
-        int32_t neighbor[D];
     };
-    // A ridge of new facets, by its four old vertices, and the facet that came with it first.
+    // A point outside the hull, a facet that it is above, and how far.
+    struct Outside {
+        int point, facet;
+        double height;
+    };
+    // A ridge between a facet below a point, by the place of its vertex beyond the ridge, and one that is not.
+    struct Rim {
+        int32_t facet, side, beyond;
+    };
+    // A ridge of new facets, by its four old vertices: ONE for each of them and the sum of their numbers.
     struct Ridge {
-        uint32_t key;
-        int32_t facet, side;
+        uint32_t key, sum;
     };
-    static constexpr int DEAD = -1, CLOSED = -1;
+    static constexpr uint32_t NO_KEY = 0, ONE = 1u << 28;
+    static constexpr int DEAD = -1, NEVER = -1, BATCH = 8, ROOM = 16384;
 
     const double* at(int i) const { return points_ + D * i; }
-    bool alive(int f) const { return facets_[f].neighbor[0] != DEAD; }
+    static bool alive(const Facet& facet) { return facet.neighbor[0] != DEAD; }
 
-    int add(const Facet& facet) {
+    int add() {
+        int f = int(facets_.size());
         if (free_.empty()) {
-            facets_.push_back(facet);
-            for (auto& row : plane_) row.push_back(0);
-            return int(facets_.size()) - 1;
+            facets_.emplace_back();
+        } else {
+            f = free_.back();
+            free_.pop_back();
         }
-        const int f = free_.back();
-        free_.pop_back();
-        facets_[f] = facet;
+        facets_[f].looked = NEVER;
         return f;
     }
 
-    // Its place is used again. Until then no point is above it.
-    void remove(int f) {
-        facets_[f].neighbor[0] = DEAD;
-        for (auto& row : plane_) row[f] = 0;
-        plane_[D][f] = INFINITY;
-        free_.push_back(f);
-    }
-
-    void set_plane(int f, const double* plane) {
+    static void set_plane(Facet& facet, const double* plane) {
         double square = 0;
         for (int d = 0; d < D; d++) square += plane[d] * plane[d];
-        for (int d = 0; d <= D; d++) plane_[d][f] = plane[d] / std::sqrt(square);
+        const double scale = 1 / std::sqrt(square);
+        for (int d = 0; d <= D; d++) facet.plane[d] = plane[d] * scale;
     }
 
-    double height(int f, const double* p) const {
-        double sum = -plane_[D][f];
-        for (int d = 0; d < D; d++) sum += plane_[d][f] * p[d];
+    static double height(const Facet& facet, const double* p) {
+        double sum = -facet.plane[D];
+        for (int d = 0; d < D; d++) sum += facet.plane[d] * p[d];
         return sum;
     }
+
+    // Whether the vertex that a neighbor does not share is above that neighbor.
+    bool dented(const Facet& facet, int k) const { return height(facets_[facet.neighbor[k]], at(facet.vertex[k])) > 0; }
 
     // Seven points, each the farthest from the flat through those before it.
     bool first_simplex(int* chosen) const {
@@ -134,71 +150,93 @@ class WrenchHull {
     }
 
     // The plane of a facet of the first simplex, by cofactors.
-    bool set_first_plane(int f) {
-        const uint8_t* vertex = facets_[f].vertex;
+    bool set_first_plane(Facet& facet) {
+        const uint8_t* vertex = facet.vertex;
         double plane[D + 1] = {};
         for (int d = 0; d < D; d++) {
-            double rows[D][D] = {};
-            rows[0][d] = 1;
+            double rows[D][D][1] = {};
+            rows[0][d][0] = 1;
             for (int i = 1; i < D; i++)
-                for (int e = 0; e < D; e++) rows[i][e] = at(vertex[i])[e] - at(vertex[0])[e];
-            plane[d] = determinant(rows);
+                for (int e = 0; e < D; e++) rows[i][e][0] = at(vertex[i])[e] - at(vertex[0])[e];
+            determinants(rows, &plane[d]);
             plane[D] += plane[d] * at(vertex[0])[d];
         }
-        set_plane(f, plane);
-        const double side = height(f, middle_);
-        for (auto& row : plane_) row[f] = side > 0 ? -row[f] : row[f];
+        set_plane(facet, plane);
+        const double side = height(facet, middle_);
+        for (double& value : facet.plane) value = side > 0 ? -value : value;
         return side != 0 && std::isfinite(side);
     }
 
-    // Facets that see the point give way to those between it and their rim.
-    void insert(int index) {
-        measure_heights(at(index));
-        seen_.clear();
+    // Notes the new facet that a point is highest above, if it is above one.
+    void find_above(int point) {
+        Outside best = {point, DEAD, 0};
+        for (int f : made_)
+            if (const double up = height(facets_[f], at(point)); up > best.height) best.facet = f, best.height = up;
+        if (best.facet != DEAD) outside_.push_back(best);
+    }
+
+    // Facets that see the point, of which one is known, give way to those between it and their rim.
+    void insert(int index, int first) {
+        find_seen(index, first);
         made_.clear();
-        for (int f = 0; f < int(height_.size()); f++)
-            if (height_[f] > 0) seen_.push_back(f);
-        for (int f : seen_)
-            for (int k = 0; k < D; k++)
-                if (const int beyond = facets_[f].neighbor[k]; height_[beyond] <= 0) add_cone(index, f, k, beyond);
-        for (int f : made_) exchange(facets_[f].neighbor[D - 1], -2 - f, f);
-        for (int f : seen_) remove(f);
+        for (const Rim& rim : rim_) add_cone(index, rim);
         connect();
+        freed_.clear();
+        for (size_t i = 0; i < outside_.size();) {
+            if (!sees(outside_[i].facet, index)) {
+                i++;
+                continue;
+            }
+            freed_.push_back(outside_[i].point);
+            outside_[i] = outside_.back();
+            outside_.pop_back();
+        }
+        for (int f : seen_) facets_[f].neighbor[0] = DEAD, free_.push_back(f);
+        for (int point : freed_) find_above(point);
     }
 
-    void measure_heights(const double* p) {
-        const int total = int(facets_.size());
-        height_.resize(total);
-        for (int f = 0; f < total; f++) height_[f] = -plane_[D][f];
-        for (int d = 0; d < D; d++)
-            for (int f = 0; f < total; f++) height_[f] += plane_[d][f] * p[d];
+    bool sees(int f, int index) const { return facets_[f].looked == index && facets_[f].height > 0; }
+
+    // Facets that see the point hang together.
+    void find_seen(int index, int first) {
+        facets_[first].looked = index;
+        facets_[first].height = height(facets_[first], at(index));
+        seen_.assign(1, first);
+        rim_.clear();
+        for (size_t i = 0; i < seen_.size(); i++) {
+            const int f = seen_[i];
+            for (int k = 0; k < D; k++) {
+                const int beyond = facets_[f].neighbor[k];
+                Facet& other = facets_[beyond];
+                if (other.looked != index) {
+                    other.looked = index;
+                    other.height = height(other, at(index));
+                    if (other.height > 0) seen_.push_back(beyond);
+                }
+                if (!(other.height > 0)) rim_.push_back({f, k, beyond});
+            }
+        }
     }
 
-    // A facet from the ridge without vertex k of facet f, which the one beyond shares, to a new vertex.
-    void add_cone(int index, int f, int k, int beyond) {
+    // A facet from a ridge of the rim to a new vertex.
+    void add_cone(int index, const Rim& rim) {
+        const int made = add();
+        made_.push_back(made);
+        Facet &facet = facets_[made], &beyond = facets_[rim.beyond];
+        const Facet& seen = facets_[rim.facet];
         // A plane through the ridge is a sum of the planes that meet there.
         double plane[D + 1];
-        for (int d = 0; d <= D; d++) plane[d] = height_[f] * plane_[d][beyond] - height_[beyond] * plane_[d][f];
-        Facet facet = facets_[f];
-        std::copy(facet.vertex + k + 1, facet.vertex + D, facet.vertex + k);
+        for (int d = 0; d <= D; d++) plane[d] = seen.height * beyond.plane[d] - beyond.height * seen.plane[d];
+        set_plane(facet, plane);
+        for (int i = 0; i < D - 1; i++) facet.vertex[i] = seen.vertex[i + (i >= rim.side)];
         facet.vertex[D - 1] = uint8_t(index);
         std::fill(facet.neighbor, facet.neighbor + D, 0);
-        facet.neighbor[D - 1] = beyond;
-        const int made = add(facet);
-        set_plane(made, plane);
-        made_.push_back(made);
-        height_.resize(facets_.size());
-        // Marked, not set: the one beyond may meet two facets that see the point.
-        exchange(beyond, f, -2 - made);
-    }
-
-    // Puts another neighbor in the place of one.
-    void exchange(int f, int32_t one, int32_t other) {
-        int32_t *neighbor = facets_[f].neighbor, *place = std::find(neighbor, neighbor + D, one);
-        if (place == neighbor + D)
+        facet.neighbor[D - 1] = rim.beyond;
+        int32_t* place = std::find(beyond.neighbor, beyond.neighbor + D, rim.facet);
+        if (place == beyond.neighbor + D)
             broken_ = true;
         else
-            *place = other;
+            *place = made;
     }
 
     // New facets are neighbors where they share a ridge: four old vertices and the new one.
@@ -206,54 +244,73 @@ class WrenchHull {
         int bits = 6;
         while ((size_t(1) << bits) < 2 * (D - 1) * made_.size()) bits++;
         const uint32_t last = (uint32_t(1) << bits) - 1;
-        ridges_.assign(size_t(last) + 1, Ridge{0, DEAD, 0});
-        size_t open = (D - 1) * made_.size();
-        for (int f : made_)
+        ridges_.assign(size_t(last) + 1, Ridge{NO_KEY, 0});
+        slots_.resize((D - 1) * made_.size());
+        uint32_t* at = slots_.data();
+        for (int f : made_) {
+            uint8_t vertex[D - 1];
+            std::copy(facets_[f].vertex, facets_[f].vertex + D - 1, vertex);
             for (int k = 0; k < D - 1; k++) {
                 uint32_t key = 0;
                 for (int i = 0; i < D - 1; i++)
-                    if (i != k) key = key << 8 | facets_[f].vertex[i];
+                    if (i != k) key = key << 8 | vertex[i];
                 uint32_t slot = key * 2654435769u >> (32 - bits);
-                while (ridges_[slot].facet != DEAD && ridges_[slot].key != key) slot = (slot + 1) & last;
-                Ridge& ridge = ridges_[slot];
-                if (ridge.facet == DEAD) {
-                    ridge = {key, f, k};
-                } else if (ridge.side != CLOSED) {
-                    facets_[f].neighbor[k] = ridge.facet;
-                    facets_[ridge.facet].neighbor[ridge.side] = f;
-                    ridge.side = CLOSED;
-                    open -= 2;
-                }
-            }
-        // Rounding can leave a ridge to one facet, or to three.
-        broken_ |= open != 0;
-    }
-
-    static double determinant(double (&rows)[D][D]) {
-        double product = 1;
-        for (int c = 0; c < D; c++) {
-            int best = c;
-            for (int r = c + 1; r < D; r++)
-                if (std::fabs(rows[r][c]) > std::fabs(rows[best][c])) best = r;
-            if (rows[best][c] == 0) return 0;
-            if (best != c) std::swap(rows[best], rows[c]), product = -product;
-            product *= rows[c][c];
-            for (int r = c + 1; r < D; r++) {
-                const double factor = rows[r][c] / rows[c][c];
-                for (int e = c + 1; e < D; e++) rows[r][e] -= factor * rows[c][e];
+                while (ridges_[slot].key != key && ridges_[slot].key != NO_KEY) slot = (slot + 1) & last;
+                ridges_[slot].key = key;
+                ridges_[slot].sum += ONE + f;
+                *at++ = slot;
             }
         }
-        return product;
+        const uint32_t* slot = slots_.data();
+        for (int f : made_)
+            for (int k = 0; k < D - 1; k++, slot++) {
+                const uint32_t sum = ridges_[*slot].sum;
+                // Rounding can leave a ridge to one facet, or to three.
+                broken_ |= sum / ONE != 2;
+                facets_[f].neighbor[k] = int32_t(sum % ONE) - f;
+            }
+    }
+
+    static double sum_of_determinants(const double (&rows)[D][D][BATCH], int count) {
+        double each[BATCH], sum = 0;
+        determinants(rows, each);
+        for (int i = 0; i < count; i++) sum += std::fabs(each[i]);
+        return sum;
+    }
+
+    // Determinants of several matrices at once, by their minors of three rows (Laplace).
+    template <int N>
+    static void determinants(const double (&rows)[D][D][N], double* out) {
+        std::fill(out, out + N, 0.0);
+        for (int a = 0; a < D; a++)
+            for (int b = a + 1; b < D; b++)
+                for (int c = b + 1; c < D; c++) {
+                    int others[D / 2], n = 0;
+                    for (int i = 0; i < D; i++)
+                        if (i != a && i != b && i != c) others[n++] = i;
+                    const double sign = (a + b + c) % 2 ? 1 : -1;
+                    const int *o = others, half = D / 2;
+                    for (int i = 0; i < N; i++)
+                        out[i] += sign * minor(rows, 0, a, b, c, i) * minor(rows, half, o[0], o[1], o[2], i);
+                }
+    }
+
+    template <int N>
+    static double minor(const double (&m)[D][D][N], int row, int a, int b, int c, int i) {
+        const auto &r = m[row], &s = m[row + 1], &t = m[row + 2];
+        return r[a][i] * (s[b][i] * t[c][i] - s[c][i] * t[b][i]) - r[b][i] * (s[a][i] * t[c][i] - s[c][i] * t[a][i]) +
+               r[c][i] * (s[a][i] * t[b][i] - s[b][i] * t[a][i]);
     }
 
     const double* points_;
     int count_;
     double middle_[D] = {};
     std::vector<Facet> facets_;
-    std::vector<double> plane_[D + 1];  // outward unit normals, and offsets
-    std::vector<double> height_;        // of the point above each facet
-    std::vector<int> free_, seen_, made_;
+    std::vector<Outside> outside_;
+    std::vector<int> free_, seen_, made_, freed_;
+    std::vector<Rim> rim_;
     std::vector<Ridge> ridges_;
+    std::vector<uint32_t> slots_;  // in `ridges_`, of each new facet's
     bool broken_ = false;
 };
 
