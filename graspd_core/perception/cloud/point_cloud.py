@@ -112,7 +112,7 @@ def least_axes(spreads: Float[np.ndarray, "n 3 3"]) -> Points:
     return found
 
 
-def clean_cloud(points: Points) -> Points:
+def clean_cloud(points: Points) -> Float[np.ndarray, "kept 3"]:
     """Drop points [m] that are not finite, thin the rest to an even density, and drop outliers.
 
     Raises CloudError if the cloud is empty or all NaN, or if fewer than 50 points are left.
