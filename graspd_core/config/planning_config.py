@@ -123,7 +123,7 @@ MASS_KNOWN = HeldShares(0.70, 0.89, 0.95, 0.60, 0.59)
 # household objects and ten scans it is 0.26 at x = 0.25, 0.64 at 0.5, 0.85 at 0.7.
 _LIGHT_GROWTH = 1.3
 # With a payload below the heavy end, a grasp is verified only if at least this fraction of objects is lighter than it.
-LEAST_LIGHT = 0.5
+LEAST_LIGHT = 0.8
 # Fraction of grasps that hold on a doubtful scene, such as one whose camera may have stood elsewhere.
 DOUBTED_SHARE = 0.6
 

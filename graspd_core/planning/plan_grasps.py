@@ -16,9 +16,7 @@ from graspd_core.config import VERIFICATIONS
 from graspd_core.errors import ConfigError
 from graspd_core.hands.model import HandModel
 from graspd_core.hands.surface_points import with_candidates
-from graspd_core.mesh.mesh_files import surface_samples
 from graspd_core.mesh.sdf import GridSDF, grid_layout
-from graspd_core.mesh.shapes import make_shape
 from graspd_core.mesh.surface_queries import make_surface, pressed_points
 from graspd_core.optimize.plan_config import PlanConfig, load_preset
 from graspd_core.optimize.restrictions import BoundRestrictions, Restriction, restrictions_in_words
@@ -240,6 +238,8 @@ def warm_up(hand: HandModel, stop: StopHook | None = None) -> None:
     from graspd_core.perception.scene_from_views import scene_from_views
 
     start_planning_worker()
-    ball = surface_samples(make_shape("sphere"), 2000, seed=0)[0] + np.array([0.0, 0.0, 0.5])
+    # The sphere is drawn here, because `make_shape` would import trimesh, which only meshes need.
+    ways = np.random.default_rng(0).normal(size=(2000, 3))
+    ball = 0.04 * ways / np.linalg.norm(ways, axis=1, keepdims=True) + np.array([0.0, 0.0, 0.5])
     scene = scene_from_views([PointCloud(ball, np.zeros(3))], alone=True)
     plan_grasps(scene, hand, count=1, preset="fast", verify="standard", stop=stop)
