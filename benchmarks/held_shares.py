@@ -1,11 +1,11 @@
-"""How often grasps of a single view hold on the true thing, by what they hold under: `HeldShares` of planning_config.
+"""Measure how often grasps of a single view hold on the true object: the `HeldShares` of planning_config.
 
-    python benchmarks/held_shares.py --out shares.jsonl [--seeds 12] [--scans FOLDER]
+    python benchmarks/held_shares.py --out shares.jsonl [--seeds 50:58] [--scans FOLDER]
 
-Every thing of `CHOSEN_ON` is seen once a seed, and so are five scans, `SCANS`, of a folder that also has a stats.csv of
-masses. Four kinds of cameras take turns, and every other view is crowded. Of the grasps that hold on the likeliest
-shape, each is tried under every hypothesis, and on the truth at its own mass and at the mass that planning supposed.
-Views that are in the file already are not seen again. A view takes ten CPU seconds.
+Every object of `CHOSEN_ON` is seen once a seed, compounds three times. So are five scans, `SCANS`, of a folder that has
+a stats.csv of masses. Four kinds of cameras take turns, and every other view is crowded. Each view is planned without a
+mass and with the object's own. Grasps that hold on the likeliest shape run every robustness check, and are tried on the
+true object at its own mass. Views that are in the file are skipped. A view takes fifteen CPU seconds.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ from typing import Any
 import numpy as np
 
 from graspd_bench.rendering.depth_noise import CAMERAS
-from graspd_bench.studies.cameras import CHOSEN_ON, CameraView, view_of
+from graspd_bench.studies.cameras import ASSUMED, CHOSEN_ON, GIVEN, CameraView, view_of
 from graspd_core.config import CertaintyConfig
 from graspd_core.errors import GraspdError
 from graspd_core.hands.library import load_hand
@@ -35,27 +35,29 @@ from graspd_core.verify.hold_trial import hold_trial, out_of_place
 from graspd_core.verify.robustness import begin_other_worlds, hypotheses_of
 from graspd_core.verify.run_clock import Run
 from graspd_core.verify.trial_registry import build_worlds
-from graspd_core.verify.world import PROTOCOLS, altered, build_world
+from graspd_core.verify.world import PROTOCOLS, build_world
 
 SCANS = ("003_cracker_box", "006_mustard_bottle", "055_baseball", "025_mug", "011_banana")
 SURE = CertaintyConfig().probability
 
 
-def cases(seeds: int, scans: Path | None) -> Iterator[CameraView]:
-    """The views that shares are taken from."""
-    things = (*CHOSEN_ON, *(str(scans / f"{name}.obj") for name in SCANS if scans))
-    for seed in range(seeds):
-        for place, thing in enumerate(things):
+def cases(seeds: range, scans: Path | None) -> Iterator[CameraView]:
+    """Yield the views, each planned in two ways."""
+    things = [(thing, 0) for thing in (*CHOSEN_ON, *(str(scans / f"{name}.obj") for name in SCANS if scans))]
+    things += [("compound", 100), ("compound", 200)]
+    for seed in seeds:
+        for place, (thing, other) in enumerate(things):
             camera, crowd = list(CAMERAS)[(seed + place) % 4], (seed // 4 + place) % 2 == 1
-            yield CameraView(thing, seed, camera, crowd, "", "allegro_right", "balanced", 8)
+            for way in (ASSUMED, GIVEN):
+                yield CameraView(thing, seed + other, camera, crowd, way, "allegro_right", "balanced", 8)
 
 
 def grasps_of_view(case: CameraView) -> list[dict[str, Any]]:
-    """What each grasp holds under that holds on the likeliest shape, and on the truth."""
+    """Return which checks each grasp passes that holds on the likeliest shape, and whether it holds on the truth."""
     stage, cloud, mass, target = view_of(case)
     hand, config = load_hand(case.hand), replace(load_preset(case.preset), certainty=CertaintyConfig(0.0))
     disk_cache.forget()
-    scene = scene_from_views([cloud], target=target)
+    scene = scene_from_views([cloud], target=target, mass=mass if case.way == GIVEN else None)
     result = plan_grasps(scene, hand, count=case.count, seed=case.seed, preset=config, measure=False)
     tried = scene.object.at_mass(result.mass or scene.object.mass)
     known = replace(scene, object=replace(tried, mass_assumed=False))
@@ -64,26 +66,25 @@ def grasps_of_view(case: CameraView) -> list[dict[str, Any]]:
     asked = hypotheses_of(known, begin_other_worlds(run, known, hand, protocol, SURE), worlds, SURE)
     truth = build_scene(stage.truth, source=case.thing, mass=mass)
     own = build_world(hand, truth.object, object_parts(truth.object), protocol)
-    as_tried, loose = altered(own, mass=tried.mass), out_of_place(protocol)
     assert asked is not None
     rows = []
     for grasp in (grasp for grasp in result.tried if grasp.verdict is Verdict.VERIFIED):
         holds = [[item.hold(grasp, lambda: False) for item in stage.items] for stage in asked.stages]
-        *places, slippery = (hold is not None and hold.passed for hold in holds[0])
+        *places, slippery = (hold is not None and hold.passed for hold in holds[0]) if holds else (False,)
         shapes = [hold.passed for hold in holds[1] if hold is not None] if len(holds) > 1 else []
         rows.append({
-            "view": case.label, "lowered": result.mass is not None, "places": sum(places), "slippery": slippery,
-            "shapes": sum(shapes), "of_shapes": len(shapes), "own": hold_trial(own, grasp, loose).passed,
-            "tried": hold_trial(as_tried, grasp, loose).passed,
+            "view": case.label, "way": case.way, "lowered": result.mass is not None, "places": sum(places),
+            "slippery": slippery, "shapes": sum(shapes), "of_shapes": len(shapes),
+            "own": hold_trial(own, grasp, out_of_place(protocol)).passed,
         })  # fmt: skip
     return rows
 
 
-def share(rows: list[dict[str, Any]], truth: str) -> str:
-    """Of the grasps that hold, and the 90 % interval that resampling the views gives."""
+def share(rows: list[dict[str, Any]]) -> str:
+    """Return the fraction that holds on the truth, and the 90 % interval of resampled views."""
     views: dict[str, list[bool]] = {}
     for row in rows:
-        views.setdefault(row["view"], []).append(row[truth])
+        views.setdefault(row["view"], []).append(row["own"])
     counts, rng = (
         np.array([(sum(holds), len(holds)) for holds in views.values()]).reshape(-1, 2),
         np.random.default_rng(0),
@@ -100,12 +101,12 @@ def main() -> None:
     """Fill the file, and print the shares."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--out", type=Path, required=True)
-    parser.add_argument("--seeds", type=int, default=12)
+    parser.add_argument("--seeds", default="50:58")
     parser.add_argument("--scans", type=Path, default=None)
     options = parser.parse_args()
     lines = [json.loads(line) for line in options.out.read_text().splitlines()] if options.out.exists() else []
     with options.out.open("a") as file:
-        for case in cases(options.seeds, options.scans):
+        for case in cases(range(*map(int, options.seeds.split(":"))), options.scans):
             if case.label in {line["view"] for line in lines}:
                 continue
             try:
@@ -115,20 +116,20 @@ def main() -> None:
             file.write(json.dumps(lines[-1]) + "\n")
             file.flush()
     rows = [row for line in lines for row in line["grasps"]]
-    full, lowered = ([row for row in rows if row["lowered"] is less] for less in (False, True))
     two = lambda row: row["shapes"] >= min(2, row["of_shapes"])  # noqa: E731
     most = lambda row: row["places"] >= 2  # noqa: E731
     every = lambda row: row["places"] == 3 and row["slippery"]  # noqa: E731
-    for name, of, placed, truth in (
-        ("mass assumed", full, most, "own"),
-        ("mass known", rows, every, "tried"),
-        ("mass lowered", lowered, every, "own"),
+    for name, placed, way, lowered in (
+        ("mass assumed", most, ASSUMED, False),
+        ("mass known", every, GIVEN, False),
+        ("mass lowered", every, ASSUMED, True),
     ):
-        print(f"{name}: likeliest {share(of, truth)}")
-        print(f"  out of place {share([r for r in of if placed(r)], truth)}")
-        print(f"  and two shapes {share([r for r in of if placed(r) and two(r)], truth)}")
-        print(f"  fails out of place {share([r for r in of if not placed(r)], truth)}")
-        print(f"  fails on shapes {share([r for r in of if placed(r) and not two(r)], truth)}")
+        of = [row for row in rows if row["way"] == way and row["lowered"] is lowered]
+        print(f"{name}: likeliest {share(of)}")
+        print(f"  out of place {share([r for r in of if placed(r)])}")
+        print(f"  and two shapes {share([r for r in of if placed(r) and two(r)])}")
+        print(f"  fails out of place {share([r for r in of if not placed(r)])}")
+        print(f"  fails on shapes {share([r for r in of if placed(r) and not two(r)])}")
 
 
 if __name__ == "__main__":

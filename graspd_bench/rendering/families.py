@@ -45,10 +45,11 @@ class Thing:
 @lru_cache(maxsize=64)
 def draw_thing(family: str, seed: int) -> Thing:
     """Return the random object of a family and seed. Raises MeshError: unknown family."""
-    if family not in FAMILIES:
-        raise MeshError(f"unknown family {family!r}; {choices(family, FAMILIES)}")
+    families = FAMILIES | OTHERS
+    if family not in families:
+        raise MeshError(f"unknown family {family!r}; {choices(family, families)}")
     rng = np.random.default_rng([sum(map(ord, family)), seed])
-    field, size, (light, heavy) = FAMILIES[family](rng)
+    field, size, (light, heavy) = families[family](rng)
     mesh = simplify(_surface(field, np.asarray(size, dtype=float)), _FACES)
     return Thing(mesh, float(rng.uniform(light, heavy) * mass_properties(mesh)[0]))
 
@@ -258,8 +259,38 @@ def _jar(rng: np.random.Generator) -> Drawn:
     return _revolved(profile), (max(wide, rim), max(wide, rim), half), (600, 1400)
 
 
+def _compound(rng: np.random.Generator) -> Drawn:
+    fields: list[Field] = []
+    centre, reach = np.zeros(3), np.zeros(3)
+    for _ in range(rng.integers(2, 5)):
+        size = rng.uniform(0.014, 0.045, 3) * (0.8 if fields else 1.0)
+        kind, long = rng.integers(3), rng.uniform(0.02, 0.07)
+        if kind == 0:
+            solid, radius = _box((0, 0, 0), tuple(size), 0.005), np.linalg.norm(size)
+        elif kind == 1:
+            ends = 0.7 * size[:2]
+            solid, radius = _cone((0, 0, -long, ends[0]), (0, 0, long, ends[1])), long + ends.max()
+        else:
+            profile = [
+                (-long, 0.5 * size[0]),
+                (-0.4 * long, 0.9 * size[0]),
+                (0.2 * long, size[0]),
+                (long, 0.6 * size[0]),
+            ]
+            solid, radius = _revolved(profile, rng.uniform(0.5, 1.0)), np.hypot(long, size[0])
+        turn = np.linalg.qr(rng.normal(size=(3, 3)))[0] if rng.random() < 0.5 else np.eye(3)
+        fields.append(lambda points, f=solid, c=centre, r=turn: f((points - c) @ r))
+        reach = np.maximum(reach, np.abs(centre) + radius)
+        step = rng.normal(size=3)
+        centre = np.clip(centre + rng.uniform(0.5, 0.9) * radius * step / np.linalg.norm(step), -0.07, 0.07)
+    return _blend(*fields, width=rng.uniform(0.002, 0.01)), (reach[0], reach[1], reach[2]), (150, 1800)
+
+
 FAMILIES: dict[str, Callable[[np.random.Generator], Drawn]] = {
     "pear": _pear, "banana": _banana, "pitcher": _pitcher, "spray": _spray, "pump": _pump, "detergent": _detergent,
     "tool": _tool, "drill": _drill, "plane": _plane, "animal": _animal, "pan": _pan, "sponge": _sponge, "jar": _jar,
 }  # fmt: skip
 """Functions that draw an object, by family."""
+
+OTHERS = {"compound": _compound}
+"""Functions that draw an object that is no household object: two to four solids, joined at random."""

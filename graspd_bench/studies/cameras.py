@@ -17,7 +17,7 @@ from pathlib import Path
 import numpy as np
 
 from graspd_bench.rendering.depth_noise import CAMERAS
-from graspd_bench.rendering.families import FAMILIES, draw_thing
+from graspd_bench.rendering.families import FAMILIES, OTHERS, draw_thing
 from graspd_bench.rendering.render import render_scene
 from graspd_bench.rendering.tabletop import TabletopScene, crowded, moved, on_table, resting_pose, ring_poses, views_of
 from graspd_bench.studies.seen_objects import calibration, reconstruction_error
@@ -40,7 +40,9 @@ from graspd_core.verify.world import PROTOCOLS, altered, build_world
 from graspd_dataset.run_records import markdown_table, thing_name
 
 # Families and shapes from which the shares of verified grasps were computed, with seeds from 0. This study uses others.
-CHOSEN_ON = ("pear", "pitcher", "pump", "tool", "plane", "sponge", "jar", "box", "cylinder", "mug", "l_block")
+CHOSEN_ON = (
+    "pear", "pitcher", "pump", "tool", "plane", "sponge", "jar", "compound", "box", "cylinder", "mug", "l_block",
+)  # fmt: skip
 FIRST_SEED, SEEDS = 100, 4
 SHAPES = ("sphere", "capsule", "bowl", "bottle")
 # Densities of built-in shapes [kg/m³]: of earthenware for `_HOLLOW`, and of all others, hollow or full.
@@ -79,7 +81,7 @@ class CameraView(Case):
     @property
     def kind(self) -> str:
         """Return the kind of object: "irregular" (a family), "regular" (a shape) or "scan"."""
-        return "irregular" if self.thing in FAMILIES else "scan" if Path(self.thing).suffix else "regular"
+        return "irregular" if self.thing in FAMILIES | OTHERS else "scan" if Path(self.thing).suffix else "regular"
 
     def shown(self) -> Record:
         return {**super().shown(), "thing": thing_name(self.thing), "kind": self.kind}

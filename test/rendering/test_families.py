@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from graspd_bench.rendering.depth_noise import CAMERAS, add_noise
-from graspd_bench.rendering.families import FAMILIES, draw_thing
+from graspd_bench.rendering.families import FAMILIES, OTHERS, draw_thing
 from graspd_bench.rendering.tabletop import crowded, moved, resting_pose
 from graspd_core.errors import MeshError
 from graspd_core.mesh.mesh_files import mass_properties, surface_samples
@@ -14,7 +14,7 @@ from graspd_core.mesh.topology import is_closed
 from graspd_core.perception.scene import heavy_mass
 
 
-@pytest.mark.parametrize("family", FAMILIES)
+@pytest.mark.parametrize("family", FAMILIES | OTHERS)
 def test_things_are_closed_turned_outwards_and_of_a_hand_s_size(family: str):
     thing, other = draw_thing(family, 100), draw_thing(family, 101)
     assert is_closed(thing.mesh)
