@@ -32,7 +32,7 @@ from graspd_core.planning.plan_grasps import plan_grasps
 from graspd_core.runtime import disk_cache
 from graspd_core.types import Verdict
 from graspd_core.verify.hold_trial import hold_trial, out_of_place
-from graspd_core.verify.robustness import begin_other_worlds, hypotheses_of
+from graspd_core.verify.robustness import begin_other_worlds, robustness_checks_of
 from graspd_core.verify.run_clock import Run
 from graspd_core.verify.trial_registry import build_worlds
 from graspd_core.verify.world import PROTOCOLS, build_world
@@ -63,7 +63,7 @@ def grasps_of_view(case: CameraView) -> list[dict[str, Any]]:
     known = replace(scene, object=replace(tried, mass_assumed=False))
     protocol, run = PROTOCOLS["standard"], Run(time.perf_counter(), None, None, None)
     worlds = build_worlds(known, hand, object_parts(known.object), protocol)
-    asked = hypotheses_of(known, begin_other_worlds(run, known, hand, protocol, SURE), worlds, SURE)
+    asked = robustness_checks_of(known, begin_other_worlds(run, known, hand, protocol, SURE), worlds, SURE)
     truth = build_scene(stage.truth, source=case.thing, mass=mass)
     own = build_world(hand, truth.object, object_parts(truth.object), protocol)
     assert asked is not None

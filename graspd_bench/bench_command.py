@@ -99,9 +99,9 @@ def run(options: argparse.Namespace) -> int:
         if path:
             check_writable(path)
     with Interrupt() as interrupt, Lines(plan, 0 if options.no_run else options.processes) as lines:
-        for job, record in run_plan(plan, options.processes, interrupt.came) if not options.no_run else ():
+        for job, record in run_plan(plan, options.processes, interrupt.is_interrupted) if not options.no_run else ():
             lines(job.study, record)
-    if interrupt.came():
+    if interrupt.is_interrupted():
         kept = f"{len(plan.done)} of {len(plan.jobs)} cases are kept in {options.out}"
         print_error(f"interrupted; {kept}")
         return EXIT_INTERRUPTED

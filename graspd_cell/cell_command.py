@@ -78,8 +78,8 @@ def run(options: argparse.Namespace) -> int:
     )
     attempts: list[Attempt] = []
     with Interrupt() as interrupt:
-        _greet(live, interrupt.came)
-        picker = Picker(robot, source, arm, hand, world.layout, cancelled=interrupt.came)
+        _greet(live, interrupt.is_interrupted)
+        picker = Picker(robot, source, arm, hand, world.layout, cancelled=interrupt.is_interrupted)
         try:
             for attempt in waiting(picker.empty_the_bin(options.attempts or 2 * options.count + 3), "pick"):
                 attempts.append(attempt)
@@ -99,7 +99,7 @@ def run(options: argparse.Namespace) -> int:
     left = [name for name, place in places.items() if place != world.layout.place.name]
     print(f"{summary(attempts)}; left: {', '.join(left) or 'nothing'}; {picker.why_ended or 'interrupted'}", flush=True)
     answer({"attempts": attempts, "left": left})
-    if interrupt.came():
+    if interrupt.is_interrupted():
         return EXIT_INTERRUPTED
     return EXIT_LEFT if left else EXIT_OK
 

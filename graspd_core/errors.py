@@ -11,7 +11,7 @@ _SHORT.maxlevel, _SHORT.maxlist, _SHORT.maxtuple, _SHORT.maxdict, _SHORT.maxset 
 _SHORT.maxstring = _SHORT.maxother = 120
 
 
-def shown(value: object) -> str:
+def short_repr(value: object) -> str:
     """Return a short text of any value, for messages. The text of a huge value is cut."""
     try:
         return _SHORT.repr(value)

@@ -89,8 +89,8 @@ class TransformBuffer:
             if stamp is None:
                 moving = [link for name in (*below_source, *below_target) if not (link := self._links[name]).static]
                 stamp = min((link.stamps[-1] for link in moving), default=0)
-            asked = f"transform {source} -> {target}"
-            return _inverse(self._down(below_target, stamp, asked)) @ self._down(below_source, stamp, asked)
+            what = f"transform {source} -> {target}"
+            return _inverse(self._down(below_target, stamp, what)) @ self._down(below_source, stamp, what)
 
     def frames(self) -> tuple[str, ...]:
         """Return the names of all known frames, in alphabetical order."""
@@ -119,20 +119,20 @@ class TransformBuffer:
             old = bisect.bisect_left(link.stamps, link.stamps[-1] - self._history)
             del link.stamps[:old], link.poses[:old]
 
-    def _down(self, names: list[str], stamp: int, asked: str) -> Float[np.ndarray, "4 4"]:
+    def _down(self, names: list[str], stamp: int, what: str) -> Float[np.ndarray, "4 4"]:
         pose = np.eye(4)
         for name in names:
-            pose = _pose_at(self._links[name], name, stamp, asked) @ pose
+            pose = _pose_at(self._links[name], name, stamp, what) @ pose
         return pose
 
 
-def _pose_at(link: _Link, name: str, stamp: int, asked: str) -> Float[np.ndarray, "4 4"]:
+def _pose_at(link: _Link, name: str, stamp: int, what: str) -> Float[np.ndarray, "4 4"]:
     if link.static:
         return link.poses[0]
     first, last = link.stamps[0], link.stamps[-1]
     if not first <= stamp <= last:
         raise TransformError(
-            f"{asked} at {_seconds(stamp)}: {name} in {link.parent} is known from {_seconds(first)} to {_seconds(last)}"
+            f"{what} at {_seconds(stamp)}: {name} in {link.parent} is known from {_seconds(first)} to {_seconds(last)}"
         )
     after = bisect.bisect_left(link.stamps, stamp)
     if link.stamps[after] == stamp:

@@ -90,7 +90,7 @@ class Contact:
 
 
 # Name of the trial that runs the robustness checks. A grasp that fails only this trial is unverified, not failed.
-HYPOTHESES = "hypotheses"
+ROBUSTNESS = "hypotheses"
 
 
 @dataclass(frozen=True)
@@ -205,7 +205,7 @@ class Grasp:
         failed = {trial.name for trial in self.trials if not trial.passed}
         if self.trials and not failed:
             return Verdict.VERIFIED
-        return Verdict.FAILED if failed - {HYPOTHESES} else Verdict.UNVERIFIED
+        return Verdict.FAILED if failed - {ROBUSTNESS} else Verdict.UNVERIFIED
 
     @property
     def usable(self) -> bool:

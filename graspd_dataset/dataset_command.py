@@ -108,7 +108,7 @@ def _make(options: argparse.Namespace) -> int:
         )
     write_run(store, with_unrecorded(store, record))
     _finish(store)
-    if interrupt.came():
+    if interrupt.is_interrupted():
         print_error(f"interrupted; the same command continues, {store.shown} keeps finished blocks")
         return EXIT_INTERRUPTED
     return EXIT_FAULTS if lines.wrong else EXIT_OK
@@ -129,7 +129,7 @@ def _run_missing(
     lines, began, written = Lines(len(missing)), time.monotonic(), 0.0
     with ray_running(options.address, options.workers, options.ray_dir) as ray, lines:
         engine = RayEngine(ray, store, limits, ship=options.address is not None)
-        for what, report in run_blocks(missing, engine, interrupt.came):
+        for what, report in run_blocks(missing, engine, interrupt.is_interrupted):
             lines(what, report)
             if time.monotonic() > written + _RECORDS:
                 write_run(store, lines.added_to(record, time.monotonic() - began))

@@ -24,7 +24,7 @@ import numpy as np
 from jaxtyping import Float
 
 from graspd_core.config.mapping import parse_yaml
-from graspd_core.errors import ConfigError, FormatError, shown
+from graspd_core.errors import ConfigError, FormatError, short_repr
 from graspd_core.hands.kinematics import link_poses
 from graspd_core.hands.model import AT_ORIGIN, HandModel, all_joint_names, all_joint_positions
 from graspd_core.runtime.inert_pickle import NUMPY_NAMES, Inert, array_of, load_inert, read_bounded
@@ -72,14 +72,14 @@ def numbers_of(value: Any, shape: tuple[int, ...], where: str) -> np.ndarray:
     if numbers is None or numbers.shape != shape or not (np.abs(numbers) <= _LARGEST).all():
         wanted = f"{' x '.join(map(str, shape))} numbers" if shape else "a number"
         wanted += f" of at most {_LARGEST:.0e}"
-        raise FormatError(f"{where}: {' '.join(shown(value).split())}; expected {wanted}")
+        raise FormatError(f"{where}: {' '.join(short_repr(value).split())}; expected {wanted}")
     return numbers
 
 
 def entry(values: Any, key: str, where: str) -> Any:
     """Return the value of a key. Raises FormatError: the key is missing, or `values` is not a mapping."""
     if not isinstance(values, Mapping):
-        raise FormatError(f"{where}: {shown(values)}; expected a mapping with the key {key!r}")
+        raise FormatError(f"{where}: {short_repr(values)}; expected a mapping with the key {key!r}")
     if key not in values:
         known = ", ".join(sorted(str(name)[:40] for name in values)[:20])
         raise FormatError(f"{where}: the key {key!r} is missing; present keys: {known or 'none'}")
@@ -101,10 +101,10 @@ def joints_by_name(values: Any, hand: HandModel, where: str) -> Float[np.ndarray
     Raises FormatError: a name is unknown, an actuated joint is missing, or a coupled joint contradicts its leader.
     """
     if not isinstance(values, Mapping):
-        raise FormatError(f"{where}: {shown(values)}; expected joint values by name")
+        raise FormatError(f"{where}: {short_repr(values)}; expected joint values by name")
     names = all_joint_names(hand)
     if strange := [name for name in values if name not in names]:
-        raise FormatError(f"{where}: {shown(strange[0])} is no joint of {hand.name}; valid: {', '.join(names)}")
+        raise FormatError(f"{where}: {short_repr(strange[0])} is no joint of {hand.name}; valid: {', '.join(names)}")
     if missing := [name for name in hand.joint_names if name not in values]:
         raise FormatError(f"{where}: joint {missing[0]!r} of {hand.name} is missing")
     joints = np.array([float(numbers_of(values[name], (), f"{where}: {name}")) for name in hand.joint_names])
@@ -133,7 +133,7 @@ def find_beside(named: Any, file: Path, where: str) -> str:
         for folder in file.resolve().parents:
             if (folder / named).is_file():
                 return str(folder / named)
-    raise FormatError(f"{where}: object {shown(named)} is in no folder above the file; give --object MESH")
+    raise FormatError(f"{where}: object {short_repr(named)} is in no folder above the file; give --object MESH")
 
 
 # Orientation (wxyz) of our base link, the palm, in the frame of the qpos, for hands that DexGraspBench models with
@@ -260,7 +260,7 @@ def read_isaac(path: Path, text: bytes, hand: HandModel, mesh: str | None) -> li
     except ValueError as error:
         raise FormatError(f"{path}: not YAML: {error}") from None
     if entry(document, "format", f"{path}") != "isaac_grasp" or document.get("format_version") != 1.0:
-        told = f"{shown(document['format'])} {shown(document.get('format_version'))}"
+        told = f"{short_repr(document['format'])} {short_repr(document.get('format_version'))}"
         raise FormatError(f"{path}: format {told}; valid: isaac_grasp 1.0")
     # Isaac Sim writes keys that end with `_frame_link`, Isaac ROS documents keys that end with `_frame`.
     target, frame = (document.get(f"{of}_frame_link", document.get(f"{of}_frame")) for of in ("object", "gripper"))
@@ -268,8 +268,8 @@ def read_isaac(path: Path, text: bytes, hand: HandModel, mesh: str | None) -> li
     frame = str(frame).rpartition("/")[2]
     grasps = entry(document, "grasps", f"{path}")
     if not isinstance(grasps, dict):
-        raise FormatError(f"{path}: grasps: {shown(grasps)}; expected grasps by name")
-    return [_grasp_of(values, hand, frame, mesh, f"{path}: {shown(name)}") for name, values in grasps.items()]
+        raise FormatError(f"{path}: grasps: {short_repr(grasps)}; expected grasps by name")
+    return [_grasp_of(values, hand, frame, mesh, f"{path}: {short_repr(name)}") for name, values in grasps.items()]
 
 
 def _grasp_of(values: Any, hand: HandModel, frame: str, mesh: str, where: str) -> ImportedGrasp:
@@ -315,7 +315,7 @@ def read_graspgen(path: Path, text: bytes, hand: HandModel, mesh: str | None) ->
     for number, (pose, good) in enumerate(zip(poses, held, strict=True)):
         where = f"{path}: grasp {number}"
         if not isinstance(good, bool):
-            raise FormatError(f"{where}: object_in_gripper: {shown(good)}; expected true or false")
+            raise FormatError(f"{where}: object_in_gripper: {short_repr(good)}; expected true or false")
         refused = "" if good else "its file says that it did not hold"
         found.append(ImportedGrasp(where, mesh, scale, _open_at(pose, hand, where), closed=False, refused=refused))
     return found
@@ -329,7 +329,7 @@ def _open_at(pose: object, hand: HandModel, where: str) -> Posture:
     rotation = matrix[:3, :3]
     rigid = np.abs(rotation @ rotation.T - np.eye(3)).max() < _ROTATION and np.linalg.det(rotation) > 0
     if not rigid or np.abs(matrix[3] - [0, 0, 0, 1]).max() > _ROTATION:
-        raise FormatError(f"{where}: transform: {shown(pose)}; expected a rotation and a translation")
+        raise FormatError(f"{where}: transform: {short_repr(pose)}; expected a rotation and a translation")
     quaternion = np.roll(Rotation.from_matrix(rotation).as_quat(), 1)
     return Posture(matrix[:3, 3], quaternion, np.clip(hand.open_posture, hand.lower, hand.upper))
 

@@ -47,7 +47,7 @@ from graspd_ros.inputs.sensor_frames import (
     depth_sensor_frame,
 )
 from graspd_ros.inputs.sensor_topics import SensorTopic
-from graspd_ros.inputs.solids import Thing, changed_things
+from graspd_ros.inputs.solids import SceneObject, updated_objects
 from graspd_ros.inputs.tf_listener import TransformListener, heard_robot
 from graspd_ros.outputs.responses import RECEIVED, Responses, health_message, resident_memory
 from graspd_ros.parameters import LiveSettings, Settings
@@ -84,7 +84,7 @@ class GraspNode(Node):
         self._announcing = threading.Lock()
         self._listener = TransformListener(self, transforms)
         self._pairs = ImagePairs()
-        self._things: Mapping[str, Thing] = {}
+        self._collision_objects: Mapping[str, SceneObject] = {}
         self._request_builder = RequestBuilder(
             self._hand.name,
             self._now,
@@ -197,9 +197,9 @@ class GraspNode(Node):
 
     def _on_collision_object(self, message: Any) -> None:
         try:
-            self._things = changed_things(self._things, message)
+            self._collision_objects = updated_objects(self._collision_objects, message)
         except Exception as error:  # whatever the message holds, the executor goes on
-            self._responses.thing_not_taken(error)
+            self._responses.collision_object_not_taken(error)
 
     def _on_cancel(self, message: String) -> None:
         if not self._worker.cancel(message.data) and message.data:
@@ -234,13 +234,13 @@ class GraspNode(Node):
     def _watch_sensors(self) -> None:
         """Log once which sensor topics deliver no messages. Requests for the latest cloud repeat the reason."""
         before = self._request_builder.missing
-        missing = {sensor.name: told for sensor in self._sensors if (told := sensor.check())}
+        missing = {sensor.name: reason for sensor in self._sensors if (reason := sensor.check())}
         for name in missing.keys() - before.keys():  # some publish on demand only: no fault by itself
             self.get_logger().warning(missing[name])
-        if told := self._pairs.doubt():
-            missing[IMAGES] = told
+        if reason := self._pairs.unpaired():
+            missing[IMAGES] = reason
             if IMAGES not in before:
-                self._responses.images_not_taken(told)
+                self._responses.images_not_taken(reason)
         self._request_builder.missing = missing
 
     def _on_diagnostics_due(self) -> None:
@@ -289,8 +289,8 @@ class GraspNode(Node):
             self._submit(request)
 
     def _submit(self, request: Request) -> None:
-        if self._things:
-            request = replace(request, things=self._things)
+        if self._collision_objects:
+            request = replace(request, collision_objects=self._collision_objects)
         with self._announcing:  # the worker starts only once the answer is out
             admission = self._worker.submit(request, BusyPolicy(request.settings.busy_policy))
             self._responses.admitted(request, admission)
@@ -312,7 +312,7 @@ class GraspNode(Node):
 
                 warm_up_library(settings, self._hand)
         except BaseException as error:  # otherwise the node would run on without a worker
-            self._responses.tell_error("", "node", error)
+            self._responses.report_error("", "node", error)
             self._on_failure()
             return
         if self._worker.stopping():
@@ -323,7 +323,7 @@ class GraspNode(Node):
         # The first log call takes 0.1 s, because rclpy searches all modules for the caller.
         self.get_logger().info(f"ready: {self._hand.name} waits for objects")
         self._ready = True
-        self._responses.publishers.tell("ready", "", "node", hand=self._hand.name, base_link=self._hand.base_link)
+        self._responses.publishers.emit("ready", "", "node", hand=self._hand.name, base_link=self._hand.base_link)
 
     def _work(self, request: Request, stop: StopHook) -> Planned:
         with self._announcing:
@@ -338,8 +338,8 @@ def _collision_object() -> type:
     try:
         from moveit_msgs.msg import CollisionObject
     except ImportError:
-        told = "parameter collision_objects: moveit_msgs/CollisionObject is not installed; install it (docs/moveit.md)"
-        raise ConfigError(f"{told} or leave the parameter empty") from None
+        text = "parameter collision_objects: moveit_msgs/CollisionObject is not installed; install it (docs/moveit.md)"
+        raise ConfigError(f"{text} or leave the parameter empty") from None
     return CollisionObject
 
 

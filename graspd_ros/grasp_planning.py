@@ -80,8 +80,8 @@ def request_from_goal(
 ) -> Request:
     """Return a goal's request. Raises GraspdError if it is for another hand or its object has no usable shape."""
     if goal.group_name not in ("", hand):
-        told = f"group_name: {goal.group_name[:128]!r} is no hand here; this node plans for {hand!r}"
-        raise RequestError(ErrorCode.WRONG_HAND, told)
+        fault = f"group_name: {goal.group_name[:128]!r} is no hand here; this node plans for {hand!r}"
+        raise RequestError(ErrorCode.WRONG_HAND, fault)
     target = goal.object
     plane = plane_of(target.surface)
     if target.meshes or target.primitives:
@@ -93,8 +93,8 @@ def request_from_goal(
         raise bad_message("object", "no meshes, no primitives and no point_cluster; give one of them")
     header = cluster.header if cluster.header.frame_id else target.header
     if plane is not None and target.header.frame_id not in ("", header.frame_id):
-        told = f"surface: in {target.header.frame_id!r}, the point_cluster in {header.frame_id!r}; give one frame"
-        raise bad_message("object", told)
+        fault = f"surface: in {target.header.frame_id!r}, the point_cluster in {header.frame_id!r}; give one frame"
+        raise bad_message("object", fault)
     request = builder.from_cluster(request_id, replace(settings, segment=False), cluster, header, listener)
     return replace(request, load=with_support(request.load, plane))
 

@@ -65,7 +65,7 @@ def answer_known(
     began, settings = time.perf_counter(), request.settings
     count, library = settings.num_grasps, GraspLibrary(Path(settings.grasp_library))
     entry = find_entry(known, settings, hand)
-    if entry is not None and not restrictions and request.surface is None and not request.things:
+    if entry is not None and not restrictions and request.surface is None and not request.collision_objects:
         grasps = unlike(library.grasps(entry, hand), excluded)[:count]
         if len(grasps) >= count:
             found = library_result(library, grasps, count, time.perf_counter() - began)

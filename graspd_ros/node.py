@@ -57,8 +57,8 @@ def run_command(
 
     `args` exclude the program name (None for this process's own). `parse` receives the arguments that are not for ROS.
     """
-    if told := foreign_ros():
-        sys.stderr.write(f"{name}: {told}\n")
+    if conflict := foreign_ros():
+        sys.stderr.write(f"{name}: {conflict}\n")
         return EXIT_BAD_INPUT
     os.environ.setdefault("AMENT_PREFIX_PATH", sys.prefix)  # the wheels leave it unset
 
@@ -99,8 +99,8 @@ def probe() -> str:
 
     Raises ImportError if two ROS are mixed, and rclpy's own exceptions if ROS does not work.
     """
-    if told := foreign_ros():
-        raise ImportError(told)
+    if conflict := foreign_ros():
+        raise ImportError(conflict)
     import rclpy
     from geometry_msgs.msg import PoseStamped
     from graspd_msgs.msg import GraspRequest
@@ -121,8 +121,8 @@ def main(args: list[str] | None = None) -> int:
     """Run the node until a signal. Return 0 when stopped, 1 after a failure, 2 for a bad argument or parameter."""
     try:
         _refuse_arguments(sys.argv[1:] if args is None else args)
-        if told := foreign_ros():
-            raise ConfigError(told)
+        if conflict := foreign_ros():
+            raise ConfigError(conflict)
     except ConfigError as error:
         sys.stderr.write(f"graspd_node: {error}\n")
         return EXIT_BAD_INPUT
@@ -169,8 +169,8 @@ def main(args: list[str] | None = None) -> int:
 
 
 def _refuse_arguments(args: list[str]) -> None:
-    told = "Grasps of objects that are asked for over ROS 2; its parameters are in config/graspd.yaml."
-    parser = Parser(prog="graspd_node", usage="graspd_node [--ros-args -p NAME:=VALUE ...]", description=told)
+    description = "Grasps of objects that are asked for over ROS 2; its parameters are in config/graspd.yaml."
+    parser = Parser(prog="graspd_node", usage="graspd_node [--ros-args -p NAME:=VALUE ...]", description=description)
     parser.parse_args(args[: args.index("--ros-args")] if "--ros-args" in args else args)
 
 
@@ -197,8 +197,8 @@ def _make_node(args: list[str] | None, on_failure: Callable[[], None]) -> GraspN
     """Return the node. If an argument or parameter is invalid, print the error to stderr and return None."""
     import rclpy
 
-    if told := log_directory():
-        sys.stderr.write(f"graspd_node: {told}\n")
+    if problem := log_directory():
+        sys.stderr.write(f"graspd_node: {problem}\n")
     from rclpy.exceptions import ParameterException
     from rclpy.signals import SignalHandlerOptions
     from rclpy.utilities import try_shutdown

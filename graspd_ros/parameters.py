@@ -218,20 +218,20 @@ class LiveSettings:
         # Convert integers of float parameters once, so that clients always see a float.
         given = [node.get_parameter(setting.name) for setting in fields if not setting.metadata["read_only"]]
         node.set_parameters(_of_their_types(given))
-        self._doubts: list[str] = []
+        self._warnings: list[str] = []
         self._read([])
-        for told in [*unknown_names(node), *self._doubts]:
-            node.get_logger().warning(told)
+        for warning in [*unknown_names(node), *self._warnings]:
+            node.get_logger().warning(warning)
         node.add_pre_set_parameters_callback(_of_their_types)
         node.add_on_set_parameters_callback(check_parameters)
         node.add_post_set_parameters_callback(self._changed)
 
     def _changed(self, changed: list[Parameter]) -> None:
-        before = self._doubts
+        before = self._warnings
         self._read(changed)
-        for told in self._doubts:
-            if told not in before:
-                self._node.get_logger().warning(told)
+        for warning in self._warnings:
+            if warning not in before:
+                self._node.get_logger().warning(warning)
 
     def _read(self, changed: list[Parameter]) -> None:
         fields = dataclasses.fields(Settings)
@@ -240,39 +240,39 @@ class LiveSettings:
             values[name] = list(values[name] or [])
         self.now = Settings(**values)
         names = {parameter.name for parameter in changed}
-        self._doubts = doubts(self.now) + _unknown_frames(self.now, names, tuple(self._frames()))
+        self._warnings = parameter_warnings(self.now) + _unknown_frames(self.now, names, tuple(self._frames()))
 
 
 def unknown_names(node: Node) -> list[str]:
     """Return a warning for each unknown parameter name given at the start."""
-    told, known = [], [setting.name for setting in dataclasses.fields(Settings)]
+    found, known = [], [setting.name for setting in dataclasses.fields(Settings)]
     # rclpy has no public access to start parameters, and does not report undeclared ones.
     for name in getattr(node, "_parameter_overrides", {}):
         if not node.has_parameter(name) and not name.startswith("qos_overrides."):
             near = difflib.get_close_matches(name, known, 1)
-            told.append(f"unknown parameter {name!r}; " + (f"did you mean {near[0]!r}?" if near else "it is ignored"))
-    return told
+            found.append(f"unknown parameter {name!r}; " + (f"did you mean {near[0]!r}?" if near else "it is ignored"))
+    return found
 
 
-def doubts(settings: Settings) -> list[str]:
+def parameter_warnings(settings: Settings) -> list[str]:
     """Return warnings about values under which no request can succeed: an empty workspace or missing mesh roots."""
-    told = []
+    found = []
     if any(low > high for low, high in zip(settings.roi_min, settings.roi_max, strict=True)):
-        told.append(f"roi_min={settings.roi_min} is above roi_max={settings.roi_max}: no point lies in the workspace")
+        found.append(f"roi_min={settings.roi_min} is above roi_max={settings.roi_max}: no point lies in the workspace")
     for root in settings.mesh_roots:
         if not root.startswith("package://") and not Path(root).is_dir():
-            told.append(f"mesh_roots: {root!r} is no directory")
-    return told
+            found.append(f"mesh_roots: {root!r} is no directory")
+    return found
 
 
 def _unknown_frames(settings: Settings, changed: Collection[str], known: Sequence[str]) -> list[str]:
     """Return a warning for each changed frame that is not in /tf. Without any transform yet, there is no warning."""
-    told = []
+    found = []
     for name in ("sensor_frame", "output_frame", "fixed_frame", "arm_base_frame"):
         frame = getattr(settings, name).removeprefix("/")
         if name in changed and frame and known and frame not in known:
-            told.append(f"parameter {name}: frame {frame!r} is not in /tf yet; known: {', '.join(known)}")
-    return told
+            found.append(f"parameter {name}: frame {frame!r} is not in /tf yet; known: {', '.join(known)}")
+    return found
 
 
 def _of_their_types(parameters: list[Parameter]) -> list[Parameter]:

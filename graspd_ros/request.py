@@ -18,7 +18,7 @@ from graspd_ros.convert import Matrix
 from graspd_ros.parameters import Settings
 
 if TYPE_CHECKING:
-    from graspd_ros.inputs.solids import Thing
+    from graspd_ros.inputs.solids import SceneObject
 
 MOST_ID = 128
 # Returns `T_target_source` of two frames. May raise a TransformError.
@@ -65,9 +65,9 @@ class Request:
         known: key of the object in a grasp library. None if no library is used.
         surface: support plane in the object's frame. None if the request gives none.
         steering: makes the steering constraints. It is slow and may raise a GraspdError. None without constraints.
-        shown: returns the points inside the request's `region_mask`, in `frame` [m]. None for sources without an image.
+        region_points: returns the points inside the `region_mask`, in `frame` [m]. None for sources without an image.
         closes_late: True if the hand closes only after it has arrived. Then grasps need their `arrival`.
-        things: collision objects of the planning scene by id. Empty if the node has no such topic.
+        collision_objects: collision objects of the planning scene by id. Empty if the node has no such topic.
         accepted: time of arrival on the monotonic clock [s].
     """
 
@@ -87,9 +87,9 @@ class Request:
     known: KnownObject | None = None
     surface: Plane | None = None
     steering: Callable[[], Steering] | None = None
-    shown: Callable[[], Float[np.ndarray, "points 3"]] | None = None
+    region_points: Callable[[], Float[np.ndarray, "points 3"]] | None = None
     closes_late: bool = False
-    things: Mapping[str, Thing] = field(default_factory=dict)
+    collision_objects: Mapping[str, SceneObject] = field(default_factory=dict)
     accepted: float = field(default_factory=time.monotonic)
 
     @property

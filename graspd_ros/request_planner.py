@@ -36,7 +36,7 @@ from graspd_core.verify.prepared_grasp import arrival, make_metrics_context
 from graspd_core.verify.robustness import begin_in_thread
 from graspd_ros.convert import Matrix, matrix_of_posture, moved_grasp, moved_result, nanoseconds
 from graspd_ros.error_codes import bad_request
-from graspd_ros.inputs.solids import among_things
+from graspd_ros.inputs.solids import with_collision_objects
 from graspd_ros.inputs.tf_listener import reach_of
 from graspd_ros.request import FrameLookup, Request
 from graspd_ros.worker import Report, WorkerEnding
@@ -131,8 +131,8 @@ class RecentRuns:
         if not left:
             return None
         outcome = Outcome.SUCCEEDED if len(left) >= count else Outcome.TOO_FEW
-        told = f"{min(count, len(left))} grasps of an earlier run, none like the {len(excluded)} excluded"
-        result = GraspResult(outcome, tuple(left[:count]), Timing(), request.settings.seed, "", told)
+        message = f"{min(count, len(left))} grasps of an earlier run, none like the {len(excluded)} excluded"
+        result = GraspResult(outcome, tuple(left[:count]), Timing(), request.settings.seed, "", message)
         return replace(runs[-1].planned, result=result, file="")
 
 
@@ -173,32 +173,32 @@ class Planner:
         self._behind: Future[Planned] | None = None
         self._runs = RecentRuns()
 
-    def plan(self, request: Request, stop: StopHook, tell: ProgressHook) -> Planned:
+    def plan(self, request: Request, stop: StopHook, report: ProgressHook) -> Planned:
         """Process one request. Raises the errors of loading, planning and transforms."""
-        left, telling = threading.Event(), threading.Lock()
+        left, reporting = threading.Event(), threading.Lock()
 
         def over() -> bool:
             return stop() or request.time_left() <= -PATIENCE
 
-        def tell_if_wanted(progress: Progress) -> None:
-            with telling:  # no progress of a request is reported after `plan` has returned
+        def report_if_wanted(progress: Progress) -> None:
+            with reporting:  # no progress of a request is reported after `plan` has returned
                 if not left.is_set():
-                    tell(progress)
+                    report(progress)
 
-        tell(Progress(Stage.LOAD, 0, 1, 0.0, 0, 0.0))
+        report(Progress(Stage.LOAD, 0, 1, 0.0, 0, 0.0))
         if self._behind and not _ended(self._behind, over):
             return _empty(request, stop)
 
         def run() -> Planned:
             torch.set_num_threads(request.settings.torch_threads)  # affects the calling thread only
-            return self._run(request, lambda: left.is_set() or stop(), tell_if_wanted)
+            return self._run(request, lambda: left.is_set() or stop(), report_if_wanted)
 
         work = self._behind = begin_in_thread("graspd_planner", run)
         end = None
         while not _ended(work, over):
             end = end or time.monotonic() + PATIENCE
             if time.monotonic() > end:
-                with telling:
+                with reporting:
                     left.set()
                 return _empty(request, stop)
         self._behind = None
@@ -209,7 +209,7 @@ class Planner:
         end = time.monotonic() + timeout
         return self._behind is None or _ended(self._behind, lambda: time.monotonic() > end)
 
-    def _run(self, request: Request, stop: StopHook, tell: ProgressHook) -> Planned:
+    def _run(self, request: Request, stop: StopHook, report: ProgressHook) -> Planned:
         # Look up the transform first. A run would be lost if it is missing.
         seen = self._lookup_at(Time() if request.timeless else request.stamp, stop)
         T_out_object = request.T_frame_object
@@ -219,17 +219,17 @@ class Planner:
         reach: tuple[Reach, ...] = ()
         if request.settings.arm:
             reach = (reach_of(request, seen, self._robot_description),)
-        if request.things:
-            request = among_things(request, seen)
+        if request.collision_objects:
+            request = with_collision_objects(request, seen)
         excluded = self._runs.excluded(request, self._lookup_at(Time(), stop))
         # Do not reuse an earlier run if its constraints, arm pose or obstacles may differ. With a library do not reuse
         # it either, because the library contains those grasps.
-        free = request.steering is None and not reach and not request.things
+        free = request.steering is None and not reach and not request.collision_objects
         known = excluded and free and request.known is None
         planned = self._runs.next_best(request, excluded) if known else None
         if planned is None:
             place = lambda grasp: grasp if T_out_object is None else moved_grasp(grasp, T_out_object)  # noqa: E731
-            moved = lambda progress: tell(_with_found(progress, place))  # noqa: E731
+            moved = lambda progress: report(_with_found(progress, place))  # noqa: E731
             planned = self._search(request, excluded, reach, stop, moved)
         self._runs.keep(request, planned)
         result = planned.result
@@ -239,14 +239,14 @@ class Planner:
         return lambda target, source: self._lookup(target, source, stamp, stop)
 
     def _search(
-        self, request: Request, excluded: list[Matrix], reach: tuple[Reach, ...], stop: StopHook, tell: ProgressHook
+        self, request: Request, excluded: list[Matrix], reach: tuple[Reach, ...], stop: StopHook, report: ProgressHook
     ) -> Planned:
         """Plan grasps, drop those similar to `excluded`, and write the rest to a file if `output_dir` is set."""
         settings = request.settings
         config = load_preset(settings.preset)
         steering = () if request.steering is None else (request.steering(),)
         restrictions = (*steering, *reach)
-        plan: dict[str, Any] = {"preset": config, "device": settings.device, "progress": tell, "stop": stop}
+        plan: dict[str, Any] = {"preset": config, "device": settings.device, "progress": report, "stop": stop}
         # Another seed makes grasps similar to the excluded ones less likely.
         plan["seed"] = settings.seed + len(excluded)
         if settings.grasp_library and request.known is not None:
@@ -256,7 +256,7 @@ class Planner:
         else:
             scene = request.load()
             arrived = _arrivals(scene, self._hand) if request.closes_late else lambda grasp: grasp
-            plan["progress"] = lambda progress: tell(_with_found(progress, arrived))
+            plan["progress"] = lambda progress: report(_with_found(progress, arrived))
             plan |= {"deadline": max(request.time_left(), 1e-3), "restrictions": restrictions}
             count = settings.num_grasps + len(excluded)
             result = plan_grasps(scene, self._hand, count=count, verify=settings.verify, **plan)

@@ -142,8 +142,8 @@ class Worker(Generic[R, V]):
         if policy is BusyPolicy.REJECT and ahead:
             return Admission(Refusal.BUSY, "busy with another request, and busy_policy is reject")
         if policy is BusyPolicy.QUEUE and ahead > self.queue_size:
-            told = f"the queue is full: one runs, {ahead - 1} of queue_size={self.queue_size} wait"
-            return Admission(Refusal.BUSY, told)
+            full = f"the queue is full: one runs, {ahead - 1} of queue_size={self.queue_size} wait"
+            return Admission(Refusal.BUSY, full)
         return None
 
     def cancel(self, request_id: str) -> int:
@@ -198,8 +198,8 @@ class Worker(Generic[R, V]):
         while (request := self._next()) is not None:
             report = self._done(request)
             with self._condition:
-                told, self._running, self._ending = self._ending, None, None
-            self._end_all([request], Report(told, value=report.value) if told else report)
+                ending, self._running, self._ending = self._ending, None, None
+            self._end_all([request], Report(ending, value=report.value) if ending else report)
 
     def _end_all(self, requests: list[R], report: Report[V]) -> None:
         for request in requests:

@@ -17,7 +17,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from graspd_core.errors import ConfigError, GraspdError, shown
+from graspd_core.errors import ConfigError, GraspdError, short_repr
 from graspd_core.hands.library import hand_names, load_hand
 from graspd_core.io.grasps_json import result_document
 from graspd_core.mesh.mesh_files import MESH_ENDINGS
@@ -108,15 +108,15 @@ def check(request: PlanRequest) -> None:
     )
     for name, value, valid in chosen:
         if value not in valid:
-            raise ConfigError(f"{name}: {shown(value)}; valid: {', '.join(valid)}")
+            raise ConfigError(f"{name}: {short_repr(value)}; valid: {', '.join(valid)}")
     if request.upload is not None and request.upload.ending not in ENDINGS:
         raise ConfigError(f"{request.upload.name[:80]}: unknown ending; valid endings: {', '.join(ENDINGS)}")
     if not (math.isfinite(request.friction) and 0.01 <= request.friction <= 2.0):
-        raise ConfigError(f"friction: {shown(request.friction)}; valid: 0.01 to 2")
+        raise ConfigError(f"friction: {short_repr(request.friction)}; valid: 0.01 to 2")
     if not 1.0 <= request.approach_angle <= 180.0:
-        raise ConfigError(f"approach angle: {shown(request.approach_angle)} degrees; valid: 1 to 180")
+        raise ConfigError(f"approach angle: {short_repr(request.approach_angle)} degrees; valid: 1 to 180")
     if not 1 <= request.count <= MOST_GRASPS:
-        raise ConfigError(f"count: {shown(request.count)} grasps; valid here: 1 to {MOST_GRASPS}")
+        raise ConfigError(f"count: {short_repr(request.count)} grasps; valid here: 1 to {MOST_GRASPS}")
 
 
 def load_object(request: PlanRequest) -> tuple[Scene, Any]:
@@ -233,7 +233,7 @@ class PlanTab:
         try:
             friction, count, angle = float(self._friction.value), int(self._count.value), float(self._angle.value)
         except (TypeError, ValueError, OverflowError):
-            given = shown((self._friction.value, self._count.value, self._angle.value))
+            given = short_repr((self._friction.value, self._count.value, self._angle.value))
             raise ConfigError(f"friction, count, angle: {given}; valid: three numbers") from None
         request = PlanRequest(
             shape=self._object.value if sent is None else next(iter(SHAPES)),

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
-from graspd_core.errors import FormatError, GraspdError, shown
+from graspd_core.errors import FormatError, GraspdError, short_repr
 from graspd_core.hands.library import hand_names, load_hand
 from graspd_core.hands.model import HandModel, all_joint_names
 from graspd_core.io.grasps_json import grasps_of, load_document
@@ -127,7 +127,7 @@ def _object_of(
         return None, np.zeros((0, 3)), (note,)
     if scene.object.sha256 == told.get("sha256"):
         return scene, seen, scene.object.warnings
-    note = f"{shown(source)} is not what these grasps were planned on: contacts may lie off it"
+    note = f"{short_repr(source)} is not what these grasps were planned on: contacts may lie off it"
     return scene, seen, (note, *scene.object.warnings)
 
 

@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
-from graspd_core.errors import ConfigError, GraspdError, shown
+from graspd_core.errors import ConfigError, GraspdError, short_repr
 from graspd_core.types import Grasp, TrialResult
 from graspd_core.verify.hold_trial import axis_name
 from graspd_core.verify.lift_trial import LiftSettings
@@ -66,7 +66,7 @@ def record_trial(context: TrialContext, grasp: Grasp, name: str) -> Recording:
     """Run and record one trial of a grasp. Raises ConfigError: the trial is unknown or does not apply to the scene."""
     names = [row.name for row in TRIALS.values() if row.applies(context)]
     if name not in names:
-        raise ConfigError(f"trial {shown(name)}; valid for this scene: {', '.join(names)}")
+        raise ConfigError(f"trial {short_repr(name)}; valid for this scene: {', '.join(names)}")
     recorder = _Recorder(context, name)
     # Use separate simulation data, because a parallel run may use the shared spare data.
     worlds = {

@@ -95,7 +95,7 @@ def wait_for_end(url: str) -> None:
     print(f"{url} - Ctrl-C ends it", flush=True)
     with Interrupt() as interrupt:
         pause = threading.Event()
-        while not interrupt.came():
+        while not interrupt.is_interrupted():
             pause.wait(0.2)
 
 

@@ -22,7 +22,7 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from graspd_core.config.mapping import from_mapping, yaml_values
-from graspd_core.errors import ConfigError, choices, shown
+from graspd_core.errors import ConfigError, choices, short_repr
 from graspd_core.hands.model import HandModel, Mount, Primitive
 from graspd_core.hands.readers.urdf import read_urdf
 from graspd_core.hands.readers.xml_io import parse_xml, read_xml
@@ -264,8 +264,8 @@ def load_arm(name_or_path: str | Path, robot_description: str = "") -> Arm:
     if not from_robot_description(entries):
         return _make_arm(entries, urdf, read_xml(urdf), str(path))
     if not robot_description:
-        told = "known only to the node with the parameter arm; elsewhere give the path of a URDF"
-        raise ConfigError(f"{path}.urdf: {ROBOT_DESCRIPTION}: {told}")
+        hint = "known only to the node with the parameter arm; elsewhere give the path of a URDF"
+        raise ConfigError(f"{path}.urdf: {ROBOT_DESCRIPTION}: {hint}")
     return _make_arm(entries, urdf, parse_xml(urdf, robot_description), str(path))
 
 
@@ -306,7 +306,7 @@ def _make_arm(entries: ArmFile, urdf: Path, root: ET.Element, where: str) -> Arm
         index = chain.joint_names.index(joint)
         if not _number(value) or not lower[index] <= value <= upper[index]:
             limits = f"[{lower[index]:g}, {upper[index]:g}]"
-            raise ConfigError(f"{where}.seed.{joint}: {shown(value)}; valid: a number within the limits {limits}")
+            raise ConfigError(f"{where}.seed.{joint}: {short_repr(value)}; valid: a number within the limits {limits}")
         seed[index] = value
     name = entries.name or Path(where).stem
     mounts = {str(hand): _mount(given, entries.tip, f"{where}.mounts.{hand}") for hand, given in entries.mounts.items()}
@@ -354,7 +354,7 @@ def _limits(
     for joint, given in _by_joint(chain, narrower, f"{where}.limits").items():
         index = chain.joint_names.index(joint)
         if not isinstance(given, list) or len(given) != 2 or not all(map(_number, given)):
-            raise ConfigError(f"{where}.limits.{joint}: expected a lower and an upper number, got {shown(given)}")
+            raise ConfigError(f"{where}.limits.{joint}: expected a lower and an upper number, got {short_repr(given)}")
         low, high = given
         if not chain.lower[index] <= low < high <= chain.upper[index]:
             limits = f"[{chain.lower[index]:g}, {chain.upper[index]:g}]"
@@ -366,7 +366,7 @@ def _limits(
 def _by_joint(chain: HandModel, values: Mapping[str, Any], where: str) -> Mapping[str, Any]:
     for joint in values:
         if joint not in chain.joint_names:
-            raise ConfigError(f"{where}: no joint {shown(joint)}; joints: {', '.join(chain.joint_names)}")
+            raise ConfigError(f"{where}: no joint {short_repr(joint)}; joints: {', '.join(chain.joint_names)}")
     return values
 
 

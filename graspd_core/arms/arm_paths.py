@@ -35,7 +35,7 @@ _ALONG = np.concatenate([[0.0], *(k + np.arange(1, steps + 1) / steps for k, ste
 _SHARES = np.maximum(1.0 - np.abs(_ALONG[:, None] - np.arange(len(STAGE_ROWS))), 0.0)
 
 
-def hand_ways(grasps: Sequence[Grasp], approach: Float[np.ndarray, "3"], up: Float[np.ndarray, "3"]) -> SE3:
+def hand_paths(grasps: Sequence[Grasp], approach: Float[np.ndarray, "3"], up: Float[np.ndarray, "3"]) -> SE3:
     """Return `T_scene_hand` along the path of each grasp. The shape is grasps by waypoints.
 
     Args:
@@ -66,7 +66,7 @@ def _stacked(postures: Sequence[Posture]) -> tuple[Float[Tensor, "n 3"], Float[T
 LARGEST_JUMP = 0.2
 # For each grasp: number of starts, and number of postures whose path is solved. Solver steps for both.
 _STARTS, _FOLLOWED = 8, 2
-_STEPS, _WAY_STEPS = 8, 5
+_STEPS, _PATH_STEPS = 8, 5
 # Postures count as equal if all joint values differ by less than this [rad].
 _SAME = 0.1
 # Grasps per batch.
@@ -124,12 +124,12 @@ def arm_paths(task: ArmTask, grasps: Sequence[Grasp]) -> list[ArmPath | str]:
 
 
 def _some_paths(task: ArmTask, grasps: Sequence[Grasp]) -> list[ArmPath | str]:
-    ways = tip_poses(task, hand_ways(grasps, task.hand.approach, task.up))
-    q, owner = _postures(task, ways[:, STAGE_ROWS[2]])
+    paths = tip_poses(task, hand_paths(grasps, task.hand.approach, task.up))
+    q, owner = _postures(task, paths[:, STAGE_ROWS[2]])
     joints = torch.as_tensor(np.stack([grasp.pregrasp.joint_positions for grasp in grasps]))[owner]
-    followed = _followed(task, ways[owner], q, joints)
+    followed = _followed(task, paths[owner], q, joints)
     best = _best_of_each(followed, owner, len(grasps))
-    reasons = _why_lost(task, ways, followed, best)
+    reasons = _why_lost(task, paths, followed, best)
     return [
         reasons[grasp] if grasp in reasons else ArmPath(task.arm.joint_names, followed.path[row].numpy(), STAGE_ROWS)
         for grasp, row in enumerate(best)
@@ -146,7 +146,7 @@ def _best_of_each(followed: _Followed, owner: Int[Tensor, "postures"], count: in
     return best
 
 
-def _why_lost(task: ArmTask, ways: SE3, followed: _Followed, best: Sequence[int]) -> dict[int, str]:
+def _why_lost(task: ArmTask, paths: SE3, followed: _Followed, best: Sequence[int]) -> dict[int, str]:
     """Return why grasps have no path, by the index of the grasp."""
     reasons: dict[int, str] = {}
     unreached: list[tuple[int, int, Tensor]] = []
@@ -159,8 +159,8 @@ def _why_lost(task: ArmTask, ways: SE3, followed: _Followed, best: Sequence[int]
             reasons[grasp] = followed.hit[row]
     if unreached:
         rows, waypoints, starts = zip(*unreached, strict=True)
-        told = why_unreached(task.arm, ways[list(rows), list(waypoints)], torch.stack(starts))
-        for (grasp, waypoint, _), reason in zip(unreached, told, strict=True):
+        causes = why_unreached(task.arm, paths[list(rows), list(waypoints)], torch.stack(starts))
+        for (grasp, waypoint, _), reason in zip(unreached, causes, strict=True):
             on_way = waypoint != STAGE_ROWS[2]
             missed = "without a continuous arm path" if on_way else "without a computed arm posture"
             reasons[grasp] = (f"{reason} on the path" if on_way else reason) if reason else missed
@@ -220,33 +220,33 @@ class _Followed:
 
 
 def _followed(
-    task: ArmTask, ways: SE3, q: Float[Tensor, "postures joints"], joints: Float[Tensor, "postures hand_joints"]
+    task: ArmTask, paths: SE3, q: Float[Tensor, "postures joints"], joints: Float[Tensor, "postures hand_joints"]
 ) -> _Followed:
     """Solve each path from the arm posture at its grasp. `joints` are the hand's joint values at the pregrasp."""
-    count, length = ways.translation.shape[:2]
+    count, length = paths.translation.shape[:2]
     if not count:
         return _Followed(q.new_zeros(0, length, q.shape[1]), [], [])
-    target = SE3(ways.rotation.flatten(0, 1), ways.translation.flatten(0, 1))
-    solved = solve(task.arm, target, q.repeat_interleave(length, 0), _WAY_STEPS)
+    target = SE3(paths.rotation.flatten(0, 1), paths.translation.flatten(0, 1))
+    solved = solve(task.arm, target, q.repeat_interleave(length, 0), _PATH_STEPS)
     path, reached = solved.q.unflatten(0, (count, length)), solved.reached.unflatten(0, (count, length))
     off = torch.where(reached, length, (torch.arange(length) - STAGE_ROWS[2]).abs())
     lost = torch.where(reached.all(1), -1, off.argmin(1)).tolist()
-    jumps, hits = path.diff(dim=1).abs().amax(1), _hits_on_way(task, path, joints)
-    told: list[str] = []
+    jumps, hits = path.diff(dim=1).abs().amax(1), _hits_on_path(task, path, joints)
+    found: list[str] = []
     for row in range(count):
         worst, joint = int(hits.depth[row].argmax()), int(jumps[row].argmax())
         hit = hits.what[worst] if hits.depth[row, worst] > 0 else ""
-        told.append(f"with a jump of {task.arm.joint_names[joint]}" if jumps[row, joint] > LARGEST_JUMP else hit)
-    return _Followed(path, lost, told)
+        found.append(f"with a jump of {task.arm.joint_names[joint]}" if jumps[row, joint] > LARGEST_JUMP else hit)
+    return _Followed(path, lost, found)
 
 
-def _hits_on_way(
+def _hits_on_path(
     task: ArmTask, path: Float[Tensor, "postures way joints"], joints: Float[Tensor, "postures hand_joints"]
 ) -> Hits:
     """Return the deepest collisions of each path: with the scene at every waypoint, with arm and hand at the stages."""
     count = len(path)
     scene = hits_of_scene(task.arm, task.scene, task.base, arm_links(task.arm, path.flatten(0, 1)))
-    stages = arm_links(task.arm, path[:, list(STAGE_ROWS)].flatten(0, 1))
-    own = hits_of_self(task.arm, stages)
-    hand = hits_of_hand(task.arm, task.hand, stages, joints.repeat_interleave(len(STAGE_ROWS), 0))
+    links = arm_links(task.arm, path[:, list(STAGE_ROWS)].flatten(0, 1))
+    own = hits_of_self(task.arm, links)
+    hand = hits_of_hand(task.arm, task.hand, links, joints.repeat_interleave(len(STAGE_ROWS), 0))
     return joined(*(Hits(hits.depth.unflatten(0, (count, -1)).amax(1), hits.what) for hits in (scene, own, hand)))

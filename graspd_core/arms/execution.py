@@ -119,20 +119,20 @@ def execution_of(
     open_, touch, press = (np.clip(p.joint_positions, low, high) for p in (grasp.pregrasp, grasp.grasp, grasp.squeeze))
     shares = np.linspace(0.0, 1.0, closed - before + 1)[:, None]
     still, steps = path[closed], np.linspace(0.0, 1.0, _SQUEEZE_ROWS + 1)[:, None]
-    way = float(np.linalg.norm(grasp.grasp.position - grasp.pregrasp.position))
-    stages = (
+    approach = float(np.linalg.norm(grasp.grasp.position - grasp.pregrasp.position))
+    moves = (
         (_both(path[retreat : before + 1], open_), RETREAT / pace.base_speed, 0.0),
-        (_both(path[before : closed + 1], open_ + shares * (touch - open_)), way / pace.closing_speed, 0.0),
+        (_both(path[before : closed + 1], open_ + shares * (touch - open_)), approach / pace.closing_speed, 0.0),
         (_both(np.repeat(still[None], len(steps), 0), touch + steps * (press - touch)), 0.0, 0.0),
         (_both(path[closed : lifted + 1], press), LIFT / pace.base_speed, lift_time(grasp, mass, pace)),
     )
-    times, rows, speeds, gates = [np.zeros(1)], [stages[0][0][:1]], [np.zeros((1, len(limits)))], [0]
-    for stage, seconds, least in stages:
-        time, speed = _from_rest_to_rest(stage, limits, PEAK_SPEED * seconds, max(least, pace.shortest))
+    times, rows, speeds, gates = [np.zeros(1)], [moves[0][0][:1]], [np.zeros((1, len(limits)))], [0]
+    for move, seconds, least in moves:
+        time, speed = _from_rest_to_rest(move, limits, PEAK_SPEED * seconds, max(least, pace.shortest))
         times.append(times[-1][-1] + time[1:])
-        rows.append(stage[1:])
+        rows.append(move[1:])
         speeds.append(speed[1:])
-        gates.append(gates[-1] + len(stage) - 1)
+        gates.append(gates[-1] + len(move) - 1)
     rows, speeds, count = np.concatenate(rows), np.concatenate(speeds), len(grasp.arm.joint_names)
     efforts = np.zeros((len(rows), hand.num_joints))
     efforts[gates[3] :] = squeeze_efforts(grasp, hand)
@@ -151,11 +151,11 @@ def lift_time(grasp: Grasp, mass: float | None, pace: ExecutionPace) -> float:
 
 
 def squeeze_efforts(
-    grasp: Grasp, hand: HandModel, stages: GraspStagesConfig | None = None
+    grasp: Grasp, hand: HandModel, settings: GraspStagesConfig | None = None
 ) -> Float[np.ndarray, "joints"]:
     """Return the joint efforts if the object stops the squeeze at the grasp posture, within limits [N·m] or [N]."""
-    stages = stages or GraspStagesConfig()
-    gain = np.where(hand.slides, stages.slide_stiffness, stages.stiffness)
+    settings = settings or GraspStagesConfig()
+    gain = np.where(hand.slides, settings.slide_stiffness, settings.stiffness)
     return np.clip(gain * (grasp.squeeze.joint_positions - grasp.grasp.joint_positions), -hand.effort, hand.effort)
 
 

@@ -74,7 +74,7 @@ class BoundReach(BoundRestriction):
     task: ArmTask
 
     @property
-    def asked(self) -> str:
+    def description(self) -> str:
         """See `BoundRestriction`."""
         return f"the reach of {self.task.arm.name}"
 
@@ -107,10 +107,10 @@ class BoundReach(BoundRestriction):
         starts = draw_starts(task.scene, task.hand, _PROBES, 0, "cpu", torch.float64, restrictions=others)
         rows = zip(*(rows.numpy() for rows in (starts.translation, starts.quaternion, starts.joints)), strict=True)
         postures = [Posture(*row) for row in rows]
-        ways = arm_paths(task, [Grasp(posture, posture, posture) for posture in postures])
-        reasons = Counter(way for way in ways if isinstance(way, str)).most_common()
-        told = ", ".join(f"{count} {reason}" for reason, count in reasons)
-        return f"of {len(ways)} hands around the object: {told}" if told else ""
+        paths = arm_paths(task, [Grasp(posture, posture, posture) for posture in postures])
+        reasons = Counter(path for path in paths if isinstance(path, str)).most_common()
+        counts = ", ".join(f"{count} {reason}" for reason, count in reasons)
+        return f"of {len(paths)} hands around the object: {counts}" if counts else ""
 
     def starts(self, positions: Places, quaternions: Turns, joints: JointRows) -> Allowed:
         """Return True for each initial pose that is within the arm's reach, also at its retreat and its lift."""

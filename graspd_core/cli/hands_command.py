@@ -45,8 +45,8 @@ def run(options: argparse.Namespace) -> int:
     names, listed = hand_names(), []
     for hand in waiting(map(load_hand, names), "hand", len(names)):
         listed.append({"name": hand.name, "joints": hand.num_joints, "candidates": len(hand.candidate_points)})
-        told = "{name}: {joints} joints, {candidates} contact candidates".format(**listed[-1])
-        print(f"{told}, {hand.urdf}", flush=True)
+        text = "{name}: {joints} joints, {candidates} contact candidates".format(**listed[-1])
+        print(f"{text}, {hand.urdf}", flush=True)
         listed[-1]["urdf"] = hand.urdf
     answer(listed)
     return EXIT_OK
@@ -108,11 +108,11 @@ def as_text(hand: HandModel) -> str:
     moving, depth = hand.link_joint_names, link_depths(hand.link_parent)
     for link, name in enumerate(hand.link_names):
         solids = Counter(_solid(p.kind, len(p.vertices)) for p in hand.primitives_of[link])
-        told = ", ".join(f"{n} x {solid}" if n > 1 else solid for solid, n in solids.items()) or "no solids"
+        solid_names = ", ".join(f"{n} x {solid}" if n > 1 else solid for solid, n in solids.items()) or "no solids"
         mass = f"{hand.link_mass[link] * 1e3:.0f} g" if hand.link_mass[link] else "no mass"
         joint = f" <- {moving[link]}" if moving[link] else ""
         candidates = int((hand.candidate_link == link).sum())
-        lines.append(f"  {'  ' * int(depth[link])}{name}{joint}: {mass}, {told}, {candidates} candidates")
+        lines.append(f"  {'  ' * int(depth[link])}{name}{joint}: {mass}, {solid_names}, {candidates} candidates")
     names = all_joint_names(hand)
     width = max(map(len, names))
     lines += ["", f"joints {'':{max(0, width - 5)}} kind         lower   upper   effort    open  closed"]

@@ -25,9 +25,9 @@ def add_command(commands: Any) -> None:
     build.add_argument("--out", type=Path, required=True, metavar="FILE", help="the library; made where there is none")
     build.add_argument("--scales", type=float, nargs="+", default=(1.0,), metavar="S", help="metres per unit of a file")
     add_planning_options(build)
-    shown = actions.add_parser("list", help="the objects of a library")
-    shown.set_defaults(run=_list)
-    shown.add_argument("library", type=Path, metavar="FILE")
+    listing = actions.add_parser("list", help="the objects of a library")
+    listing.set_defaults(run=_list)
+    listing.add_argument("library", type=Path, metavar="FILE")
 
 
 def _build(options: argparse.Namespace) -> int:
@@ -46,17 +46,17 @@ def _build(options: argparse.Namespace) -> int:
     short, objects = 0, []
     with Interrupt() as interrupt:
         for source, scale in [(source, scale) for source in sources for scale in options.scales]:
-            if interrupt.came():
+            if interrupt.is_interrupted():
                 break
             try:
-                has = _add_object(options, library, source, scale, hand, config, request, interrupt.came)
+                has = _add_object(options, library, source, scale, hand, config, request, interrupt.is_interrupted)
             except MeshError as error:
                 print_error(error)
                 has = 0
             objects.append({"source": source, "scale": scale, "grasps": has})
             short += has < options.count
     answer({"library": options.out, "objects": objects})
-    return EXIT_INTERRUPTED if interrupt.came() else EXIT_TOO_FEW if short else EXIT_OK
+    return EXIT_INTERRUPTED if interrupt.is_interrupted() else EXIT_TOO_FEW if short else EXIT_OK
 
 
 def _add_object(options: argparse.Namespace, library: GraspLibrary, source: str, scale: float, *rest: Any) -> int:
@@ -77,10 +77,10 @@ def _add_object(options: argparse.Namespace, library: GraspLibrary, source: str,
     if has >= options.count:
         print(f"{entry.name}: {has} grasps are there")
         return has
-    asked = {**request, "count": options.count - has, "seed": options.seed + has}
+    missing = {**request, "count": options.count - has, "seed": options.seed + has}
     with Reporter() as reporter:
         hooks = {"progress": reporter, "stop": stop}
-        result = plan_grasps(scene, hand, preset=config, deadline=options.deadline, **hooks, **asked)
+        result = plan_grasps(scene, hand, preset=config, deadline=options.deadline, **hooks, **missing)
     has = add_planned(library, scene, hand, config, result, options.verify) or has
     print(f"{entry.name}: {has} of {options.count} grasps, {result.timing.total:.1f} s", flush=True)
     return has
@@ -89,8 +89,8 @@ def _add_object(options: argparse.Namespace, library: GraspLibrary, source: str,
 def _refuse_name(library: GraspLibrary, entry: LibraryEntry) -> None:
     for other, _ in library.entries(name=entry.name):
         if other.source != entry.source and other.mesh_sha256 != entry.mesh_sha256:
-            told = f"{entry.source}: the library {library.path} has another {entry.name!r}, of {other.source}"
-            raise ConfigError(f"{told}; give one of the files another name")
+            fault = f"{entry.source}: the library {library.path} has another {entry.name!r}, of {other.source}"
+            raise ConfigError(f"{fault}; give one of the files another name")
 
 
 def _list(options: argparse.Namespace) -> int:

@@ -16,7 +16,7 @@ from graspd_core.cli.running import EXIT_INTERRUPTED, EXIT_OK, EXIT_TOO_FEW
 from graspd_core.config import VERIFICATIONS, SceneConfig, load_scene_config
 from graspd_core.errors import BagError, CloudError, ConfigError, TransformError
 from graspd_core.io.bags import BagFrame, is_bag, read_frames, read_transforms
-from graspd_core.io.messages import ORIGIN, CameraPlace, frame_doubt
+from graspd_core.io.messages import ORIGIN, CameraPlace, frame_fault
 from graspd_core.optimize.plan_config import PlanConfig, load_plugin, load_preset, preset_names
 from graspd_core.perception.cloud.point_cloud import PointCloud
 from graspd_core.types import GraspResult, Outcome, Timing
@@ -204,7 +204,7 @@ def bag_views(path: Path, options: argparse.Namespace) -> Iterator[tuple[BagFram
     """
     said = options.view_point and tuple(options.view_point)
     transforms, place = None, CameraPlace(said, options.sensor_frame)
-    told = set[str]()
+    done = set[str]()
     frames = read_frames(
         path, topic=options.topic, info_topic=options.camera_info, every=options.every, limit=options.limit
     )
@@ -218,9 +218,9 @@ def bag_views(path: Path, options: argparse.Namespace) -> Iterator[tuple[BagFram
                 raise BagError(f"{path}: no frame {name!r}; frames of its transforms: {known}")
         try:
             seen = frame.view(transforms, options.frame, place)
-            if place == ORIGIN and frame.frame not in told and (doubt := frame_doubt(frame.frame, frame.view().points)):
-                print_note(doubt)
-            told.add(frame.frame)
+            if place == ORIGIN and frame.frame not in done and (note := frame_fault(frame.frame, frame.view().points)):
+                print_note(note)
+            done.add(frame.frame)
             yield frame, seen
         except (CloudError, TransformError) as error:
             yield frame, str(error)
@@ -307,17 +307,17 @@ def _steering(options: argparse.Namespace) -> tuple[Steering, ...]:
         _refuse_alone("approach-angle", options.approach_angle, "approach")
     if options.roll is None:
         _refuse_alone("roll-tolerance", options.roll_tolerance, "roll")
-    asked = (options.approach, options.roll, options.region)
-    if all(value is None for value in asked) and not options.avoid:
+    given = (options.approach, options.roll, options.region)
+    if all(value is None for value in given) and not options.avoid:
         return ()
     from graspd_core.planning.regions import Box
     from graspd_core.planning.steering import Steering
 
     angles = {"approach_angle": options.approach_angle, "roll": options.roll, "roll_tolerance": options.roll_tolerance}
-    wishes: dict[str, Any] = {name: float(np.radians(value)) for name, value in angles.items() if value is not None}
+    radians: dict[str, Any] = {name: float(np.radians(value)) for name, value in angles.items() if value is not None}
     region = None if options.region is None else _region(options.region)
     avoid = [Box(values[:3], values[3:]) for values in options.avoid]
-    return (Steering(approach_direction=options.approach, region=region, avoid=avoid, **wishes),)
+    return (Steering(approach_direction=options.approach, region=region, avoid=avoid, **radians),)
 
 
 def _refuse_alone(name: str, value: float | None, other: str) -> None:

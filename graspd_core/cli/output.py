@@ -27,14 +27,14 @@ _PATIENCE = 1.0
 
 
 @dataclass(frozen=True)
-class _Asked:
+class _OutputSettings:
     """Output settings of the running command: whether notes are hidden, and the stream for JSON, None for text."""
 
     quiet: bool = False
     document_to: Any = None
 
 
-_asked = _Asked()
+_settings = _OutputSettings()
 
 
 def add_output_options(parser: argparse.ArgumentParser) -> None:
@@ -42,18 +42,18 @@ def add_output_options(parser: argparse.ArgumentParser) -> None:
     # There is no default, because a subcommand's default would overwrite the option given before it.
     parser.add_argument("--quiet", action="store_true", default=argparse.SUPPRESS, help="errors and the result only")
     if parser.get_default("json") is None:
-        told = "the result as one JSON document on stdout"
-        parser.add_argument("--json", action="store_true", default=argparse.SUPPRESS, help=told)
+        text = "the result as one JSON document on stdout"
+        parser.add_argument("--json", action="store_true", default=argparse.SUPPRESS, help=text)
 
 
 @contextmanager
 def output_of(options: argparse.Namespace) -> Iterator[None]:
     """Apply `--quiet` and `--json` inside the context. With `--json`, stdout gets only JSON, stderr all other text."""
-    global _asked
+    global _settings
     quiet, as_json = getattr(options, "quiet", False), getattr(options, "json", False)
-    before, _asked = _asked, _Asked(quiet, sys.stdout if as_json else None)
+    before, _settings = _settings, _OutputSettings(quiet, sys.stdout if as_json else None)
     with contextlib.ExitStack() as stack:
-        stack.callback(globals().update, _asked=before)
+        stack.callback(globals().update, _settings=before)
         if as_json:
             text = stack.enter_context(open(os.devnull, "w")) if quiet else sys.stderr
             stack.enter_context(contextlib.redirect_stdout(text))
@@ -62,10 +62,10 @@ def output_of(options: argparse.Namespace) -> Iterator[None]:
 
 def answer(document: Any) -> None:
     """Print the command's result as JSON if `--json` was given."""
-    if _asked.document_to is not None:
+    if _settings.document_to is not None:
         # NaN is not JSON.
         text = json.dumps(document, indent=1, allow_nan=False, default=_plain)
-        print(text, file=_asked.document_to, flush=True)
+        print(text, file=_settings.document_to, flush=True)
 
 
 def _plain(value: Any) -> Any:
@@ -79,7 +79,7 @@ def _plain(value: Any) -> Any:
 
 def print_note(text: object) -> None:
     """Print a note on stderr, unless `--quiet` was given."""
-    if not _asked.quiet:
+    if not _settings.quiet:
         print_error(text)
 
 
@@ -98,7 +98,7 @@ def bar(what: str, total: int | None, done: int = 0, **settings: Any) -> Any:
 
 
 def _draws() -> bool:
-    return sys.stderr.isatty() and not _asked.quiet
+    return sys.stderr.isatty() and not _settings.quiet
 
 
 @contextmanager
@@ -112,11 +112,11 @@ def busy(what: str) -> Iterator[None]:
     def show() -> None:
         if ended.wait(_PATIENCE):
             return
-        shown = bar(what, None, leave=False, bar_format="{desc}: {elapsed}")
-        shown.start_t = began
+        progress_bar = bar(what, None, leave=False, bar_format="{desc}: {elapsed}")
+        progress_bar.start_t = began
         while not ended.wait(_PATIENCE):
-            shown.refresh()
-        shown.close()
+            progress_bar.refresh()
+        progress_bar.close()
 
     thread = threading.Thread(target=show, daemon=True)
     thread.start()

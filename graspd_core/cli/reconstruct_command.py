@@ -51,6 +51,6 @@ def run(options: argparse.Namespace) -> int:
         print_note(warning)
     extent = mesh.vertices.max(0) - mesh.vertices.min(0)
     print(f"{options.out}: {len(mesh.faces)} faces, {' x '.join(f'{e * 1e3:.0f}' for e in extent)} mm")
-    told = [*warnings, *whole.warnings]
-    answer({"file": options.out, "faces": len(mesh.faces), "extent": extent.tolist(), "warnings": told})
+    notes = [*warnings, *whole.warnings]
+    answer({"file": options.out, "faces": len(mesh.faces), "extent": extent.tolist(), "warnings": notes})
     return EXIT_OK

@@ -86,11 +86,11 @@ def run(options: argparse.Namespace) -> int:
     with Interrupt() as interrupt:
         for job in waiting(_jobs(options), "read cloud"):
             # Check here, so that an interrupt also ends a recording in which every cloud is refused.
-            if interrupted := interrupt.came():
+            if interrupted := interrupt.is_interrupted():
                 break
             try:
                 result, document = _planned(
-                    job, options, hand, config, {**request, "settings": settings, "stop": interrupt.came}
+                    job, options, hand, config, {**request, "settings": settings, "stop": interrupt.is_interrupted}
                 )
             except GraspdError as error:
                 print(f"{job.label}: refused: {error}", flush=True)

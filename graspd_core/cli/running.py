@@ -43,7 +43,7 @@ class Interrupt:
             for number, handler in self._before.items():
                 signal.signal(number, handler)
 
-    def came(self) -> bool:
+    def is_interrupted(self) -> bool:
         return self._event.is_set()
 
     def _handle(self, number: int, frame: FrameType | None) -> None:
@@ -133,20 +133,20 @@ class Watched:
 
     Attributes:
         watch: watch hook for `plan_grasps`.
-        told: additional progress hook for `plan_grasps`.
+        progress_hook: additional progress hook for `plan_grasps`.
         show: function that shows the result until Ctrl-C.
     """
 
     watch: WatchHook | None = None
-    told: ProgressHook | None = None
+    progress_hook: ProgressHook | None = None
     show: Callable[[GraspResult], None] = lambda result: None
 
     def progress(self, reporter: ProgressHook) -> ProgressHook:
         """Return a progress hook that calls both `reporter` and the browser's hook."""
-        told = self.told
-        if told is None:
+        hook = self.progress_hook
+        if hook is None:
             return reporter
-        return lambda progress: (reporter(progress), told(progress))[0]
+        return lambda progress: (reporter(progress), hook(progress))[0]
 
 
 # Package that each command outside graspd_core needs.

@@ -100,7 +100,7 @@ def run(options: argparse.Namespace) -> int:
         page_of_run = sibling("graspd_viewer.view_command").watched(options, scene, hand, config)
     with page_of_run as page:
         with Reporter() as reporter, Interrupt() as interrupt:
-            hooks = {"progress": page.progress(reporter), "watch": page.watch, "stop": interrupt.came}
+            hooks = {"progress": page.progress(reporter), "watch": page.watch, "stop": interrupt.is_interrupted}
             result = plan_grasps(scene, hand, preset=config, deadline=deadline.left(), **hooks, **request)
         for warning in result.warnings[len(known) :]:
             print_note(warning)
@@ -121,12 +121,12 @@ def _report(
         save_result(options.out, result, scene.object, hand, config)
     if options.html or options.picture:
         page = sibling("graspd_viewer.grasp_page")
-        shown = (scene.object.mesh, hand, result.grasps)
+        content = (scene.object.mesh, hand, result.grasps)
         up = result.support and result.support.normal
         if options.html:
-            page.save_view(options.html, *shown, name=Path(options.object).name, up=up)
+            page.save_view(options.html, *content, name=Path(options.object).name, up=up)
         if options.picture:
-            page.save_picture(options.picture, *shown, up=up)
+            page.save_picture(options.picture, *content, up=up)
     different = len(distinct(result.grasps[: good_grasps(result)], hand))
     print(summary(result, options.count, different))
     if options.out:

@@ -14,7 +14,7 @@ from typing import Any, Literal, TypeVar
 
 import yaml
 
-from graspd_core.errors import ConfigError, choices, shown
+from graspd_core.errors import ConfigError, choices, short_repr
 
 T = TypeVar("T")
 
@@ -40,9 +40,9 @@ def coerced(
 ) -> dict[str, Any]:
     """Return a mapping's values, converted to the types in `hints`. Raises ConfigError like `from_mapping`."""
     if not isinstance(values, Mapping):
-        raise ConfigError(f"{where}: expected a mapping of {sorted(hints)}, got {shown(values)}")
-    if unknown := sorted(set(values) - set(hints), key=shown):
-        raise ConfigError(f"{where}: unknown key {shown(unknown[0])}; {choices(unknown[0], sorted(hints))}")
+        raise ConfigError(f"{where}: expected a mapping of {sorted(hints)}, got {short_repr(values)}")
+    if unknown := sorted(set(values) - set(hints), key=short_repr):
+        raise ConfigError(f"{where}: unknown key {short_repr(unknown[0])}; {choices(unknown[0], sorted(hints))}")
     return {key: _coerce(hints[key], value, f"{where}.{key}", starts.get(key)) for key, value in values.items()}
 
 
@@ -84,9 +84,9 @@ def _coerce(hint: Any, value: Any, where: str, start: Any = None, *, signed: boo
         return from_mapping(typing.cast(type, hint), value, where, start)
     origin = typing.get_origin(hint)
     if origin is Literal:
-        if value not in typing.get_args(hint):
-            raise ConfigError(f"{where}: {shown(value)} is not one of {', '.join(map(str, typing.get_args(hint)))}")
-        return value
+        if value in (valid := typing.get_args(hint)):
+            return value
+        raise ConfigError(f"{where}: {short_repr(value)} is not one of {', '.join(map(str, valid))}")
     if origin in (typing.Union, types.UnionType):
         if value is None and type(None) in typing.get_args(hint):
             return None
@@ -94,11 +94,11 @@ def _coerce(hint: Any, value: Any, where: str, start: Any = None, *, signed: boo
     if typing.get_origin(hint) is tuple:
         return _tuple(typing.get_args(hint), value, where)
     if isinstance(value, int) and abs(value) > _LARGEST_INTEGER:
-        raise ConfigError(f"{where}: {shown(value)} is too large; valid: up to {_LARGEST_INTEGER}")
+        raise ConfigError(f"{where}: {short_repr(value)} is too large; valid: up to {_LARGEST_INTEGER}")
     if hint is float and isinstance(value, int) and not isinstance(value, bool):
         value = float(value)
     if not isinstance(value, hint) or (isinstance(value, bool) and hint is not bool):
-        raise ConfigError(f"{where}: expected {hint.__name__}, got {shown(value)}")
+        raise ConfigError(f"{where}: expected {hint.__name__}, got {short_repr(value)}")
     if isinstance(value, int | float) and not (math.isfinite(value) and (signed or value >= 0)):
         raise ConfigError(f"{where}: {value!r} must be a finite number{'' if signed else ', zero or more'}")
     return value
@@ -106,7 +106,7 @@ def _coerce(hint: Any, value: Any, where: str, start: Any = None, *, signed: boo
 
 def _tuple(hints: tuple[Any, ...], value: Any, where: str) -> tuple[Any, ...]:
     if not isinstance(value, list | tuple) or len(value) != len(hints):
-        raise ConfigError(f"{where}: expected {len(hints)} values, got {shown(value)}")
+        raise ConfigError(f"{where}: expected {len(hints)} values, got {short_repr(value)}")
     pairs = enumerate(zip(hints, value, strict=True))
     return tuple(_coerce(hint, given, f"{where}[{k}]", signed=True) for k, (hint, given) in pairs)
 

@@ -53,7 +53,7 @@ def load_hand(name_or_path: str | Path, *, candidates: int = 600, prefix: str = 
         hand = apply_description(_with_effort(read_hand_file(description.urdf, description.root)), description)
     else:
         hand = default_postures(default_palm(_with_effort(read_hand_file(path))))
-    hand = replace(hand, adjacent=adjacent_links(hand), warnings=(*hand.warnings, *doubts(hand)))
+    hand = replace(hand, adjacent=adjacent_links(hand), warnings=(*hand.warnings, *hand_warnings(hand)))
     return _prefixed(with_candidates(hand, candidates), prefix)
 
 
@@ -114,7 +114,7 @@ _PARALLEL, _LEVEL, _SIDE_BY_SIDE = 0.999, 0.008, 0.04
 _APART = 0.2
 
 
-def doubts(hand: HandModel) -> tuple[str, ...]:
+def hand_warnings(hand: HandModel) -> tuple[str, ...]:
     """Return warnings about implausible properties: too high efforts, an open linkage, fingers on two palms."""
     rotations, translations = link_poses(hand, np.clip(0.0, hand.lower, hand.upper))
     linkages = _open_linkages(hand, rotations, translations)
@@ -127,8 +127,8 @@ def _strong_joints(hand: HandModel) -> tuple[str, ...]:
     if hand.effort[worst] <= bounds[worst]:
         return ()
     unit = "N" if hand.slides[worst] else "N·m"
-    told = f"an effort of {hand.effort[worst]:.3g} {unit}, more than the {bounds[worst]:g} of any hand"
-    return (f"joint {hand.joint_names[worst]!r}: {told}; say what it is in a hand description (effort)",)
+    fault = f"an effort of {hand.effort[worst]:.3g} {unit}, more than the {bounds[worst]:g} of any hand"
+    return (f"joint {hand.joint_names[worst]!r}: {fault}; say what it is in a hand description (effort)",)
 
 
 def _open_linkages(
@@ -148,8 +148,8 @@ def _open_linkages(
             beside = abs(apart @ axis) < _LEVEL and 0.0 < np.linalg.norm(apart) < _SIDE_BY_SIDE
             if abs(axis @ along) > _PARALLEL and beside:
                 names = " and ".join(repr(hand.link_joint_names[link]) for link in (other, one))
-                told = "look like those of a closed linkage, but move independently"
-                return (f"joints {names} {told}; couple such joints with <mimic>",)
+                fault = "look like those of a closed linkage, but move independently"
+                return (f"joints {names} {fault}; couple such joints with <mimic>",)
     return ()
 
 

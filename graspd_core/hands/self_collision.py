@@ -202,11 +202,11 @@ def solid_overlaps(
     directions = torch.cat([*axes, edges, torch.stack([apart, *across], 1)], 1)
     swept = [(solids.is_round[side] > 0) | (solids.core[side, 0] == 0) for side in sides]
     length = (directions * directions).sum(-1).clamp_min(1e-24).sqrt()
-    told = length > torch.cat([length.new_full((15,), _PARALLEL), length.new_full((3,), _SHORTEST)])
-    told[:, 15:] &= (swept[0] | swept[1])[:, None]
+    usable = length > torch.cat([length.new_full((15,), _PARALLEL), length.new_full((3,), _SHORTEST)])
+    usable[:, 15:] &= (swept[0] | swept[1])[:, None]
     directions = directions / length[..., None]
     widths = sum(_width(solids, side, directions @ of.transpose(-1, -2)) for side, of in zip(sides, axes, strict=True))
-    depth = torch.where(told, widths - (directions * apart[:, None]).sum(-1).abs(), torch.inf)
+    depth = torch.where(usable, widths - (directions * apart[:, None]).sum(-1).abs(), torch.inf)
     rated = depth.detach() + _RATHER_FACES * (torch.arange(18, device=depth.device) >= 6)
     least = depth.gather(1, rated.argmin(-1, keepdim=True))[:, 0]
     return row[least > 0], least[least > 0]

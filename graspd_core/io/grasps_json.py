@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Bool, Float
 
-from graspd_core.errors import ConfigError, FormatError, shown
+from graspd_core.errors import ConfigError, FormatError, short_repr
 from graspd_core.hands.model import HandModel, all_joint_names, all_joint_positions
 from graspd_core.optimize.plan_config import PlanConfig, to_mapping
 from graspd_core.perception.scene import ObjectModel
@@ -196,7 +196,7 @@ def load_document(path: str | Path) -> dict[str, Any]:
     if not isinstance(document, dict) or document.get("format") != FORMAT:
         raise FormatError(f"{path}: not a {FORMAT} file")
     if document.get("version") not in (1, VERSION):
-        version = shown(document.get("version"))
+        version = short_repr(document.get("version"))
         raise FormatError(f"{path}: version {version} is unknown; this reader knows 1 and {VERSION}")
     return document
 
@@ -215,7 +215,7 @@ def grasps_of(document: dict[str, Any]) -> tuple[Grasp, ...]:
         upgrade = _from_version_1 if document.get("version") == 1 else dict
         return tuple(_grasp_of(upgrade(values), actuated) for values in document["grasps"])
     except KeyError as error:
-        raise FormatError(f"grasps: a grasp lacks the key {shown(error.args[0])}") from None
+        raise FormatError(f"grasps: a grasp lacks the key {short_repr(error.args[0])}") from None
     # A JSON number may be too large for a float.
     except (AttributeError, TypeError, ValueError, OverflowError) as error:
         raise FormatError(f"grasps: {' '.join(str(error).split())[:300]}") from None
@@ -245,7 +245,7 @@ def _grasp_of(values: dict[str, Any], actuated: Bool[np.ndarray, "movable"]) -> 
         arm=_arm_of(values["arm"]) if values.get("arm") is not None else None,
     )
     if values["verdict"] != grasp.verdict:
-        raise ValueError(f"verdict: {shown(values['verdict'])}; by its trials the grasp is {grasp.verdict}")
+        raise ValueError(f"verdict: {short_repr(values['verdict'])}; by its trials the grasp is {grasp.verdict}")
     return grasp
 
 
@@ -275,7 +275,7 @@ def _metrics_of(values: dict[str, Any]) -> GraspMetrics | None:
 
 def _trial_of(values: dict[str, Any]) -> TrialResult:
     if not isinstance(values["passed"], bool):
-        raise ValueError(f"passed: {shown(values['passed'])}; expected true or false")
+        raise ValueError(f"passed: {short_repr(values['passed'])}; expected true or false")
     # Values that are not finite were written as null.
     moved = [_scaled(values, key, 1.0) for key in ("displacement", "rotation")]
     displacement, rotation = (math.inf if value is None else value for value in moved)
@@ -291,7 +291,7 @@ def _arm_of(values: dict[str, Any]) -> ArmPath:
     positions = _numbers_of(values, "positions", rows, len(names))
     first, second, third, fourth = (int(values["stages"][stage]) for stage in ARM_STAGES)
     if not 0 <= first <= second <= third <= fourth < rows:
-        raise ValueError(f"arm.stages: {shown(values['stages'])}; expected ascending row indices below {rows}")
+        raise ValueError(f"arm.stages: {short_repr(values['stages'])}; expected ascending row indices below {rows}")
     return ArmPath(names, positions, (first, second, third, fourth))
 
 
@@ -303,7 +303,7 @@ def _contact_of(values: dict[str, Any]) -> Contact:
 def _numbers_of(values: dict[str, Any], key: str, *shape: int) -> Float[np.ndarray, "..."]:
     numbers = np.array(values[key], dtype=float)
     if numbers.shape != shape or not np.isfinite(numbers).all():
-        raise ValueError(f"{key}: {shown(values[key])}; expected {math.prod(shape)} finite number(s)")
+        raise ValueError(f"{key}: {short_repr(values[key])}; expected {math.prod(shape)} finite number(s)")
     return numbers
 
 

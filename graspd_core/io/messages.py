@@ -182,7 +182,7 @@ def no_lookup(target: str, source: str) -> Float[np.ndarray, "4 4"]:
     raise TransformError(f"transform {source} -> {target}: no transforms are given")
 
 
-def frame_doubt(frame: str, points: Float[np.ndarray, "n 3"]) -> str:
+def frame_fault(frame: str, points: Float[np.ndarray, "n 3"]) -> str:
     """Return a warning if the camera's viewing direction contradicts the frame's name, else an empty text.
 
     The camera is at the frame's origin. By REP 103 it looks along z in optical frames and along x in body frames.
@@ -215,13 +215,13 @@ def camera_from_message(info: Any, *, rectified: bool = False) -> PinholeCamera:
     if not np.isfinite(matrix).all():
         raise CloudError(f"camera_info: {'P' if by_projection else 'K'} is {matrix.tolist()}; valid: finite numbers")
     roi, bins = info.roi, np.array([max(info.binning_x, 1), max(info.binning_y, 1)])
-    shown = matrix.copy()
-    shown[:2, 2] -= roi.x_offset, roi.y_offset
-    shown[:2] /= bins[:, None]
+    filled = matrix.copy()
+    filled[:2, 2] -= roi.x_offset, roi.y_offset
+    filled[:2] /= bins[:, None]
     width, height = image_size(info)
     # A rectified image needs no distortion model, so an unknown model, such as that of a fisheye lens, is ignored.
     distortion, model = ([], "") if rectified else (list(info.d), info.distortion_model)
-    return camera_from_calibration(int(width), int(height), shown.ravel().tolist(), distortion, model)
+    return camera_from_calibration(int(width), int(height), filled.ravel().tolist(), distortion, model)
 
 
 def image_size(message: Any) -> tuple[int, int]:

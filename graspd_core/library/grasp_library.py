@@ -152,7 +152,7 @@ class GraspLibrary:
         if self.path.exists() and self.path.stat().st_size:
             return
         self.path.parent.mkdir(parents=True, exist_ok=True)
-        with self._told(), _opened(self.path, "rwc") as base:
+        with self._own_errors(), _opened(self.path, "rwc") as base:
             base.execute("PRAGMA journal_mode = WAL")
             head = f"PRAGMA application_id = {_APPLICATION}; PRAGMA user_version = {VERSION};"
             base.executescript(f"BEGIN IMMEDIATE; {head} {_SCHEMA} COMMIT;")
@@ -160,9 +160,9 @@ class GraspLibrary:
     def checked(self) -> GraspLibrary:
         """Check the file and return this library. Raises FormatError: it is missing, damaged, or of another version."""
         with self._reading() as base:
-            (told,) = base.execute("PRAGMA quick_check(1)").fetchone()
-        if told != "ok":
-            raise self._torn(told)
+            (state,) = base.execute("PRAGMA quick_check(1)").fetchone()
+        if state != "ok":
+            raise self._torn(state)
         return self
 
     def entries(self, **wanted: str | float) -> list[tuple[LibraryEntry, int]]:
@@ -241,7 +241,7 @@ class GraspLibrary:
         """Open the file and check its version. With `write` the body runs in a transaction."""
         if not self.path.is_file():
             raise FormatError(f"{self.path}: no such file; `graspd library build --out {self.path}` makes a library")
-        with self._told(), _opened(self.path, "rw" if os.access(self.path, os.W_OK) else "ro") as base:
+        with self._own_errors(), _opened(self.path, "rw" if os.access(self.path, os.W_OK) else "ro") as base:
             if write:
                 base.execute("BEGIN IMMEDIATE")
             (application,), (version,) = (
@@ -259,7 +259,7 @@ class GraspLibrary:
                 base.execute("COMMIT")
 
     @contextmanager
-    def _told(self) -> Iterator[None]:
+    def _own_errors(self) -> Iterator[None]:
         """Convert SQLite's errors to FormatError."""
         try:
             yield
@@ -271,9 +271,9 @@ class GraspLibrary:
         except OSError as error:
             raise FormatError(f"{self.path}: {error.strerror or error}") from None
 
-    def _torn(self, told: object) -> GraspdError:
+    def _torn(self, detail: object) -> GraspdError:
         return FormatError(
-            f"{self.path}: damaged or not a library ({' '.join(str(told).split())[:200]}); use an intact copy, or "
+            f"{self.path}: damaged or not a library ({' '.join(str(detail).split())[:200]}); use an intact copy, or "
             "build another with `graspd library build --out FILE`"
         )
 

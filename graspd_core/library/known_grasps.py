@@ -33,7 +33,7 @@ from graspd_core.library.grasp_library import (
 )
 from graspd_core.mesh.sdf import sample_sdf
 from graspd_core.optimize.loop import Poses
-from graspd_core.optimize.obstacle_distance import gap_on_the_way, make_obstacle_tensors
+from graspd_core.optimize.obstacle_distance import gap_on_path, make_obstacle_tensors
 from graspd_core.optimize.plan_config import PlanConfig, load_preset
 from graspd_core.optimize.restrictions import BoundRestrictions, Restriction, restrictions_in_words
 from graspd_core.perception.scene import Scene, moved_grasp, near_scene
@@ -76,10 +76,10 @@ def entry_by_name(library: GraspLibrary, hand: HandModel | None, name: str, phys
     called = [entry for entry, _ in library.entries(name=name)]
     if not called:
         names = library.names()
-        shown = (difflib.get_close_matches(name, names, _MOST_NAMED) or names)[:_MOST_NAMED]
-        more = f" and {len(names) - len(shown)} more" if len(names) > len(shown) else ""
-        told = f"{', '.join(shown) or 'none'}{more}"
-        raise ConfigError(f"{name[:128]!r} is not in the library {library.path}; it has {told}")
+        listed = (difflib.get_close_matches(name, names, _MOST_NAMED) or names)[:_MOST_NAMED]
+        more = f" and {len(names) - len(listed)} more" if len(names) > len(listed) else ""
+        valid = f"{', '.join(listed) or 'none'}{more}"
+        raise ConfigError(f"{name[:128]!r} is not in the library {library.path}; it has {valid}")
     same = _with_hand(library, hand, called, name)
     if len({entry.mesh_sha256 for entry in same}) > 1:
         sources = ", ".join(sorted({entry.source for entry in same}))
@@ -136,8 +136,8 @@ def _with_hand(
     if same:
         return same
     hands = sorted({entry.hand for entry in entries})
-    told = f"for {', '.join(hands)}, not for {hand.name}" if hand.name not in hands else "for another form of this hand"
-    raise ConfigError(f"{what}: in the library {library.path} {told}; `graspd library build --hand` adds it")
+    made = f"for {', '.join(hands)}, not for {hand.name}" if hand.name not in hands else "for another form of this hand"
+    raise ConfigError(f"{what}: in the library {library.path} {made}; `graspd library build --hand` adds it")
 
 
 def _held_entry(
@@ -206,17 +206,17 @@ def known_grasps(
         good.append(grasp)
         if len(good) == count:
             break
-    told = restrictions_in_words(bound, refused, len(good), len(admitted)) if refused else ""
+    refusals = restrictions_in_words(bound, refused, len(good), len(admitted)) if refused else ""
     result = library_result(library, good, count, time.perf_counter() - began)
-    message = "; ".join(filter(None, (result.message, told)))
+    message = "; ".join(filter(None, (result.message, refusals)))
     return replace(result, message=message, refused=refused, warnings=(*scene.object.warnings, *hand.named_warnings))
 
 
 def library_result(library: GraspLibrary, grasps: Sequence[Grasp], count: int, seconds: float) -> GraspResult:
     """Return grasps of a library as the result of a request for `count` grasps that took `seconds`."""
     timing = Timing(first_verified=seconds if grasps else None, total=seconds)
-    told = f"{len(grasps)} grasps of the library {library.path.name}"
-    return result_of(grasps, count, method="library", timing=timing, message=told)
+    message = f"{len(grasps)} grasps of the library {library.path.name}"
+    return result_of(grasps, count, method="library", timing=timing, message=message)
 
 
 def known_or_planned(
@@ -242,16 +242,16 @@ def known_or_planned(
     began, deadline, stop = time.perf_counter(), request.pop("deadline", None), request.get("stop")
     left = lambda: None if deadline is None else deadline - (time.perf_counter() - began)  # noqa: E731
     over = lambda: (stop is not None and stop()) or (left() or 1.0) <= 0  # noqa: E731
-    asked: dict[str, Any] = {"verify": verify, "restrictions": restrictions}
-    known = known_grasps(library, scene, hand, count=count, wanted=wanted, stop=over, **asked)
+    options: dict[str, Any] = {"verify": verify, "restrictions": restrictions}
+    known = known_grasps(library, scene, hand, count=count, wanted=wanted, stop=over, **options)
     found = len(known.grasps)
     if found >= count:
         return known
     config = load_preset(preset) if isinstance(preset, str) else preset
     rest = None if deadline is None else max(left() or 0.0, 1e-3)
     # The seed that found the stored grasps would find them again, so another seed is used.
-    asked |= {"count": count - found, "seed": seed + found, "preset": config, "deadline": rest}
-    planned = plan_grasps(scene, hand, **asked, **request)
+    options |= {"count": count - found, "seed": seed + found, "preset": config, "deadline": rest}
+    planned = plan_grasps(scene, hand, **options, **request)
     warnings = planned.warnings
     try:
         add_planned(library, scene, hand, config, planned, verify, name)
@@ -261,7 +261,7 @@ def known_or_planned(
     outcome = planned.outcome
     if outcome in (Outcome.SUCCEEDED, Outcome.NO_CANDIDATES) and found + len(new):
         outcome = Outcome.SUCCEEDED if found + len(new) >= count else Outcome.TOO_FEW
-    told = f"{found} grasps of the library {library.path.name}, {len(new)} planned"
+    counts = f"{found} grasps of the library {library.path.name}, {len(new)} planned"
     # The message is used only if it is more than the name of the outcome.
     why = planned.message if planned.message != planned.outcome.value else ""
     return replace(
@@ -269,7 +269,7 @@ def known_or_planned(
         outcome=outcome,
         tried=(*known.tried, *new, *(grasp for grasp in planned.tried if not grasp.usable)),
         count=count,
-        message="; ".join(filter(None, (told, why))),
+        message="; ".join(filter(None, (counts, why))),
         warnings=warnings,
         refused=Counter(known.refused) + Counter(planned.refused),
     )
@@ -332,13 +332,13 @@ def clearance(scene: Scene, hand: HandModel, grasps: Sequence[Grasp]) -> Float[n
 
     turns = _rows([grasp.grasp.quaternion_wxyz for grasp in grasps])
 
-    def ends(stage: str) -> Poses:
-        postures: list[Posture] = [getattr(grasp, stage) for grasp in grasps]
+    def ends(name: str) -> Poses:
+        postures: list[Posture] = [getattr(grasp, name) for grasp in grasps]
         return Poses(_rows([p.position for p in postures]), turns, _rows([p.joint_positions for p in postures]))
 
     kinematics = make_kinematics(hand, dtype=torch.float64)
-    ways = [("pregrasp", "grasp"), ("grasp", "squeeze")]
-    gaps = [gap_on_the_way(obstacles, kinematics, ends(a), ends(b), NEAR) for a, b in ways]
+    moves = [("pregrasp", "grasp"), ("grasp", "squeeze")]
+    gaps = [gap_on_path(obstacles, kinematics, ends(a), ends(b), NEAR) for a, b in moves]
     return torch.stack(gaps).amin(0).numpy()
 
 

@@ -39,9 +39,9 @@ def drop_small_components(mesh: TriangleMesh) -> tuple[TriangleMesh, int]:
         return mesh, 0
     gap = np.full(count, np.inf)
     rest = make_surface(TriangleMesh(mesh.vertices, mesh.faces[~tiny[piece]]))
-    asked = tiny[piece]
-    distance = surface_distance(rest, corners[asked].reshape(-1, 3)).reshape(-1, 3).min(1)
-    np.minimum.at(gap, piece[asked], distance)
+    queried = tiny[piece]
+    distance = surface_distance(rest, corners[queried].reshape(-1, 3)).reshape(-1, 3).min(1)
+    np.minimum.at(gap, piece[queried], distance)
     small = tiny & (gap > extent)
     used, compact = np.unique(mesh.faces[~small[piece]], return_inverse=True)
     return TriangleMesh(mesh.vertices[used], compact.reshape(-1, 3)), int(small.sum())

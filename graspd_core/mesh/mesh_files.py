@@ -161,7 +161,7 @@ def read_mesh(path: str | Path, *, scale: float = 1.0) -> tuple[TriangleMesh, tu
         raise MeshError(f"{path}: {named} vertices and no face: cut off before its faces, or no mesh")
     mesh, warnings = _without_strays(TriangleMesh(vertices, faces), str(path))
     # The OBJ reader drops unused vertices silently, so they are counted in the text.
-    warnings += _strays_told(str(path), named - len(vertices))
+    warnings += _stray_warnings(str(path), named - len(vertices))
     torn = text and not text.endswith((b"\n", b"\r")) and np.ptp(mesh.vertices, axis=0).max() < 1e6
     if torn and not topology.is_closed(TriangleMesh(*topology.merge_vertices(mesh))):
         warnings += (f"{path}: the last line has no line end and the surface is not closed: the file may be cut off",)
@@ -331,10 +331,10 @@ def _without_strays(mesh: TriangleMesh, source: str) -> tuple[TriangleMesh, tupl
     if not np.isfinite(mesh.vertices).all():
         bad = int((~np.isfinite(mesh.vertices).all(1)).sum())
         raise MeshError(f"{source}: {bad} of {len(mesh.vertices)} vertices are NaN or infinite")
-    return mesh, _strays_told(source, strays)
+    return mesh, _stray_warnings(source, strays)
 
 
-def _strays_told(source: str, strays: int) -> tuple[str, ...]:
+def _stray_warnings(source: str, strays: int) -> tuple[str, ...]:
     return (f"{source}: dropped {strays} stray vertices that no face uses",) if strays > 0 else ()
 
 
@@ -347,8 +347,8 @@ def _doubted_size(mesh: TriangleMesh, source: str, scale: float) -> list[str]:
     if SMALL <= size <= LARGE:
         return []
     odd = "large" if size > LARGE else "small"
-    doubt = "not in metres" if scale == 1 else "in another unit"
-    return [f"{source}: {size:.3g} m across, {odd} for a hand; if the file is {doubt}, {unit_advice(size, scale)}"]
+    cause = "not in metres" if scale == 1 else "in another unit"
+    return [f"{source}: {size:.3g} m across, {odd} for a hand; if the file is {cause}, {unit_advice(size, scale)}"]
 
 
 def _distinct(mesh: TriangleMesh, source: str) -> tuple[TriangleMesh, int, int]:

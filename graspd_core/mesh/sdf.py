@@ -207,11 +207,11 @@ def _inside(mesh: TriangleMesh, nodes: _Vectors, distance: _Lengths, spacing: fl
         return winding_inside(mesh, nodes.reshape(3, -1).T).reshape(distance.shape)
     labelled: Any = label(distance > 0.51 * spacing)
     region, regions = labelled
-    asked = region == 0
+    queried = region == 0
     _, first = np.unique(region, return_index=True)
-    asked.ravel()[first] = True
+    queried.ravel()[first] = True
     inside = np.zeros(distance.shape, dtype=bool)
-    inside[asked] = winding_inside(mesh, nodes[:, asked].T)
+    inside[queried] = winding_inside(mesh, nodes[:, queried].T)
     answers = np.zeros(regions + 1, dtype=bool)
     answers[region.ravel()[first]] = inside.ravel()[first]
     return np.where(region > 0, answers[region], inside)

@@ -96,10 +96,10 @@ def make_winding_tree(mesh: TriangleMesh) -> WindingTree:
 def is_inside(tree: WindingTree, points: Float[np.ndarray, "points 3"]) -> Bool[np.ndarray, "points"]:
     """Return which points lie inside: in the bounding box, with an absolute winding number above one half."""
     inside = np.all((points >= tree.low) & (points <= tree.high), axis=1)
-    asked = points[inside] - tree.centre
-    number = _numbers(tree, asked, _COARSE)
+    queries = points[inside] - tree.centre
+    number = _numbers(tree, queries, _COARSE)
     doubtful = np.abs(number - 0.5) < _DOUBT
-    number[doubtful] = _numbers(tree, asked[doubtful], _FINE)
+    number[doubtful] = _numbers(tree, queries[doubtful], _FINE)
     inside[inside] = number > 0.5
     return inside
 

@@ -22,7 +22,7 @@ from graspd_core.optimize.grasp_postures import (
     squeeze,
 )
 from graspd_core.optimize.loop import Hooks, Poses
-from graspd_core.optimize.obstacle_distance import gap_on_the_way
+from graspd_core.optimize.obstacle_distance import gap_on_path
 from graspd_core.optimize.plan_config import PlanConfig, method_row
 from graspd_core.optimize.problem import Problem, build_problem
 from graspd_core.optimize.ranking import Staged, score
@@ -150,7 +150,7 @@ def finished(problem: Problem, hand: HandModel, some: Staged) -> list[Grasp]:
     """Return the grasps of staged poses with their scores, in the same order."""
     scores = score(problem, some)
     if problem.obstacles is not None:
-        depth = -gap_on_the_way(problem.obstacles, problem.hand.kinematics, some.opened, some.poses)
+        depth = -gap_on_path(problem.obstacles, problem.hand.kinematics, some.opened, some.poses)
         knocks = approach_depth(problem, problem.obstacles, some.opened) > _DEEPEST
         scores = torch.where(depth > _DEEPEST, -torch.inf, scores - torch.where(knocks, _KNOCK_COST, 0.0))
     return _grasps(hand, some, scores)

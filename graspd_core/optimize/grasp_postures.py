@@ -35,7 +35,7 @@ from graspd_core.se3 import SE3, rotation_from_quaternion
 # Contacts of one link in addition to its nearest candidate.
 _SPREAD = 2
 # Fractions of the path from pregrasp to grasp at which the hand is kept clear of the object.
-_WAY = (0.0, 0.4, 0.8)
+_PATH = (0.0, 0.4, 0.8)
 # Cost of squared travel: of joints [1/rad²], of the base [1/m²].
 _JOINT_COST, _BASE_COST = 0.1, 2e3
 # Weight of the hand's self-collision at the pregrasp [1/mm²].
@@ -177,23 +177,23 @@ def _find_pregrasp(
     problem: Problem, poses: Poses, config: GraspStagesConfig, stop: Callable[[], bool]
 ) -> tuple[Poses, Values]:
     start = torch.cat([poses.translation, poses.joints], -1)
-    rotation = rotation_from_quaternion(poses.quaternion).repeat(len(_WAY), 1, 1)
+    rotation = rotation_from_quaternion(poses.quaternion).repeat(len(_PATH), 1, 1)
     rates, cost = _rates_and_costs(problem, _pregrasp_settings(config))
     with torch.no_grad():
         reached = hand_distance(problem, poses.base, poses.joints)
-    remaining = torch.tensor([1.0 - a for a in _WAY], dtype=start.dtype, device=start.device)[:, None, None]
+    remaining = torch.tensor([1.0 - a for a in _PATH], dtype=start.dtype, device=start.device)[:, None, None]
     # If the grasp itself penetrates the object, the path starts from that depth.
     wanted = (reached.clamp(max=0.0) * (1 - remaining) + remaining * config.clearance).flatten(0, 1)
 
-    def way_to(x: Rows) -> Float[Tensor, "way_batch variables"]:
+    def path_to(x: Rows) -> Float[Tensor, "way_batch variables"]:
         return (remaining * x + (1 - remaining) * start).flatten(0, 1)
 
     def distances(x: Rows) -> Float[Tensor, "way_batch points"]:
-        way = way_to(x)
-        return hand_distance(problem, SE3(rotation, way[:, :3]), way[:, 3:])
+        path = path_to(x)
+        return hand_distance(problem, SE3(rotation, path[:, :3]), path[:, 3:])
 
     def loss(x: Rows) -> Values:
-        short = ((wanted - distances(x)).clamp_min(0.0) / 0.001).unflatten(0, (len(_WAY), -1))
+        short = ((wanted - distances(x)).clamp_min(0.0) / 0.001).unflatten(0, (len(_PATH), -1))
         total = (short * short).mean(-1).sum(0) + (cost * (x - start) ** 2).sum(-1)
         opened = forward(problem.hand.kinematics, x[:, 3:])
         total = total + _SELF_WEIGHT * solid_collision(problem, opened)
@@ -201,14 +201,14 @@ def _find_pregrasp(
             total = total + _SELF_WEIGHT * self_collision(problem, opened)
         if problem.obstacles is None:
             return total
-        way = way_to(x)
-        links = forward(problem.hand.kinematics, way[:, 3:])
-        blocked = obstacle_depth(problem.obstacles, SE3(rotation, way[:, :3]), links)
-        return total + blocked.unflatten(0, (len(_WAY), -1)).sum(0)
+        path = path_to(x)
+        links = forward(problem.hand.kinematics, path[:, 3:])
+        blocked = obstacle_depth(problem.obstacles, SE3(rotation, path[:, :3]), links)
+        return total + blocked.unflatten(0, (len(_PATH), -1)).sum(0)
 
     x = _descended(problem, start, loss, rates, config.open_steps, stop)
     with torch.no_grad():
-        share = 1 - (wanted - distances(x)).amax(-1).unflatten(0, (len(_WAY), -1)).amax(0) / config.clearance
+        share = 1 - (wanted - distances(x)).amax(-1).unflatten(0, (len(_PATH), -1)).amax(0) / config.clearance
     return Poses(x[:, :3], poses.quaternion, x[:, 3:]), share
 
 
@@ -443,9 +443,9 @@ def _balancing_weights(
         if (downhill * downhill).sum(-1).max(initial=0.0) < _CONVERGED:
             break
         chosen = g * (pressed > 0)[..., None]
-        way = np.linalg.solve(np.eye(7) + gain * chosen.transpose(0, 2, 1) @ chosen, downhill[..., None])[..., 0]
-        now, slope, step = value(r), (downhill * way).sum(-1), np.ones(batch)
-        while (worse := (value(r + step[:, None] * way) > now - 1e-4 * step * slope + 1e-14) & (step > 1e-8)).any():
+        newton = np.linalg.solve(np.eye(7) + gain * chosen.transpose(0, 2, 1) @ chosen, downhill[..., None])[..., 0]
+        now, slope, step = value(r), (downhill * newton).sum(-1), np.ones(batch)
+        while (worse := (value(r + step[:, None] * newton) > now - 1e-4 * step * slope + 1e-14) & (step > 1e-8)).any():
             step[worse] /= 2
-        r = r + step[:, None] * way
+        r = r + step[:, None] * newton
     return gain * (g @ r[..., None])[..., 0].clip(0.0)

@@ -36,7 +36,7 @@ from graspd_core.se3 import SE3, rotation_from_quaternion
 
 # Fractions at which the hand is tested: of the straight path from retreat to pregrasp, and of that to the grasp.
 RETREAT_SHARES = (0.15, 0.3, 0.5, 0.75, 1.0)
-_WAY_SHARES = (0.0, 0.25, 0.5, 0.75, 1.0)
+_PATH_SHARES = (0.0, 0.25, 0.5, 0.75, 1.0)
 # Gaps of at least this make no difference to the optimiser [m].
 WIDE = 0.005
 # Points that represent the rim of a cylinder, and the greatest number of points that represent a hull.
@@ -80,8 +80,8 @@ def make_obstacle_tensors(
 ) -> ObstacleTensors | None:
     """Return the support and the obstacles that this hand can reach, None if there are none. Results are cached."""
     vertices = torch.as_tensor(scene.object.mesh.vertices)
-    gaps = [float(sample_sdf(thing.sdf, vertices.to(thing.sdf.field))[0].min()) for thing in scene.obstacles]
-    reached = [thing for thing, gap in zip(scene.obstacles, gaps, strict=True) if gap < hand_reach(hand) + RETREAT]
+    gaps = [float(sample_sdf(solid.sdf, vertices.to(solid.sdf.field))[0].min()) for solid in scene.obstacles]
+    reached = [solid for solid, gap in zip(scene.obstacles, gaps, strict=True) if gap < hand_reach(hand) + RETREAT]
     if scene.support is None and not reached:
         return None
 
@@ -214,7 +214,7 @@ def _gaps_to(
 
 
 @torch.no_grad()
-def gap_on_the_way(
+def gap_on_path(
     obstacles: ObstacleTensors, kinematics: Kinematics, pregrasp: Poses, grasp: Poses, wide: float = WIDE
 ) -> Values:
     """Return the least signed distance [m] of the hand to any obstacle on the path retreat, pregrasp, grasp.
@@ -224,9 +224,9 @@ def gap_on_the_way(
     """
     rotation = rotation_from_quaternion(grasp.quaternion)
     begun = [drawn_back(pregrasp.translation, rotation, obstacles.approach, RETREAT * s) for s in RETREAT_SHARES]
-    way = [(at, pregrasp.joints) for at in begun]
+    path = [(at, pregrasp.joints) for at in begun]
     ends = (pregrasp.translation, grasp.translation), (pregrasp.joints, grasp.joints)
-    way += [tuple(a * before + (1 - a) * after for before, after in ends) for a in _WAY_SHARES]
-    placed = [(SE3(rotation, at), forward(kinematics, joints)) for at, joints in way]
+    path += [tuple(a * before + (1 - a) * after for before, after in ends) for a in _PATH_SHARES]
+    placed = [(SE3(rotation, at), forward(kinematics, joints)) for at, joints in path]
     gaps = [least_gap(obstacles, base, links, wide) for base, links in placed]
     return torch.stack(gaps).amin(0)

@@ -21,7 +21,7 @@ from typing import TYPE_CHECKING, Any
 
 from graspd_core.config import CertaintyConfig, GraspStagesConfig, ProblemConfig, RobustConfig, RoundsConfig
 from graspd_core.config.mapping import coerced, yaml_values
-from graspd_core.errors import ConfigError, choices, shown
+from graspd_core.errors import ConfigError, choices, short_repr
 from graspd_core.optimize.closed_form.closed_form_config import ClosedFormConfig, at_budget
 from graspd_core.optimize.graspd2022.graspd2022_config import Graspd2022Config
 from graspd_core.paths import config_dir
@@ -102,7 +102,7 @@ def method_row(name: Any, where: str = "config") -> Method:
     """Return the row of a method. Raises ConfigError: the method is unknown. `where` is the prefix of the message."""
     _run_plugins()
     if not isinstance(name, str) or (name not in METHODS and name not in _registered()):
-        raise ConfigError(f"{where}.method: unknown method {shown(name)}; {choices(name, method_names())}")
+        raise ConfigError(f"{where}.method: unknown method {short_repr(name)}; {choices(name, method_names())}")
     if name not in METHODS:
         METHODS[name] = _registered()[name].load()
     return METHODS[name]
@@ -206,8 +206,8 @@ def load_preset(name: str) -> PlanConfig:
     by_path = Path(name).suffix in (".yaml", ".yml") or "/" in name
     path = Path(name) if by_path else config_dir() / "presets" / f"{name}.yaml"
     if not path.is_file():
-        told = f"preset {name}: no such file" if by_path else f"unknown preset {name!r}"
-        raise ConfigError(f"{told}; {choices(name, preset_names(), ', or a .yaml file')}")
+        fault = f"preset {name}: no such file" if by_path else f"unknown preset {name!r}"
+        raise ConfigError(f"{fault}; {choices(name, preset_names(), ', or a .yaml file')}")
     with yaml_values(path) as values:
         return plan_config(values, where=path.name)
 

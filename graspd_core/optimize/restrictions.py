@@ -100,12 +100,12 @@ class BoundRestriction:
         return ""
 
     @property
-    def asked(self) -> str:
+    def description(self) -> str:
         """Name of the restriction in the message of a run that found no candidate."""
         return type(self).__name__
 
     def why_none(self, others: BoundRestrictions) -> str:
-        """Return why no candidate satisfies this restriction and the run's `others`. Empty if `asked` says enough."""
+        """Return why no candidate satisfies this restriction and the run's `others`. Empty if none is needed."""
         return ""
 
     @property
@@ -193,7 +193,7 @@ def restrictions_in_words(restrictions: BoundRestrictions, refused: Mapping[str,
         return f"{held} candidates held, {sum(refused.values())} refused: {reasons}"
     if not restrictions.each or tried:
         return ""
-    told = f"no candidate was found under {', '.join(one.asked for one in restrictions.each)}"
+    message = f"no candidate was found under {', '.join(one.description for one in restrictions.each)}"
     rest = ((one, tuple(other for other in restrictions.each if other is not one)) for one in restrictions.each)
     reasons = (one.why_none(replace(restrictions, each=others)) for one, others in rest)
-    return "; ".join([told, *filter(None, reasons)])
+    return "; ".join([message, *filter(None, reasons)])

@@ -67,16 +67,16 @@ def why_trials_failed(scene: Scene, grasps: Sequence[Grasp]) -> str:
     if not failed:
         return ""
     reasons = Counter(kind_of(grasp.reason) for grasp in failed).most_common(_REASONS_TOLD)
-    told = f"{len(failed)} grasps failed their trials: {', '.join(f'{reason} ({count})' for reason, count in reasons)}"
+    text = f"{len(failed)} grasps failed their trials: {', '.join(f'{reason} ({count})' for reason, count in reasons)}"
     if scene.support is None:
-        return told
+        return text
     heights = scene.object.mesh.vertices @ scene.support.normal - scene.support.offset
     normals = np.array([contact.normal for grasp in failed for contact in grasp.contacts]).reshape(-1, 3)
     above = np.median(normals @ scene.support.normal) if len(normals) else 0.0
     if heights.max() > _LOW or above < _FROM_ABOVE:
-        return told
+        return text
     return (
-        f"{told}; it is {heights.max() * 1e3:.0f} mm high on its support, so that fingers press on it from above: "
+        f"{text}; it is {heights.max() * 1e3:.0f} mm high on its support, so that fingers press on it from above: "
         "bring a part of it over an edge, or take a hand with thinner fingers"
     )
 

@@ -39,7 +39,7 @@ from graspd_core.types import (
 )
 from graspd_core.verify.limits import LEAST_PAYLOAD
 from graspd_core.verify.run_clock import Run, result_of
-from graspd_core.verify.verification import payloads, rank_by_robustness, trials_ahead
+from graspd_core.verify.verification import payloads, prefetch, rank_by_robustness
 
 # Number of grasps whose payload is measured if none is verified.
 _WEIGHED = 8
@@ -54,12 +54,12 @@ def planning_scene(scene: Scene, resolution: int) -> tuple[Scene, Float[np.ndarr
     if not 8 <= resolution <= 256:
         raise ConfigError(f"resolution: {resolution} nodes; valid: 8 to 256")
     scene, far = near_scene(scene)
-    as_asked = tuple(scene.sdf.field.shape[1:]) == grid_layout(scene.object.mesh, resolution).counts
-    if as_asked and not far.any():
+    same_grid = tuple(scene.sdf.field.shape[1:]) == grid_layout(scene.object.mesh, resolution).counts
+    if same_grid and not far.any():
         return scene, far
     sdf = object_sdf(scene.object, resolution).to(scene.sdf.field.device, scene.sdf.field.dtype)
     confidence = scene.confidence
-    if confidence is not None and not as_asked:
+    if confidence is not None and not same_grid:
         confidence = sample_confidence(confidence, scene.sdf, _nodes(sdf)).reshape(sdf.field.shape[1:])
     return replace(scene, sdf=sdf, confidence=confidence), far
 
@@ -113,8 +113,8 @@ def plan_grasps(
     run = Run(time.perf_counter(), deadline, progress, stop, watch)
     support, bound = scene.support, BoundRestrictions(tuple(one.bind(scene, hand) for one in restrictions))
     scene, hand, message, rounds = _prepared(run, scene, hand, config, verify, bound)
-    ahead = trials_ahead(run, scene, hand, verify, config.certainty) if rounds and verify != "none" else None
-    found = run_rounds(run, scene, hand, rounds, ahead, bound.moved(run.origin), measure=measure, **request)
+    prefetched = prefetch(run, scene, hand, verify, config.certainty) if rounds and verify != "none" else None
+    found = run_rounds(run, scene, hand, rounds, prefetched, bound.moved(run.origin), measure=measure, **request)
     result = result_of(
         [moved_grasp(grasp, run.origin) for grasp in on_surface(scene, _ranked(run, found, config, seed))],
         count,
@@ -125,9 +125,9 @@ def plan_grasps(
         warnings=(*scene.object.warnings, *hand.named_warnings, *_lifted_less(scene, found.mass)),
         refused=found.refused,
     )
-    told = "" if run.over() else _why_few(run, scene, bound, found, result)
+    reason = "" if run.over() else _why_few(run, scene, bound, found, result)
     masses = {"mass": found.mass, "tried_mass": found.mass or scene.object.mass}
-    result = replace(result, message=message or told or result.outcome.value, support=support, **masses)
+    result = replace(result, message=message or reason or result.outcome.value, support=support, **masses)
     run.report(Stage.DONE, 1, 1, 0.0, found.good)
     return result if found.good else _less_sure(scene, run.origin, result)
 
@@ -164,21 +164,21 @@ def on_surface(scene: Scene, grasps: Sequence[Grasp]) -> tuple[Grasp, ...]:
 def _lifted_less(scene: Scene, mass: float | None) -> tuple[str, ...]:
     if mass is None:
         return ()
-    told = f"the hand cannot hold the {scene.object.mass:.2g} kg that were assumed: grasps were tried at {mass:.2g} kg"
-    return (f"{scene.object.source}: {told}",)
+    text = f"the hand cannot hold the {scene.object.mass:.2g} kg that were assumed: grasps were tried at {mass:.2g} kg"
+    return (f"{scene.object.source}: {text}",)
 
 
 def _why_few(run: Run, scene: Scene, bound: BoundRestrictions, found: RoundsResult, result: GraspResult) -> str:
-    told = restrictions_in_words(bound, found.refused, found.good, len(found.grasps))
-    if told or result.outcome is not Outcome.TOO_FEW:
-        return told
+    reason = restrictions_in_words(bound, found.refused, found.good, len(found.grasps))
+    if reason or result.outcome is not Outcome.TOO_FEW:
+        return reason
     if bare := sum(not grasp.trials and not grasp.contacts for grasp in result.tried):
         return f"{bare} of {len(result.tried)} untried candidates do not touch the object"
-    told = why_trials_failed(scene, result.tried)
+    reason = why_trials_failed(scene, result.tried)
     if found.good or found.context is None:
-        return told
+        return reason
     most = max(payloads(found.context, result.tried[:_WEIGHED], run.over), default=0.0)
-    return f"{told}; the best of them would hold {most:.2g} kg" if most > LEAST_PAYLOAD else told
+    return f"{reason}; the best of them would hold {most:.2g} kg" if most > LEAST_PAYLOAD else reason
 
 
 def _less_sure(scene: Scene, far: Float[np.ndarray, "3"], result: GraspResult) -> GraspResult:
@@ -186,17 +186,17 @@ def _less_sure(scene: Scene, far: Float[np.ndarray, "3"], result: GraspResult) -
     held = sum(grasp.verdict is Verdict.UNVERIFIED for grasp in result.tried)
     if scene.evidence is None or not held:
         return result
-    told, view = f"{held} grasps hold on the likeliest shape, none is robust enough", None
+    message, view = f"{held} grasps hold on the likeliest shape, none is robust enough", None
     if scene.evidence.doubts:
-        told += f": {scene.evidence.doubts[0]}"
+        message += f": {scene.evidence.doubts[0]}"
     elif scene.evidence.hidden:
         from graspd_core.perception.reconstruct.hidden_side import next_view
 
-        told += ", since a part of the object was guessed"
+        message += ", since a part of the object was guessed"
         view = next_view(scene.evidence, scene.object.mesh, far)
     if view is not None:
-        told += "; one more view, from next_view, would show most of it"
-    return replace(result, message="; ".join(filter(None, (told, result.message))), next_view=view)
+        message += "; one more view, from next_view, would show most of it"
+    return replace(result, message="; ".join(filter(None, (message, result.message))), next_view=view)
 
 
 def _timing(run: Run, scene: Scene, found: RoundsResult) -> Timing:

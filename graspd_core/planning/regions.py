@@ -12,7 +12,7 @@ import torch
 from jaxtyping import Bool, Float
 from scipy.spatial import KDTree
 
-from graspd_core.errors import ConfigError, shown
+from graspd_core.errors import ConfigError, short_repr
 from graspd_core.hands.kinematics import RETREAT, forward, make_kinematics
 from graspd_core.hands.model import HandModel
 from graspd_core.mesh.sdf import build_sdf
@@ -32,7 +32,7 @@ def numbers(name: str, given: Any, count: int) -> tuple[float, ...]:
     except (TypeError, ValueError):
         values = np.empty(0)
     if values.shape != (count,) or not np.isfinite(values).all():
-        raise ConfigError(f"{name}: {shown(given)}; valid: {count} finite numbers")
+        raise ConfigError(f"{name}: {short_repr(given)}; valid: {count} finite numbers")
     return tuple(values.tolist())
 
 
@@ -57,7 +57,7 @@ class Box:
         for name, count in (("center", 3), ("size", 3), ("quaternion_wxyz", 4)):
             object.__setattr__(self, name, numbers(f"box {name}", getattr(self, name), count))
         if min(self.size) <= 0:
-            raise ConfigError(f"box size: {shown(self.size)}; valid: three lengths above 0, in metres")
+            raise ConfigError(f"box size: {short_repr(self.size)}; valid: three lengths above 0, in metres")
         if not any(self.quaternion_wxyz):
             raise ConfigError("box quaternion_wxyz: all 0; valid: w, x, y, z, not all 0")
 

@@ -20,7 +20,7 @@ from graspd_core.types import Grasp, Snapshot, Stage, Verdict
 from graspd_core.verify.limits import LEAST_PAYLOAD
 from graspd_core.verify.run_clock import Run
 from graspd_core.verify.verification import (
-    TrialsAhead,
+    Prefetched,
     TriedGrasps,
     VerificationContext,
     lighter,
@@ -36,13 +36,13 @@ _TORCH_SAYS = ("can't allocate memory", "not enough memory", "out of memory")
 
 
 @contextmanager
-def enough_memory(asked: str) -> Iterator[None]:
-    """Raise ResourceError, naming `asked`, if the work inside the context runs out of memory."""
+def enough_memory(what: str) -> Iterator[None]:
+    """Raise ResourceError, naming `what`, if the work inside the context runs out of memory."""
     try:
         yield
     except (MemoryError, RuntimeError) as error:
         if isinstance(error, MemoryError) or any(words in str(error) for words in _TORCH_SAYS):
-            raise ResourceError(f"{asked}: not enough memory; ask for fewer grasps, or use a faster preset") from None
+            raise ResourceError(f"{what}: not enough memory; ask for fewer grasps, or use a faster preset") from None
         raise
 
 
@@ -119,7 +119,7 @@ def run_rounds(
     scene: Scene,
     hand: HandModel,
     rounds: list[PlanConfig],
-    ahead: TrialsAhead | None,
+    prefetched: Prefetched | None,
     restrictions: BoundRestrictions = UNRESTRICTED,
     *,
     count: int,
@@ -130,31 +130,31 @@ def run_rounds(
     """Find and try candidates, round by round, until `count` grasps are good.
 
     If many grasps are requested, a small batch comes first, for an early answer. If too few grasps hold, the next round
-    starts from other initial poses. Candidates that a restriction refuses are not tried. `ahead` holds the worlds of
-    the trials. Without it, no candidate is tried.
+    starts from other initial poses. Candidates that a restriction refuses are not tried. `prefetched` holds the worlds
+    of the trials. Without it, no candidate is tried.
     """
     state = RoundsResult(time.perf_counter())
     rounds = rounds[:1] if scene.evidence is not None and scene.evidence.doubts else rounds
-    early = [(config, _FIRST_BATCH) for config in rounds[:1] if ahead is not None and count >= _MANY]
+    early = [(config, _FIRST_BATCH) for config in rounds[:1] if prefetched is not None and count >= _MANY]
     for attempt, (config, most) in enumerate([*early, *((config, count) for config in rounds)]):
         enough, good, began = min(most + state.good, count), state.good, time.perf_counter()
-        asked = {"config": config, "hooks": _hooks(run, good), "device": device, "restrictions": restrictions}
+        options = {"config": config, "hooks": _hooks(run, good), "device": device, "restrictions": restrictions}
         seek = enough - good if good or not attempt else max(enough, _MANY)
         with enough_memory(f"{seek} grasps at once"):
-            candidates = find_candidates(PlannerInput(scene, hand, seek, seed + _SEED_STEP * attempt, **asked)).grasps
+            candidates = find_candidates(PlannerInput(scene, hand, seek, seed + _SEED_STEP * attempt, **options)).grasps
         # The time is counted here, because the loop below does not run after an interrupted search.
         state, began = _searched_since(state, began), time.perf_counter()
         for some in _in_rank_order(candidates, enough - good, restrictions):
             admitted, refused = restrictions.admit(some)
             state = replace(_searched_since(state, began), refused=state.refused + refused)
             tried = TriedGrasps()
-            if ahead is None:
+            if prefetched is None:
                 first = admitted[: enough - state.good]
                 tried = TriedGrasps(measured(scene, hand, first) if measure else first)
             elif admitted:
                 if state.context is None:
                     context = make_trial_context(
-                        run, scene, hand, ahead, config.certainty, measure=measure, friction=config.robust.friction
+                        run, scene, hand, prefetched, config.certainty, measure=measure, friction=config.robust.friction
                     )
                     state = replace(state, context=context)
                 if state.context is not None:
@@ -169,8 +169,8 @@ def run_rounds(
         # Lower the mass only after a second round for stronger grasps. Without an unverified grasp, lower it at once.
         doubted = any(grasp.verdict is Verdict.UNVERIFIED for grasp in state.grasps)
         too_heavy = attempt >= len(early) + doubted and not state.good and scene.object.mass_assumed
-        if too_heavy and ahead is not None and state.mass is None:
-            state = _tried_lighter(run, scene, ahead, state, config.certainty, count)
+        if too_heavy and prefetched is not None and state.mass is None:
+            state = _tried_lighter(run, scene, prefetched, state, config.certainty, count)
             if state.good >= count or run.over():
                 break
     return state
@@ -181,7 +181,7 @@ def _searched_since(state: RoundsResult, began: float) -> RoundsResult:
 
 
 def _tried_lighter(
-    run: Run, scene: Scene, ahead: TrialsAhead, state: RoundsResult, certainty: CertaintyConfig, count: int
+    run: Run, scene: Scene, prefetched: Prefetched, state: RoundsResult, certainty: CertaintyConfig, count: int
 ) -> RoundsResult:
     """Try the best grasps again with a lower mass that the strongest of them can lift. Try the strongest first."""
     if state.context is None:
@@ -192,7 +192,7 @@ def _tried_lighter(
     mass = min(_LIFTED * most, _HALF * scene.object.mass)
     if most <= LEAST_PAYLOAD or run.over():
         return state
-    context = lighter(scene, ahead, state.context, certainty, mass, most)
+    context = lighter(scene, prefetched, state.context, certainty, mass, most)
     strongest = sorted(range(len(best)), key=lambda place: -lifted[place])
     tried = run_trials(run, context, tuple(replace(best[place], trials=()) for place in strongest), count, 0)
     grasps = surest_first((*tried.grasps, *others))

@@ -15,7 +15,7 @@ import numpy as np
 import torch
 from jaxtyping import Bool, Float
 
-from graspd_core.errors import ConfigError, shown
+from graspd_core.errors import ConfigError, short_repr
 from graspd_core.hands.kinematics import RETREAT, in_base, link_poses
 from graspd_core.hands.model import HandModel
 from graspd_core.mesh.mesh_files import surface_samples
@@ -115,7 +115,7 @@ class Steering:
         if self.region is not None and not isinstance(self.region, Box | Sphere | NearPoints):
             raise ConfigError(f"region: {type(self.region).__name__}; valid: Box, Sphere, NearPoints")
         if any(not isinstance(box, Box) for box in self.avoid):
-            raise ConfigError(f"avoid: {shown(self.avoid)}; valid: a sequence of Box")
+            raise ConfigError(f"avoid: {short_repr(self.avoid)}; valid: a sequence of Box")
         if self.roll is None:
             return
         if not np.isfinite(self.roll):
@@ -125,7 +125,8 @@ class Steering:
         if self.roll_zero is not None:
             zero, along = numbers("roll_zero", self.roll_zero, 3), np.array(self.approach_direction, dtype=float)
             if not np.linalg.norm(np.cross(zero, along)) > _PARALLEL * np.linalg.norm(zero) * np.linalg.norm(along):
-                raise ConfigError(f"roll_zero: {shown(zero)}; valid: a direction that is not along approach_direction")
+                given = short_repr(zero)
+                raise ConfigError(f"roll_zero: {given}; valid: a direction that is not along approach_direction")
 
     def bind(self, scene: Scene, hand: HandModel) -> BoundSteering:
         """Bind the steering to this hand in this scene.
@@ -156,7 +157,7 @@ class BoundSteering(BoundRestriction):
     wanted: Aim
 
     @property
-    def asked(self) -> str:
+    def description(self) -> str:
         """Names of the given constraints."""
         given = {name: getattr(self.steering, name) is not None for name in ("approach_direction", "region", "roll")}
         given["avoid"] = len(self.steering.avoid) > 0
@@ -165,8 +166,8 @@ class BoundSteering(BoundRestriction):
     @property
     def aim(self) -> Aim | None:
         """Aim of the initial poses. None without a constraint on region or approach direction."""
-        asked = self.wanted.direction is not None or self.wanted.places is not None
-        return self.wanted if asked else None
+        constrained = self.wanted.direction is not None or self.wanted.places is not None
+        return self.wanted if constrained else None
 
     @cached_property
     def obstacles(self) -> tuple[Obstacle, ...]:
@@ -200,21 +201,21 @@ class BoundSteering(BoundRestriction):
         """Return each candidate that meets all constraints, else a refusal that names the first violated one."""
         if not grasps:
             return grasps
-        asked, wanted, missed = self.steering, self.wanted, dict[str, Bool[np.ndarray, "grasps"]]()
+        steering, wanted, missed = self.steering, self.wanted, dict[str, Bool[np.ndarray, "grasps"]]()
         if wanted.direction is not None:
             angles = np.array([angle_of_approach(self.hand, grasp, wanted.direction) for grasp in grasps])
-            told = f"outside the approach cone of {np.degrees(asked.approach_angle):.0f} degrees"
-            missed[told] = angles > asked.approach_angle + _ROUNDING
+            reason = f"outside the approach cone of {np.degrees(steering.approach_angle):.0f} degrees"
+            missed[reason] = angles > steering.approach_angle + _ROUNDING
         if wanted.roll is not None:
             quaternions = np.stack([grasp.grasp.quaternion_wxyz for grasp in grasps])
             turns = rotation_from_quaternion(torch.as_tensor(quaternions).double())
             missing = wanted.roll.missing(turns @ torch.as_tensor(self.hand.approach), turns)
-            missed["with another roll"] = np.abs(missing.numpy()) > asked.roll_tolerance + _ROUNDING
-        if asked.region is not None:
-            outside = np.array([outside_region(asked.region, grasp) for grasp in grasps])
+            missed["with another roll"] = np.abs(missing.numpy()) > steering.roll_tolerance + _ROUNDING
+        if steering.region is not None:
+            outside = np.array([outside_region(steering.region, grasp) for grasp in grasps])
             missed["with a contact outside the region"] = outside > CONTACT_TOLERANCE
-        stages = [[getattr(grasp, stage) for grasp in grasps] for stage in ("pregrasp", "grasp", "squeeze")]
-        in_boxes = [entered(self.hand, postures, asked.avoid) for postures in stages]
+        at_each = [[getattr(grasp, stage) for grasp in grasps] for stage in ("pregrasp", "grasp", "squeeze")]
+        in_boxes = [entered(self.hand, postures, steering.avoid) for postures in at_each]
         missed["with a link in an avoided box"] = np.any(in_boxes, axis=0)
         reasons = [next((why for why, rows in missed.items() if rows[i]), "") for i in range(len(grasps))]
         return [Refusal(why) if why else grasp for why, grasp in zip(reasons, grasps, strict=True)]

@@ -143,8 +143,8 @@ class _Reader(pickle._Unpickler):
         try:
             return self._admitted[module, name]
         except KeyError:
-            shown = f"{module}.{name}"[:200]
-            raise _RefusedError(shown if shown.isprintable() else ascii(shown)) from None
+            full_name = f"{module}.{name}"[:200]
+            raise _RefusedError(full_name if full_name.isprintable() else ascii(full_name)) from None
 
 
 class _RefusedError(Exception):
@@ -171,12 +171,12 @@ def load_inert(content: bytes, admitted: Mapping[tuple[str, str], Maker], what: 
     try:
         return _Reader(content, admitted).load()
     except _RefusedError as refused:
-        told = f"asks for {refused}, which a {what} does not need; the file is refused, and nothing was run"
-        raise ValueError(told) from None
+        reason = f"asks for {refused}, which a {what} does not need; the file is refused, and nothing was run"
+        raise ValueError(reason) from None
     # A file that is no pickle can raise any exception.
     except Exception as error:
-        told = f"{type(error).__name__}: {error}".splitlines()[0]
-        raise ValueError(f"not the pickle of a {what}: {told[:200]}") from error
+        reason = f"{type(error).__name__}: {error}".splitlines()[0]
+        raise ValueError(f"not the pickle of a {what}: {reason[:200]}") from error
 
 
 # Valid types of array entries: booleans, integers, floats.
@@ -207,14 +207,14 @@ def array_of(value: Inert) -> np.ndarray:
 def _dtype(value: Any) -> np.dtype:
     code = value.arguments[0] if isinstance(value, Inert) and value.kind == "dtype" and value.arguments else None
     if not isinstance(code, str) or code not in _NUMERIC:
-        raise ValueError(f"holds an array of type {_shown(code)}; valid: booleans, integers, floats")
+        raise ValueError(f"holds an array of type {_short_text(code)}; valid: booleans, integers, floats")
     order = value.state[1] if isinstance(value.state, tuple) and len(value.state) > 1 else "="
     if order not in ("<", ">", "|", "="):
-        raise ValueError(f"holds an array in byte order {_shown(order)}; valid: <, >, |, =")
+        raise ValueError(f"holds an array in byte order {_short_text(order)}; valid: <, >, |, =")
     return np.dtype(("<" if order in ("|", "=") else order) + code)
 
 
-def _shown(value: object) -> str:
+def _short_text(value: object) -> str:
     return repr(value[:40]) if isinstance(value, str) else f"a {type(value).__name__}"
 
 

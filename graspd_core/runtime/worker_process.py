@@ -82,7 +82,7 @@ class WorkerProcess:
                     self._start()
                 try:
                     self._pipe.send_bytes(call)
-                    told = self._pipe.recv_bytes()
+                    reply = self._pipe.recv_bytes()
                     break
                 except (EOFError, OSError):
                     self._process.wait()
@@ -94,7 +94,7 @@ class WorkerProcess:
             else:
                 # The function is not run in place, because it could kill this process too.
                 raise MemoryError(f"{work.__name__}: the worker process died twice, perhaps for lack of memory")
-        failed, answer = pickle.loads(told)
+        failed, answer = pickle.loads(reply)
         if failed:
             raise answer
         return answer
@@ -119,14 +119,14 @@ class WorkerProcess:
                         raise TimeoutError(f"no end after {seconds:g} s")
                     if (held := resident_mb(self._process.pid)) > most_mb:
                         raise MemoryError(f"its process used {held:.0f} MB, more than {most_mb:g} MB")
-                told = self._pipe.recv_bytes()
+                reply = self._pipe.recv_bytes()
             except (EOFError, ConnectionError):
                 raise ChildProcessError(f"its process died with exit code {self._process.wait()}") from None
             except BaseException:
                 self._process.kill()
                 self._process.wait()
                 raise
-        failed, answer = pickle.loads(told)
+        failed, answer = pickle.loads(reply)
         if failed:
             raise answer
         return answer

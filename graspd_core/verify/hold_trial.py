@@ -221,9 +221,9 @@ def set_joints(world: World, data: Any, values: np.ndarray) -> None:
 def _move(world: World, data: Any, start: Posture, end: Posture, protocol: Protocol, worst: np.ndarray) -> str:
     """Move the targets linearly from start to end. Return why the trial failed, empty if it did not."""
     steps = round(protocol.stage_time / protocol.timestep)
-    way = straight_way(start, end, np.arange(1, steps + 1) / steps)
+    path = straight_path(start, end, np.arange(1, steps + 1) / steps)
     for step in range(1, steps + 1):
-        set_targets(data, way, step - 1)
+        set_targets(data, path, step - 1)
         advance(world, data)
         if step % CHECK_EVERY == 0:
             reason = breach(world, data, protocol, worst)
@@ -233,7 +233,7 @@ def _move(world: World, data: Any, start: Posture, end: Posture, protocol: Proto
 
 
 @dataclass(frozen=True, eq=False)
-class Way:
+class PosturePath:
     """Base poses (wxyz, [m]) and joint targets [rad] or [m] along the path between two postures."""
 
     positions: Float[np.ndarray, "n 3"]
@@ -241,24 +241,24 @@ class Way:
     joints: Float[np.ndarray, "n joints"]
 
 
-def straight_way(start: Posture, end: Posture, shares: Float[np.ndarray, "n"]) -> Way:
+def straight_path(start: Posture, end: Posture, shares: Float[np.ndarray, "n"]) -> PosturePath:
     """Return the postures at the fractions `shares` of the straight path from start to end."""
     a = shares[:, None]
     # Take the shorter rotation of the base. A quaternion and its negative are the same rotation.
     sign = 1.0 if start.quaternion_wxyz @ end.quaternion_wxyz >= 0 else -1.0
     quaternions = (1 - a) * start.quaternion_wxyz + a * sign * end.quaternion_wxyz
-    return Way(
+    return PosturePath(
         (1 - a) * start.position + a * end.position,
         quaternions / np.linalg.norm(quaternions, axis=1, keepdims=True),
         (1 - a) * start.joint_positions + a * end.joint_positions,
     )
 
 
-def set_targets(data: Any, way: Way, index: int) -> None:
+def set_targets(data: Any, path: PosturePath, index: int) -> None:
     """Set base pose and joint targets to point `index` of the path."""
-    data.mocap_pos[0] = way.positions[index]
-    data.mocap_quat[0] = way.quaternions[index]
-    data.ctrl[:] = way.joints[index]
+    data.mocap_pos[0] = path.positions[index]
+    data.mocap_quat[0] = path.quaternions[index]
+    data.ctrl[:] = path.joints[index]
 
 
 def diverged(data: Any) -> bool:

@@ -32,7 +32,7 @@ from graspd_core.verify.hold_trial import (
     set_joints,
     set_targets,
     step_until_known,
-    straight_way,
+    straight_path,
 )
 from graspd_core.verify.world import Protocol, World, advance, trial_data
 
@@ -122,9 +122,9 @@ def _raise(
     away, touched = (begin.position - grasp.pregrasp.position) / settings.retreat, False
     for name, start, end, duration in _stages(begin, grasp, protocol, settings):
         steps = round(duration / protocol.timestep)
-        way = straight_way(start, end, np.arange(1, steps + 1) / steps)
+        path = straight_path(start, end, np.arange(1, steps + 1) / steps)
         for step in range(1, steps + 1):
-            set_targets(data, way, step - 1)
+            set_targets(data, path, step - 1)
             if name == _LIFTING:
                 _sink(world, data, away if world.up is None else world.up, step / steps, settings)
             advance(world, data)
@@ -182,9 +182,9 @@ def reach_through(world: World, data: Any, postures: tuple[Posture, ...], limit:
     worst, reason = 0.0, ""
     names = ("while coming", "while closing")
     for (start, end), name in zip(pairwise(postures), names, strict=True):
-        way = straight_way(start, end, np.array([*_SHARES, 1.0]))
-        for index in range(len(way.positions)):
-            set_targets(data, way, index)
+        path = straight_path(start, end, np.array([*_SHARES, 1.0]))
+        for index in range(len(path.positions)):
+            set_targets(data, path, index)
             set_joints(world, data, data.ctrl)
             mujoco.mj_kinematics(world.model, data)
             for geom, said in world.obstacles:

@@ -32,7 +32,7 @@ from graspd_core.mesh.convex_parts import convex_parts
 from graspd_core.perception.reconstruct.merge_views import Evidence
 from graspd_core.perception.scene import COARSE_CUTS, ObjectModel, Scene, build_scene
 from graspd_core.runtime.worker_process import run_isolated
-from graspd_core.types import HYPOTHESES, Grasp, StopHook, TrialResult
+from graspd_core.types import ROBUSTNESS, Grasp, StopHook, TrialResult
 from graspd_core.verify.hold_trial import STOPPED, PoseError, displaced, hold_trial, out_of_place, pose_errors
 from graspd_core.verify.run_clock import Run
 from graspd_core.verify.trial_registry import TrialContext
@@ -114,11 +114,11 @@ _SHAPES = "graspd-shapes"
 
 # Results of some checks in order, None for an impossible check. `HoldUnder` runs the checks of a stage on a grasp.
 Results = Generator[TrialResult | None]
-HoldUnder = Callable[["HypothesisStage", Grasp, StopHook], Results]
+HoldUnder = Callable[["CheckStage", Grasp, StopHook], Results]
 
 
 @dataclass(frozen=True)
-class Hypothesis:
+class RobustnessCheck:
     """One robustness check: a variant of the scene that may be the true one.
 
     Attributes:
@@ -131,7 +131,7 @@ class Hypothesis:
 
 
 @dataclass(frozen=True)
-class HypothesisStage:
+class CheckStage:
     """Robustness checks of one kind.
 
     Attributes:
@@ -140,7 +140,7 @@ class HypothesisStage:
         though_failed: probability that a grasp that fails this stage still holds on the true object.
     """
 
-    items: tuple[Hypothesis, ...]
+    items: tuple[RobustnessCheck, ...]
     least: int
     though_failed: float
 
@@ -149,11 +149,11 @@ class LaterWorld:
     """A world that a thread builds on the first request. The result is kept. It is None if there is no such world."""
 
     def __init__(self, make: Callable[[], World | None]):
-        self._make, self._begun, self._asked = make, None, threading.Lock()
+        self._make, self._begun, self._lock = make, None, threading.Lock()
 
     def begin(self) -> Future[World | None]:
         """Start to build the world, if that has not started yet. Return its future."""
-        with self._asked:
+        with self._lock:
             self._begun = self._begun or begin_in_thread(_SHAPES, self._make)
             return self._begun
 
@@ -163,7 +163,7 @@ class LaterWorld:
 
 
 @dataclass(frozen=True)
-class Hypotheses:
+class RobustnessChecks:
     """The robustness checks that a grasp must pass.
 
     Attributes:
@@ -173,7 +173,7 @@ class Hypotheses:
         doubts: reasons to doubt the scene or its mass. If there are any, no check runs and no grasp passes.
     """
 
-    stages: tuple[HypothesisStage, ...]
+    stages: tuple[CheckStage, ...]
     probability: float
     waited_for: threading.Event = field(default_factory=threading.Event)
     doubts: tuple[str, ...] = ()
@@ -200,9 +200,9 @@ def begin_other_worlds(
     return worlds
 
 
-def hypotheses_of(
+def robustness_checks_of(
     scene: Scene, others: Sequence[LaterWorld], trials: TrialContext, probability: float
-) -> Hypotheses | None:
+) -> RobustnessChecks | None:
     """Return the checks that a grasp must pass to reach the requested `probability`. None if there are none.
 
     `others` comes from `begin_other_worlds`. If the mass is known, a grasp must hold on all displaced poses and with
@@ -210,11 +210,11 @@ def hypotheses_of(
     """
     shares = held_shares(scene.object)
     if scene.evidence is not None and scene.evidence.doubts:
-        return Hypotheses((), DOUBTED_SHARE, doubts=scene.evidence.doubts)
+        return RobustnessChecks((), DOUBTED_SHARE, doubts=scene.evidence.doubts)
     if scene.evidence is None or probability <= shares.likeliest:
         return None
     places = [
-        Hypothesis(f"place {number}", partial(_hold_displaced, trials, error))
+        RobustnessCheck(f"place {number}", partial(_hold_displaced, trials, error))
         for number, error in enumerate(pose_errors(_PLACES_SEED, _PLACES), 1)
     ]
     least = _LEAST_PLACES
@@ -222,45 +222,45 @@ def hypotheses_of(
         slippery = at_friction(trials.protocol, _LESS_FRICTION * Protocol.friction[0])
         world = altered(trials.alone, friction=slippery.friction)
         work = lambda grasp, stop: hold_trial(world, grasp, slippery, stop=stop)  # noqa: E731
-        places.append(Hypothesis(f"friction {slippery.friction[0]:.2g}", work))
+        places.append(RobustnessCheck(f"friction {slippery.friction[0]:.2g}", work))
         least = len(places)
-    stages = [HypothesisStage(tuple(places), least, shares.fails_places)]
+    stages = [CheckStage(tuple(places), least, shares.fails_places)]
     # If no side was hidden, there are no other shapes to check.
     surest = shares.shapes if others or not scene.evidence.hidden else shares.places
     waited_for = threading.Event()
     if others:
         shapes = tuple(
-            Hypothesis(f"other shape {number}", partial(_hold_in, world, trials.protocol, waited_for))
+            RobustnessCheck(f"other shape {number}", partial(_hold_in, world, trials.protocol, waited_for))
             for number, world in enumerate(others, 1)
         )
-        stages.append(HypothesisStage(shapes, LEAST_SHAPES, shares.fails_shapes))
-    return Hypotheses(tuple(stages), surest, waited_for)
+        stages.append(CheckStage(shapes, LEAST_SHAPES, shares.fails_shapes))
+    return RobustnessChecks(tuple(stages), surest, waited_for)
 
 
-def less_sure(hypotheses: Hypotheses, most: float, heavy: float) -> Hypotheses:
+def less_sure(checks: RobustnessChecks, most: float, heavy: float) -> RobustnessChecks:
     """Scale all probabilities by the probability that the object weighs at most the payload `most` [kg].
 
     `heavy` is the heavy end of what the object's volume allows [kg]. If too many such objects weigh more than `most`,
     the checks return this as a doubt. Checks that have doubts are returned unchanged.
     """
-    if hypotheses.doubts:
-        return hypotheses
+    if checks.doubts:
+        return checks
     share = share_as_light(most, heavy)
     if share < LEAST_LIGHT:
         doubt = f"the grasp lifts {most:.2g} kg, and too many objects of this volume weigh more"
-        return Hypotheses((), share * MASS_KNOWN.likeliest, doubts=(doubt,))
-    stages = tuple(replace(stage, though_failed=share * stage.though_failed) for stage in hypotheses.stages)
-    return replace(hypotheses, stages=stages, probability=share * hypotheses.probability)
+        return RobustnessChecks((), share * MASS_KNOWN.likeliest, doubts=(doubt,))
+    stages = tuple(replace(stage, though_failed=share * stage.though_failed) for stage in checks.stages)
+    return replace(checks, stages=stages, probability=share * checks.probability)
 
 
-def one_by_one(stage: HypothesisStage, grasp: Grasp, stop: StopHook) -> Results:
+def one_by_one(stage: CheckStage, grasp: Grasp, stop: StopHook) -> Results:
     """Yield the trial result of each check in turn. A trial starts only when its result is requested."""
     for item in stage.items:
         yield item.hold(grasp, stop)
 
 
-def try_hypotheses(
-    hypotheses: Hypotheses,
+def try_robustness(
+    checks: RobustnessChecks,
     grasp: Grasp,
     stop: StopHook,
     hold_under: HoldUnder = one_by_one,
@@ -271,9 +271,9 @@ def try_hypotheses(
     travel and rotation of the passed trials. `hold_under` runs the checks of one stage.
     """
     travel = turn = 0.0
-    if hypotheses.doubts:
-        return TrialResult(HYPOTHESES, False, travel, turn, hypotheses.doubts[0]), hypotheses.probability
-    for stage in hypotheses.stages:
+    if checks.doubts:
+        return TrialResult(ROBUSTNESS, False, travel, turn, checks.doubts[0]), checks.probability
+    for stage in checks.stages:
         held, reasons = 0, []
         with closing(hold_under(stage, grasp, stop)) as results:
             for item, result in zip(stage.items, results, strict=False):
@@ -287,10 +287,10 @@ def try_hypotheses(
                 if held == stage.least or len(reasons) > len(stage.items) - stage.least:
                     break
         if stop():
-            return TrialResult(HYPOTHESES, False, travel, turn, STOPPED), stage.though_failed
+            return TrialResult(ROBUSTNESS, False, travel, turn, STOPPED), stage.though_failed
         if held < min(stage.least, held + len(reasons)):
-            return TrialResult(HYPOTHESES, False, travel, turn, reasons[0]), stage.though_failed
-    return TrialResult(HYPOTHESES, True, travel, turn, ""), hypotheses.probability
+            return TrialResult(ROBUSTNESS, False, travel, turn, reasons[0]), stage.though_failed
+    return TrialResult(ROBUSTNESS, True, travel, turn, ""), checks.probability
 
 
 def held_shares(target: ObjectModel) -> HeldShares:

@@ -28,18 +28,18 @@ from graspd_core.verify.limits import FINENESS, LEAST_PAYLOAD, least_friction, p
 from graspd_core.verify.metrics import measure
 from graspd_core.verify.prepared_grasp import MetricsContext, make_metrics_context
 from graspd_core.verify.robustness import (
+    CheckStage,
     HoldUnder,
-    Hypotheses,
-    HypothesisStage,
     LaterWorld,
     Results,
+    RobustnessChecks,
     begin_in_thread,
     begin_other_worlds,
-    hypotheses_of,
     less_sure,
     one_by_one,
     results_in_order,
-    try_hypotheses,
+    robustness_checks_of,
+    try_robustness,
 )
 from graspd_core.verify.run_clock import Run
 from graspd_core.verify.trial_registry import TrialContext, build_worlds, grasp_trials
@@ -70,7 +70,7 @@ class VerificationContext:
 
     trials: TrialContext
     metrics: Callable[[], MetricsContext] | None
-    hypotheses: Hypotheses | None = None
+    checks: RobustnessChecks | None = None
     friction: bool = False
     heavy: float | None = None
 
@@ -81,7 +81,7 @@ class VerificationContext:
 
 
 @dataclass(frozen=True)
-class TrialsAhead:
+class Prefetched:
     """Worlds of the trials, which background threads build during the search.
 
     Attributes:
@@ -93,7 +93,7 @@ class TrialsAhead:
     others: tuple[LaterWorld, ...]
 
 
-def trials_ahead(run: Run, scene: Scene, hand: HandModel, verify: str, certainty: CertaintyConfig) -> TrialsAhead:
+def prefetch(run: Run, scene: Scene, hand: HandModel, verify: str, certainty: CertaintyConfig) -> Prefetched:
     """Start to build the trial worlds in background threads, which takes about as long as the optimiser.
 
     Only one object is cut at a time. An object is skipped if its run has ended. Otherwise work would pile up if runs
@@ -106,31 +106,31 @@ def trials_ahead(run: Run, scene: Scene, hand: HandModel, verify: str, certainty
 
     worlds = begin_in_thread("graspd-parts", build)
     protocol = at_friction(PROTOCOLS[verify], scene.object.friction)
-    return TrialsAhead(worlds, begin_other_worlds(run, scene, hand, protocol, certainty.probability))
+    return Prefetched(worlds, begin_other_worlds(run, scene, hand, protocol, certainty.probability))
 
 
 def make_trial_context(
     run: Run,
     scene: Scene,
     hand: HandModel,
-    ahead: TrialsAhead,
+    prefetched: Prefetched,
     certainty: CertaintyConfig,
     *,
     measure: bool,
     friction: bool = False,
 ) -> VerificationContext | None:
     """Wait for the worlds and return the context of the trials. Return None if the run ends first."""
-    while not run.over() and not wait([ahead.worlds], timeout=_POLL).done:
+    while not run.over() and not wait([prefetched.worlds], timeout=_POLL).done:
         pass
-    if run.over() or (worlds := ahead.worlds.result()) is None:
+    if run.over() or (worlds := prefetched.worlds.result()) is None:
         return None
-    hypotheses = hypotheses_of(scene, ahead.others, worlds, certainty.probability)
+    checks = robustness_checks_of(scene, prefetched.others, worlds, certainty.probability)
     make = lambda: replace(_metrics_context(scene, hand), world=worlds.alone)  # noqa: E731
-    return VerificationContext(worlds, make if measure else None, hypotheses, friction)
+    return VerificationContext(worlds, make if measure else None, checks, friction)
 
 
 def lighter(
-    scene: Scene, ahead: TrialsAhead, context: VerificationContext, certainty: CertaintyConfig, mass: float, most: float
+    scene: Scene, ahead: Prefetched, context: VerificationContext, certainty: CertaintyConfig, mass: float, most: float
 ) -> VerificationContext:
     """Return the context with a lower object `mass` [kg] than the assumed one.
 
@@ -141,10 +141,10 @@ def lighter(
     around = trials.around and altered(trials.around, mass=mass)
     trials = replace(trials, alone=altered(trials.alone, mass=mass), around=around)
     known = replace(scene, object=replace(scene.object, mass_assumed=False))
-    hypotheses = hypotheses_of(known, others, trials, certainty.probability)
-    if hypotheses is not None and (doubted := less_sure(hypotheses, most, scene.object.mass)).doubts:
-        hypotheses = doubted
-    return replace(context, trials=trials, hypotheses=hypotheses, heavy=scene.object.mass)
+    checks = robustness_checks_of(known, others, trials, certainty.probability)
+    if checks is not None and (doubted := less_sure(checks, most, scene.object.mass)).doubts:
+        checks = doubted
+    return replace(context, trials=trials, checks=checks, heavy=scene.object.mass)
 
 
 def payloads(context: VerificationContext, grasps: Sequence[Grasp], stop: StopHook) -> list[float]:
@@ -220,11 +220,11 @@ def run_trials(
     metrics: list[Future[GraspMetrics]] = []
     threads, doubted = torch.get_num_threads(), 0
     # If the scene itself is doubtful, no grasp can be verified. Then `count` unverified grasps are enough.
-    hopeless = context.hypotheses is not None and bool(context.hypotheses.doubts)
+    hopeless = context.checks is not None and bool(context.checks.doubts)
     first = None
     seen = None if run.watch is None else candidates_seen(candidates)
     # The first answer comes sooner if the best candidate runs several robustness checks in parallel.
-    alone = context.hypotheses is not None and not before
+    alone = context.checks is not None and not before
     # No trial gives more than one verified grasp.
     trials = _tried(run, context, candidates, alone, lambda: count - len(verified))
     with closing(trials), ThreadPoolExecutor(threads, thread_name_prefix="graspd-metrics") as pool:
@@ -265,28 +265,28 @@ def _tried(
     If `alone` is set, the first candidate runs several robustness checks in parallel. The others wait until it waits
     for a world or is done.
     """
-    threads, hypotheses = torch.get_num_threads(), context.hypotheses
+    threads, checks = torch.get_num_threads(), context.checks
     work = partial(_all_trials, context, one_by_one)
-    if alone and hypotheses is not None:
-        work = partial(_best_first, context, hypotheses, candidates[0], threads)
+    if alone and checks is not None:
+        work = partial(_best_first, context, checks, candidates[0], threads)
     return results_in_order(run.over, work, candidates, threads, needed, known_over=run.known_over)
 
 
 def _best_first(
-    context: VerificationContext, hypotheses: Hypotheses, best: Grasp, threads: int, grasp: Grasp, stop: StopHook
+    context: VerificationContext, checks: RobustnessChecks, best: Grasp, threads: int, grasp: Grasp, stop: StopHook
 ) -> Grasp:
     """Try a candidate. All but the best wait until the best one waits for a world or is done."""
     if grasp is not best:
-        while not hypotheses.waited_for.wait(_POLL) and not stop():
+        while not checks.waited_for.wait(_POLL) and not stop():
             pass
         return _all_trials(context, one_by_one, grasp, stop)
     try:
         return _all_trials(context, one_by_one if threads == 1 else partial(_at_once, threads), grasp, stop)
     finally:
-        hypotheses.waited_for.set()
+        checks.waited_for.set()
 
 
-def _at_once(threads: int, stage: HypothesisStage, grasp: Grasp, stop: StopHook) -> Results:
+def _at_once(threads: int, stage: CheckStage, grasp: Grasp, stop: StopHook) -> Results:
     """Run the checks that are needed in any case in parallel, then the others one by one."""
     first, others = stage.items[: stage.least], stage.items[stage.least :]
     yield from results_in_order(stop, lambda item, ended: item.hold(grasp, ended), first, threads, lambda: len(first))
@@ -295,13 +295,13 @@ def _at_once(threads: int, stage: HypothesisStage, grasp: Grasp, stop: StopHook)
 
 def _all_trials(context: VerificationContext, hold_under: HoldUnder, grasp: Grasp, stop: StopHook) -> Grasp:
     results = grasp_trials(context.trials, grasp, stop)
-    hypotheses, trials = context.hypotheses, context.trials
-    if not results[-1].passed or hypotheses is None:
+    checks, trials = context.checks, context.trials
+    if not results[-1].passed or checks is None:
         return replace(grasp, trials=results)
     if context.heavy is not None:
         most = payload(trials.alone, grasp, trials.protocol, least=context.mass, held=True, stop=stop)
-        hypotheses = less_sure(hypotheses, most, context.heavy)
-    under, probability = try_hypotheses(hypotheses, grasp, stop, hold_under)
+        checks = less_sure(checks, most, context.heavy)
+    under, probability = try_robustness(checks, grasp, stop, hold_under)
     return replace(grasp, trials=(*results, under), probability=probability)
 
 

@@ -84,7 +84,7 @@ class RequestBuilder:
     def latest(self, settings: Settings) -> SensorFrame:
         """Return the newest frame. Raises RequestError: none has arrived (with known reasons), or it is too old."""
         if self.newest is None:
-            why = "".join(f"; {told}" for told in self.missing.values())
+            why = "".join(f"; {reason}" for reason in self.missing.values())
             raise RequestError(ErrorCode.NO_CLOUD, f"no cloud or depth image has come yet{why}")
         self.newest.check(nanoseconds(self._now()), settings.cloud_max_age)
         return self.newest
@@ -122,20 +122,20 @@ class RequestBuilder:
         given = SourceInput(request_id, source.name, message, settings, listener, self._now(), self)
         request = source.find(given)
         steering, exclude = self._steering(message, request), tuple(message.exclude)
-        lost = [(told.header.frame_id, pose_matrix(told.pose, "exclude_poses")) for told in message.exclude_poses]
-        asked = {"steering": steering, "exclude": exclude, "exclude_poses": tuple(lost)}
-        return replace(request, closes_late=message.closes_late, **asked)
+        lost = [(pose.header.frame_id, pose_matrix(pose.pose, "exclude_poses")) for pose in message.exclude_poses]
+        fields = {"steering": steering, "exclude": exclude, "exclude_poses": tuple(lost)}
+        return replace(request, closes_late=message.closes_late, **fields)
 
     def _steering(self, message: GraspRequest, request: Request) -> Callable[[], Steering] | None:
         """Check the steering fields and return a function that also reads `region_mask`. None without constraints."""
-        if not _asks_for_any(message):
+        if not _has_constraints(message):
             return None
-        stamp, shown = message.header.stamp, request.shown
+        stamp, region_points = message.header.stamp, request.region_points
         lookup = lambda target, source: self.lookup(target, source, stamp)  # noqa: E731
         steering = steering_of(message, request.to_object(message.header.frame_id, np.eye(4), lookup))
-        if not message.region_mask.height or shown is None:
+        if not message.region_mask.height or region_points is None:
             return lambda: steering
-        return lambda: replace(steering, region=NearPoints(shown()))
+        return lambda: replace(steering, region=NearPoints(region_points()))
 
     def from_loader(
         self, request_id: str, header: Header, settings: Settings, load: Callable[[], Scene], listener: Listener | None
@@ -163,11 +163,11 @@ class RequestBuilder:
 def check_request(message: GraspRequest, hand: str) -> None:
     """Raise RequestError if a field is invalid on its own. `source_of` checks the source."""
     if message.id and not _ID.fullmatch(message.id):
-        shown = message.id[:MOST_ID]
-        raise bad_request(f"id: {shown!r}; valid: at most {MOST_ID} letters, digits and _.:@+-")
+        start = message.id[:MOST_ID]
+        raise bad_request(f"id: {start!r}; valid: at most {MOST_ID} letters, digits and _.:@+-")
     if message.hand not in ("", hand):
-        told = f"hand: {message.hand[:MOST_ID]!r} is not loaded; this node plans for {hand}"
-        raise RequestError(ErrorCode.WRONG_HAND, told)
+        fault = f"hand: {message.hand[:MOST_ID]!r} is not loaded; this node plans for {hand}"
+        raise RequestError(ErrorCode.WRONG_HAND, fault)
     if message.num_grasps > MOST_GRASPS:
         raise bad_request(f"num_grasps: {message.num_grasps}; valid: 1 to {MOST_GRASPS}, 0 for the parameter")
     # Only the node's owner may set a preset by path. A message must not make the node read files.
@@ -185,15 +185,15 @@ def check_request(message: GraspRequest, hand: str) -> None:
         near(message.target_point, "target_point")
         if message.source in (GraspRequest.MESH, GraspRequest.KNOWN):
             given = (message.mesh_uri or message.known_object)[:MOST_PATH]
-            told = f"given with {given}, a mesh; valid with CLOUD=0, LATEST_CLOUD=2 and VIEWS=3"
-            raise bad_request(f"target_point: {told}")
+            fault = f"given with {given}, a mesh; valid with CLOUD=0, LATEST_CLOUD=2 and VIEWS=3"
+            raise bad_request(f"target_point: {fault}")
     _check_camera_and_mask(message)
     if message.source not in (GraspRequest.MESH, GraspRequest.KNOWN) and any(message.surface.coef):
         raise bad_request(f"surface: given with source {message.source}, a cloud; valid with MESH=1 and KNOWN=4")
     if message.known_object and (message.source != GraspRequest.KNOWN or message.mesh_uri):
-        told = f"source {message.source}" if message.source != GraspRequest.KNOWN else "mesh_uri too"
+        fault = f"source {message.source}" if message.source != GraspRequest.KNOWN else "mesh_uri too"
         name = message.known_object[:MOST_ID]
-        raise bad_request(f"known_object: {name!r} with {told}; valid with KNOWN=4, without mesh_uri")
+        raise bad_request(f"known_object: {name!r} with {fault}; valid with KNOWN=4, without mesh_uri")
     if len(message.exclude) + len(message.exclude_poses) > MOST_EXCLUDED:
         counts = f"{len(message.exclude)} ids, {len(message.exclude_poses)} poses"
         raise bad_request(f"exclude: {counts}; valid: at most {MOST_EXCLUDED} together")
@@ -233,7 +233,7 @@ def _check_range(name: str, value: float, limits: tuple[float, float], unit: str
         raise bad_request(f"{name}: {value!r}; valid: {low:g} to {high:g} {unit}")
 
 
-def _asks_for_any(message: GraspRequest) -> bool:
+def _has_constraints(message: GraspRequest) -> bool:
     angles = message.approach_angle, message.roll, message.roll_tolerance
     masked = message.region_mask.height > 0
     return any((_direction(message), message.use_roll, *angles, message.region.dimensions, masked, message.avoid))
@@ -364,15 +364,15 @@ def frame_loader(
 
     def load() -> Scene:
         cloud = seen.seen_by_camera(frame, place, lookup)
-        told = frame.doubts(cloud)
+        warnings = frame.warnings(cloud)
         if mask is None:
             target = None if point is None else Target(point=point)
-            return seen.scene_of_views((seen.trimmed(cloud, settings),), settings, target, told)
-        points, shown = seen.masked_points(frame, mask)
+            return seen.scene_of_views((seen.trimmed(cloud, settings),), settings, target, warnings)
+        points, marks = seen.masked_points(frame, mask)
         marked = replace(cloud, points=points)
         inside = seen.within(marked, settings)
         marked = replace(marked, points=points[inside])
-        return seen.scene_of_views((marked,), settings, Target(mask=shown[inside]), told)
+        return seen.scene_of_views((marked,), settings, Target(mask=marks[inside]), warnings)
 
     return load
 
@@ -457,13 +457,13 @@ def _of_frame(given: SourceInput, frame: SensorFrame) -> Request:
     physics = f"{given.settings.mass} {given.settings.friction}"
     meant = "" if mask is not None else f"{point} {place} {given.settings.segment} {physics}"
     key = f"{frame.kind} {frame.frame} {nanoseconds(frame.stamp)} {meant}" if nanoseconds(frame.stamp) and meant else ""
-    shown = lambda: _shown(frame, message.region_mask)  # noqa: E731
-    return given.request(frame.frame, frame.stamp, load, object_key=key, shown=shown)
+    region_points = lambda: _region_points(frame, message.region_mask)  # noqa: E731
+    return given.request(frame.frame, frame.stamp, load, object_key=key, region_points=region_points)
 
 
-def _shown(frame: SensorFrame, mask: Image) -> Float[np.ndarray, "points 3"]:
-    points, shown = seen.masked_points(frame, mask, "region_mask")
-    return points[shown & np.isfinite(points).all(1)]
+def _region_points(frame: SensorFrame, mask: Image) -> Float[np.ndarray, "points 3"]:
+    points, marked = seen.masked_points(frame, mask, "region_mask")
+    return points[marked & np.isfinite(points).all(1)]
 
 
 def _target(given: SourceInput, frame: str) -> Float[np.ndarray, "3"] | None:

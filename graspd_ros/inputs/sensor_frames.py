@@ -26,7 +26,7 @@ from graspd_core.io.messages import (
     ORIGIN,
     CameraPlace,
     depth_and_camera,
-    frame_doubt,
+    frame_fault,
     image_size,
     no_lookup,
     pixels_from_message,
@@ -82,32 +82,32 @@ class SensorFrame:
         A `limit` of 0 means no limit.
         """
         if not self.frame.strip("/"):
-            told = f"the {self.kind} names no frame: its header.frame_id is empty, so that its grasps could be anywhere"
-            raise RequestError(ErrorCode.BAD_CLOUD, f"{told}; have its publisher set one")
+            text = f"the {self.kind} names no frame: its header.frame_id is empty, so that its grasps could be anywhere"
+            raise RequestError(ErrorCode.BAD_CLOUD, f"{text}; have its publisher set one")
         age = (now - (nanoseconds(self.stamp) or self.arrived)) * 1e-9
         if not limit or -limit <= age <= limit:
             return
-        told, hint = f"is {age:.1f} s old", "for a bag set use_sim_time, or cloud_max_age 0"
+        text, hint = f"is {age:.1f} s old", "for a bag set use_sim_time, or cloud_max_age 0"
         if age < 0:
-            told = f"has a stamp {-age:.1f} s in the future"
+            text = f"has a stamp {-age:.1f} s in the future"
             hint = "its clock is not the node's, or use_sim_time is set for one of them only"
         more = f"more than cloud_max_age={limit:g} s ({hint})"
-        raise RequestError(ErrorCode.STALE_CLOUD, f"the {self.kind} in {self.frame!r} {told}, {more}")
+        raise RequestError(ErrorCode.STALE_CLOUD, f"the {self.kind} in {self.frame!r} {text}, {more}")
 
-    def doubts(self, cloud: PointCloud) -> tuple[str, ...]:
+    def warnings(self, cloud: PointCloud) -> tuple[str, ...]:
         """Return warnings about a cloud, one sentence each: a stamp in the future, or a wrong frame orientation."""
         ahead = (nanoseconds(self.stamp) - self.arrived) * 1e-9
-        told = f"the {self.kind} came {ahead:.1f} s before its stamp: its clock is ahead of the node's"
+        early = f"the {self.kind} came {ahead:.1f} s before its stamp: its clock is ahead of the node's"
         # The orientation is checked only if the camera is at the frame's origin.
-        turned = "" if cloud.viewpoint.any() else frame_doubt(self.frame, cloud.points)
-        return tuple(said for said in (told if ahead > AHEAD else "", turned) if said)
+        turned = "" if cloud.viewpoint.any() else frame_fault(self.frame, cloud.points)
+        return tuple(said for said in (early if ahead > AHEAD else "", turned) if said)
 
 
 def cloud_frame(message: PointCloud2, arrived: int) -> SensorFrame:
     """Return a cloud message as a frame. Its points are read on use. Raises RequestError if the cloud is too large."""
     if len(message.data) > MOST_CLOUD_BYTES:
-        told = f"a cloud of {len(message.data)} bytes; at most {MOST_CLOUD_BYTES} are taken"
-        raise RequestError(ErrorCode.BAD_CLOUD, told)
+        fault = f"a cloud of {len(message.data)} bytes; at most {MOST_CLOUD_BYTES} are taken"
+        raise RequestError(ErrorCode.BAD_CLOUD, fault)
     header = message.header
     read = lambda place=ORIGIN, lookup=no_lookup: place.cloud(message, lookup)  # noqa: E731
     return SensorFrame(CLOUD, header.frame_id, header.stamp, arrived, read, lambda: pixels_from_message(message))
@@ -167,15 +167,15 @@ class ImagePairs:
         self._waiting = None
         return image, info
 
-    def doubt(self) -> str:
+    def unpaired(self) -> str:
         """Return one line about images without a matching CameraInfo. Empty if they match or wait under `UNPAIRED`."""
         if self._waiting is None or self._clock() - self._alone_since < UNPAIRED:
             return ""
         last = next(reversed(self._infos.values()), None)
-        of = "none" if last is None else _shown_kind(last)
+        of = "none" if last is None else _kind_text(last)
         return (
             f"depth images: {self._images} images and {self._calibrations} CameraInfos received, but no two match; "
-            f"last image: {_shown_kind(self._waiting)}, last CameraInfo: {of}; "
+            f"last image: {_kind_text(self._waiting)}, last CameraInfo: {of}; "
             "valid: a CameraInfo of the same frame and size"
         )
 
@@ -184,7 +184,7 @@ def _kind(message: Any) -> _Kind:
     return (message.header.frame_id.removeprefix("/"), *image_size(message))
 
 
-def _shown_kind(message: Any) -> str:
+def _kind_text(message: Any) -> str:
     frame, width, height = _kind(message)
     return f"{width} x {height} in {frame[:64]!r}"
 
@@ -227,10 +227,10 @@ def masked_points(
             f"pixels, as the {frame.kind} has"
         )
     if mask.step < width or len(mask.data) < (height - 1) * mask.step + width:
-        told = f"{name}: {len(mask.data)} bytes, step {mask.step}, are too few for {width} x {height} pixels"
-        raise bad_request(told)
-    shown = np.ndarray((height, width), np.uint8, memoryview(mask.data), 0, (mask.step, 1)) > 0
-    return np.where(np.isfinite(pixels), pixels, np.nan).reshape(-1, 3), shown.reshape(-1)
+        fault = f"{name}: {len(mask.data)} bytes, step {mask.step}, are too few for {width} x {height} pixels"
+        raise bad_request(fault)
+    marked = np.ndarray((height, width), np.uint8, memoryview(mask.data), 0, (mask.step, 1)) > 0
+    return np.where(np.isfinite(pixels), pixels, np.nan).reshape(-1, 3), marked.reshape(-1)
 
 
 @dataclass(frozen=True)
@@ -259,11 +259,11 @@ class Views:
 
 
 def scene_of_views(
-    views: tuple[PointCloud, ...], settings: Settings, target: Target | None, doubts: tuple[str, ...] = ()
+    views: tuple[PointCloud, ...], settings: Settings, target: Target | None, warnings: tuple[str, ...] = ()
 ) -> Scene:
     """Return the scene of clouds in a common frame. `target` selects the object in the same frame.
 
-    `doubts` become warnings of the object. Raises GraspdError if no usable object is found in the clouds, or the
+    `warnings` become warnings of the object. Raises GraspdError if no usable object is found in the clouds, or the
     `scene_config` file is no longer valid.
     """
     # Start the robustness variants of the shape in parallel with its distance grid, if grasps are verified.
@@ -278,7 +278,7 @@ def scene_of_views(
         friction=settings.friction,
         ahead=ahead,
     )
-    return replace(scene, object=replace(scene.object, warnings=(*doubts, *scene.object.warnings)))
+    return replace(scene, object=replace(scene.object, warnings=(*warnings, *scene.object.warnings)))
 
 
 def trimmed(cloud: PointCloud, settings: Settings) -> PointCloud:
@@ -295,8 +295,8 @@ def within(cloud: PointCloud, settings: Settings) -> Bool[np.ndarray, "n"]:
         return inside
     seen = points[np.isfinite(points).all(1)]
     span = f", they lie from {seen.min(0).round(3).tolist()} to {seen.max(0).round(3).tolist()}" if len(seen) else ""
-    told = (
+    fault = (
         f"none of {len(points)} points lies in the workspace, roi_min={settings.roi_min} to roi_max={settings.roi_max}"
     )
     unit = unit_hint((cloud,), WORKSPACE) if len(seen) else ""
-    raise RequestError(ErrorCode.BAD_CLOUD, f"{told}{span}{unit}")
+    raise RequestError(ErrorCode.BAD_CLOUD, f"{fault}{span}{unit}")

@@ -55,7 +55,7 @@ class SensorTopic:
         if instead_of is not None and self.name == node.resolve_topic_name(name, only_expand=True):
             self.name = instead_of.name + ending
         self._received = self._lost = 0
-        self._silent_since = self._told = -float("inf")
+        self._silent_since = self._reported = -float("inf")
         self._subscription: Subscription | None = None
         self._before: Subscription | None = None
         self._twice: set[int] = set()  # stamps that the old subscription received while both existed
@@ -140,8 +140,8 @@ class SensorTopic:
 
     def _on_lost(self, count: int) -> None:
         self._lost += count
-        if time.monotonic() - self._told >= REPEAT:
-            self._told = time.monotonic()
+        if time.monotonic() - self._reported >= REPEAT:
+            self._reported = time.monotonic()
             of = self._lost + self._received
             self._node.get_logger().warning(
                 f"{self.name}: {self._lost} of {of} messages were lost on the way: {REMEDY}"

@@ -22,7 +22,7 @@ from graspd_ros.convert import Matrix, moved_plane, moved_points, pose_matrix
 from graspd_ros.error_codes import RequestError, bad_request
 from graspd_ros.request import FrameLookup, Request
 
-MOST_THINGS = 1000
+MOST_OBJECTS = 1000
 # Number of dimensions of each kind of solid.
 _SIZES = {SolidPrimitive.BOX: 3, SolidPrimitive.SPHERE: 1, SolidPrimitive.CYLINDER: 2, SolidPrimitive.CONE: 2}
 
@@ -56,8 +56,8 @@ def _mesh(shape: Mesh, owner: str) -> TriangleMesh:
     vertices = np.array([[p.x, p.y, p.z] for p in shape.vertices]).reshape(-1, 3)
     faces = np.array([list(t.vertex_indices) for t in shape.triangles], dtype=np.int64).reshape(-1, 3)
     if not len(faces) or not np.isfinite(vertices).all() or faces.max() >= len(vertices):
-        told = f"meshes: {len(vertices)} vertices and {len(faces)} triangles"
-        raise bad_message(owner, f"{told}; valid: finite vertices, and triangles whose indices name them")
+        counts = f"meshes: {len(vertices)} vertices and {len(faces)} triangles"
+        raise bad_message(owner, f"{counts}; valid: finite vertices, and triangles whose indices name them")
     return TriangleMesh(vertices, faces)
 
 
@@ -119,21 +119,21 @@ def with_support(load: Callable[[], Scene], plane: Plane | None) -> Callable[[],
 
 
 @dataclass(frozen=True, eq=False)
-class Thing:
+class SceneObject:
     """Collision object of the planning scene.
 
     Attributes:
         frame: frame of the pose.
-        T_frame_thing: pose of the object in `frame` [m].
+        T_frame_object: pose of the object in `frame` [m].
         shapes: meshes in the object's own frame [m].
     """
 
     frame: str
-    T_frame_thing: Matrix
+    T_frame_object: Matrix
     shapes: tuple[TriangleMesh, ...]
 
 
-def changed_things(things: Mapping[str, Thing], message: Any) -> Mapping[str, Thing]:
+def updated_objects(objects: Mapping[str, SceneObject], message: Any) -> Mapping[str, SceneObject]:
     """Return a copy of the collision objects, by id, updated with a `moveit_msgs/CollisionObject`.
 
     Raises RequestError if the id is unknown, or a shape, pose or operation is invalid.
@@ -146,17 +146,17 @@ def changed_things(things: Mapping[str, Thing], message: Any) -> Mapping[str, Th
         raise bad_message(owner, "id: empty; valid: a name; REMOVE alone may have none, and then removes all objects")
     if operation not in operations:
         raise bad_message(owner, f"operation: {operation[0]}; valid: ADD=0, REMOVE=1, APPEND=2, MOVE=3")
-    there = things.get(name)
+    there = objects.get(name)
     if there is None and operation in (message.REMOVE, message.MOVE):
-        raise bad_message(owner, f"{operations[operation]}: unknown id; known: {', '.join(things) or 'none'}")
+        raise bad_message(owner, f"{operations[operation]}: unknown id; known: {', '.join(objects) or 'none'}")
     if operation == message.REMOVE:
-        return {other: thing for other, thing in things.items() if other != name}
-    if there is None and len(things) >= MOST_THINGS:
-        raise bad_message(owner, f"{MOST_THINGS} collision objects are kept already; REMOVE some")
-    return {**things, name: _changed(there, message, owner)}
+        return {other: kept for other, kept in objects.items() if other != name}
+    if there is None and len(objects) >= MOST_OBJECTS:
+        raise bad_message(owner, f"{MOST_OBJECTS} collision objects are kept already; REMOVE some")
+    return {**objects, name: _changed(there, message, owner)}
 
 
-def _changed(there: Thing | None, message: Any, owner: str) -> Thing:
+def _changed(there: SceneObject | None, message: Any, owner: str) -> SceneObject:
     if message.planes:
         raise bad_message(owner, "planes: not supported, since they are infinite; give a box, or the request's surface")
     solids = primitive_shapes(message.primitives, message.primitive_poses, owner)
@@ -170,19 +170,19 @@ def _changed(there: Thing | None, message: Any, owner: str) -> Thing:
     if message.operation == message.MOVE and there is not None:
         if shapes:
             raise bad_message(owner, "MOVE with shapes; give ADD, or no shapes")
-        return Thing(frame, T, there.shapes)
+        return SceneObject(frame, T, there.shapes)
     if not shapes:
         raise bad_message(owner, "no primitives and no meshes; give one of them")
-    return Thing(frame, T, shapes)
+    return SceneObject(frame, T, shapes)
 
 
-def among_things(request: Request, lookup: FrameLookup) -> Request:
-    """Return the request with a loader that adds its collision objects (`things`) to the scene as obstacles.
+def with_collision_objects(request: Request, lookup: FrameLookup) -> Request:
+    """Return the request with a loader that adds its `collision_objects` to the scene as obstacles.
 
     `lookup` transforms between frames at the request's time. Raises TransformError: an object's frame is unknown.
     """
     settings, load = request.settings, request.load
-    placed = {name: _thing_shapes(name, thing, request, lookup) for name, thing in request.things.items()}
+    placed = {name: _placed_shapes(name, kept, request, lookup) for name, kept in request.collision_objects.items()}
 
     def loaded() -> Scene:
         config = load_scene_config(settings.scene_config) if settings.scene_config else SceneConfig()
@@ -191,9 +191,9 @@ def among_things(request: Request, lookup: FrameLookup) -> Request:
     return replace(request, load=loaded)
 
 
-def _thing_shapes(name: str, thing: Thing, request: Request, lookup: FrameLookup) -> list[TriangleMesh]:
+def _placed_shapes(name: str, neighbour: SceneObject, request: Request, lookup: FrameLookup) -> list[TriangleMesh]:
     try:
-        T = request.to_object(thing.frame, thing.T_frame_thing, lookup)
+        T = request.to_object(neighbour.frame, neighbour.T_frame_object, lookup)
     except TransformError as error:
         raise TransformError(f"collision object {name!r}: {error}") from None
-    return [moved_mesh(shape, T) for shape in thing.shapes]
+    return [moved_mesh(shape, T) for shape in neighbour.shapes]

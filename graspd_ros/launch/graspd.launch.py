@@ -41,9 +41,9 @@ def given(values: dict[str, str]) -> dict[str, str | bool]:
 
 
 def _argument(name: str) -> DeclareLaunchArgument:
-    default, told = ARGUMENTS[name]
-    told += "; empty: as the parameter file says" if name in PARAMETERS else ""
-    return DeclareLaunchArgument(name, default_value=default, description=told)
+    default, text = ARGUMENTS[name]
+    text += "; empty: as the parameter file says" if name in PARAMETERS else ""
+    return DeclareLaunchArgument(name, default_value=default, description=text)
 
 
 def _node(context) -> list[Node]:

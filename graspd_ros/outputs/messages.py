@@ -296,7 +296,7 @@ def trajectory_of(grasp: Grasp, hand: HandModel, pace: Pace) -> JointTrajectory:
     It contains only the driven joints, because controllers refuse others. Coupled joints follow without a command.
     Positions are within the joint limits. The last point is a target inside the object, which joints do not reach.
     """
-    times = stage_times(grasp, hand, pace)
+    times = posture_times(grasp, hand, pace)
     return JointTrajectory(
         header=Header(frame_id=hand.base_link),
         joint_names=list(hand.joint_names),
@@ -309,18 +309,18 @@ def base_poses(grasp: Grasp, frame: str, stamp: Time) -> list[PoseStamped]:
     return [PoseStamped(header=Header(frame_id=frame, stamp=stamp), pose=pose_of_posture(p)) for p in _postures(grasp)]
 
 
-def stage_times(grasp: Grasp, hand: HandModel, pace: Pace) -> tuple[float, float, float]:
+def posture_times(grasp: Grasp, hand: HandModel, pace: Pace) -> tuple[float, float, float]:
     """Return the times of pregrasp, grasp and squeeze from the start of the trajectory [s].
 
     The first time lets every joint cross its whole range. The base is assumed to be at the pregrasp by then.
     """
     speed = _greatest_speeds(hand, pace)
     first = max(pace.shortest, _PEAK * float(np.max((hand.upper - hand.lower) / speed, initial=0.0)))
-    closing = _stage_time(grasp.pregrasp, grasp.grasp, speed, pace)
-    return first, first + closing, first + closing + _stage_time(grasp.grasp, grasp.squeeze, speed, pace)
+    closing = _move_time(grasp.pregrasp, grasp.grasp, speed, pace)
+    return first, first + closing, first + closing + _move_time(grasp.grasp, grasp.squeeze, speed, pace)
 
 
-def _stage_time(start: Posture, end: Posture, speed: np.ndarray, pace: Pace) -> float:
+def _move_time(start: Posture, end: Posture, speed: np.ndarray, pace: Pace) -> float:
     joints = float(np.max(np.abs(end.joint_positions - start.joint_positions) / speed, initial=0.0))
     travel = float(np.linalg.norm(end.position - start.position)) / pace.base_speed
     # q and -q are the same rotation. Take the smaller angle.
@@ -357,9 +357,9 @@ def arm_trajectory(grasp: Grasp, path: ArmPath, pace: Pace) -> JointTrajectory:
     """
     from graspd_core.arms.arm_paths import LIFT
 
-    way = float(np.linalg.norm(grasp.grasp.position - grasp.pregrasp.position))
+    approach = float(np.linalg.norm(grasp.grasp.position - grasp.pregrasp.position))
     times = [pace.shortest]
-    for first, last, travel in zip(path.stages, path.stages[1:], (RETREAT, way, LIFT), strict=False):
+    for first, last, travel in zip(path.stages, path.stages[1:], (RETREAT, approach, LIFT), strict=False):
         fastest = float(np.abs(np.diff(path.positions[first : last + 1], axis=0)).max()) * (last - first)
         seconds = max(pace.shortest, _PEAK * fastest / pace.joint_speed, _PEAK * travel / pace.base_speed)
         times += (times[-1] + seconds * np.arange(1, last - first + 1) / (last - first)).tolist()
@@ -401,18 +401,18 @@ def result_markers(
     frame: str,
     stamp: Time,
     *,
-    shown: int = 1,
+    most: int = 1,
     parts: Sequence[str] = USUAL_PARTS,
     solids: Sequence[Primitive] | None = None,
 ) -> MarkerArray:
-    """Return the markers of the best `shown` grasps. `solids` draw the hand. If None, its collision solids are used.
+    """Return the markers of the best `most` grasps. `solids` draw the hand. If None, its collision solids are used.
 
     The first marker deletes all earlier ones, so that a result without grasps clears the display.
     """
     header = Header(frame_id=frame, stamp=stamp)
     markers = [Marker(header=header, action=Marker.DELETEALL)]
     for rank, grasp in enumerate(grasps):
-        made = _parts_of(grasp, rank, hand, hand.primitives if solids is None else solids) if rank < shown else {}
+        made = _parts_of(grasp, rank, hand, hand.primitives if solids is None else solids) if rank < most else {}
         if grasp.verdict is Verdict.FAILED:
             made["rejected"] = lambda grasp=grasp, rank=rank: _rejected(grasp, rank)
         for namespace in parts:

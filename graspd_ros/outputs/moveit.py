@@ -69,7 +69,7 @@ def moveit_grasp(
         # At the end of MoveIt's approach the hand is still open.
         T_frame_base = matrix_of_pose(grasp.arrival_pose)
         first.positions = [waits[name] for name in grasp.trajectory.joint_names]
-    way = T_frame_base[:3, 3] - matrix_of_pose(grasp.pregrasp_pose)[:3, 3]
+    approach = T_frame_base[:3, 3] - matrix_of_pose(grasp.pregrasp_pose)[:3, 3]
     T_base_parent = np.eye(4) if T_parent_base is None else np.linalg.inv(T_parent_base)
     if T_parent_base is None and grasp.mount_link:
         T_base_parent = np.linalg.inv(T_frame_grasp) @ matrix_of_pose(grasp.mount_grasp_pose)
@@ -83,7 +83,7 @@ def moveit_grasp(
         grasp_posture=_posture(grasp, closing, since=first),
         grasp_pose=PoseStamped(header=grasp.header, pose=pose),
         grasp_quality=quality,
-        pre_grasp_approach=_translation(messages, way, grasp.header.frame_id, float(np.linalg.norm(way))),
+        pre_grasp_approach=_translation(messages, approach, grasp.header.frame_id, float(np.linalg.norm(approach))),
         post_grasp_retreat=_translation(messages, up, retreat_frame, retreat_distance),
         allowed_touch_objects=list(touch),
     )
@@ -93,8 +93,8 @@ def _posture(grasp: Grasp, points: list[Any], since: Any = None) -> JointTraject
     began = nanoseconds(since.time_from_start) if since else 0
     for point in points:
         set_nanoseconds(point.time_from_start, nanoseconds(point.time_from_start) - began)
-    way = grasp.trajectory
-    return JointTrajectory(header=way.header, joint_names=list(way.joint_names), points=points)
+    trajectory = grasp.trajectory
+    return JointTrajectory(header=trajectory.header, joint_names=list(trajectory.joint_names), points=points)
 
 
 def _translation(messages: ModuleType, direction: np.ndarray, frame: str, distance: float) -> Any:

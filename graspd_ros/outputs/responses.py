@@ -252,7 +252,7 @@ class Publishers:
             if not self._closed:
                 self._publishers[type(message)].publish(message)
 
-    def tell(self, event: str, request_id: str, source: str, **details: Any) -> None:
+    def emit(self, event: str, request_id: str, source: str, **details: Any) -> None:
         """Publish one event on ~/status."""
         stamp = self._node.get_clock().now().nanoseconds * 1e-9
         line = {"event": event, "request": request_id, "source": source, "stamp": stamp, **details}
@@ -283,7 +283,7 @@ class Responses:
         self._hand = hand
         self._visuals: Sequence[Primitive] | None = None
         self._superseded = 0
-        self._superseded_told = self._complained = -float("inf")
+        self._superseded_reported = self._complained = -float("inf")
 
     def forget(self) -> None:
         """Reset counters and latched topics. Only the last answer stays available to late subscribers."""
@@ -304,7 +304,7 @@ class Responses:
         """Answer an invalid request message with status REFUSED."""
         code, message = code_of(error), sentence_of(error)
         if code is ErrorCode.INTERNAL:
-            self.tell_error(request_id[:MOST_ID], source, error)
+            self.report_error(request_id[:MOST_ID], source, error)
         else:
             self._refused(request_id[:MOST_ID], source, code, message)
         ending = messages.AnswerEnding(GraspArray.REFUSED, code, message)
@@ -317,36 +317,36 @@ class Responses:
             self._complained = time.monotonic()
             self.not_made(request_id, "cloud", error)
 
-    def thing_not_taken(self, error: Exception) -> None:
+    def collision_object_not_taken(self, error: Exception) -> None:
         """Report an invalid collision-object message. The planning scene stays unchanged."""
         self._refused("", "collision_objects", code_of(error), sentence_of(error))
 
-    def images_not_taken(self, told: str) -> None:
+    def images_not_taken(self, reason: str) -> None:
         """Report why no incoming depth image is used."""
-        self._refused("", "sensors", ErrorCode.NO_CLOUD, told)
+        self._refused("", "sensors", ErrorCode.NO_CLOUD, reason)
 
     def _refused(self, request_id: str, source: str, code: ErrorCode, message: str) -> None:
-        self.publishers.tell("refused", request_id, source, code=code, message=message)
+        self.publishers.emit("refused", request_id, source, code=code, message=message)
         self._log().warning(f"{request_id or source}: refused: {message}")
 
     def _accepted(self, request: Request, ahead: int) -> None:
         self.counters.count(ACCEPTED)
-        self.publishers.tell("accepted", request.id, request.source, ahead=ahead)
+        self.publishers.emit("accepted", request.id, request.source, ahead=ahead)
         if ahead:
-            header, told = Header(frame_id=request.frame_out, stamp=self._now()), f"queued: {ahead} ahead"
-            self._report(request, GraspProgress(header=header, request_id=request.id, stage="queued", message=told))
+            header, message = Header(frame_id=request.frame_out, stamp=self._now()), f"queued: {ahead} ahead"
+            self._report(request, GraspProgress(header=header, request_id=request.id, stage="queued", message=message))
 
     def started(self, request: Request) -> None:
         """Report that the worker starts an `only_newest` request. Other requests were reported on submission."""
         if request.only_newest:
-            self._tell_superseded(request.id)
+            self._report_superseded(request.id)
             self._accepted(request, 0)
 
     def progress_hook(self, request: Request) -> ProgressHook:
         """Return a hook that publishes progress at most at `progress_rate`, and passes each grasp to the listener."""
         lowest, last, period = math.inf, -math.inf, 1 / request.settings.progress_rate
 
-        def tell(progress: Progress) -> None:
+        def publish_progress(progress: Progress) -> None:
             nonlocal lowest, last
             if (now := time.monotonic()) - last < period:
                 return
@@ -355,7 +355,7 @@ class Responses:
                 lowest = min(lowest, progress.best)
             progress = dataclasses.replace(progress, best=lowest if math.isfinite(lowest) else 0.0)
             event = {**progress_event(progress), "elapsed": elapsed}
-            self.publishers.tell("progress", request.id, request.source, **event)
+            self.publishers.emit("progress", request.id, request.source, **event)
             message = messages.progress_message(progress, request.id, request.frame_out, self._now(), elapsed)
             self._report(request, message)
 
@@ -364,7 +364,7 @@ class Responses:
                 rank, header = progress.verified - 1, Header(frame_id=request.frame_out, stamp=request.stamp)
                 found = messages.grasp_message(progress.found, rank, request.id, header, self._hand, _pace(request))
                 request.listener.found(found)
-            tell(progress)
+            publish_progress(progress)
 
         return hook
 
@@ -385,7 +385,7 @@ class Responses:
 
     def _finished(self, request: Request, report: Report[Planned]) -> None:
         if report.error is not None:
-            self.tell_error(request.id, request.source, report.error)
+            self.report_error(request.id, request.source, report.error)
             code, message = code_of(report.error), sentence_of(report.error)
             answer = self._answer(request, messages.AnswerEnding(GraspArray.FAILED, code, message))
             self._publish(answer, request.listener)
@@ -394,12 +394,12 @@ class Responses:
         elif report.ending is WorkerEnding.SUPERSEDED and request.only_newest and report.value is None:
             self._superseded += 1
             self.counters.count(SUPERSEDED)
-            if time.monotonic() - self._superseded_told >= COUNT_PERIOD:
-                self._tell_superseded(request.id)
+            if time.monotonic() - self._superseded_reported >= COUNT_PERIOD:
+                self._report_superseded(request.id)
         else:
             found = {"result": report.value.result, **_weight(report.value)} if report.value else {}
             answer = self._answer(request, dataclasses.replace(_ENDINGS[report.ending], **found))
-            self.publishers.tell(report.ending.value, request.id, request.source)
+            self.publishers.emit(report.ending.value, request.id, request.source)
             self._publish(answer, request.listener)
 
     def _result(self, request: Request, planned: Planned) -> None:
@@ -408,20 +408,20 @@ class Responses:
         ending = dataclasses.replace(messages.ending_of(result), **_weight(planned))
         answer = self._answer(request, ending)
         event = {**result_event(result), **_weight(planned)}
-        shown = []
+        latched = []
         best = presentable(result)
         if best is not None:
-            shown.append(messages.joint_message(best.grasp, hand, request.stamp))
+            latched.append(messages.joint_message(best.grasp, hand, request.stamp))
             header = Header(frame_id=request.frame_out, stamp=request.stamp)
-            shown.append(PoseStamped(header=header, pose=pose_of_posture(best.grasp)))
-            shown.append(next(iter(answer.grasps)).trajectory)
+            latched.append(PoseStamped(header=header, pose=pose_of_posture(best.grasp)))
+            latched.append(next(iter(answer.grasps)).trajectory)
         if request.settings.publish_markers and planned.worked_on:
             settings = request.settings
-            look = {"shown": settings.marker_grasps, "parts": settings.marker_parts, "solids": self.drawn(settings)}
-            shown.append(result_markers(result.tried, hand, request.frame_out, request.stamp, **look))
-        for message in shown:
+            look = {"most": settings.marker_grasps, "parts": settings.marker_parts, "solids": self.drawn(settings)}
+            latched.append(result_markers(result.tried, hand, request.frame_out, request.stamp, **look))
+        for message in latched:
             self.publishers.publish(message)
-        self.publishers.tell("result", request.id, request.source, frame=request.frame_out, file=planned.file, **event)
+        self.publishers.emit("result", request.id, request.source, frame=request.frame_out, file=planned.file, **event)
         self._log().info(f"{request.id}: {event['verified']} of {event['grasps']} verified: {event['message']}")
         self.counters.planned(result, request.elapsed())
         self._publish(answer, request.listener)
@@ -456,23 +456,23 @@ class Responses:
     def nothing_to_cancel(self, request_id: str) -> None:
         """Report a cancel without a matching request. This is common and harmless."""
         message = f"cancel: no request {request_id!r} is waiting or running"
-        self.publishers.tell("error", request_id, "cancel", kind="NotFound", code=ErrorCode.NOT_FOUND, message=message)
+        self.publishers.emit("error", request_id, "cancel", kind="NotFound", code=ErrorCode.NOT_FOUND, message=message)
         self._log().debug(message)
 
-    def tell_error(self, request_id: str, source: str, error: BaseException) -> None:
+    def report_error(self, request_id: str, source: str, error: BaseException) -> None:
         """Report an error on ~/status and in the log."""
         message, kind, code = sentence_of(error), type(error).__name__, code_of(error)
-        self.publishers.tell("error", request_id, source, kind=kind, code=code, message=message)
+        self.publishers.emit("error", request_id, source, kind=kind, code=code, message=message)
         expected = isinstance(error, GraspdError | OSError)
         detail = "" if expected else "\n" + "".join(traceback.format_exception(error))
         self._log().error(f"{request_id or source}: {message}{detail}")
 
-    def _tell_superseded(self, request_id: str) -> None:
+    def _report_superseded(self, request_id: str) -> None:
         """Publish the number of superseded clouds since the last report, and reset it."""
         count, self._superseded = self._superseded, 0
         if count:
-            self._superseded_told = time.monotonic()
-            self.publishers.tell("superseded", request_id, "cloud", count=count)
+            self._superseded_reported = time.monotonic()
+            self.publishers.emit("superseded", request_id, "cloud", count=count)
 
     def _now(self) -> Time:
         return self._node.get_clock().now().to_msg()
@@ -498,8 +498,8 @@ def presentable(result: GraspResult) -> Grasp | None:
 
 def progress_event(progress: Progress) -> dict[str, Any]:
     """Return a progress report as a JSON-ready event. `fraction` refers to the current stage."""
-    told = {name: value for name, value in vars(progress).items() if name != "found"}
-    return {**told, "fraction": messages.fraction_of(progress)}
+    values = {name: value for name, value in vars(progress).items() if name != "found"}
+    return {**values, "fraction": messages.fraction_of(progress)}
 
 
 def result_event(result: GraspResult) -> dict[str, Any]:

@@ -17,7 +17,7 @@ from scipy.spatial import ConvexHull
 from graspd_core import load_hand, load_scene, make_shape
 from graspd_core.arms.arm import Arm, arm_links, capsules_about, placed, segment_distance, tip_hand
 from graspd_core.arms.arm_collision import hits_of_hand, hits_of_scene, hits_of_self, hits_of_support
-from graspd_core.arms.arm_paths import LARGEST_JUMP, LIFT, STAGE_ROWS, ArmTask, arm_paths, hand_ways, make_task
+from graspd_core.arms.arm_paths import LARGEST_JUMP, LIFT, STAGE_ROWS, ArmTask, arm_paths, hand_paths, make_task
 from graspd_core.arms.inverse_kinematics import random_postures
 from graspd_core.hands.kinematics import RETREAT, forward, make_kinematics
 from graspd_core.hands.model import HandModel, Primitive, PrimitiveKind
@@ -60,12 +60,12 @@ def task_of(arm: Arm, hand: HandModel, scene: Scene, away: float) -> ArmTask:
 def test_the_way_of_a_hand_is_that_of_the_trial(hand: HandModel):
     """It retreats as far as the trials come from; rows of the stages are where the postures say."""
     grasp = from_above(hand, 0.2, 0.5)
-    way = hand_ways([grasp], hand.approach, np.array([0.0, 0.0, 1.0]))
+    way = hand_paths([grasp], hand.approach, np.array([0.0, 0.0, 1.0]))
     heights = way.translation[0, list(STAGE_ROWS), 2].tolist()
     assert heights == pytest.approx([0.23 + RETREAT, 0.23, 0.2, 0.2 + LIFT])
     assert way.translation.diff(dim=1).norm(dim=-1).max() < 0.025
     again = replace(grasp.grasp, quaternion_wxyz=-grasp.grasp.quaternion_wxyz)
-    other = hand_ways([replace(grasp, grasp=again)], hand.approach, np.array([0.0, 0.0, 1.0]))
+    other = hand_paths([replace(grasp, grasp=again)], hand.approach, np.array([0.0, 0.0, 1.0]))
     assert torch.allclose(other.rotation, way.rotation)
 
 
@@ -85,7 +85,7 @@ def test_a_way_goes_where_the_hand_goes_within_limits_without_jump_or_hit(arm, h
         assert np.abs(np.diff(path.positions, axis=0)).max() <= LARGEST_JUMP
         links = arm_links(arm, q)
         carried = task.base.compose(links[:, arm.tip].compose(tip_hand(arm, hand)))
-        wanted = hand_ways([grasp], hand.approach, task.up)[0]
+        wanted = hand_paths([grasp], hand.approach, task.up)[0]
         assert torch.allclose(carried.translation, wanted.translation, atol=2e-4)
         assert torch.allclose(carried.rotation, wanted.rotation, atol=2e-3)
         assert np.array_equal(path.at("grasp"), path.positions[STAGE_ROWS[2]])

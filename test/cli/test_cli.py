@@ -231,9 +231,9 @@ def test_grasps_come_from_where_they_are_asked_to(tmp_path: Path, capsys: pytest
 def test_the_first_interrupt_ends_the_run_and_the_second_the_process(number: signal.Signals):
     before = signal.getsignal(number)
     with Interrupt() as interrupt:
-        assert not interrupt.came()
+        assert not interrupt.is_interrupted()
         signal.raise_signal(number)
-        assert interrupt.came()
+        assert interrupt.is_interrupted()
         with pytest.raises(KeyboardInterrupt):
             signal.raise_signal(number)
     assert signal.getsignal(number) is before
@@ -415,7 +415,7 @@ def test_a_long_recording_is_not_fused_whole(bags, capsys, monkeypatch, quick):
 
 
 def test_ctrl_c_ends_a_recording_of_which_every_cloud_is_refused(bags, capsys, monkeypatch, quick):
-    monkeypatch.setattr(Interrupt, "came", lambda self: True)
+    monkeypatch.setattr(Interrupt, "is_interrupted", lambda self: True)
     assert main(["replay", str(bags["hopeless"]), *quick]) == EXIT_INTERRUPTED
     assert capsys.readouterr().out.startswith("0 scenes: ")
 

@@ -70,7 +70,7 @@ def test_quiet_leaves_the_result_alone(capsys: pytest.CaptureFixture[str]):
     # What is wrong is told, and the next command speaks again.
     assert main(["synthesize", "shape:bxo", "--quiet"]) == EXIT_BAD_INPUT
     assert capsys.readouterr().err == "graspd: unknown shape 'bxo'; did you mean 'box'?\n"
-    assert output._asked == output._Asked()
+    assert output._settings == output._OutputSettings()
 
 
 def test_json_of_synthesize_is_the_document_of_the_file(tmp_path: Path, capsys: pytest.CaptureFixture[str]):

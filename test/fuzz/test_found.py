@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from graspd_core.errors import BagError, shown
+from graspd_core.errors import BagError, short_repr
 from graspd_core.io.bags import CLOUD, read_frames
 from graspd_core.perception.cloud.cloud_files import load_views
 
@@ -294,4 +294,4 @@ def test_what_is_shown_is_short() -> None:
     endless: list[object] = []
     endless.append(endless)
     values = (10**5000, "x" * 10**6, {n: [n] * 1000 for n in range(1000)}, endless, json.loads("[" * 500 + "]" * 500))
-    assert max(len(shown(value)) for value in values) < 1000
+    assert max(len(short_repr(value)) for value in values) < 1000

@@ -19,7 +19,7 @@ from graspd_core.optimize.closed_form.closed_form_config import ClosedFormConfig
 from graspd_core.optimize.loop import Hooks, Poses, pack, unpack
 from graspd_core.optimize.obstacle_distance import (
     WIDE,
-    gap_on_the_way,
+    gap_on_path,
     hand_reach,
     least_gap,
     make_obstacle_tensors,
@@ -204,7 +204,7 @@ def test_no_candidate_reaches_through_the_table_or_a_wall(hand, scenes):
             Poses(*(torch.as_tensor(x)[None] for x in (p.position, grasp.grasp.quaternion_wxyz, p.joint_positions)))
             for p in (grasp.pregrasp, grasp.grasp)
         ]
-        assert -float(gap_on_the_way(obstacles, kinematics, ends[0], ends[1])) < 0.0016
+        assert -float(gap_on_path(obstacles, kinematics, ends[0], ends[1])) < 0.0016
 
 
 SETTINGS = ProblemConfig(candidates=200, features=24)

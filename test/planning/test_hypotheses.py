@@ -27,22 +27,22 @@ from graspd_core.mesh.convex_parts import convex_parts
 from graspd_core.perception import scene as scene_module
 from graspd_core.perception.reconstruct.merge_views import Evidence
 from graspd_core.perception.scene import COARSE_CUTS, ObjectModel, Scene, object_parts
-from graspd_core.types import HYPOTHESES, Grasp, GraspResult, Posture, StopHook, TrialResult, Verdict
+from graspd_core.types import ROBUSTNESS, Grasp, GraspResult, Posture, StopHook, TrialResult, Verdict
 from graspd_core.verify import robustness as hypotheses
 from graspd_core.verify import verification
 from graspd_core.verify.hold_trial import hold_trial
 from graspd_core.verify.limits import payload
 from graspd_core.verify.robustness import (
-    Hypotheses,
-    Hypothesis,
-    HypothesisStage,
+    CheckStage,
     LaterWorld,
+    RobustnessCheck,
+    RobustnessChecks,
     begin_in_thread,
     begin_other_shapes,
     begin_other_worlds,
-    hypotheses_of,
     less_sure,
-    try_hypotheses,
+    robustness_checks_of,
+    try_robustness,
 )
 from graspd_core.verify.run_clock import Run
 from graspd_core.verify.trial_registry import TrialContext, build_worlds
@@ -84,18 +84,18 @@ def planned(shift: tuple[float, float, float] = (0.0, 0.0, 0.0)) -> GraspResult:
 FAILED, PASSED = (0.5, 0.6), 0.9
 
 
-def under(*stages: Sequence[bool | None], least: int | None = None) -> Hypotheses:
+def under(*stages: Sequence[bool | None], least: int | None = None) -> RobustnessChecks:
     """Hypotheses that a grasp passes, fails, or that cannot be tried. `least` of a stage must hold it, or all."""
 
-    def hypothesis(number: str, held: bool | None) -> Hypothesis:
+    def hypothesis(number: str, held: bool | None) -> RobustnessCheck:
         result = None
         if held is not None:
             result = TrialResult("hold", held, 0.01 * int(number[-1]), 0.0, "" if held else "the object moved")
-        return Hypothesis(f"number {number}", lambda grasp, stop: result)
+        return RobustnessCheck(f"number {number}", lambda grasp, stop: result)
 
     made = [tuple(hypothesis(f"{i}.{j}", held) for j, held in enumerate(stage)) for i, stage in enumerate(stages)]
     wanted = [len(items) if least is None else least for items in made]
-    return Hypotheses(tuple(map(HypothesisStage, made, wanted, FAILED)), PASSED)
+    return RobustnessChecks(tuple(map(CheckStage, made, wanted, FAILED)), PASSED)
 
 
 @pytest.mark.parametrize(
@@ -109,8 +109,8 @@ def under(*stages: Sequence[bool | None], least: int | None = None) -> Hypothese
     ],
 )
 def test_a_grasp_must_hold_under_all_that_can_be_tried(passed, verified, probability, travel, reason):
-    result, likely = try_hypotheses(under(*passed), GRASP, lambda: False)
-    assert (result.name, result.passed, likely) == (HYPOTHESES, verified, probability)
+    result, likely = try_robustness(under(*passed), GRASP, lambda: False)
+    assert (result.name, result.passed, likely) == (ROBUSTNESS, verified, probability)
     assert result.reason == (f"fails under {reason}" if reason else "")
     assert result.displacement == travel
 
@@ -129,8 +129,8 @@ def test_a_grasp_must_hold_under_all_that_can_be_tried(passed, verified, probabi
 )
 def test_where_some_must_hold_it_more_may_fail_and_what_there_is_not_counts_nowhere(passed, verified):
     asked = under(passed, least=2)
-    assert try_hypotheses(asked, GRASP, lambda: False)[0].passed == verified
-    assert try_hypotheses(asked, GRASP, lambda: False, partial(verification._at_once, 2))[0].passed == verified
+    assert try_robustness(asked, GRASP, lambda: False)[0].passed == verified
+    assert try_robustness(asked, GRASP, lambda: False, partial(verification._at_once, 2))[0].passed == verified
 
 
 _STAGE = st.lists(st.sampled_from([True, True, True, False, None]), max_size=5)
@@ -139,8 +139,8 @@ _STAGE = st.lists(st.sampled_from([True, True, True, False, None]), max_size=5)
 @given(st.lists(_STAGE, min_size=1, max_size=2), st.integers(2, 4))
 def test_several_at_a_time_come_to_the_same(passed, threads):
     asked, together = under(*passed), partial(verification._at_once, threads)
-    one = try_hypotheses(asked, GRASP, lambda: False)
-    assert one == try_hypotheses(asked, GRASP, lambda: False, together)
+    one = try_robustness(asked, GRASP, lambda: False)
+    assert one == try_robustness(asked, GRASP, lambda: False, together)
     assert one[0].passed == all(held is not False for stage in passed for held in stage)
 
 
@@ -162,7 +162,7 @@ def test_others_are_tried_once_the_best_waits_for_a_shape(monkeypatch):
         return held
 
     monkeypatch.setattr(verification, "grasp_trials", likeliest)
-    asked = Hypotheses((HypothesisStage((Hypothesis("a shape", waits),), 1, 0.5),), PASSED, waited_for)
+    asked = RobustnessChecks((CheckStage((RobustnessCheck("a shape", waits),), 1, 0.5),), PASSED, waited_for)
     box = load_scene("shape:box")
     worlds = build_worlds(box, load_hand("allegro_right"), object_parts(box.object), PROTOCOLS["standard"])
     context = verification.VerificationContext(worlds, None, asked)
@@ -208,14 +208,14 @@ def test_nothing_is_tried_after_a_failure_and_what_was_stopped_is_not_verified()
     def never(grasp, stop):
         raise AssertionError("tried")
 
-    late = Hypothesis("late", never)
+    late = RobustnessCheck("late", never)
     failing = under((True, False), (True,))
     first, second = failing.stages
     asked = replace(
         failing, stages=(replace(first, items=(*first.items, late), least=3), replace(second, items=(late,)))
     )
-    assert not try_hypotheses(asked, GRASP, lambda: False)[0].passed
-    assert not try_hypotheses(under((True, True, True)), GRASP, lambda: True)[0].passed
+    assert not try_robustness(asked, GRASP, lambda: False)[0].passed
+    assert not try_robustness(under((True, True, True)), GRASP, lambda: True)[0].passed
 
 
 def test_two_shapes_are_begun_and_others_once_they_are_asked_for(monkeypatch):
@@ -247,7 +247,7 @@ def test_no_more_is_in_doubt_than_the_probability_asks_for(assumed):
     for probability, stages in ((0.0, None), (shares.likeliest, None), (shares.places, 1), (shares.shapes, 2)):
         run = Run(time.perf_counter(), 0.0, None, None)
         others = begin_other_worlds(run, seen, hand, PROTOCOLS["standard"], probability)
-        asked = hypotheses_of(seen, others, worlds, probability)
+        asked = robustness_checks_of(seen, others, worlds, probability)
         assert (None if asked is None else len(asked.stages)) == stages
         assert bool(others) == (stages == 2)
         if asked is not None:
@@ -261,21 +261,21 @@ def test_at_less_than_the_assumed_mass_a_grasp_is_less_sure():
     seen, hand = seen_from(), load_hand("allegro_right")
     seen = replace(seen, object=replace(seen.object, mass_assumed=True))
     worlds = build_worlds(seen, hand, object_parts(seen.object), PROTOCOLS["standard"])
-    ahead = verification.TrialsAhead(begin_in_thread("worlds", lambda: worlds), (LaterWorld(lambda: None),))
+    ahead = verification.Prefetched(begin_in_thread("worlds", lambda: worlds), (LaterWorld(lambda: None),))
     context = verification.VerificationContext(worlds, None)
     heavy = seen.object.mass
     half = verification.lighter(seen, ahead, context, CertaintyConfig(), 0.4 * heavy, 0.7 * heavy)
     assert half.trials.alone.model.body_mass[half.trials.alone.object_body] == 0.4 * heavy
     share = share_as_light(0.7, 1.0)
     assert LEAST_LIGHT < share < 1.0
-    assert half.hypotheses is not None
-    own = less_sure(half.hypotheses, 0.7 * heavy, heavy)
+    assert half.checks is not None
+    own = less_sure(half.checks, 0.7 * heavy, heavy)
     assert own.probability == pytest.approx(share * MASS_KNOWN.shapes)
     assert own.stages[0].though_failed == pytest.approx(share * MASS_KNOWN.fails_places)
     # Most objects of this volume are heavier than a tenth of the heavy end: no grasp is verified.
     tenth = verification.lighter(seen, ahead, context, CertaintyConfig(), 0.08 * heavy, 0.1 * heavy)
-    assert tenth.hypotheses is not None
-    result, probability = try_hypotheses(tenth.hypotheses, GRASP, lambda: False)
+    assert tenth.checks is not None
+    result, probability = try_robustness(tenth.checks, GRASP, lambda: False)
     assert not result.passed
     assert "too many objects of this volume weigh more" in result.reason
     assert probability == pytest.approx(share_as_light(0.1, 1.0) * MASS_KNOWN.likeliest)
@@ -287,7 +287,7 @@ def test_a_grasp_is_as_sure_as_objects_are_lighter_than_its_own_payload():
     grasps = tuple(replace(grasp, trials=()) for grasp in planned().tried if grasp.verdict is not Verdict.FAILED)
     payloads = {id(grasp.grasp): payload(worlds.alone, grasp, worlds.protocol) for grasp in grasps}
     heavy = 1.35 * max(payloads.values())
-    context = verification.VerificationContext(worlds, None, Hypotheses((), PASSED), heavy=heavy)
+    context = verification.VerificationContext(worlds, None, RobustnessChecks((), PASSED), heavy=heavy)
     tried = verification.run_trials(Run(0.0, None, None, None), context, grasps, len(grasps), 0).grasps
     for grasp in tried:
         share = share_as_light(payloads[id(grasp.grasp)], heavy)
@@ -313,7 +313,7 @@ def test_of_one_view_a_verified_grasp_is_as_sure_as_asked_for():
     verified = [grasp for grasp in result.tried if grasp.verdict is Verdict.VERIFIED]
     assert verified
     for grasp in verified:
-        assert [trial.name for trial in grasp.trials] == ["hold", "lift", HYPOTHESES]
+        assert [trial.name for trial in grasp.trials] == ["hold", "lift", ROBUSTNESS]
         assert grasp.probability is not None
         assert grasp.probability >= SURE
     for grasp in result.tried:
@@ -328,7 +328,7 @@ def test_of_one_view_a_verified_grasp_is_as_sure_as_asked_for():
 def test_who_asks_for_no_certainty_gets_the_trials_of_the_likeliest_shape_and_a_mesh_is_not_doubted():
     result = plan(seen_from(), 0.0)
     assert all(grasp.probability is None for grasp in result.tried)
-    assert all(trial.name != HYPOTHESES for grasp in result.tried for trial in grasp.trials)
+    assert all(trial.name != ROBUSTNESS for grasp in result.tried for trial in grasp.trials)
     result = plan(load_scene("shape:cylinder"), SURE)
     assert all([trial.name for trial in grasp.trials] == ["hold"] for grasp in result.tried)
 
@@ -356,7 +356,7 @@ def test_seen_all_round_only_place_and_friction_are_in_doubt(monkeypatch):
     ]
     assert verified
     for grasp in verified:
-        assert [trial.name for trial in grasp.trials] == ["hold", "lift", HYPOTHESES]
+        assert [trial.name for trial in grasp.trials] == ["hold", "lift", ROBUSTNESS]
         assert grasp.probability == MASS_KNOWN.shapes
 
 
@@ -368,7 +368,7 @@ def test_trials_with_less_friction_do_not_cut_the_object_again(monkeypatch):
         lambda *given, **cuts: cut.append(cuts) or convex_parts(*given, **cuts),
     )
     result = plan(seen_from((0.001, 0.0, 0.0)), SURE)
-    assert any(HYPOTHESES in [trial.name for trial in grasp.trials] for grasp in result.tried)
+    assert any(ROBUSTNESS in [trial.name for trial in grasp.trials] for grasp in result.tried)
     assert cut == [COARSE_CUTS]
 
 

@@ -7,7 +7,7 @@ import sys
 from dataclasses import replace
 from typing import Any
 
-from graspd_core.types import HYPOTHESES, Outcome, TrialResult
+from graspd_core.types import ROBUSTNESS, Outcome, TrialResult
 from graspd_ros import request_planner as planning
 from graspd_ros.node import main
 
@@ -28,7 +28,7 @@ def rigged(*args: Any, seed: int, **kwargs: Any):
     if seed != DOUBTS:
         return honest(*args, seed=seed, **kwargs)
     found = honest(*args, seed=seed, **kwargs | {"progress": lambda progress: None})
-    doubt = TrialResult(HYPOTHESES, False, 0.0, 0.0, "holds on the likeliest shape only")
+    doubt = TrialResult(ROBUSTNESS, False, 0.0, 0.0, "holds on the likeliest shape only")
     doubted = tuple(replace(grasp, trials=(*grasp.trials, doubt)) for grasp in found.tried)
     return replace(found, tried=doubted, outcome=Outcome.TOO_FEW)
 

@@ -25,7 +25,7 @@ from graspd_ros import known_objects
 from graspd_ros.error_codes import ErrorCode, code_of
 from graspd_ros.inputs import request_builder
 from graspd_ros.inputs.request_builder import RequestBuilder
-from graspd_ros.inputs.solids import Thing
+from graspd_ros.inputs.solids import SceneObject
 from graspd_ros.parameters import Settings
 from graspd_ros.request_planner import Planned, Planner
 from graspd_ros.worker import StopHook
@@ -53,7 +53,7 @@ def folder(built: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path
 class Node:
     """What the node does with a message, without ROS around it."""
 
-    def __init__(self, hand: HandModel, things: Mapping[str, Thing] | None = None, **settings: object) -> None:
+    def __init__(self, hand: HandModel, things: Mapping[str, SceneObject] | None = None, **settings: object) -> None:
         self._things = things or {}
         usual = {"preset": "fast", "num_grasps": 2, "grasp_library": "known.grasps", "mesh_roots": ["."]}
         self.settings = Settings(**{**usual, **settings})
@@ -67,7 +67,7 @@ class Node:
     def answer(self, **fields: object) -> Planned:
         fields.setdefault("id", "r")
         request = self._builder.from_message(str(fields["id"]), self.settings, GraspRequest(**fields))
-        return self._planner.plan(replace(request, things=self._things), lambda: False, lambda _: None)
+        return self._planner.plan(replace(request, collision_objects=self._things), lambda: False, lambda _: None)
 
     def answer_path(self, path: str) -> Planned:
         request = self._builder.from_mesh("r", self.settings, path)
@@ -215,7 +215,7 @@ def test_what_stands_about_a_known_object_is_kept_clear_of(folder: Path, hand: H
     cube, low, high = (box.vertices - box.vertices.min(0)) / np.ptp(box.vertices, axis=0), ball.min(0), ball.max(0)
     wall = TriangleMesh(np.array([high[0] + 0.01, -0.5, -0.5]) + cube, box.faces)
     same = TriangleMesh(low + cube * (high - low), box.faces)
-    things = {name: Thing("object", np.eye(4), (shape,)) for name, shape in (("wall", wall), ("ball", same))}
+    things = {name: SceneObject("object", np.eye(4), (shape,)) for name, shape in (("wall", wall), ("ball", same))}
     free, walled = Node(hand).answer(**known()).result, Node(hand, things=things).answer(**known()).result
 
     def farthest(result: GraspResult) -> float:

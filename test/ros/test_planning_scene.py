@@ -20,7 +20,7 @@ from tf2_msgs.msg import TFMessage
 from graspd_core import hand_mesh, load_hand, load_scene
 from graspd_core.errors import GraspdError, TransformError
 from graspd_ros.error_codes import code_of
-from graspd_ros.inputs.solids import MOST_THINGS, Thing, among_things, changed_things
+from graspd_ros.inputs.solids import MOST_OBJECTS, SceneObject, updated_objects, with_collision_objects
 from graspd_ros.parameters import Settings
 from graspd_ros.request import Request
 
@@ -130,18 +130,18 @@ def corner(thing) -> np.ndarray:
 
 
 def test_things_are_added_replaced_extended_moved_and_removed():
-    first = changed_things({}, message(**crate(), pose=Pose(position=Point(x=1.0))))
+    first = updated_objects({}, message(**crate(), pose=Pose(position=Point(x=1.0))))
     np.testing.assert_allclose(corner(first["wall"]), [0.01, 0.1, 0.1])
-    assert first["wall"].T_frame_thing[0, 3] == 1.0
-    longer = changed_things(first, message(CollisionObject.APPEND, **crate(x=0.5)))
+    assert first["wall"].T_frame_object[0, 3] == 1.0
+    longer = updated_objects(first, message(CollisionObject.APPEND, **crate(x=0.5)))
     np.testing.assert_allclose(corner(longer["wall"]), [0.51, 0.1, 0.1])
-    assert longer["wall"].T_frame_thing[0, 3] == 1.0
-    moved = changed_things(longer, message(CollisionObject.MOVE, frame="shelf", pose=Pose(orientation=QUARTER)))
+    assert longer["wall"].T_frame_object[0, 3] == 1.0
+    moved = updated_objects(longer, message(CollisionObject.MOVE, frame="shelf", pose=Pose(orientation=QUARTER)))
     assert (moved["wall"].frame, len(moved["wall"].shapes)) == ("shelf", 2)
-    assert len(changed_things(moved, message(**crate()))["wall"].shapes) == 1
-    both = changed_things(moved, message(CollisionObject.APPEND, name="other", **crate()))
-    assert list(changed_things(both, message(CollisionObject.REMOVE, frame=""))) == ["other"]
-    assert changed_things(both, message(CollisionObject.REMOVE, name="", frame="")) == {}
+    assert len(updated_objects(moved, message(**crate()))["wall"].shapes) == 1
+    both = updated_objects(moved, message(CollisionObject.APPEND, name="other", **crate()))
+    assert list(updated_objects(both, message(CollisionObject.REMOVE, frame=""))) == ["other"]
+    assert updated_objects(both, message(CollisionObject.REMOVE, name="", frame="")) == {}
     assert len(first["wall"].shapes) == 1, "what a request holds on to stays"
 
 
@@ -167,7 +167,7 @@ BAD = {
 @pytest.mark.parametrize("culprit", BAD)
 def test_a_message_that_cannot_be_meant_is_refused_by_name(culprit: str):
     with pytest.raises(GraspdError) as refused:
-        changed_things(changed_things({}, message(**crate())), BAD[culprit])
+        updated_objects(updated_objects({}, message(**crate())), BAD[culprit])
     assert culprit in str(refused.value)
     assert "\n" not in str(refused.value)
     assert code_of(refused.value) == "BAD_REQUEST"
@@ -175,33 +175,33 @@ def test_a_message_that_cannot_be_meant_is_refused_by_name(culprit: str):
 
 def test_there_is_an_end_of_things():
     wall = changed_things({}, message(**crate()))["wall"]
-    many = {str(number): wall for number in range(MOST_THINGS)}
+    many = {str(number): wall for number in range(MOST_OBJECTS)}
     with pytest.raises(GraspdError, match="1000 collision objects are kept already"):
         changed_things(many, message(**crate()))
     assert changed_things(many, message(name="7", **crate()))
 
 
-def request(things: Mapping[str, Thing], pose: np.ndarray | None = None) -> Request:
+def request(things: Mapping[str, SceneObject], pose: np.ndarray | None = None) -> Request:
     load = lambda: load_scene("shape:box")  # noqa: E731
-    return Request("r", "mesh", "map", Time(), Settings(), load, T_frame_object=pose, things=things)
+    return Request("r", "mesh", "map", Time(), Settings(), load, T_frame_object=pose, collision_objects=things)
 
 
 def test_things_come_to_the_object_through_their_frame_and_its_pose():
-    things = changed_things({}, message(frame="shelf", **crate(), pose=Pose(position=Point(x=0.1))))
+    things = updated_objects({}, message(frame="shelf", **crate(), pose=Pose(position=Point(x=0.1))))
     T_map_shelf, T_map_object = np.eye(4), np.eye(4)
     T_map_shelf[:3, 3] = [1.0, 0.0, 0.0]
     T_map_object[:3, 3] = [0.95, 0.0, 0.0]
-    scene = among_things(request(things, T_map_object), lambda *asked: {("map", "shelf"): T_map_shelf}[asked]).load()
-    (obstacle,) = scene.obstacles
+    frames = lambda *names: {("map", "shelf"): T_map_shelf}[names]  # noqa: E731
+    (obstacle,) = with_collision_objects(request(things, T_map_object), frames).load().obstacles
     assert obstacle.mesh.vertices[:, 0].mean() == pytest.approx(0.15, abs=0.005)
     own = {"wall": replace(things["wall"], frame="map")}
-    assert not among_things(request(own, T_map_object), lambda *_: pytest.fail("asked")).load().obstacles
+    assert not with_collision_objects(request(own, T_map_object), lambda *_: pytest.fail("asked")).load().obstacles
 
 
 def test_a_frame_that_nobody_knows_names_the_thing():
     def lookup(*_: str) -> np.ndarray:
         raise TransformError("unknown frame 'shelf'; known: map")
 
-    things = changed_things({}, message(frame="shelf", **crate()))
+    things = updated_objects({}, message(frame="shelf", **crate()))
     with pytest.raises(TransformError, match="collision object 'wall': unknown frame 'shelf'; known: map"):
-        among_things(request(things), lookup)
+        with_collision_objects(request(things), lookup)

@@ -13,7 +13,7 @@ import torch
 from graspd_core.errors import FormatError, HandError, MeshError
 from graspd_core.optimize.grasp_postures import find_contacts
 from graspd_core.optimize.loop import Poses
-from graspd_core.types import HYPOTHESES, Snapshot, TrialResult, Verdict
+from graspd_core.types import ROBUSTNESS, Snapshot, TrialResult, Verdict
 from graspd_viewer.drawing import Mechanics, placed_links, posture_at, sdf_slice, skeletons, slice_axes
 from graspd_viewer.grasp_list import figures_html, label, listed, table_html
 from graspd_viewer.live_view import LiveView
@@ -78,7 +78,7 @@ def test_the_list_is_filtered_and_sorted_and_escaped(result):
 
 def test_a_grasp_that_is_less_sure_is_said_with_its_probability(result):
     held = result.tried[0]
-    under = TrialResult(HYPOTHESES, False, 0.1, 0.1, "fails under 2 of the 5 hypotheses tried")
+    under = TrialResult(ROBUSTNESS, False, 0.1, 0.1, "fails under 2 of the 5 hypotheses tried")
     less = replace(held, trials=(*held.trials, under), probability=0.75)
     sure, untried = replace(held, probability=0.97), replace(held, trials=())
     grasps = (less, sure, untried, result.tried[3])

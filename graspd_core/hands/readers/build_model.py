@@ -17,7 +17,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from jaxtyping import Float
 
-from graspd_core.errors import HandError, shown
+from graspd_core.errors import HandError, short_repr
 from graspd_core.hands.model import HandModel, JointKind, Mimic, Primitive
 from graspd_core.hands.readers.xml_io import read_numbers
 from graspd_core.se3 import axis_rotation
@@ -188,9 +188,8 @@ def _depth_first(path: Path, links: Sequence[LinkSpec], joints: Sequence[JointSp
     for joint in joints:
         for end, link in (("parent", joint.parent), ("child", joint.child)):
             if link not in names:
-                raise HandError(
-                    f"{path}: joint {joint.name!r} has the {end} link {shown(link)}, which the file does not define"
-                )
+                text = f"{path}: joint {joint.name!r} has the {end} link {short_repr(link)}"
+                raise HandError(f"{text}, which the file does not define")
         if joint.child in above:
             raise HandError(f"{path}: link {joint.child!r} is the child of two joints; a hand is a tree")
         above[joint.child] = joint.parent

@@ -12,7 +12,7 @@ import yaml
 from jaxtyping import Float
 
 from graspd_core.config.mapping import YamlError, parse_yaml
-from graspd_core.errors import HandError, choices, shown
+from graspd_core.errors import HandError, choices, short_repr
 from graspd_core.hands.default_postures import default_palm, default_postures
 from graspd_core.hands.kinematics import link_poses
 from graspd_core.hands.model import HandModel, Mount
@@ -38,8 +38,8 @@ class Source:
     def mapping(self, key: str, value: Any) -> dict[str, Any]:
         """Check a mapping. Keys are converted to text, because the names of some joints are numbers."""
         if not isinstance(value, dict):
-            raise self.error(key, f"expected a mapping of keys to values, got {shown(value)}")
-        return {name if isinstance(name, str) else shown(name): entry for name, entry in value.items()}
+            raise self.error(key, f"expected a mapping of keys to values, got {short_repr(value)}")
+        return {name if isinstance(name, str) else short_repr(name): entry for name, entry in value.items()}
 
     def section(self, key: str, value: Any, known: tuple[str, ...], required: tuple[str, ...]) -> dict[str, Any]:
         """Check a mapping for unknown and missing keys. An empty `key` means the whole file."""
@@ -56,13 +56,13 @@ class Source:
     def text(self, key: str, value: Any) -> str:
         """Check that a value is text."""
         if not isinstance(value, str):
-            raise self.error(key, f"expected text, got {shown(value)}")
+            raise self.error(key, f"expected text, got {short_repr(value)}")
         return value
 
     def numbers(self, key: str, value: Any, count: int) -> Float[np.ndarray, "count"]:
         """Check a list of `count` numbers."""
         if not isinstance(value, list) or len(value) != count or not all(map(_is_number, value)):
-            raise self.error(key, f"expected {count} numbers, got {shown(value)}")
+            raise self.error(key, f"expected {count} numbers, got {short_repr(value)}")
         return np.array(value, dtype=np.float64)
 
     def direction(self, key: str, value: Any) -> Float[np.ndarray, "3"]:
@@ -78,7 +78,7 @@ class Source:
         values = self.mapping(key, value)
         for joint, number in values.items():
             if not _is_number(number):
-                raise self.error(f"{key}.{joint}", f"expected a number, got {shown(number)}")
+                raise self.error(f"{key}.{joint}", f"expected a number, got {short_repr(number)}")
         return {joint: float(number) for joint, number in values.items()}
 
     def effort(self, value: Any) -> float | dict[str, float]:
@@ -86,7 +86,7 @@ class Source:
         efforts = self.by_joint("effort", value) if isinstance(value, dict) else value
         values = list(efforts.values()) if isinstance(efforts, dict) else [efforts]
         if not all(_is_number(number) and number > 0 for number in values):
-            raise self.error("effort", f"expected positive numbers, got {shown(value)}")
+            raise self.error("effort", f"expected positive numbers, got {short_repr(value)}")
         return efforts if isinstance(efforts, dict) else float(efforts)
 
     def mount(self, value: Any) -> Mount:

@@ -18,7 +18,7 @@ import numpy as np
 import torch
 from jaxtyping import Float
 
-from graspd_core.errors import HandError, shown
+from graspd_core.errors import HandError, short_repr
 from graspd_core.hands.model import HandModel, JointKind, Primitive, PrimitiveKind
 from graspd_core.hands.readers.build_model import (
     Coupling,
@@ -64,7 +64,7 @@ def _read_assets(path: Path, spec: Any) -> dict[str, _MeshAsset]:
         if np.any(mesh.refpos) or not np.array_equal(mesh.refquat, (1, 0, 0, 0)):
             raise fault(path, mesh, "<mesh refpos=...> and <mesh refquat=...> are not read; move the vertices instead")
         if not np.all(mesh.scale):
-            raise fault(path, mesh, f"<mesh scale={shown(list(mesh.scale))}>: a factor cannot be zero")
+            raise fault(path, mesh, f"<mesh scale={short_repr(list(mesh.scale))}>: a factor cannot be zero")
         file = str(Path(spec.meshdir) / mesh.file) if mesh.file else ""
         vertices = np.array(mesh.uservert, dtype=float).reshape(-1, 3)
         assets[mesh.name or Path(mesh.file).stem] = _MeshAsset(_place(mesh), file, np.array(mesh.scale), vertices)
@@ -225,7 +225,7 @@ def _include(path: Path, holder: Path, parent: ET.Element, seen: set[Path], dept
 def _read_included(path: Path, holder: Path, place: ET.Element, seen: set[Path]) -> tuple[Path, ET.Element]:
     """Read an included file, which lies beside the main file or beside `holder`. Return its path and root."""
     name = place.get("file") or ""
-    told = f"<include file={shown(name)}>"
+    told = f"<include file={short_repr(name)}>"
     found = next((folder / name for folder in (path.parent, holder.parent) if inside_exists(folder / name)), None)
     if found is None:
         raise wrong(path, place, f"{told}: no such file beside {path.name}")
@@ -250,7 +250,7 @@ def _refuse(path: Path, root: ET.Element) -> None:
         for key, text in element.attrib.items():
             # MuJoCo accepts nan and inf, but writes a note to the terminal and to a log file.
             if key not in _NAMES and re.search(r"(?i)(^|\s)[+-]?(nan|inf)", text):
-                raise wrong(path, element, f"<{element.tag} {key}={shown(text)}>: expected finite numbers")
+                raise wrong(path, element, f"<{element.tag} {key}={short_repr(text)}>: expected finite numbers")
     classes = len(root.findall(".//default"))
     if classes > _MOST_CLASSES:
         raise wrong(path, root, f"{classes} default classes; a hand has at most {_MOST_CLASSES}")
@@ -346,7 +346,7 @@ def _reference(parts: _Parts, joint: int) -> float:
 
 def _refuse_far(parts: _Parts, element: Any, position: Float[np.ndarray, "3"]) -> None:
     if not np.abs(position).max() <= FARTHEST:
-        text = f"pos={shown(position.tolist())}: more than {FARTHEST:g} m away; lengths are in metres"
+        text = f"pos={short_repr(position.tolist())}: more than {FARTHEST:g} m away; lengths are in metres"
         raise fault(parts.path, element, text)
 
 
@@ -392,7 +392,7 @@ def _couplings(parts: _Parts) -> dict[str, Coupling]:
             raise fault(parts.path, tie, told)
         constant, slope, *bends = tie.data[:5].tolist()
         if any(bends):
-            given = shown(tie.data[:5].tolist())
+            given = short_repr(tie.data[:5].tolist())
             raise fault(parts.path, tie, f"<joint polycoef={given}>: not linear; valid: zeros after the second number")
         one, two = (parts.model.joint(name).id for name in (tie.name1, tie.name2))
         offset = _reference(parts, one) + constant - slope * _reference(parts, two)

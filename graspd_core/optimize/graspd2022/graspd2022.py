@@ -526,17 +526,17 @@ def _clean(gradient: Tensor, finite: Tensor) -> Tensor:
 
 def plan(task: PlannerInput) -> PlannerOutput:
     """Run Grasp'D from `starts_per_grasp` starts for every requested grasp."""
-    settings, thing, problem = task.config.settings, task.scene.object, task.problem
+    settings, target, problem = task.config.settings, task.scene.object, task.problem
     drawn = max(1, round(task.count * settings.initial.starts_per_grasp))
     if settings.initial.kind == "published":
         starts = published_starts(problem, task.scene, task.hand, drawn, task.seed, settings.initial.standoff)
         starts = task.allowed(starts)
     else:
-        asked = task.scene, task.hand, drawn, task.seed, task.device, task.dtype
-        starts = draw_starts(*asked, restrictions=task.restrictions)
+        drawing = task.scene, task.hand, drawn, task.seed, task.device, task.dtype
+        starts = draw_starts(*drawing, restrictions=task.restrictions)
     if len(starts.joints) == 0:
         return PlannerOutput(starts)
-    body = make_body(thing.mass, thing.inertia, thing.center_of_mass, thing.radius, task.device, task.dtype)
+    body = make_body(target.mass, target.inertia, target.center_of_mass, target.radius, task.device, task.dtype)
     solution = minimise(Graspd2022(settings, body), problem, starts, task.hooks)
     poses = solution.poses[torch.isfinite(solution.loss)]
     inside = replace(poses, joints=poses.joints.clamp(problem.hand.lower, problem.hand.upper))

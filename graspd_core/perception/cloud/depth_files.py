@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
-from graspd_core.errors import CloudError, shown
+from graspd_core.errors import CloudError, short_repr
 from graspd_core.perception.cloud.camera import (
     DepthImage,
     PinholeCamera,
@@ -87,7 +87,7 @@ def load_depth_camera(path: str | Path) -> DepthCamera:
     except (ValueError, RecursionError) as error:
         raise CloudError(f"{path}: not JSON: {str(error)[:200]}") from None
     if not isinstance(told, dict):
-        raise CloudError(f"{path}: {shown(told)}; a camera's file holds an object with width, height and K")
+        raise CloudError(f"{path}: {short_repr(told)}; a camera's file holds an object with width, height and K")
     try:
         return _camera_of(told)
     except CloudError as error:
@@ -100,7 +100,7 @@ def _camera_of(told: Mapping[str, Any]) -> DepthCamera:
             raise CloudError(f"{key} is missing: the size of the image that the matrix is for; it has {_keys(told)}")
     if "depth_scale" in told and "depth_unit" not in told:
         raise CloudError(
-            f"depth_scale: {shown(told['depth_scale'])} is ambiguous, because programs disagree on its unit; "
+            f"depth_scale: {short_repr(told['depth_scale'])} is ambiguous, because programs disagree on its unit; "
             "write depth_unit, in metres per unit: 0.001 for millimetres"
         )
     width, height = (int(_numbers(told[key], (), key)) for key in ("width", "height"))
@@ -133,7 +133,7 @@ def _unit(told: Any) -> float:
         return _UNITS[word[0]]
     unit = 0.0 if isinstance(told, str) else float(_numbers(told, (), "depth_unit"))
     if not 0 < unit <= 1:
-        raise CloudError(f"depth_unit: {shown(told)}; valid: metres per unit up to 1, or {', '.join(_UNITS)}")
+        raise CloudError(f"depth_unit: {short_repr(told)}; valid: metres per unit up to 1, or {', '.join(_UNITS)}")
     return unit
 
 
@@ -144,7 +144,7 @@ def _numbers(told: Any, shape: tuple[int, ...] | None, key: str) -> np.ndarray:
         numbers = np.full(1, np.nan)
     if not np.isfinite(numbers).all() or isinstance(told, bool) or (shape is not None and numbers.shape != shape):
         wanted = "numbers" if shape is None else f"{' × '.join(map(str, shape))} numbers" if shape else "a number"
-        raise CloudError(f"{key}: {shown(told)}; expected {wanted}")
+        raise CloudError(f"{key}: {short_repr(told)}; expected {wanted}")
     return numbers
 
 

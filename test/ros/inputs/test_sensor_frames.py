@@ -21,7 +21,7 @@ from graspd_core.io.messages import (
     camera_from_message,
     depth_and_camera,
     depth_from_message,
-    frame_doubt,
+    frame_fault,
     image_size,
     points_from_message,
 )
@@ -160,16 +160,16 @@ def test_an_image_takes_the_last_calibration_of_its_frame_and_size():
     other = calibration()
     other.header.frame_id = "elsewhere"
     assert pairs.add(other) is None
-    assert pairs.doubt() == ""
+    assert pairs.unpaired() == ""
     now[0] = UNPAIRED
-    assert pairs.doubt() == (
+    assert pairs.unpaired() == (
         "depth images: 1 images and 2 CameraInfos received, but no two match; last image: 64 x 48 in 'camera', "
         "last CameraInfo: 64 x 48 in 'elsewhere'; valid: a CameraInfo of the same frame and size"
     )
     # Once, without a stamp, and long before or after: it holds for all images.
     own = calibration(stamp=0)
     assert pairs.add(own) == (first, own)
-    assert pairs.doubt() == ""
+    assert pairs.unpaired() == ""
     for later in others:
         assert pairs.add(later) == (later, own)
     # A newer one takes its place, whatever its stamp.
@@ -184,8 +184,8 @@ def test_images_without_any_calibration_are_counted():
     for _ in range(200):
         assert pairs.add(image(np.ones((48, 64)), "16UC1")) is None
         now[0] += 0.2
-    assert pairs.doubt().startswith("depth images: 200 images and 0 CameraInfos received")
-    assert pairs.doubt().endswith("last CameraInfo: none; valid: a CameraInfo of the same frame and size")
+    assert pairs.unpaired().startswith("depth images: 200 images and 0 CameraInfos received")
+    assert pairs.unpaired().endswith("last CameraInfo: none; valid: a CameraInfo of the same frame and size")
     # Of binned and cropped images the size counts that they are sent with; one without a frame is of any.
     binned = calibration(128, 96, binning_x=2, binning_y=2)
     binned.header.frame_id = ""
@@ -234,7 +234,7 @@ def test_data_that_contradicts_the_name_of_its_frame_is_told(scene):
         asked = GraspRequest(cloud=message(points, frame, True))
         warnings = builder(T).from_message("r", Settings(cloud_max_age=0.0), asked).load().object.warnings
         assert (doubted in str(warnings)) is told, frame
-    assert frame_doubt("camera_link", body.reshape(-1, 3)) == ""
+    assert frame_fault("camera_link", body.reshape(-1, 3)) == ""
 
 
 def test_a_workspace_without_a_point_says_where_they_are_and_names_the_unit(scene):

@@ -25,7 +25,7 @@ from graspd_core import hand_mesh, load_hand
 from graspd_core.hands.model import Primitive
 from graspd_core.paths import config_dir
 from graspd_core.types import (
-    HYPOTHESES,
+    ROBUSTNESS,
     Contact,
     Grasp,
     GraspMetrics,
@@ -249,7 +249,7 @@ def test_hands_are_listed_and_a_reset_leaves_late_joiners_nothing_but_the_last_a
 def test_a_grasp_that_is_less_sure_is_told_with_the_next_view_and_not_presented():
     hand = load_hand("parallel_gripper")
     posture = Posture(np.zeros(3), np.array([1.0, 0.0, 0.0, 0.0]), np.zeros(len(hand.joint_names)))
-    trials = (TrialResult("hold", True, 0.0, 0.0), TrialResult(HYPOTHESES, False, 0.0, 0.0, "fails under 3"))
+    trials = (TrialResult("hold", True, 0.0, 0.0), TrialResult(ROBUSTNESS, False, 0.0, 0.0, "fails under 3"))
     grasp = Grasp(posture, posture, posture, trials=trials, probability=0.51)
     view, T_table_camera = np.eye(4), np.eye(4)
     view[2, 3], T_table_camera[0, 3] = 0.5, 1.0
@@ -276,7 +276,7 @@ def grasp(verdict: Verdict = Verdict.VERIFIED, seed: int = 0) -> Grasp:
 
 
 def markers(*grasps: Grasp, shown: int = 1) -> list[Marker]:
-    message = result_markers(grasps, HAND, "camera", Time(sec=7), shown=shown)
+    message = result_markers(grasps, HAND, "camera", Time(sec=7), most=shown)
     serialize_message(message)  # every field is of its type
     return list(message.markers)
 

@@ -68,7 +68,7 @@ class Publishers:
     def publish(self, message) -> None:
         self.published.append(message)
 
-    def tell(self, event: str, *_, **__) -> None:
+    def emit(self, event: str, *_, **__) -> None:
         self.events.append(event)
 
 

@@ -30,7 +30,7 @@ from graspd_ros.outputs.messages import (
     arm_trajectory,
     base_poses,
     grasp_message,
-    stage_times,
+    posture_times,
     trajectory_of,
 )
 
@@ -92,14 +92,14 @@ def test_joints_stay_within_their_limits_and_in_step(first, second, third):
 
 def test_the_first_point_leaves_time_to_come_from_anywhere():
     still = posture([0.5] * HAND.num_joints)
-    first = stage_times(grasp(still, still, still), HAND, Pace(joint_speed=0.5))[0]
+    first = posture_times(grasp(still, still, still), HAND, Pace(joint_speed=0.5))[0]
     assert first == pytest.approx(1.5 * (HAND.upper - HAND.lower).max() / 0.5)
 
 
 def test_a_negated_quaternion_is_no_turn():
     here = posture([0.5] * HAND.num_joints)
     negated = dataclasses.replace(here, quaternion_wxyz=-here.quaternion_wxyz)
-    times = stage_times(grasp(here, negated, here), HAND, Pace())
+    times = posture_times(grasp(here, negated, here), HAND, Pace())
     np.testing.assert_allclose(np.diff(times), Pace().shortest)
 
 
@@ -108,7 +108,7 @@ def test_a_sliding_joint_keeps_the_speed_of_the_base():
         HAND, joint_kind=tuple("prismatic" if kind == "revolute" else kind for kind in HAND.joint_kind)
     )
     here, there = posture([0.0] * HAND.num_joints), posture([1.0] * HAND.num_joints)
-    slow = np.diff(stage_times(grasp(here, there, there), sliding, Pace()))[0]
+    slow = np.diff(posture_times(grasp(here, there, there), sliding, Pace()))[0]
     assert slow == pytest.approx(1.5 * (HAND.upper - HAND.lower).max() / Pace().base_speed)
 
 
@@ -199,7 +199,7 @@ def test_a_follower_is_no_faster_than_its_kind_may_be(mounted: HandModel, carrie
     )
     pace = Pace(joint_speed=0.1, shortest=0.01)
     travel = carried.grasp.joint_positions - carried.pregrasp.joint_positions
-    first, closed, _ = stage_times(carried, quick, pace)
+    first, closed, _ = posture_times(carried, quick, pace)
     assert closed - first == pytest.approx(1.5 * 3 * np.abs(travel).max() / 0.1)
 
 
