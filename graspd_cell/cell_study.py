@@ -39,8 +39,6 @@ DEVELOPED_ON, _FIRST_SEED = 199, 200
 SEEDS = tuple(range(_FIRST_SEED, _FIRST_SEED + 4))
 # Most attempts at a bin: this many per object, plus some more.
 _TRIES_A_THING, _MORE_TRIES = 2, 3
-# Time after which graspd plans for no further object [s]. It is long so that a busy machine does not change results.
-_SECONDS = 20.0
 # Upper bounds of the probability bands in the calibration table.
 _BANDS = (0.5, 0.7, 0.85, 0.95, 1.01)
 
@@ -105,9 +103,7 @@ def run_cell(case: CellCase) -> Record:
     robot.wait(SETTLING)
     began = robot.referee()
     watch = AttemptWatch(robot)
-    source = _TimedSource(
-        InProcessGrasps(arm, hand, world.layout, preset=case.preset, seed=case.seed, seconds=_SECONDS)
-    )
+    source = _TimedSource(InProcessGrasps(arm, hand, world.layout, preset=case.preset, seed=case.seed))
     picker = Picker(robot, source, arm, hand, world.layout)
     most, error = _TRIES_A_THING * case.size + _MORE_TRIES, ""
     try:

@@ -93,21 +93,20 @@ class InProcessGrasps:
     Args:
         arm, hand, layout: parts of the cell.
         preset: name of graspd's preset.
-        seconds: time after which no further object is planned. Each object may take as long again.
+        most: greatest number of objects planned for in one view. A count, so that a busy machine changes nothing.
         seed: seed of the optimiser.
         tries: failed grasps of an object before it is given up.
     """
 
     def __init__(
-        self, arm: Arm, hand: HandModel, layout: CellLayout, *, preset: str = "balanced", seconds: float = 3.0,
+        self, arm: Arm, hand: HandModel, layout: CellLayout, *, preset: str = "balanced", most: int = 4,
         seed: int = 0, tries: int = 4,
     ) -> None:  # fmt: skip
         self._hand, self._source = hand, layout.pick
         self._plan = {
-            "settings": scene_config(layout.pick), "surface": TABLE, "tries": tries, "seconds": seconds,
+            "settings": scene_config(layout.pick), "surface": TABLE, "tries": tries, "most": most,
             "solids": {f"wall {k}": [box_mesh(wall)] for k, wall in enumerate(layout.solids[1:])},
             "restrictions": (Reach(arm, (0.0, 0.0, 0.0)),), "measure": False, "preset": preset, "seed": seed,
-            "deadline": seconds,
         }  # fmt: skip
         warm_up(hand)
 

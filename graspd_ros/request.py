@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Protocol
 
@@ -12,8 +12,8 @@ from builtin_interfaces.msg import Time
 from graspd_msgs.msg import Grasp, GraspArray, GraspProgress
 from jaxtyping import Float
 
-from graspd_core import Scene, Steering
-from graspd_core.types import Plane
+from graspd_core import PointCloud, Scene, Steering
+from graspd_core.types import Plane, TriangleMesh
 from graspd_ros.convert import Matrix
 from graspd_ros.parameters import Settings
 
@@ -23,6 +23,8 @@ if TYPE_CHECKING:
 MOST_ID = 128
 # Returns `T_target_source` of two frames. May raise a TransformError.
 FrameLookup = Callable[[str, str], Matrix]
+# Returns clouds in one frame, and warnings about them. May raise a GraspdError.
+SeenViews = Callable[[], tuple[tuple[PointCloud, ...], tuple[str, ...]]]
 
 
 class Listener(Protocol):
@@ -68,6 +70,8 @@ class Request:
         region_points: returns the points inside the `region_mask`, in `frame` [m]. None for sources without an image.
         closes_late: True if the hand closes only after it has arrived. Then grasps need their `arrival`.
         collision_objects: collision objects of the planning scene by id. Empty if the node has no such topic.
+        views: reads the clouds that show the objects of a request for any object. None for a request of one object.
+        solids: meshes of `collision_objects` in the object's frame [m]. The worker sets them.
         accepted: time of arrival on the monotonic clock [s].
     """
 
@@ -90,6 +94,8 @@ class Request:
     region_points: Callable[[], Float[np.ndarray, "points 3"]] | None = None
     closes_late: bool = False
     collision_objects: Mapping[str, SceneObject] = field(default_factory=dict)
+    views: SeenViews | None = None
+    solids: Mapping[str, Sequence[TriangleMesh]] = field(default_factory=dict)
     accepted: float = field(default_factory=time.monotonic)
 
     @property

@@ -18,8 +18,11 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import torch
 from builtin_interfaces.msg import Time
+from jaxtyping import Float
 
 from graspd_core import HandModel, Scene, load_preset, plan_grasps, save_result
+from graspd_core.config import load_scene_config
+from graspd_core.planning.any_thing import Failure, plan_any_thing, result_of_things
 from graspd_core.types import (
     Grasp,
     GraspResult,
@@ -34,7 +37,16 @@ from graspd_core.types import (
 )
 from graspd_core.verify.prepared_grasp import arrival, make_metrics_context
 from graspd_core.verify.robustness import begin_in_thread
-from graspd_ros.convert import Matrix, matrix_of_posture, moved_grasp, moved_result, nanoseconds
+from graspd_ros.convert import (
+    Matrix,
+    matrix_of,
+    matrix_of_posture,
+    moved_grasp,
+    moved_points,
+    moved_result,
+    nanoseconds,
+    wxyz_of_matrix,
+)
 from graspd_ros.error_codes import bad_request
 from graspd_ros.inputs.solids import with_collision_objects
 from graspd_ros.inputs.tf_listener import reach_of
@@ -65,6 +77,8 @@ class Planned:
         worked_on: False if the request ended before any run.
         mass: object's mass in the trials [kg]. 0 without trials.
         mass_assumed: True if the request gave no mass.
+        objects: place [m] of each object seen, and why it has no verified grasp, for a request of any object. The first
+            is the one of the grasps.
     """
 
     result: GraspResult
@@ -72,6 +86,7 @@ class Planned:
     worked_on: bool = True
     mass: float = 0.0
     mass_assumed: bool = False
+    objects: tuple[tuple[Float[np.ndarray, "3"], str], ...] = ()
 
 
 @dataclass(frozen=True)
@@ -112,6 +127,19 @@ class RecentRuns:
                 pose = request.to_object(run.frame, placed, lookup)
             poses.append(pose)
         return poses + [request.to_object(frame, pose, lookup) for frame, pose in request.exclude_poses]
+
+    def failures(self, request: Request, excluded: Sequence[Matrix], lookup: FrameLookup) -> list[Failure]:
+        """Return the excluded grasps as failures at the places of their objects, as far as these are known.
+
+        `excluded` is from the function `excluded`. Raises TransformError as `lookup`.
+        """
+        places: list[Any] = [None] * len(excluded)
+        for row, name in enumerate(request.exclude):
+            run = self._grasp(name)[0]
+            for place, _ in run.planned.objects[:1]:
+                places[row] = request.to_object(run.frame, matrix_of(place, (1.0, 0.0, 0.0, 0.0)), lookup)[:3, 3]
+        grasps = [Posture(pose[:3, 3], wxyz_of_matrix(pose), np.zeros(0)) for pose in excluded]
+        return [Failure(place, grasp) for place, grasp in zip(places, grasps, strict=True)]
 
     def _grasp(self, name: str) -> tuple[_Run, Grasp]:
         run_id, _, rank = name.rpartition("/")
@@ -232,8 +260,10 @@ class Planner:
             moved = lambda progress: report(_with_found(progress, place))  # noqa: E731
             planned = self._search(request, excluded, reach, stop, moved)
         self._runs.keep(request, planned)
-        result = planned.result
-        return replace(planned, result=result if T_out_object is None else moved_result(result, T_out_object))
+        if T_out_object is None:
+            return planned
+        objects = tuple((moved_points(place[None], T_out_object)[0], reason) for place, reason in planned.objects)
+        return replace(planned, result=moved_result(planned.result, T_out_object), objects=objects)
 
     def _lookup_at(self, stamp: Time, stop: StopHook) -> FrameLookup:
         return lambda target, source: self._lookup(target, source, stamp, stop)
@@ -248,8 +278,12 @@ class Planner:
         restrictions = (*steering, *reach)
         plan: dict[str, Any] = {"preset": config, "device": settings.device, "progress": report, "stop": stop}
         # Another seed makes grasps similar to the excluded ones less likely.
-        plan["seed"] = settings.seed + len(excluded)
-        if settings.grasp_library and request.known is not None:
+        plan["seed"], objects = settings.seed + len(excluded), ()
+        if request.views is not None:
+            failures = self._runs.failures(request, excluded, self._lookup_at(Time(), stop))
+            plan |= {"restrictions": restrictions, "verify": settings.verify}
+            result, scene, objects = _any_object(request, self._hand, failures, **plan)
+        elif settings.grasp_library and request.known is not None:
             from graspd_ros.known_objects import answer_known
 
             result, scene = answer_known(request, request.known, self._hand, excluded, restrictions, **plan)
@@ -266,7 +300,7 @@ class Planner:
         mass, assumed = result.mass or 0.0, False
         if scene is not None:
             mass, assumed = result.mass or scene.object.mass, scene.object.mass_assumed
-        planned = Planned(result, mass=mass, mass_assumed=assumed)
+        planned = Planned(result, mass=mass, mass_assumed=assumed, objects=objects)
         if not settings.output_dir or stop():
             return planned
         path = Path(settings.output_dir) / f"{request.id}.json"
@@ -275,6 +309,24 @@ class Planner:
         seconds, scene = 1e-9 * nanoseconds(request.stamp), scene or request.load()
         save_result(path, result, scene.object, self._hand, config, frame=frame, stamp=seconds)
         return replace(planned, file=str(path))
+
+
+def _any_object(
+    request: Request, hand: HandModel, failures: Sequence[Failure], **plan: Any
+) -> tuple[GraspResult, Scene | None, tuple[tuple[Float[np.ndarray, "3"], str], ...]]:
+    """Plan for any object of the request's views. Return result, scene, and place and reason of each object seen."""
+    assert request.views is not None
+    (views, told), settings = request.views(), request.settings
+    about = {"settings": load_scene_config(settings.scene_config) if settings.scene_config else None}
+    about |= {"solids": request.solids, "mass": settings.mass or None, "friction": settings.friction}
+    plan |= {"count": settings.num_grasps, "seed": settings.seed, "deadline": max(request.time_left(), 1e-3)}
+    things = plan_any_thing(views, hand, failures=failures, **about, **plan)
+    result = result_of_things(things, settings.seed)
+    scene = next((thing.scene for thing in things if thing.scene is not None), None)
+    if scene is not None and request.closes_late:
+        result = replace(result, tried=tuple(map(_arrivals(scene, hand), result.tried)))
+    result = replace(result, warnings=(*told, *result.warnings))
+    return result, scene, tuple((thing.place, thing.reason) for thing in things)
 
 
 def _ended(work: Future[Any], over: StopHook) -> bool:

@@ -5,14 +5,14 @@ from __future__ import annotations
 import argparse
 import dataclasses
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from graspd_core.cli.output import print_note
-from graspd_core.cli.running import EXIT_INTERRUPTED, EXIT_OK, EXIT_TOO_FEW
+from graspd_core.cli.running import EXIT_INTERRUPTED, EXIT_OK, EXIT_TOO_FEW, Deadline
 from graspd_core.config import VERIFICATIONS, SceneConfig, load_scene_config
 from graspd_core.errors import BagError, CloudError, ConfigError, TransformError
 from graspd_core.io.bags import BagFrame, is_bag, read_frames, read_transforms
@@ -23,7 +23,9 @@ from graspd_core.types import GraspResult, Outcome, Timing
 
 if TYPE_CHECKING:
     from graspd_core.arms.reach import Reach
+    from graspd_core.hands.model import HandModel
     from graspd_core.optimize.restrictions import Restriction
+    from graspd_core.perception.scene import Scene
     from graspd_core.planning.regions import Region
     from graspd_core.planning.steering import Steering
 
@@ -151,9 +153,14 @@ def add_bag_options(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--limit", type=int, default=None, metavar="N", help="end after N clouds")
 
 
-def add_object_options(parser: argparse.ArgumentParser) -> None:
-    """Add the options that choose the object in a cloud, the viewpoint and the scene settings."""
+def add_object_options(parser: argparse.ArgumentParser, *, any_object: bool = False) -> None:
+    """Add the options that choose the object in a cloud, the viewpoint and the scene settings.
+
+    `any_object` adds `--any`.
+    """
     which = parser.add_mutually_exclusive_group()
+    if any_object:
+        which.add_argument("--any", action="store_true", help="the object of all seen that has the surest grasp")
     which.add_argument(
         "--target", type=float, nargs=3, default=None, metavar=("X", "Y", "Z"),
         help="a point on the object, in metres; else what is nearest the axis of view",
@@ -187,6 +194,35 @@ def target_of(options: argparse.Namespace):
 def scene_config_of(options: argparse.Namespace) -> SceneConfig:
     """Return the settings from the file of `--scene`, or the defaults. Raises ConfigError: the file is not valid."""
     return load_scene_config(options.scene) if options.scene else SceneConfig()
+
+
+def plan_any_object(
+    views: Sequence[PointCloud],
+    hand: HandModel,
+    options: argparse.Namespace,
+    deadline: Deadline,
+    *,
+    source: str,
+    **request: Any,
+) -> tuple[GraspResult, Scene, dict[str, Any]]:
+    """Plan for any object that the views show (`--any`). Return result, scene, and JSON entries about all objects.
+
+    Args:
+        source: name of the views, for messages.
+        request: keyword arguments of `plan_grasps`.
+
+    Raises GraspdError: the views are unusable, or show no object.
+    """
+    from graspd_core.planning.any_thing import plan_any_thing, result_of_things
+
+    about = {"settings": scene_config_of(options), "mass": options.mass, "friction": options.friction}
+    things = plan_any_thing(views, hand, deadline=deadline.left(), source=source, **about, **request)
+    result = result_of_things(things, options.seed)
+    places = [thing.place.round(3).tolist() for thing in things]
+    if things[0].grasp is not None:
+        print_note(f"{source}: the object about {tuple(places[0])} m, of {len(things)} seen")
+    entries = [{"center": place, "reason": thing.reason} for place, thing in zip(places, things, strict=True)]
+    return result, next(thing.scene for thing in things if thing.scene is not None), {"objects": entries}
 
 
 def check_bag_options(options: argparse.Namespace) -> None:

@@ -20,6 +20,7 @@ from graspd_core.cli.options import (
     merged_views,
     not_loaded,
     not_loaded_document,
+    plan_any_object,
     planning_options,
     scene_config_of,
     target_of,
@@ -60,7 +61,7 @@ def add_command(commands: Any) -> None:
     parser.add_argument("bag", metavar="BAG", type=Path, help="a directory, or a file .mcap or .db3")
     add_bag_options(parser)
     parser.add_argument("--fuse", action="store_true", help="take all clouds as views of one scene")
-    add_object_options(parser)
+    add_object_options(parser, any_object=True)
     add_planning_options(parser)
     parser.add_argument("--out", type=Path, default=None, metavar="DIR", help="or a .json file for a single result")
 
@@ -132,23 +133,32 @@ def _planned(
     from graspd_core.planning.plan_grasps import plan_grasps
 
     began = time.perf_counter()
-    deadline = Deadline(options.deadline, began)
-    try:
-        with deadline.cuts_short(), busy("load"):
-            scene = _scene_of(job, options, request.pop("settings"))
-    except DeadlinePassed:
-        result = not_loaded(options, config, began)
-        return result, not_loaded_document(result)
-    for warning in scene.object.warnings:
-        print_note(f"{job.label}: {warning}")
-    with Reporter() as reporter:
-        result = plan_grasps(scene, hand, preset=config, progress=reporter, deadline=deadline.left(), **request)
-    for warning in result.warnings[len(scene.object.warnings) + len(hand.named_warnings) :]:
+    deadline, about = Deadline(options.deadline, began), {}
+    settings = request.pop("settings")
+    if options.any:
+        _check_usable(job)
+        with Reporter() as reporter:
+            request |= {"preset": config, "progress": reporter}
+            result, scene, about = plan_any_object(job.views, hand, options, deadline, source=job.label, **request)
+        told = [warning for warning in result.warnings if warning not in hand.named_warnings]
+    else:
+        try:
+            with deadline.cuts_short(), busy("load"):
+                scene = _scene_of(job, options, settings)
+        except DeadlinePassed:
+            result = not_loaded(options, config, began)
+            return result, not_loaded_document(result)
+        for warning in scene.object.warnings:
+            print_note(f"{job.label}: {warning}")
+        with Reporter() as reporter:
+            result = plan_grasps(scene, hand, preset=config, progress=reporter, deadline=deadline.left(), **request)
+        told = result.warnings[len(scene.object.warnings) + len(hand.named_warnings) :]
+    for warning in told:
         print_note(f"{job.label}: {warning}")
     if options.out:
         path = options.out if options.out.suffix == ".json" else options.out / f"{job.name}.json"
         save_result(path, result, scene.object, hand, config)
-    return result, result_document(result, scene.object, hand, config)
+    return result, {**result_document(result, scene.object, hand, config), **about}
 
 
 def _jobs(options: argparse.Namespace) -> Iterator[_Job]:
@@ -170,8 +180,7 @@ def _scene_of(job: _Job, options: argparse.Namespace, settings: SceneConfig):
     """Return the scene of a job's views. Raises GraspdError: the views show no usable object."""
     from graspd_core.perception.scene_from_views import scene_from_views
 
-    if job.refusal:
-        raise CloudError(job.refusal)
+    _check_usable(job)
     return scene_from_views(
         job.views,
         target=target_of(options),
@@ -181,6 +190,12 @@ def _scene_of(job: _Job, options: argparse.Namespace, settings: SceneConfig):
         friction=options.friction,
         source=f"{options.bag}: {job.label}",
     )
+
+
+def _check_usable(job: _Job) -> None:
+    """Raise CloudError if the job's cloud is unusable."""
+    if job.refusal:
+        raise CloudError(job.refusal)
 
 
 def _status(statuses: list[int]) -> int:

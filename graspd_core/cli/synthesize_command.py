@@ -18,6 +18,7 @@ from graspd_core.cli.options import (
     good_grasps,
     not_loaded,
     not_loaded_document,
+    plan_any_object,
     planning_options,
     restrictions_of,
     scene_config_of,
@@ -44,7 +45,7 @@ def add_command(commands: Any) -> None:
     parser.add_argument("object", metavar="OBJECT", help="mesh, cloud or depth image, or shape:NAME")
     add_planning_options(parser)
     add_camera_option(parser)
-    add_object_options(parser)
+    add_object_options(parser, any_object=True)
     add_restriction_options(parser)
     sizes = parser.add_mutually_exclusive_group()
     sizes.add_argument("--scale", type=float, default=1.0, metavar="S", help="metres per unit of the file or the depth")
@@ -72,6 +73,8 @@ def run(options: argparse.Namespace) -> int:
     for path in (options.out, options.html, options.picture):
         if path:
             check_writable(path)
+    if options.any:
+        return _any_object(options, config, request, deadline)
     try:
         with deadline.cuts_short(), busy("load"):
             scene = load_scene(
@@ -109,14 +112,44 @@ def run(options: argparse.Namespace) -> int:
     return exit_status(result)
 
 
+def _any_object(options: argparse.Namespace, config: PlanConfig, request: dict[str, Any], deadline: Deadline) -> int:
+    """Plan for any object of a cloud, and report like `run`. Raises ConfigError: a mesh, or `--view` is given too."""
+    from graspd_core.hands.library import load_hand
+    from graspd_core.perception.cloud.cloud_files import is_cloud_file
+    from graspd_core.perception.cloud.depth_files import is_depth_image
+    from graspd_core.perception.load_scene import scaled_views
+
+    if options.view:
+        raise ConfigError("--any: --view is given too; give one of them")
+    if not (options.camera or is_depth_image(options.object) or is_cloud_file(options.object)):
+        raise ConfigError(f"--any: given with {options.object}; valid with clouds and depth images of several objects")
+    scale = _UNITS[options.units] if options.units else options.scale
+    views = scaled_views(options.object, options.camera, scale, options.view_point)
+    hand = load_hand(options.hand)
+    with Reporter() as reporter, Interrupt() as interrupt:
+        hooks = {"progress": reporter, "stop": interrupt.came}
+        result, scene, about = plan_any_object(
+            views, hand, options, deadline, source=options.object, preset=config, **hooks, **request
+        )
+    for warning in result.warnings:
+        print_note(warning)
+    _report(options, result, scene, hand, config, about)
+    return exit_status(result)
+
+
 def _report(
-    options: argparse.Namespace, result: GraspResult, scene: Scene, hand: HandModel, config: PlanConfig
+    options: argparse.Namespace,
+    result: GraspResult,
+    scene: Scene,
+    hand: HandModel,
+    config: PlanConfig,
+    about: dict[str, Any] | None = None,
 ) -> None:
-    """Write the result to the requested files and print a summary."""
+    """Write the result to the requested files and print a summary. `about` adds entries to the JSON document."""
     from graspd_core.io.grasps_json import result_document, save_result
     from graspd_core.verify.metrics import distinct
 
-    answer(result_document(result, scene.object, hand, config))
+    answer({**result_document(result, scene.object, hand, config), **(about or {})})
     if options.out:
         save_result(options.out, result, scene.object, hand, config)
     if options.html or options.picture:

@@ -2,21 +2,22 @@
 
 Objects with fewer earlier failures come first. Among equals, higher objects come first, because nothing lies on them.
 An object without failures gets one round of the planner. The first verified grasp ends the search. After `enough`
-objects, a likely grasp also ends the search, to limit its time.
+objects, a likely grasp also ends the search, to limit its time. `result_of_things` is the answer to one request.
 """
 
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import Any
 
 import numpy as np
 from jaxtyping import Float
 
 from graspd_core.config import SceneConfig
-from graspd_core.errors import CloudError, MeshError
+from graspd_core.errors import CloudError, ConfigError, MeshError, NoObjectError
 from graspd_core.hands.model import HandModel
 from graspd_core.mesh.surface_queries import make_surface, surface_distance
 from graspd_core.optimize.plan_config import load_preset
@@ -26,13 +27,14 @@ from graspd_core.perception.scene import Scene
 from graspd_core.perception.scene_from_views import scene_from_views
 from graspd_core.perception.segment.segment import find_things
 from graspd_core.perception.segment.target_selection import Target
-from graspd_core.planning.plan_grasps import plan_grasps
-from graspd_core.types import Grasp, GraspResult, Plane, Posture, TriangleMesh, Verdict
+from graspd_core.planning.plan_grasps import check_request, plan_grasps
+from graspd_core.types import Grasp, GraspResult, Outcome, Plane, Posture, Timing, TriangleMesh, Verdict
+from graspd_core.verify.robustness import begin_other_shapes
 
 # Two grasps are alike if their bases differ by less than this distance [m] and this angle [rad].
 LIKE_DISTANCE, LIKE_TURN = 0.015, 0.26
 # Why an object is skipped.
-OUT_OF_TRIES = "failed too often"
+OUT_OF_TRIES, NOT_LOOKED_AT = "failed too often", "not planned for"
 # An object within this distance of an earlier failure's place is the same object [m].
 _SAME_PLACE = 0.04
 # Least probability of a likely grasp.
@@ -46,11 +48,11 @@ class Failure:
     """An earlier failed try: a grasp that failed, or an object for which no grasp was found.
 
     Attributes:
-        place: mean of the object's points [m].
+        place: mean of the object's points [m]. None if the object is unknown. Then only its grasp is left out.
         grasp: hand posture at the failed grasp. None if no grasp was tried.
     """
 
-    place: Float[np.ndarray, "3"]
+    place: Float[np.ndarray, "3"] | None
     grasp: Posture | None = None
 
 
@@ -99,11 +101,14 @@ def plan_any_thing(
     settings: SceneConfig | None = None,
     surface: Plane | None = None,
     solids: Mapping[str, Sequence[TriangleMesh]] | None = None,
+    mass: float | None = None,
+    friction: float = 0.6,
+    source: str = "cloud",
     failures: Sequence[Failure] = (),
     tries: int = 4,
-    seconds: float | None = None,
+    deadline: float | None = None,
     enough: int = 2,
-    on_thing: Callable[[ThingPlan], None] | None = None,
+    most: int | None = None,
     **plan: Any,
 ) -> tuple[ThingPlan, ...]:
     """Plan for one object after the other until one has a verified grasp. Return all objects, by descending `surety`.
@@ -113,32 +118,63 @@ def plan_any_thing(
         settings: settings for segmentation, reconstruction and obstacles.
         surface: support plane of all objects, if it is known.
         solids: known solids by name, in the frame of the views [m]. They are obstacles and never grasped.
+        mass: mass of each object [kg]. None assumes `heavy_mass` of its volume.
+        friction: Coulomb friction coefficient between hand and objects.
+        source: name of the views, for messages.
         failures: failures of earlier requests. Grasps like the failed ones are left out.
         tries: an object with this many failures is skipped.
-        seconds: time after which no further object is planned for [s].
+        deadline: time after which the whole search ends [s]. None for no limit.
         enough: number of objects after which a likely grasp ends the search.
-        on_thing: called with each object that was planned for.
-        plan: keyword arguments of `plan_grasps`. `seed` is increased by the object's number of failures.
+        most: greatest number of objects that are planned for. None for all.
+        plan: other keyword arguments of `plan_grasps`. `seed` is increased by the object's number of failures.
 
     Raises:
         CloudError: a cloud is empty, all NaN, or has too few points.
-        ConfigError: see `plan_grasps`.
+        ConfigError: see `plan_grasps`. A region that misses an object is not an error, but the object's `reason`.
     """
     began, things, over = time.perf_counter(), list[ThingPlan](), False
+    asked = {"seed": 0, "count": 1, "verify": "standard", "device": "cpu", "preset": "balanced"} | plan
+    check_request(deadline=deadline, **{name: asked[name] for name in ("count", "seed", "verify", "device")})
+    config = load_preset(asked["preset"]) if isinstance(asked["preset"], str) else asked["preset"]
+    ahead = None if asked["verify"] == "none" else partial(begin_other_shapes, config.certainty.probability)
+    about = {"settings": settings, "mass": mass, "friction": friction, "source": source, "ahead": ahead}
+    stop = asked.get("stop") or (lambda: False)
     seen = [p for p in find_things(views, settings and settings.segmentation) if not _is_solid(p, solids or {})]
     for points, failed in _in_order(seen, failures):
         if over or len(failed) >= tries:
-            told = OUT_OF_TRIES if len(failed) >= tries else "not planned for"
-            things.append(ThingPlan(points, reason=told, looked_at=False))
+            reason = OUT_OF_TRIES if len(failed) >= tries else NOT_LOOKED_AT
+            things.append(ThingPlan(points, reason=reason, looked_at=False))
             continue
-        scene = _scene_among(views, points, settings, surface, solids)
-        things.append(_thing_plan(points, scene, hand, failed, plan))
-        if on_thing is not None:
-            on_thing(things[-1])
-        likely = sum(thing.looked_at for thing in things) >= enough and any(thing.is_likely for thing in things)
-        late = seconds is not None and time.perf_counter() - began > seconds
-        over = likely or late or things[-1].surety > 1.0
+        scene = _scene_among(views, points, surface, solids, about)
+        left = None if deadline is None else max(deadline - (time.perf_counter() - began), 1e-3)
+        lost = [*failed, *(failure for failure in failures if failure.place is None)]
+        things.append(_thing_plan(points, scene, hand, lost, {**asked, "preset": config, "deadline": left}))
+        looked = sum(thing.looked_at for thing in things)
+        late = deadline is not None and time.perf_counter() - began > deadline
+        over = late or stop() or looked == most or things[-1].surety > 1.0
+        over = over or (looked >= enough and any(thing.is_likely for thing in things))
     return tuple(sorted(things, key=lambda thing: -thing.surety))
+
+
+def result_of_things(things: Sequence[ThingPlan], seed: int = 0) -> GraspResult:
+    """Return the result of the first object. If it has no grasp, the message tells the reason for each object.
+
+    Raises:
+        CloudError: `things` is empty (NoObjectError), or no object's scene can be built.
+        ConfigError: no object meets the restrictions.
+    """
+    if not things:
+        raise NoObjectError("cloud: no object is seen that is no known solid; valid: a cloud with a graspable object")
+    best, results = things[0], [thing.result for thing in things if thing.result is not None]
+    if best.grasp is not None and best.result is not None:
+        return best.result
+    told = f"none of {len(things)} objects has a grasp: {'; '.join(dict.fromkeys(thing.reason for thing in things))}"
+    ended = [result for result in results if result.outcome in (Outcome.CANCELLED, Outcome.DEADLINE)]
+    for result in (*ended, *results):
+        return replace(result, message=told)
+    if any(thing.looked_at for thing in things):
+        raise (CloudError if all(thing.scene is None for thing in things) else ConfigError)(told)
+    return GraspResult(Outcome.NO_CANDIDATES, (), Timing(), seed, "", told)
 
 
 def _is_solid(points: Float[np.ndarray, "_ 3"], solids: Mapping[str, Sequence[TriangleMesh]]) -> bool:
@@ -152,7 +188,11 @@ def _in_order(
     things: Sequence[Float[np.ndarray, "_ 3"]], failures: Sequence[Failure]
 ) -> list[tuple[Float[np.ndarray, "_ 3"], list[Failure]]]:
     rows = [
-        (points, [f for f in failures if np.linalg.norm(points.mean(0) - f.place) < _SAME_PLACE]) for points in things
+        (
+            points,
+            [f for f in failures if f.place is not None and np.linalg.norm(points.mean(0) - f.place) < _SAME_PLACE],
+        )
+        for points in things
     ]
     return sorted(rows, key=lambda row: (len(row[1]), -float(row[0][:, 2].max())))
 
@@ -160,34 +200,38 @@ def _in_order(
 def _scene_among(
     views: Sequence[PointCloud],
     points: Float[np.ndarray, "_ 3"],
-    settings: SceneConfig | None,
     surface: Plane | None,
     solids: Mapping[str, Sequence[TriangleMesh]] | None,
+    about: dict[str, Any],
 ) -> Scene | str:
-    """Return the scene of the object with these points, or the message of the error."""
+    """Return the scene of the object with these points, or the message of the error.
+
+    `about` holds other arguments of `scene_from_views`.
+    """
     # The target is a point on the object, because the middle of a ring is empty.
     middle = points[np.linalg.norm(points - points.mean(0), axis=1).argmin()]
     try:
-        scene = scene_from_views(views, target=Target(point=middle), settings=settings)
+        scene = scene_from_views(views, target=Target(point=middle), **about)
     except (CloudError, MeshError) as error:
         return str(error)
     scene = scene if surface is None else replace(scene, support=surface)
-    return with_neighbours(scene, solids, settings) if solids else scene
+    return with_neighbours(scene, solids, about["settings"]) if solids else scene
 
 
 def _thing_plan(
     points: Float[np.ndarray, "_ 3"], scene: Scene | str, hand: HandModel, failed: Sequence[Failure], plan: Any
 ) -> ThingPlan:
+    """Plan for one object. `plan` holds the keyword arguments of `plan_grasps`."""
     if isinstance(scene, str):
         return ThingPlan(points, reason=scene)
-    lost = [failure.grasp for failure in failed if failure.grasp is not None]
-    config = plan.get("preset", "balanced")
-    config = load_preset(config) if isinstance(config, str) else config
+    lost, config = [failure.grasp for failure in failed if failure.grasp is not None], plan["preset"]
     if not failed:
         config = replace(config, rounds=replace(config.rounds, most=1))
-    count, seed = plan.get("count", 1) + 2 * len(lost), plan.get("seed", 0) + len(failed)
-    plan = {**plan, "preset": config, "count": count, "seed": seed}
-    result = plan_grasps(scene, hand, **plan)
+    count, seed = plan["count"] + 2 * len(lost), plan["seed"] + len(failed)
+    try:
+        result = plan_grasps(scene, hand, **{**plan, "preset": config, "count": count, "seed": seed})
+    except ConfigError as error:  # a restriction that this object cannot meet
+        return ThingPlan(points, scene, reason=str(error))
     left = [grasp for grasp in unlike(result.tried, lost) if grasp.verdict is not Verdict.FAILED]
     if not left:
         reason = result.message or next((g.reason for g in result.tried if g.reason), "") or result.outcome.value

@@ -24,7 +24,7 @@ from sensor_msgs.msg import Image, PointCloud2
 from shape_msgs.msg import SolidPrimitive
 from std_msgs.msg import Header
 
-from graspd_core import Box, NearPoints, Scene, Sphere, Steering, Target, load_scene, preset_names
+from graspd_core import Box, NearPoints, PointCloud, Scene, Sphere, Steering, Target, load_scene, preset_names
 from graspd_core.errors import MeshError
 from graspd_core.io.messages import CameraPlace
 from graspd_core.perception.cloud.viewpoint_check import check_scene
@@ -36,7 +36,7 @@ from graspd_ros.inputs import sensor_frames as seen
 from graspd_ros.inputs.sensor_frames import Lookup, SensorFrame, Views, cloud_frame, place_of
 from graspd_ros.inputs.solids import plane_of, with_support
 from graspd_ros.parameters import BUDGETS, MASSES, MOST_GRASPS, SCALES, Settings
-from graspd_ros.request import MOST_ID, KnownObject, Listener, Request
+from graspd_ros.request import MOST_ID, KnownObject, Listener, Request, SeenViews
 
 MOST_EXCLUDED = 256
 MOST_BOXES = 64
@@ -117,6 +117,8 @@ class RequestBuilder:
         Raises GraspdError: a field is invalid, the mesh is not readable, or the cloud is missing, old or not in /tf.
         """
         check_request(message, self._hand)
+        if message.any_object and not settings.segment:
+            raise bad_request("any_object: the parameter segment is false, so that clouds show one object; set it true")
         settings = settings_of(message, settings)
         source = source_of(message)
         given = SourceInput(request_id, source.name, message, settings, listener, self._now(), self)
@@ -188,6 +190,7 @@ def check_request(message: GraspRequest, hand: str) -> None:
             fault = f"given with {given}, a mesh; valid with CLOUD=0, LATEST_CLOUD=2 and VIEWS=3"
             raise bad_request(f"target_point: {fault}")
     _check_camera_and_mask(message)
+    _check_any_object(message)
     if message.source not in (GraspRequest.MESH, GraspRequest.KNOWN) and any(message.surface.coef):
         raise bad_request(f"surface: given with source {message.source}, a cloud; valid with MESH=1 and KNOWN=4")
     if message.known_object and (message.source != GraspRequest.KNOWN or message.mesh_uri):
@@ -206,6 +209,17 @@ def _check_camera_and_mask(message: GraspRequest) -> None:
         other = "target_point" if message.use_target_point else "alone"
         raise bad_request(f"target_mask: {other} is given too; give only one of target_point, target_mask, alone")
     _check_mask_source(message, "target_mask", message.target_mask.height)
+
+
+def _check_any_object(message: GraspRequest) -> None:
+    if not message.any_object:
+        return
+    given = {"use_target_point": message.use_target_point, "alone": message.alone}
+    given["target_mask"] = message.target_mask.height > 0
+    for other in (name for name, value in given.items() if value):
+        raise bad_request(f"any_object: {other} is given too, which says what the object is; give one of them")
+    if message.source in (GraspRequest.MESH, GraspRequest.KNOWN):
+        raise bad_request(f"any_object: with source {message.source}; valid with CLOUD=0, LATEST_CLOUD=2 and VIEWS=3")
 
 
 def _check_mask_source(message: GraspRequest, name: str, height: int) -> None:
@@ -363,11 +377,11 @@ def frame_loader(
     """
 
     def load() -> Scene:
+        if mask is None:
+            views, warnings = frame_views(frame, settings, place, lookup)()
+            return seen.scene_of_views(views, settings, None if point is None else Target(point=point), warnings)
         cloud = seen.seen_by_camera(frame, place, lookup)
         warnings = frame.warnings(cloud)
-        if mask is None:
-            target = None if point is None else Target(point=point)
-            return seen.scene_of_views((seen.trimmed(cloud, settings),), settings, target, warnings)
         points, marks = seen.masked_points(frame, mask)
         marked = replace(cloud, points=points)
         inside = seen.within(marked, settings)
@@ -375,6 +389,16 @@ def frame_loader(
         return seen.scene_of_views((marked,), settings, Target(mask=marks[inside]), warnings)
 
     return load
+
+
+def frame_views(frame: SensorFrame, settings: Settings, place: CameraPlace, lookup: Lookup) -> SeenViews:
+    """Return a function that reads a sensor frame as one view. The worker's thread calls `lookup`."""
+
+    def read() -> tuple[tuple[PointCloud, ...], tuple[str, ...]]:
+        cloud = seen.seen_by_camera(frame, place, lookup)
+        return (seen.trimmed(cloud, settings),), frame.warnings(cloud)
+
+    return read
 
 
 def _from_cloud(given: SourceInput) -> Request:
@@ -430,7 +454,8 @@ def _from_views(given: SourceInput) -> Request:
         raise RequestError(ErrorCode.NO_CLOUD, "no view is kept; call ~/add_view while clouds arrive")
     point = _target(given, views.frame)
     target = None if point is None else Target(point=point)
-    return given.request(views.frame, views.stamp, lambda: seen.scene_of_views(views.clouds, settings, target))
+    more = {"views": lambda: (views.clouds, ())} if given.message.any_object else {}
+    return given.request(views.frame, views.stamp, lambda: seen.scene_of_views(views.clouds, settings, target), **more)
 
 
 SOURCES: dict[int, Source] = {
@@ -453,11 +478,15 @@ def source_of(message: GraspRequest) -> Source:
 def _of_frame(given: SourceInput, frame: SensorFrame) -> Request:
     message, place = given.message, place_of(given.settings, given.message)
     point, mask = _target(given, frame.frame), message.target_mask if message.target_mask.height else None
-    load = frame_loader(frame, given.settings, place, given.builder.lookup_in_time, point, mask)
+    lookup = given.builder.lookup_in_time
+    load = frame_loader(frame, given.settings, place, lookup, point, mask)
+    region_points = lambda: _region_points(frame, message.region_mask)  # noqa: E731
+    if message.any_object:
+        views = frame_views(frame, given.settings, place, lookup)
+        return given.request(frame.frame, frame.stamp, load, region_points=region_points, views=views)
     physics = f"{given.settings.mass} {given.settings.friction}"
     meant = "" if mask is not None else f"{point} {place} {given.settings.segment} {physics}"
     key = f"{frame.kind} {frame.frame} {nanoseconds(frame.stamp)} {meant}" if nanoseconds(frame.stamp) and meant else ""
-    region_points = lambda: _region_points(frame, message.region_mask)  # noqa: E731
     return given.request(frame.frame, frame.stamp, load, object_key=key, region_points=region_points)
 
 

@@ -177,7 +177,7 @@ def _changed(there: SceneObject | None, message: Any, owner: str) -> SceneObject
 
 
 def with_collision_objects(request: Request, lookup: FrameLookup) -> Request:
-    """Return the request with a loader that adds its `collision_objects` to the scene as obstacles.
+    """Return the request with its collision objects as `solids`, and a loader that adds them to the scene as obstacles.
 
     `lookup` transforms between frames at the request's time. Raises TransformError: an object's frame is unknown.
     """
@@ -188,7 +188,7 @@ def with_collision_objects(request: Request, lookup: FrameLookup) -> Request:
         config = load_scene_config(settings.scene_config) if settings.scene_config else SceneConfig()
         return with_neighbours(load(), placed, config)
 
-    return replace(request, load=loaded)
+    return replace(request, load=loaded, solids=placed)
 
 
 def _placed_shapes(name: str, neighbour: SceneObject, request: Request, lookup: FrameLookup) -> list[TriangleMesh]:

@@ -112,6 +112,7 @@ class AnswerEnding:
     """End of a request for a GraspArray. The grasps of `result` are in the answer's frame.
 
     `mass` is the object's mass in the trials [kg], 0 without trials. `mass_assumed` is True if no mass was given.
+    `objects` has the place [m] of each object seen and why it has no verified grasp, for a request of any object.
     """
 
     status: int
@@ -120,6 +121,7 @@ class AnswerEnding:
     result: GraspResult | None = None
     mass: float = 0.0
     mass_assumed: bool = False
+    objects: Sequence[tuple[np.ndarray, str]] = ()
 
 
 def ending_of(result: GraspResult) -> AnswerEnding:
@@ -146,6 +148,8 @@ def array_message(
         mass=_number(ending.mass, 0.0),
         mass_assumed=ending.mass_assumed,
         elapsed=elapsed,
+        objects=[point_of(place) for place, _ in ending.objects],
+        object_reasons=[reason for _, reason in ending.objects],
     )
     if ending.result is not None:
         message.outcome = ending.result.outcome.name.lower()

@@ -398,6 +398,7 @@ class Responses:
                 self._report_superseded(request.id)
         else:
             found = {"result": report.value.result, **_weight(report.value)} if report.value else {}
+            found |= {"objects": report.value.objects} if report.value else {}
             answer = self._answer(request, dataclasses.replace(_ENDINGS[report.ending], **found))
             self.publishers.emit(report.ending.value, request.id, request.source)
             self._publish(answer, request.listener)
@@ -405,7 +406,7 @@ class Responses:
     def _result(self, request: Request, planned: Planned) -> None:
         result, hand = planned.result, self._hand
         # Make all messages before publishing any, so that an invalid result is reported as an error only.
-        ending = dataclasses.replace(messages.ending_of(result), **_weight(planned))
+        ending = dataclasses.replace(messages.ending_of(result), objects=planned.objects, **_weight(planned))
         answer = self._answer(request, ending)
         event = {**result_event(result), **_weight(planned)}
         latched = []

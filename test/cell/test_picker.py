@@ -29,7 +29,7 @@ class KeptGrasps:
     def next(self, view: DepthView, failures: tuple[Failure, ...]) -> Offer:
         key = self._world.arm.name, self._world.hand.name
         if key not in OFFERS:
-            source = InProcessGrasps(self._world.arm, self._world.hand, self._world.layout, preset="fast", seconds=60.0)
+            source = InProcessGrasps(self._world.arm, self._world.hand, self._world.layout, preset="fast")
             OFFERS[key] = source.next(view, failures)
         return OFFERS[key]
 

@@ -48,6 +48,9 @@ BAD_OPTIONS: list[tuple[list[str], str]] = [
     (["--mass", "-0.1"], "mass -0.1 kg must be a positive number"),
     (["--units", "furlong"], "invalid choice: 'furlong' (choose from"),
     (["--scale", "2", "--units", "mm"], "not allowed with argument"),
+    (["--any", "--alone"], "not allowed with argument"),
+    (["--any"], "--any: given with shape:box; valid with clouds and depth images of several objects"),
+    (["--any", "--view"], "--any: --view is given too; give one of them"),
     (["--verify", "gently"], "invalid choice: 'gently' (choose from"),
     (["--picture", "grasp.jpg"], "--picture grasp.jpg; valid: a file name that ends in .png"),
     (["--threads", "0"], "threads: 0; valid: 1 or more"),
@@ -387,7 +390,8 @@ def test_where_the_camera_of_a_cloud_stood_can_be_said_and_is_checked(tmp_path, 
     to = [*quick, "--target", "0", "0", "0.05", "--out", str(tmp_path / "out.json")]
     assert main(["synthesize", str(file), "--view-point", *place, *to]) == EXIT_OK
     assert np.linalg.norm(load_document(tmp_path / "out.json")["object"]["center_of_mass"][:2]) < 0.01
-    capsys.readouterr()
+    assert main(["synthesize", str(file), "--view-point", *place, *quick, "--any"]) == EXIT_OK
+    assert f"{file}: the object about (" in capsys.readouterr().err
     for wrong in ([], ["--view-point", *turned]):
         for command in (["synthesize", str(file)], ["reconstruct", str(file)]):
             rest = to if command[0] == "synthesize" else ["--out", str(tmp_path / "x.ply")]
@@ -406,6 +410,15 @@ def test_where_the_camera_of_a_cloud_stood_can_be_said_and_is_checked(tmp_path, 
     assert "refused: cloud: its camera did not stand at the origin of its frame" in capsys.readouterr().out
     assert main(["replay", str(tmp_path / "bag"), "--sensor-frame", "elbow", *to]) == EXIT_BAD_INPUT
     assert "no frame 'elbow'; frames of its transforms: " in the_line(capsys)
+
+
+def test_any_object_of_a_recording_is_told_with_all_seen(bags, capsys, quick):
+    assert main(["replay", str(bags["mcap"]), "--json", "--limit", "1", "--any", *quick]) == EXIT_OK
+    out, err = capsys.readouterr()
+    (scene,) = json.loads(out)["scenes"]
+    (seen,) = scene["objects"]
+    assert scene["outcome"]["name"] == "SUCCEEDED"
+    assert f"the object about {tuple(seen['center'])} m, of 1 seen" in err
 
 
 def test_a_long_recording_is_not_fused_whole(bags, capsys, monkeypatch, quick):

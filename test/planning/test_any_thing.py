@@ -5,9 +5,17 @@ import pytest
 
 from graspd_bench.rendering.depth_noise import DEFAULT
 from graspd_bench.rendering.tabletop import CAMERA, ring_poses, tabletop, views_of
-from graspd_core import Grasp, PointCloud, Posture, Verdict, load_hand
-from graspd_core.errors import CloudError
-from graspd_core.planning.any_thing import OUT_OF_TRIES, Failure, ThingPlan, plan_any_thing, unlike
+from graspd_core import Grasp, Outcome, PointCloud, Posture, Sphere, Steering, Verdict, load_hand
+from graspd_core.errors import CloudError, ConfigError, NoObjectError
+from graspd_core.planning.any_thing import (
+    NOT_LOOKED_AT,
+    OUT_OF_TRIES,
+    Failure,
+    ThingPlan,
+    plan_any_thing,
+    result_of_things,
+    unlike,
+)
 
 HAND = load_hand("parallel_gripper")
 ASKED = {"preset": "fast", "measure": False, "seed": 0}
@@ -52,6 +60,28 @@ def test_what_failed_comes_last_and_is_given_up_after_some_tries(views, first):
     over = plan_any_thing(views, HAND, failures=[Failure(thing.place) for thing in first] * 2, tries=2, **ASKED)
     assert [thing.reason for thing in over] == [OUT_OF_TRIES] * 2
     assert not any(thing.looked_at for thing in over)
+
+
+def test_one_result_answers_for_all_things(views, first):
+    assert first[0].result is not None
+    assert result_of_things(first) is first[0].result
+    # A grasp that failed nobody knows where is left out, and makes no object come later.
+    loose = Failure(None, first[0].grasp.grasp)
+    again = plan_any_thing(views, HAND, failures=[loose], verify="none", most=1, **ASKED)
+    assert [thing.reason for thing in again][1:] == [NOT_LOOKED_AT]
+    np.testing.assert_array_equal(again[0].points, first[0].points)
+    assert unlike([again[0].grasp], [first[0].grasp.grasp])
+    # The deadline is that of the whole search, so that the second object is not begun.
+    late = plan_any_thing(views, HAND, deadline=1e-3, **ASKED)
+    result = result_of_things(late)
+    assert (result.outcome, result.tried) == (Outcome.DEADLINE, ())
+    assert result.message == "none of 2 objects has a grasp: " + "; ".join(thing.reason for thing in late)
+    assert late[1].reason == NOT_LOOKED_AT
+    far = Steering(region=Sphere([9.0, 0.0, 0.0], 0.1))
+    with pytest.raises(ConfigError, match=r"none of 2 objects .*region: no part .*; region: "):
+        result_of_things(plan_any_thing(views, HAND, restrictions=(far,), **ASKED))
+    with pytest.raises(NoObjectError, match="no object is seen"):
+        result_of_things(())
 
 
 def test_a_grasp_like_one_that_was_lost_is_not_given_again(views: tuple[PointCloud, ...], first: tuple[ThingPlan, ...]):

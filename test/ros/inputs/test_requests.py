@@ -93,6 +93,10 @@ def refusal(**fields) -> RequestError:
         ({"mesh_scale": math.nan}, "mesh_scale: nan"),
         ({"use_target_point": True, "target_point": Point(x=math.nan)}, "target_point: [nan"),
         ({"use_target_point": True, "target_point": Point(z=1e9)}, "within 1000 m"),
+        ({"any_object": True, "alone": True}, "any_object: alone is given too"),
+        ({"any_object": True, "target_mask": Image(height=1)}, "any_object: target_mask is given too"),
+        ({"any_object": True, "source": GraspRequest.MESH}, "any_object: with source 1; valid with CLOUD=0"),
+        ({"any_object": True, "source": GraspRequest.KNOWN}, "any_object: with source 4; valid with CLOUD=0"),
     ],
 )
 def test_a_field_out_of_range_is_named(fields, culprit):
@@ -196,6 +200,12 @@ def test_views_are_gathered_in_one_frame():
     np.testing.assert_array_equal(first.viewpoint, [1.0, 0.0, 0.0])
     np.testing.assert_array_equal(second.points, [[2.0, 0.0, 0.0]])
     assert taker.from_message("a", settings, GraspRequest(source=GraspRequest.VIEWS)).frame == "map"
+    every = GraspRequest(source=GraspRequest.VIEWS, any_object=True)
+    asked = taker.from_message("a", settings, every)
+    assert asked.views is not None
+    assert asked.views() == (taker.views.clouds, ())
+    with pytest.raises(RequestError, match="any_object: the parameter segment is false"):
+        taker.from_message("a", replace(settings, segment=False), every)
     taker.newest = sensor_frame(np.zeros((3, 3)), frame="lost")
     with pytest.raises(GraspdError, match="lost"):
         taker.add_view(settings)
