@@ -117,8 +117,8 @@ _ROWS = (
     Metric("volume", "", 1.0, lambda g: g.wrench_hull.volume, "volume of that hull", 3),
     Metric(
         "payload", "kg", 1.0, None,
-        "greatest mass whose pulls in the hold trial the grasp holds, at its friction, by bisection to a tenth; of "
-        "grasps that passed that trial",
+        "greatest mass at which the grasp resists the pulls of the hold trial, by bisection to a tenth, at its "
+        "friction; only for grasps that passed that trial",
     ),
     Metric(
         "least_friction", "", 1.0, None,
