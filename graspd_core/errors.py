@@ -20,6 +20,11 @@ def shown(value: object) -> str:
         return f"a huge {type(value).__name__}"
 
 
+def first_line(error: BaseException) -> str:
+    """Return the first line of an error of a library, at most 200 characters, or its type if it says nothing."""
+    return next(iter(str(error).splitlines()), "")[:200] or type(error).__name__
+
+
 def choices(name: object, valid: Iterable[str], more: str = "") -> str:
     """Return the hint for an unknown name: the most similar valid name, else all valid names followed by `more`."""
     names = [*valid]

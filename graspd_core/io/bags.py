@@ -13,7 +13,7 @@ from functools import cache
 from pathlib import Path
 from typing import Any
 
-from graspd_core.errors import BagError
+from graspd_core.errors import BagError, first_line
 from graspd_core.io.messages import ORIGIN, CameraPlace, add_transforms, cloud_from_depth_message, no_lookup, stamp_of
 from graspd_core.perception.cloud.camera import ENCODINGS
 from graspd_core.perception.cloud.cloud_files import recording_told
@@ -198,7 +198,7 @@ def _opened(path: str | Path) -> Iterator[Any]:
         reader.open()
     # For a broken file the library raises many kinds of errors, such as struct, sqlite3, yaml and assertion errors.
     except Exception as error:
-        raise BagError(f"{path}: not a readable bag, or cut short ({_first_line(error)})") from error
+        raise BagError(f"{path}: not a readable bag, or cut short ({first_line(error)})") from error
     try:
         yield reader
     finally:
@@ -214,7 +214,7 @@ def _messages(path: str | Path, reader: Any, connections: list[Any]) -> Iterator
         try:
             item = next(messages, None)
         except Exception as error:
-            raise BagError(f"{path}: broken or cut short ({_first_line(error)})") from error
+            raise BagError(f"{path}: broken or cut short ({first_line(error)})") from error
         if item is None:
             return
         yield item
@@ -227,7 +227,7 @@ def _decode(path: str | Path, reader: Any, connection: Any, raw: Any) -> Any:
     try:
         return types.deserialize_cdr(raw, kind)
     except Exception as error:
-        raise BagError(f"{path}: a message on {connection.topic} is broken ({_first_line(error)})") from error
+        raise BagError(f"{path}: a message on {connection.topic} is broken ({first_line(error)})") from error
 
 
 def _topics(reader: Any) -> tuple[BagTopic, ...]:
@@ -290,7 +290,3 @@ def _info_topic(path: str | Path, reader: Any, image: str, name: str | None) -> 
 
 def _storage_files(path: Path) -> list[Path]:
     return sorted(file for ending in BAG_ENDINGS for file in path.glob(f"*.{ending}"))
-
-
-def _first_line(error: Exception) -> str:
-    return next(iter(str(error).splitlines()), "") or type(error).__name__

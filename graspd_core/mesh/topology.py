@@ -93,11 +93,16 @@ def is_oriented(faces: Faces) -> bool:
     return bool((balance[counts == 2] == 0).all())
 
 
+def edge_counts(faces: Faces) -> tuple[Int[np.ndarray, "edges 2"], Int[np.ndarray, "edges"]]:
+    """Return the vertices of each edge, the lower first, and the number of faces that it belongs to."""
+    edges, base = np.sort(_edges(faces), axis=1), int(faces.max(initial=0)) + 1
+    keys, counts = np.unique(edges[:, 0] * base + edges[:, 1], return_counts=True)
+    return np.column_stack([keys // base, keys % base]), counts
+
+
 def is_closed(mesh: TriangleMesh) -> bool:
     """Return True if every edge belongs to an even number of faces."""
-    a, b = _edges(mesh.faces).T
-    _, counts = np.unique(np.minimum(a, b) * len(mesh.vertices) + np.maximum(a, b), return_counts=True)
-    return bool((counts % 2 == 0).all())
+    return bool((edge_counts(mesh.faces)[1] % 2 == 0).all())
 
 
 def orient(vertices: Vertices, faces: Faces) -> Faces:

@@ -20,7 +20,7 @@ from graspd_core.perception.scene import ObjectModel, Obstacle, Scene, build_sce
 from graspd_core.perception.segment.segment import Segmentation, segment
 from graspd_core.perception.segment.target_selection import Target
 from graspd_core.runtime.worker_process import run_isolated
-from graspd_core.types import Plane, TriangleMesh
+from graspd_core.types import Plane
 
 # From this distance to the origin on, float32 coordinates are coarser than a camera [m].
 _FAR = 100.0
@@ -95,21 +95,21 @@ def reconstruct_object(
         seen = Segmentation(tuple(views), None, (), ())
     else:
         seen = segment(views, target=target, settings=settings.segmentation)
-    doubts = _doubts(seen, views, settings.segmentation.max_range) if seen.views else ()
+    doubts = ()
+    if seen.views:
+        about_units = _unit_doubts(seen, views, settings.segmentation.max_range)
+        doubts = (*about_units, *_camera_doubts(seen, views), *filter(None, (seen.beside,)))
     whole = reconstruct(seen.views, seen.support, settings.reconstruction, () if alone else views)
     whole = replace(whole, evidence=replace(whole.evidence, doubts=doubts))
     told = tuple(f"cloud: {doubt}; no grasp counts as verified" for doubt in doubts)
-    return whole, seen.support, _obstacles(seen, whole.mesh, settings), seen.warnings + told
+    reach = settings.segmentation.obstacle_range
+    obstacles = make_obstacles(seen.obstacles, seen.support, whole.mesh, reach, settings.obstacles)
+    return whole, seen.support, obstacles, seen.warnings + told
 
 
 def _single(points: Points) -> Points:
     near = np.abs(points[np.isfinite(points)]).max(initial=0.0) < _FAR
     return points.astype(np.float32).astype(float) if near else points
-
-
-def _doubts(seen: Segmentation, views: Sequence[PointCloud], farthest: float) -> tuple[str, ...]:
-    """Return reasons to doubt unit, cameras or segmentation. If there is a reason, no grasp counts as verified."""
-    return (*_unit_doubts(seen, views, farthest), *_camera_doubts(seen, views), *filter(None, (seen.beside,)))
 
 
 def _unit_doubts(seen: Segmentation, views: Sequence[PointCloud], farthest: float) -> tuple[str, ...]:
@@ -155,8 +155,3 @@ def _needs_no_camera(views: Sequence[PointCloud]) -> bool:
     first = views[0]
     all_round = len(views) == 1 and is_unposed(first, first.forward is not None)
     return all_round and (fits_nowhere(first) or is_all_round(first))
-
-
-def _obstacles(seen: Segmentation, mesh: TriangleMesh, settings: SceneConfig) -> tuple[Obstacle, ...]:
-    reach = settings.segmentation.obstacle_range
-    return make_obstacles(seen.obstacles, seen.support, mesh, reach, settings.obstacles)

@@ -43,7 +43,7 @@ def test_hopeless_clouds_are_named(entry, views, complaint):
 def test_cleaning_drops_nan_and_strays_and_thins():
     points, _ = surface_samples(make_shape("box"), 20_000, 0)
     strays = np.array([[0.5, 0, 0], [0, -0.4, 0.2], [np.nan, 0, 0]])
-    clean = clean_cloud(np.vstack([points, strays]), ORIGIN).points
+    clean = clean_cloud(np.vstack([points, strays]))
     assert np.isfinite(clean).all()
     assert np.abs(clean).max() < 0.05
     assert 1000 < len(clean) < 15_000
@@ -52,11 +52,11 @@ def test_cleaning_drops_nan_and_strays_and_thins():
 @pytest.mark.parametrize("far", [1e7, 1e300])
 def test_one_point_far_away_does_not_spoil_the_others(far):
     points, _ = surface_samples(make_shape("box"), 3000, 0)
-    clean = clean_cloud(np.vstack([points, [[far, 0, 0]]]), ORIGIN).points
+    clean = clean_cloud(np.vstack([points, [[far, 0, 0]]]))
     assert np.abs(clean).max() < 0.05
-    np.testing.assert_array_equal(clean, clean_cloud(points, ORIGIN).points)
+    np.testing.assert_array_equal(clean, clean_cloud(points))
     with pytest.raises(CloudError, match="too far apart"):
-        clean_cloud(points * 1e300, ORIGIN)
+        clean_cloud(points * 1e300)
 
 
 def test_a_cloud_moves_with_its_camera():

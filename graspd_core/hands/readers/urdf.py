@@ -205,13 +205,12 @@ def below_link(path: Path, root: ET.Element, link: str) -> None:
     links = {str(element.get("name")): element for element in root.findall("link")}
     if link not in links:
         raise HandError(f"{path}: root: no link {link!r}; links: {', '.join(links) or 'none, it is no URDF'}")
-    ends = [(end.find("parent"), end.find("child"), end) for end in root.findall("joint")]
-    ends = [("" if p is None else p.get("link"), "" if c is None else c.get("link"), e) for p, c, e in ends]
+    ends = [(_end(joint, "parent"), str(_end(joint, "child")), joint) for joint in root.findall("joint")]
     kept, waiting = {link}, [link]
     while waiting:
         parent = waiting.pop()
-        below = [str(child) for above, child, _ in ends if above == parent and child not in kept]
-        kept.update(below)
+        below = {child for above, child, _ in ends if above == parent} - kept
+        kept |= below
         waiting += below
     for name, element in links.items():
         if name not in kept:

@@ -15,7 +15,7 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float
 
-from graspd_core.errors import CloudError, Extra
+from graspd_core.errors import CloudError, Extra, first_line
 from graspd_core.perception.cloud.camera import camera_from_calibration, cloud_from_depth, depth_in_metres
 from graspd_core.perception.cloud.point_cloud import PointCloud, Points, Vector
 from graspd_core.perception.cloud.viewpoint_check import seen_from
@@ -46,14 +46,14 @@ class _Element:
     codes: list[str] = field(default_factory=list)
 
 
-def read_ply_points(path: Path) -> Points:
+def read_ply_points(data: bytes) -> Points:
     """Read the vertices of a ply file, text or binary in either byte order. NaN is kept.
 
     Raises ValueError if the file is not a ply file, lacks x, y or z, is cut short, or has list properties in or before
     the vertices.
     """
     # The word must start a line, because a comment may contain it.
-    head, *more = re.split(rb"[\r\n]end_header", path.read_bytes(), maxsplit=1)
+    head, *more = re.split(rb"[\r\n]end_header", data, maxsplit=1)
     rest = more[0] if more else b""
     body = rest[rest.find(b"\n") + 1 :]
     order, elements = _ply_header(head.decode("ascii", errors="replace").splitlines())
@@ -76,13 +76,10 @@ def read_ply_points(path: Path) -> Points:
     return _rows(body, _packed([order + element.codes[k] for k in places], places, sizes), element.count, start)
 
 
-def read_pcd_points(path: Path) -> Points | None:
-    """Read the points of a pcd file, text or binary. NaN is kept. Return None for compressed data.
-
-    Raises ValueError if the header is incomplete or inconsistent, or if the file is cut short.
-    """
+def _pcd_header(data: bytes) -> tuple[dict[str, list[str]], int]:
+    """Return the words of a pcd file's header by their key, and where the points begin."""
     header: dict[str, list[str]] = {}
-    data, at = path.read_bytes(), 0
+    at = 0
     while at < len(data) and "DATA" not in header:
         end = data.find(b"\n", at)
         end = len(data) if end < 0 else end
@@ -90,6 +87,14 @@ def read_pcd_points(path: Path) -> Points | None:
         at = end + 1
         if words and not words[0].startswith("#"):
             header[words[0]] = words[1:]
+    return header, at
+
+
+def _pcd_points(data: bytes, header: dict[str, list[str]], at: int) -> Points | None:
+    """Read the points of a pcd file, text or binary. NaN is kept. Return None for compressed data.
+
+    Raises ValueError if the header is incomplete or inconsistent, or if the file is cut short.
+    """
     missing = [key for key in ("FIELDS", "SIZE", "TYPE", "WIDTH", "HEIGHT", "DATA") if not header.get(key)]
     if missing:
         raise ValueError(f"its header has no {missing[0]}")
@@ -209,11 +214,7 @@ def load_views(path: str | Path, viewpoint: Vector | None = None) -> tuple[Point
     if ending not in CLOUD_ENDINGS:
         raise CloudError(f"{path}: unknown cloud ending {path.suffix!r}; valid endings: {', '.join(CLOUD_ENDINGS)}")
     if ending not in ("npy", "npz"):
-        if viewpoint is None:
-            viewpoint = _pcd_viewpoint(path) if ending == "pcd" else np.zeros(3)
-        points = _read_points(path, ending)
-        height = _pcd_height(path) if ending == "pcd" else 1
-        return (seen_from(points.reshape(height if len(points) % height == 0 else 1, -1, 3), viewpoint),)
+        return (_read_points(path, ending, viewpoint),)
     arrays = read_numpy(path)
     try:
         if "depth" in arrays or "depths" in arrays:
@@ -327,7 +328,7 @@ def read_numpy(path: Path) -> dict[str, np.ndarray]:
     # For a broken file, NumPy and the readers that it uses may raise any exception. A header that promises too much
     # raises MemoryError.
     except Exception as error:
-        told = _first_line(error)
+        told = first_line(error)
         if "allow_pickle" in told:
             told = "it holds a pickled object of Python, which is not loaded for safety: np.savez(path, points=points)"
         raise CloudError(f"{path}: not readable as numbers ({told})") from error
@@ -340,9 +341,31 @@ def _ply_has_faces(path: Path) -> bool:
     return any(len(words) > 2 and words[2] != b"0" for words in faces)
 
 
-def _pcd_viewpoint(path: Path) -> Vector:
+def _read_points(path: Path, ending: str, viewpoint: Vector | None) -> PointCloud:
+    """Read a ply, pcd or xyz file, seen from `viewpoint`, else from where a pcd file says, else from the origin."""
+    data, points, header = path.read_bytes(), None, {}
+    try:
+        if ending == "ply":
+            points = read_ply_points(data)
+        elif ending == "pcd":
+            header, at = _pcd_header(data)
+            viewpoint = _pcd_viewpoint(path, header) if viewpoint is None else viewpoint
+            points = _pcd_points(data, header, at)
+    except (ValueError, TypeError) as error:
+        raise CloudError(f"{path}: not a readable {ending} cloud ({first_line(error)})") from error
+    points = _read_open3d(path) if points is None else points
+    if len(points) == 0 and ending == "xyz" and b"," in data[:4096]:
+        raise CloudError(f"{path}: its numbers are separated by commas; an xyz file has blanks: tr , ' '")
+    if len(points) == 0:
+        raise CloudError(f"{path}: empty, or not a readable {ending} cloud")
+    rows = header.get("HEIGHT", [""])[0]
+    height = int(rows) if rows.isdigit() and int(rows) > 0 and len(points) % int(rows) == 0 else 1
+    return seen_from(points.reshape(height, -1, 3), np.zeros(3) if viewpoint is None else viewpoint)
+
+
+def _pcd_viewpoint(path: Path, header: Mapping[str, list[str]]) -> Vector:
     """Return the sensor's position [m] from the header, or the origin if the header has none."""
-    words = _pcd_header(path, b"VIEWPOINT")[:3] or [b"0"] * 3
+    words = header.get("VIEWPOINT", [])[:3] or ["0"] * 3
     try:
         place = np.array([float(word) for word in words])
     except ValueError:
@@ -350,39 +373,6 @@ def _pcd_viewpoint(path: Path) -> Vector:
     if place.shape != (3,) or not np.isfinite(place).all():
         raise CloudError(f"{path}: its VIEWPOINT is not 3 finite numbers and a quaternion")
     return place
-
-
-def _pcd_height(path: Path) -> int:
-    words = _pcd_header(path, b"HEIGHT")
-    return int(words[0]) if words and words[0].isdigit() and int(words[0]) > 0 else 1
-
-
-def _pcd_header(path: Path, name: bytes) -> list[bytes]:
-    with path.open("rb") as file:
-        lines = [line.split() for line in file.read(4096).split(b"\nDATA")[0].splitlines()]
-    return next((words[1:] for words in lines if words[:1] == [name]), [])
-
-
-def _read_points(path: Path, ending: str) -> Points:
-    points = None
-    try:
-        if ending == "ply":
-            points = read_ply_points(path)
-        elif ending == "pcd":
-            points = read_pcd_points(path)
-    except (ValueError, TypeError, OSError) as error:
-        raise CloudError(f"{path}: not a readable {ending} cloud ({_first_line(error)})") from error
-    points = _read_open3d(path) if points is None else points
-    if len(points) == 0 and ending == "xyz" and _has_commas(path):
-        raise CloudError(f"{path}: its numbers are separated by commas; an xyz file has blanks: tr , ' '")
-    if len(points) == 0:
-        raise CloudError(f"{path}: empty, or not a readable {ending} cloud")
-    return points
-
-
-def _has_commas(path: Path) -> bool:
-    with path.open("rb") as file:
-        return b"," in file.read(4096)
 
 
 def _read_open3d(path: Path) -> Points:
@@ -394,9 +384,5 @@ def _read_open3d(path: Path) -> Points:
         try:
             cloud = o3d.io.read_point_cloud(path, remove_nan_points=False, remove_infinite_points=False)
         except (MemoryError, RuntimeError) as error:
-            raise CloudError(f"{path}: not a readable cloud ({_first_line(error)})") from error
+            raise CloudError(f"{path}: not a readable cloud ({first_line(error)})") from error
     return np.array(cloud.points).reshape(-1, 3)
-
-
-def _first_line(error: BaseException) -> str:
-    return next(iter(str(error).splitlines()), "")[:200] or type(error).__name__

@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import Float
 
 from graspd_core.errors import MeshError
-from graspd_core.mesh.topology import scaled_normals
+from graspd_core.mesh.topology import edge_counts, scaled_normals
 from graspd_core.perception.cloud.point_cloud import PointCloud, Points, Vector
 from graspd_core.types import TriangleMesh
 
@@ -92,21 +92,13 @@ def _camera_place(corners: Float[np.ndarray, "n 3 3"], normals: Points) -> Vecto
     return None
 
 
-def _edges(mesh: TriangleMesh) -> tuple[np.ndarray, np.ndarray]:
-    edges = np.sort(mesh.faces[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2), axis=1)
-    keys, count = np.unique(edges[:, 0] * len(mesh.vertices) + edges[:, 1], return_counts=True)
-    return np.column_stack([keys // len(mesh.vertices), keys % len(mesh.vertices)]), count
-
-
 def _is_open(mesh: TriangleMesh) -> bool:
     """Return True if some edge belongs to one face only. Edges at a sample of the vertices are checked first."""
     for share in (32, 1):
         # Every face of an edge contains both ends of the edge, so the faces at a vertex include all faces of its edges.
         wanted = np.arange(len(mesh.vertices)) % share == 0
-        faces = mesh.faces[wanted[mesh.faces].any(1)] if share > 1 else mesh.faces
-        edges = np.sort(faces[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2), axis=1)
-        edges = edges[wanted[edges].any(1)]
-        if (np.unique(edges[:, 0] * len(mesh.vertices) + edges[:, 1], return_counts=True)[1] == 1).any():
+        edges, count = edge_counts(mesh.faces[wanted[mesh.faces].any(1)])
+        if (wanted[edges].any(1) & (count == 1)).any():
             return True
     return False
 
@@ -116,7 +108,7 @@ def _borders(mesh: TriangleMesh) -> int:
     from scipy.sparse import coo_matrix
     from scipy.sparse.csgraph import connected_components
 
-    edges, count = _edges(mesh)
+    edges, count = edge_counts(mesh.faces)
     used, compact = np.unique(edges[count == 1], return_inverse=True)
     if not len(used):
         return 0
@@ -126,7 +118,7 @@ def _borders(mesh: TriangleMesh) -> int:
 
 
 def _is_grid(mesh: TriangleMesh) -> bool:
-    edges, count = _edges(mesh)
+    edges, count = edge_counts(mesh.faces)
     inner = np.ones(len(mesh.vertices), dtype=bool)
     inner[edges[count == 1]] = False
     meet = np.bincount(mesh.faces.ravel(), minlength=len(mesh.vertices))

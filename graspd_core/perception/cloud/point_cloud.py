@@ -112,8 +112,8 @@ def least_axes(spreads: Float[np.ndarray, "n 3 3"]) -> Points:
     return found
 
 
-def clean_cloud(points: Points, viewpoint: Vector) -> PointCloud:
-    """Drop points that are not finite, thin the rest to an even density, and drop outliers.
+def clean_cloud(points: Points) -> Float[np.ndarray, "kept 3"]:
+    """Drop points [m] that are not finite, thin the rest to an even density, and drop outliers.
 
     Raises CloudError if the cloud is empty or all NaN, or if fewer than 50 points are left.
     """
@@ -144,7 +144,7 @@ def clean_cloud(points: Points, viewpoint: Vector) -> PointCloud:
     kept, _ = thinned.remove_statistical_outlier(nb_neighbors=20, std_ratio=2.5)
     result = np.asarray(kept.points)
     _refuse_few(len(result), len(points), "plausible")
-    return PointCloud(result, np.asarray(viewpoint, dtype=float))
+    return result
 
 
 def _refuse_few(left: int, given: int, kind: str) -> None:

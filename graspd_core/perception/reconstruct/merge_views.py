@@ -165,7 +165,7 @@ def is_unposed(view: PointCloud, axis_known: bool = False) -> bool:
     """
     from scipy.spatial import KDTree
 
-    points = clean_cloud(view.points, view.viewpoint).points
+    points = clean_cloud(view.points)
     if (view.viewpoint > points.min(0)).all() and (view.viewpoint < points.max(0)).all() and is_all_round(view):
         return True
     local = (points - view.viewpoint) @ view_frame(PointCloud(points, view.viewpoint))

@@ -121,7 +121,9 @@ def reconstruct(
     mesh = _closed(seen, guess.surfels, free_space, step, settings, cells)
     confidence = _confidence(mesh, np.concatenate([view.points for view in local]), settings)
     hidden = not unposed and _is_guessed(mesh, seen, guess, confidence, len(local), standing, settings)
-    warnings = (_sentence(len(views), guess.method),) if hidden else ()
+    by = guess.method or "closing the surface smoothly within the cameras' outlines"
+    sides = "one side only" if len(views) == 1 else f"{len(views)} sides, not all round"
+    warnings = (f"cloud: seen from {sides}; the rest is guessed by {by}",) if hidden else ()
     method = f"poisson, {guess.method}" if guess.method else "poisson"
     evidence = Evidence(seen, free_space, step, rotation, origin, guess.method, settings, hidden)
     mesh = TriangleMesh(mesh.vertices @ rotation.T + origin, mesh.faces)
@@ -163,7 +165,7 @@ def closed_mesh(
     step: float,
     settings: ReconstructionConfig,
     field: Field,
-    cells: int = GRID_CELLS,
+    cells: int,
 ) -> TriangleMesh:
     """Return a closed mesh through the seen and the guessed surfels, down to the support if there is one.
 
@@ -191,9 +193,9 @@ def _clean(views: Sequence[PointCloud], settings: ReconstructionConfig) -> list[
             raise CloudError("cloud: the position of a view's camera (viewpoint) is not finite")
     most = settings.max_points // len(views)
     kept = [_some(view, most) for view in views]
-    clean = clean_cloud(np.concatenate(kept), views[0].viewpoint)
-    tree = KDTree(clean.points)
-    near = 3 * float(np.median(tree.query(clean.points, k=2)[0][:, 1]))
+    clean = clean_cloud(np.concatenate(kept))
+    tree = KDTree(clean)
+    near = 3 * float(np.median(tree.query(clean, k=2)[0][:, 1]))
     result = []
     for points, view in zip(kept, views, strict=True):
         points = points[tree.query(points, distance_upper_bound=near)[0] < near] if len(points) else points
@@ -312,9 +314,3 @@ def _open_area(mesh: TriangleMesh, standing: bool) -> tuple[Float[np.ndarray, "f
     foot = (across[:, 2] < -_DOWN * length) & (np.maximum(np.maximum(a, b), c)[:, 2] < MAX_FOOT_HEIGHT_M)
     normals = across / np.maximum(length, 1e-30)[:, None]
     return 0.5 * np.where(foot & standing, 0.0, length), normals
-
-
-def _sentence(views: int, method: str) -> str:
-    seen = "one side only" if views == 1 else f"{views} sides, not all round"
-    by = method or "closing the surface smoothly within the cameras' outlines"
-    return f"cloud: seen from {seen}; the rest is guessed by {by}"
