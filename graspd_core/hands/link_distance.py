@@ -24,9 +24,8 @@ from graspd_core.hands.model import HandModel, Primitive
 from graspd_core.mesh.topology import scaled_normals
 from graspd_core.se3 import SE3, safe_norm
 
-# Points, their distances [m], and a size of a solid [m], which is one value or one per point.
+# Points and their distances [m].
 _Places, _Distances = Float[Tensor, "*batch 3"], Float[Tensor, "*batch"]
-_Length = float | Float[Tensor, "*#batch"]
 # Number of primitives whose planes and bounds are cached. It is enough for the hand with the most primitives.
 _MOST = 2048
 
@@ -35,17 +34,24 @@ def primitive_sdf(primitive: Primitive, points: _Places) -> _Distances:
     """Return the signed distance [m] of points to one primitive. Points are in the link frame."""
     rotation, translation = (torch.as_tensor(a).to(points) for a in (primitive.rotation, primitive.translation))
     local = (points - translation) @ rotation
+    if primitive.kind == "hull":
+        normals, offsets = (torch.as_tensor(a).to(points) for a in hull_planes(primitive))
+        return (local @ normals.T - offsets).amax(-1)
+    core, radius = _core_of(primitive)
+    reach = local.abs()
+    if primitive.kind == "cylinder":
+        reach, core = torch.stack([safe_norm(reach[..., :2]), reach[..., 2]], -1), core[1:]
+    return corner_sdf(reach - reach.new_tensor(core)) - radius
+
+
+def _core_of(primitive: Primitive) -> tuple[tuple[float, ...], float]:
+    """Return a box or round solid as a core and the radius by which it is grown (see `CollisionTensors`) [m]."""
     size = primitive.size
     if primitive.kind == "box":
-        return box_sdf(local, torch.tensor(size, dtype=points.dtype, device=points.device))
-    if primitive.kind == "sphere":
-        return sphere_sdf(local, size[0])
-    if primitive.kind == "capsule":
-        return capsule_sdf(local, size[0], size[1])
+        return size, 0.0
     if primitive.kind == "cylinder":
-        return cylinder_sdf(local, size[0], size[1])
-    normals, offsets = (torch.as_tensor(a).to(points) for a in hull_planes(primitive))
-    return (local @ normals.T - offsets).amax(-1)
+        return (size[0], *size), 0.0
+    return (0.0, 0.0, *size[1:], 0.0)[:3], size[0]
 
 
 def depth_inside(hand: HandModel, link: int, points: Float[np.ndarray, "points 3"]) -> Float[np.ndarray, "points"]:
@@ -81,9 +87,8 @@ def bounds(primitive: Primitive) -> tuple[Float[np.ndarray, "3"], Float[np.ndarr
     if primitive.kind == "hull":
         corners = primitive.vertices @ primitive.rotation.T + primitive.translation
         return corners.min(0), corners.max(0)
-    size = primitive.size
-    half = {"box": size, "sphere": size * 3, "cylinder": (size[0], *size), "capsule": (size[0], size[0], sum(size))}
-    reach = np.abs(primitive.rotation) @ np.array(half[primitive.kind])
+    core, radius = _core_of(primitive)
+    reach = np.abs(primitive.rotation) @ (np.array(core) + radius)
     return primitive.translation - reach, primitive.translation + reach
 
 
@@ -98,28 +103,6 @@ def hull_planes(primitive: Primitive) -> tuple[Float[np.ndarray, "planes 3"], Fl
     # Coplanar triangles give one plane. They are compared after rounding to 1e-9, far below a mesh file's resolution.
     planes = planes[np.unique(np.round(planes, 9), axis=0, return_index=True)[1]]
     return planes[:, :3], planes[:, 3]
-
-
-def sphere_sdf(points: _Places, radius: _Length) -> _Distances:
-    """Return the signed distance [m] to a sphere about the origin."""
-    return safe_norm(points) - radius
-
-
-def capsule_sdf(points: _Places, radius: _Length, half_length: _Length) -> _Distances:
-    """Return the signed distance [m] to a capsule: all points within `radius` of the segment |z| ≤ `half_length`."""
-    z = points[..., 2]
-    beyond = z.sign() * (z.abs() - half_length).clamp_min(0.0)
-    return safe_norm(torch.cat([points[..., :2], beyond[..., None]], -1)) - radius
-
-
-def box_sdf(points: _Places, half_extents: Float[Tensor, "*#batch 3"]) -> _Distances:
-    """Return the signed distance [m] to an axis-aligned box about the origin."""
-    return corner_sdf(points.abs() - half_extents)
-
-
-def cylinder_sdf(points: _Places, radius: _Length, half_length: _Length) -> _Distances:
-    """Return the signed distance [m] to a flat-ended cylinder along z, |z| ≤ `half_length`."""
-    return corner_sdf(torch.stack([safe_norm(points[..., :2]) - radius, points[..., 2].abs() - half_length], -1))
 
 
 def corner_sdf(past: Float[Tensor, "*batch n"]) -> _Distances:
@@ -160,16 +143,7 @@ def make_collision_tensors(hand: HandModel, device: torch.device | str, dtype: t
 @lru_cache(maxsize=8)
 def _make_collision_tensors(hand: HandModel, device: torch.device, dtype: torch.dtype) -> CollisionTensors:
     solids = [p for p in hand.primitives if p.kind != "hull"]
-    core, radius, is_round = [], [], []
-    for p in solids:
-        if p.kind == "box":
-            core.append(p.size)
-        elif p.kind == "cylinder":
-            core.append((p.size[0], p.size[0], p.size[1]))
-        else:
-            core.append((0.0, 0.0, p.size[1] if p.kind == "capsule" else 0.0))
-        radius.append(p.size[0] if p.kind in ("sphere", "capsule") else 0.0)
-        is_round.append(float(p.kind == "cylinder"))
+    cores = [_core_of(p) for p in solids]
 
     def tensor(values: object, shape: tuple[int, ...]) -> Tensor:
         return torch.as_tensor(np.asarray(values, dtype=float).reshape(shape), device=device, dtype=dtype)
@@ -178,9 +152,9 @@ def _make_collision_tensors(hand: HandModel, device: torch.device, dtype: torch.
     return CollisionTensors(
         rotation=tensor([p.rotation for p in solids], (n, 3, 3)),
         translation=tensor([p.translation for p in solids], (n, 3)),
-        core=tensor(core, (n, 3)),
-        radius=tensor(radius, (n,)),
-        is_round=tensor(is_round, (n,)),
+        core=tensor([core for core, _ in cores], (n, 3)),
+        radius=tensor([radius for _, radius in cores], (n,)),
+        is_round=tensor([p.kind == "cylinder" for p in solids], (n,)),
         link=torch.as_tensor([p.link for p in solids], device=device, dtype=torch.long),
     )
 

@@ -17,7 +17,7 @@ from torch import Tensor
 from graspd_core.config import GraspStagesConfig
 from graspd_core.hands.kinematics import RETREAT, drawn_back, forward, place_points
 from graspd_core.hands.link_distance import pair_distance, solid_distance
-from graspd_core.hands.solid_overlap import solid_overlaps
+from graspd_core.hands.self_collision import solid_overlaps
 from graspd_core.mesh.sdf import sample_sdf
 from graspd_core.optimize.kernel import builds as structs
 from graspd_core.optimize.loop import Distances, Joints, Poses, Rows, Values, adam_moments, pack

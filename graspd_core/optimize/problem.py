@@ -24,8 +24,7 @@ from graspd_core.hands.kinematics import (
 )
 from graspd_core.hands.link_distance import CollisionTensors, make_collision_tensors, pair_distance, solid_bound
 from graspd_core.hands.model import HandModel
-from graspd_core.hands.self_collision import collision_spheres
-from graspd_core.hands.solid_overlap import solid_overlaps, solid_pairs
+from graspd_core.hands.self_collision import collision_spheres, solid_overlaps, solid_pairs
 from graspd_core.mesh.mesh_files import surface_samples
 from graspd_core.mesh.sdf import GridSDF, sample_sdf
 from graspd_core.mesh.sharp_features import THIN_WALLED, crease_points, neighbours_together

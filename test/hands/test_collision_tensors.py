@@ -3,6 +3,7 @@
 import gc
 import weakref
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 import pytest
@@ -24,16 +25,12 @@ from graspd_core.hands.kinematics import (
 from graspd_core.hands.library import load_hand
 from graspd_core.hands.link_distance import (
     CollisionTensors,
-    box_sdf,
-    capsule_sdf,
-    cylinder_sdf,
     make_collision_tensors,
     pair_distance,
     primitive_sdf,
     solid_distance,
-    sphere_sdf,
 )
-from graspd_core.hands.model import HandModel, Primitive
+from graspd_core.hands.model import HandModel, Primitive, PrimitiveKind
 from graspd_core.hands.readers.urdf import read_urdf
 from graspd_core.se3 import SE3
 
@@ -127,12 +124,14 @@ def test_gradients_are_finite_on_an_axis(solids):
     assert gradient.isfinite().all()
 
 
-HALF = torch.tensor([0.1, 0.2, 0.3], dtype=torch.float64)
+SIZES: dict[PrimitiveKind, tuple[float, ...]] = {
+    "sphere": (0.2,),
+    "box": (0.1, 0.2, 0.3),
+    "capsule": (0.1, 0.2),
+    "cylinder": (0.1, 0.2),
+}
 KERNELS = {
-    "sphere": lambda p: sphere_sdf(p, 0.2),
-    "box": lambda p: box_sdf(p, HALF.to(p.dtype)),
-    "capsule": lambda p: capsule_sdf(p, 0.1, 0.2),
-    "cylinder": lambda p: cylinder_sdf(p, 0.1, 0.2),
+    kind: partial(primitive_sdf, Primitive(0, kind, np.eye(3), np.zeros(3), size)) for kind, size in SIZES.items()
 }
 GOLDEN = [
     ("sphere", (0.0, 0.0, 0.0), -0.2),

@@ -9,7 +9,7 @@ import torch
 from graspd_core import Posture, hand_names, load_hand, load_scene
 from graspd_core.hands.kinematics import forward, make_kinematics
 from graspd_core.hands.link_distance import CollisionTensors, make_collision_tensors
-from graspd_core.hands.solid_overlap import solid_overlaps, solid_pairs
+from graspd_core.hands.self_collision import solid_overlaps, solid_pairs
 from graspd_core.se3 import SE3
 from graspd_core.verify.hold_trial import set_hand_pose
 from graspd_core.verify.world import PROTOCOLS, build_world, trial_data

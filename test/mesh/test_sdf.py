@@ -1,6 +1,7 @@
 """The grid against exact distances and differences; sharp points, and walls thinner than a cell."""
 
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 import pytest
@@ -13,7 +14,8 @@ from graspd_bench.stress.broken_meshes import thin_cup
 from graspd_bench.stress.run_stress_case import GRASP, faults, run_case
 from graspd_bench.stress.stress_cases import CASES
 from graspd_core import TriangleMesh, load_hand, load_scene, plan_grasps
-from graspd_core.hands.link_distance import box_sdf, capsule_sdf, cylinder_sdf, sphere_sdf
+from graspd_core.hands.link_distance import primitive_sdf
+from graspd_core.hands.model import Primitive, PrimitiveKind
 from graspd_core.mesh.mesh_files import check_mesh, save_mesh, surface_samples
 from graspd_core.mesh.sdf import BAND, PADDING, GridSDF, build_sdf, grid_layout, is_solid, sample_sdf
 from graspd_core.mesh.shapes import (
@@ -33,12 +35,17 @@ from graspd_core.mesh.sharp_features import farthest_points, neighbours_together
 from graspd_core.mesh.surface_queries import closest_points, make_surface, winding_inside
 from graspd_core.se3 import random_rotations
 
+
+def exact(kind: PrimitiveKind, *size: float):
+    return partial(primitive_sdf, Primitive(0, kind, np.eye(3), np.zeros(3), size))
+
+
 EXACT = {
-    "sphere": lambda p: sphere_sdf(p, SPHERE_RADIUS),
-    "box": lambda p: box_sdf(p, torch.tensor(BOX_HALF, dtype=p.dtype)),
-    "plate": lambda p: box_sdf(p, torch.tensor(PLATE_HALF, dtype=p.dtype)),
-    "cylinder": lambda p: cylinder_sdf(p, CYLINDER_RADIUS, CYLINDER_HALF),
-    "capsule": lambda p: capsule_sdf(p, CAPSULE_RADIUS, CAPSULE_HALF),
+    "sphere": exact("sphere", SPHERE_RADIUS),
+    "box": exact("box", *BOX_HALF),
+    "plate": exact("box", *PLATE_HALF),
+    "cylinder": exact("cylinder", CYLINDER_RADIUS, CYLINDER_HALF),
+    "capsule": exact("capsule", CAPSULE_RADIUS, CAPSULE_HALF),
 }
 
 

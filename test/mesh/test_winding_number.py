@@ -11,7 +11,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import array_shapes, arrays
 
-from graspd_core.hands.link_distance import box_sdf
+from graspd_core.hands.link_distance import primitive_sdf
+from graspd_core.hands.model import Primitive
 from graspd_core.mesh.shapes import BOX_HALF, MUG_HALF, make_shape
 from graspd_core.mesh.surface_queries import (
     closest_points,
@@ -76,7 +77,8 @@ def test_the_exact_distance_of_a_box_is_the_closed_form(seed, shift):
     box = make_shape("box")
     query = make_distance_query(TriangleMesh(box.vertices + shift, box.faces))
     points = about(box, 200, seed)
-    expected = box_sdf(torch.as_tensor(points), torch.tensor(BOX_HALF, dtype=torch.float64)).numpy()
+    solid = Primitive(0, "box", np.eye(3), np.zeros(3), tuple(BOX_HALF))
+    expected = primitive_sdf(solid, torch.as_tensor(points)).numpy()
     # Embree counts in float32 about the centre: 1e-8 m at 10 cm.
     assert signed_distance(query, points + shift) == pytest.approx(expected, abs=5e-8)
 
