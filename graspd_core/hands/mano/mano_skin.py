@@ -20,7 +20,7 @@ from graspd_core.se3 import rotation_from_quaternion, safe_norm
 
 @dataclass(frozen=True, eq=False)
 class Skin:
-    """A MANO model as tensors on one device. Fields as in `ManoData`."""
+    """A MANO model as tensors. Fields as in `ManoData`."""
 
     template: Float[Tensor, "vertices 3"]
     shape_directions: Float[Tensor, "vertices 3 shapes"]
@@ -29,9 +29,9 @@ class Skin:
     weights: Float[Tensor, "vertices 16"]
 
 
-def make_skin(data: ManoData, device: torch.device | str = "cpu", dtype: torch.dtype = torch.float32) -> Skin:
+def make_skin(data: ManoData, dtype: torch.dtype = torch.float64) -> Skin:
     fields = (data.template, data.shape_directions, data.pose_directions, data.joint_regressor, data.weights)
-    return Skin(*(torch.as_tensor(array, device=device, dtype=dtype) for array in fields))
+    return Skin(*(torch.as_tensor(array, dtype=dtype) for array in fields))
 
 
 def rest(
@@ -76,21 +76,6 @@ def rotation_from_vector(vector: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*b
     """Return the rotation matrices of axis-angle vectors [rad]. The function is smooth at zero."""
     half = 0.5 * safe_norm(vector)[..., None]
     return rotation_from_quaternion(torch.cat([half.cos(), 0.5 * torch.sinc(half / torch.pi) * vector], -1))
-
-
-def pose_from_components(
-    data: ManoData, coefficients: Float[Tensor, "batch components"], *, about_mean: bool = True
-) -> Float[Tensor, "batch 15 3"]:
-    """Return the pose for coefficients of the first principal components: axis-angle of bodies 1 to 15 [rad].
-
-    Raises HandError: there are more coefficients than components.
-    """
-    count = coefficients.shape[-1]
-    if count > len(data.components):
-        raise HandError(f"{data.path}: {count} pose coefficients, but {len(data.components)} components")
-    components, mean = (torch.as_tensor(a).to(coefficients) for a in (data.components, data.mean))
-    pose = coefficients @ components[:count] + (mean if about_mean else 0.0)
-    return pose.unflatten(-1, (15, 3))
 
 
 def wrist_loop(data: ManoData) -> Int[np.ndarray, "loop"]:
