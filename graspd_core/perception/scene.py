@@ -241,12 +241,8 @@ def object_sdf(model: ObjectModel, resolution: int = 48) -> GridSDF:
         return {name: tensor.numpy() for name, tensor in vars(sdf).items()}
 
     def valid(arrays: cache.Arrays) -> bool:
-        shapes = {
-            "field": (4, *grid_layout(model.mesh, resolution).counts),
-            "origin": (3,),
-            "spacing": (),
-            "half": (3,),
-        }
+        counts = grid_layout(model.mesh, resolution).counts
+        shapes = {"field": (4, *counts), "origin": (3,), "spacing": (), "half": (3,)}
         return {name: array.shape for name, array in arrays.items()} == shapes
 
     arrays = cache.remember(f"sdf-{model.sha256}-{resolution}", build, valid)

@@ -15,6 +15,7 @@ from torch import Tensor
 
 from graspd_core.errors import HandError
 from graspd_core.hands.mano.mano_file import PARENTS, ManoData
+from graspd_core.mesh.topology import face_edges
 from graspd_core.se3 import rotation_from_quaternion, safe_norm
 
 
@@ -83,8 +84,8 @@ def wrist_loop(data: ManoData) -> Int[np.ndarray, "loop"]:
 
     Raises HandError: the boundary is not a single loop.
     """
-    edges = np.concatenate([data.faces[:, [0, 1]], data.faces[:, [1, 2]], data.faces[:, [2, 0]]])
-    present = set(map(tuple, edges.tolist()))
+    edges = face_edges(data.faces).tolist()
+    present = set(map(tuple, edges))
     if len(present) != len(edges):
         raise HandError(f"{data.path}: f: faces that are wound against each other, or an edge of three faces")
     after = {a: b for a, b in present if (b, a) not in present}
