@@ -24,7 +24,8 @@ from torch import Tensor
 from graspd_core.config.mapping import from_mapping, yaml_values
 from graspd_core.errors import ConfigError, choices, short_repr
 from graspd_core.hands.model import HandModel, Mount, Primitive
-from graspd_core.hands.readers.urdf import read_urdf
+from graspd_core.hands.readers.description import is_number
+from graspd_core.hands.readers.urdf import joint_end, keep_links, read_urdf
 from graspd_core.hands.readers.xml_io import parse_xml, read_xml
 from graspd_core.paths import config_dir
 from graspd_core.se3 import SE3, rotation_from_quaternion
@@ -304,7 +305,7 @@ def _make_arm(entries: ArmFile, urdf: Path, root: ET.Element, where: str) -> Arm
     seed = 0.5 * (lower + upper)
     for joint, value in _by_joint(chain, entries.seed, f"{where}.seed").items():
         index = chain.joint_names.index(joint)
-        if not _number(value) or not lower[index] <= value <= upper[index]:
+        if not is_number(value) or not lower[index] <= value <= upper[index]:
             limits = f"[{lower[index]:g}, {upper[index]:g}]"
             raise ConfigError(f"{where}.seed.{joint}: {short_repr(value)}; valid: a number within the limits {limits}")
         seed[index] = value
@@ -320,8 +321,8 @@ def _keep_chain(root: ET.Element, base: str, tip: str, where: str) -> None:
     for key, link in (("tip", tip), ("base", base)):
         if link and link not in links:
             raise ConfigError(f"{where}.{key}: no link {link!r} in the URDF; links: {', '.join(links) or 'none'}")
-    joints = {_end(joint, "child"): joint for joint in root.findall("joint")}
-    above = {child: _end(joint, "parent") for child, joint in joints.items()}
+    joints = {joint_end(joint, "child"): joint for joint in root.findall("joint")}
+    above = {child: joint_end(joint, "parent") for child, joint in joints.items()}
     chain = [tip]
     while chain[-1] != base and chain[-1] in above and above[chain[-1]] not in chain:
         chain.append(above[chain[-1]])
@@ -333,17 +334,9 @@ def _keep_chain(root: ET.Element, base: str, tip: str, where: str) -> None:
         welded = [c for c, j in joints.items() if above[c] == parent and j.get("type") == "fixed" and c not in kept]
         kept.update(welded)
         waiting += welded
-    for element in root.findall("link"):
-        if element.get("name") not in kept:
-            root.remove(element)
-    for child, element in joints.items():
-        if child not in kept or child == chain[-1]:
-            root.remove(element)
-
-
-def _end(joint: ET.Element, end: str) -> str:
-    element = joint.find(end)
-    return "" if element is None else str(element.get("link"))
+    if chain[-1] in joints:
+        root.remove(joints[chain[-1]])
+    keep_links(root, kept)
 
 
 def _limits(
@@ -353,7 +346,7 @@ def _limits(
     lower, upper = chain.lower.copy(), chain.upper.copy()
     for joint, given in _by_joint(chain, narrower, f"{where}.limits").items():
         index = chain.joint_names.index(joint)
-        if not isinstance(given, list) or len(given) != 2 or not all(map(_number, given)):
+        if not isinstance(given, list) or len(given) != 2 or not all(map(is_number, given)):
             raise ConfigError(f"{where}.limits.{joint}: expected a lower and an upper number, got {short_repr(given)}")
         low, high = given
         if not chain.lower[index] <= low < high <= chain.upper[index]:
@@ -368,10 +361,6 @@ def _by_joint(chain: HandModel, values: Mapping[str, Any], where: str) -> Mappin
         if joint not in chain.joint_names:
             raise ConfigError(f"{where}: no joint {short_repr(joint)}; joints: {', '.join(chain.joint_names)}")
     return values
-
-
-def _number(value: object) -> bool:
-    return isinstance(value, int | float) and not isinstance(value, bool) and abs(value) < 1e9
 
 
 def _mount(given: Any, tip: str, where: str) -> Mount:

@@ -127,7 +127,7 @@ def _any_object(options: argparse.Namespace, config: PlanConfig, request: dict[s
     views = scaled_views(options.object, options.camera, scale, options.view_point)
     hand = load_hand(options.hand)
     with Reporter() as reporter, Interrupt() as interrupt:
-        hooks = {"progress": reporter, "stop": interrupt.came}
+        hooks = {"progress": reporter, "stop": interrupt.is_interrupted}
         result, scene, about = plan_any_object(
             views, hand, options, deadline, source=options.object, preset=config, **hooks, **request
         )

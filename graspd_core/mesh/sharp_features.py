@@ -12,7 +12,7 @@ from jaxtyping import Bool, Float, Int
 
 from graspd_core.mesh.mesh_files import surface_samples
 from graspd_core.mesh.surface_queries import DistanceQuery, make_distance_query, signed_distance
-from graspd_core.mesh.topology import packed_rows, scaled_normals
+from graspd_core.mesh.topology import edge_counts, face_edges, packed_rows, scaled_normals
 from graspd_core.types import TriangleMesh
 
 Points = Float[np.ndarray, "n 3"]
@@ -65,7 +65,7 @@ def crease_points(mesh: TriangleMesh, count: int, seed: int) -> Float[np.ndarray
     """
     scaled, faces = scaled_normals(mesh.vertices, mesh.faces), mesh.faces
     normals = scaled / np.maximum(np.linalg.norm(scaled, axis=1, keepdims=True), 1e-300)
-    sides = np.sort(np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]]))
+    sides = np.sort(face_edges(faces))
     _, first, of, faces_at = np.unique(packed_rows(sides), return_index=True, return_inverse=True, return_counts=True)
     turned = np.zeros((len(first), 3))
     np.add.at(turned, of, np.tile(normals, (3, 1)))
@@ -142,8 +142,7 @@ def _pool(mesh: TriangleMesh, seed: int, size: int) -> tuple[Points, Points]:
         np.add.at(vertex_normals, mesh.faces[:, corner], scaled)
     vertex_normals /= np.maximum(np.linalg.norm(vertex_normals, axis=-1, keepdims=True), 1e-20)
     rng = np.random.default_rng(seed)
-    pairs = np.sort(np.concatenate([mesh.faces[:, [0, 1]], mesh.faces[:, [1, 2]], mesh.faces[:, [2, 0]]]))
-    edges = pairs[np.unique(packed_rows(pairs), return_index=True)[1]]
+    edges, _ = edge_counts(mesh.faces)
     lengths = np.linalg.norm(mesh.vertices[edges[:, 0]] - mesh.vertices[edges[:, 1]], axis=-1)
     along = rng.choice(len(edges), size=size, p=lengths / lengths.sum())
     a = rng.random((size, 1))

@@ -80,13 +80,14 @@ def drop_repeated(faces: Faces) -> Int[np.ndarray, "kept 3"]:
     return faces[np.sort(first)]
 
 
-def _edges(faces: Faces) -> Int[np.ndarray, "edges 2"]:
+def face_edges(faces: Faces) -> Int[np.ndarray, "edges 2"]:
+    """Return the edges of all faces in the direction of their winding: all first edges, then all second, all third."""
     return np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]])
 
 
 def is_oriented(faces: Faces) -> bool:
     """Return True if the winding is consistent: two faces run through their common edge in opposite directions."""
-    edges = _edges(faces)
+    edges = face_edges(faces)
     low, high = edges.min(1), edges.max(1)
     _, which, counts = np.unique(low * (int(faces.max()) + 1) + high, return_inverse=True, return_counts=True)
     balance = np.bincount(which, weights=np.where(edges[:, 0] < edges[:, 1], 1, -1))
@@ -95,7 +96,7 @@ def is_oriented(faces: Faces) -> bool:
 
 def edge_counts(faces: Faces) -> tuple[Int[np.ndarray, "edges 2"], Int[np.ndarray, "edges"]]:
     """Return the vertices of each edge, the lower first, and the number of faces that it belongs to."""
-    edges, base = np.sort(_edges(faces), axis=1), int(faces.max(initial=0)) + 1
+    edges, base = np.sort(face_edges(faces), axis=1), int(faces.max(initial=0)) + 1
     keys, counts = np.unique(edges[:, 0] * base + edges[:, 1], return_counts=True)
     return np.column_stack([keys // base, keys % base]), counts
 

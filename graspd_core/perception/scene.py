@@ -40,11 +40,6 @@ def moved_sdf(sdf: GridSDF, offset: Float[np.ndarray, "3"]) -> GridSDF:
     return GridSDF(sdf.field, origin.to(sdf.origin), sdf.spacing, sdf.half)
 
 
-def moved_plane(plane: Plane, offset: Float[np.ndarray, "3"]) -> Plane:
-    """Return the plane shifted by `offset` [m]."""
-    return Plane(plane.normal, plane.offset + float(plane.normal @ offset))
-
-
 def moved_grasp(grasp: Grasp, offset: Float[np.ndarray, "3"]) -> Grasp:
     """Return the grasp shifted by `offset` [m], or the grasp itself if the offset is zero."""
     if not offset.any():
@@ -246,12 +241,8 @@ def object_sdf(model: ObjectModel, resolution: int = 48) -> GridSDF:
         return {name: tensor.numpy() for name, tensor in vars(sdf).items()}
 
     def valid(arrays: cache.Arrays) -> bool:
-        shapes = {
-            "field": (4, *grid_layout(model.mesh, resolution).counts),
-            "origin": (3,),
-            "spacing": (),
-            "half": (3,),
-        }
+        counts = grid_layout(model.mesh, resolution).counts
+        shapes = {"field": (4, *counts), "origin": (3,), "spacing": (), "half": (3,)}
         return {name: array.shape for name, array in arrays.items()} == shapes
 
     arrays = cache.remember(f"sdf-{model.sha256}-{resolution}", build, valid)
@@ -302,11 +293,12 @@ def near_scene(scene: Scene) -> tuple[Scene, Float[np.ndarray, "3"]]:
     far = far_centre(scene.object.mesh.vertices)
     if not far.any():
         return scene, far
+    plane = scene.support
     near = replace(
         scene,
         object=moved_object(scene.object, -far),
         sdf=moved_sdf(scene.sdf, -far),
-        support=scene.support and moved_plane(scene.support, -far),
+        support=plane and Plane(plane.normal, plane.offset - float(plane.normal @ far)),
         obstacles=tuple(moved_obstacle(obstacle, -far) for obstacle in scene.obstacles),
         evidence=scene.evidence and replace(scene.evidence, origin=scene.evidence.origin - far),
     )

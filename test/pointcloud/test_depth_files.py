@@ -88,9 +88,9 @@ def test_the_camera_may_say_the_unit(tmp_path: Path, unit: Any):
 )
 def test_a_matrix_is_read_in_every_usual_form(tmp_path: Path, matrix: dict[str, Any]):
     path = written(tmp_path, **dict.fromkeys(("fx", "fy", "cx", "cy")), **matrix)
-    assert load_depth_camera(path).camera == CAMERA
+    assert load_depth_camera(path)[0] == CAMERA
     bent = written(tmp_path, distortion=[0.1, -0.2, 0.001, 0, 0])
-    assert load_depth_camera(bent).camera.distortion == (0.1, -0.2, 0.001, 0.0, 0.0)
+    assert load_depth_camera(bent)[0].distortion == (0.1, -0.2, 0.001, 0.0, 0.0)
 
 
 @pytest.mark.parametrize(
@@ -112,7 +112,7 @@ def test_a_matrix_is_read_in_every_usual_form(tmp_path: Path, matrix: dict[str, 
 def test_a_camera_that_says_something_else_is_named(tmp_path: Path, keys: dict[str, Any], told: str | None):
     path = written(tmp_path, **keys)
     if told is None:
-        assert load_depth_camera(path).camera == CAMERA
+        assert load_depth_camera(path)[0] == CAMERA
         return
     with pytest.raises(CloudError, match=rf"camera.json: .*{told}") as caught:
         load_depth_camera(path)

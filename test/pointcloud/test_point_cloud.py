@@ -98,15 +98,8 @@ def message_of(points: np.ndarray, code: str, step: int, row_padding: int) -> Si
         np.ndarray((height, width), code, data, first + axis * size, (row_step, step))[...] = points[..., axis]
     number = {4: 7, 8: 8}[size]
     fields = {"rgb": (0, 6), **{name: (first + axis * size, number) for axis, name in enumerate("xyz")}}
-    return SimpleNamespace(
-        width=width,
-        height=height,
-        point_step=step,
-        row_step=row_step,
-        is_bigendian=code[0] == ">",
-        fields=fields_of(fields),
-        data=data.tobytes(),
-    )
+    sizes = {"width": width, "height": height, "point_step": step, "row_step": row_step}
+    return SimpleNamespace(is_bigendian=code[0] == ">", fields=fields_of(fields), data=data.tobytes(), **sizes)
 
 
 layouts = st.tuples(st.sampled_from(["<f4", ">f4", "<f8", ">f8"]), st.integers(24, 40), st.integers(0, 9))

@@ -128,7 +128,6 @@ class ManoData:
         joint_regressor: joints as combinations of vertices.
         weights: skinning weights. Each row sums to one.
         faces: triangles, counter-clockwise seen from outside. The mesh is open at the wrist.
-        components: principal components of the pose, one per row [rad].
         mean: mean pose, as axis-angle vectors of bodies 1 to 15 [rad].
     """
 
@@ -139,7 +138,6 @@ class ManoData:
     joint_regressor: Float[np.ndarray, "16 vertices"]
     weights: Float[np.ndarray, "vertices 16"]
     faces: Int[np.ndarray, "faces 3"]
-    components: Float[np.ndarray, "components 45"]
     mean: Float[np.ndarray, "45"]
 
 
@@ -161,7 +159,6 @@ def read_mano(path: Path) -> ManoData:
         joint_regressor=_read(path, content, "J_regressor", (len(BODIES), count)),
         weights=_read(path, content, "weights", (count, len(BODIES))),
         faces=_read(path, content, "f", (None, 3)).astype(np.int64),
-        components=_read(path, content, "hands_components", (None, 45)),
         mean=_read(path, content, "hands_mean", (45,)),
     )
     tree = _read(path, content, "kintree_table", (2, len(BODIES))).astype(np.int64)

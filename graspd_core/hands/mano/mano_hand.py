@@ -30,11 +30,9 @@ from torch import Tensor
 from graspd_core.errors import HandError
 from graspd_core.hands.mano.mano_file import BODIES, PARENTS, ManoData, read_mano
 from graspd_core.hands.mano.mano_skin import (
-    Skin,
     close_wrist,
     closed_faces,
     make_skin,
-    pose_from_components,
     rest,
     rotation_from_vector,
     skin_vertices,
@@ -104,9 +102,9 @@ def palm_normal(data: ManoData, joints: Float[np.ndarray, "16 3"]) -> Float[np.n
     wrist, index, little = joints[0], joints[1], joints[7]
     normal = np.cross(index - wrist, little - wrist)
     normal /= np.linalg.norm(normal)
-    skin = make_skin(data, dtype=torch.float64)
+    skin = make_skin(data)
     zero = torch.zeros(1, data.shape_directions.shape[-1], dtype=torch.float64)
-    mean = pose_from_components(data, zero.new_zeros(1, 0))
+    mean = torch.as_tensor(data.mean).reshape(1, 15, 3)
     turned = torch.cat([torch.eye(3).to(zero).expand(1, 1, 3, 3), rotation_from_vector(mean)], 1)
     flat = torch.eye(3).to(zero).expand(1, 16, 3, 3)
     bent, straight = (skin_vertices(skin, zero, r, zero.new_zeros(1, 3))[1][0].numpy() for r in (turned, flat))
@@ -193,7 +191,7 @@ class ManoHand:
 
     def skinned_mesh(self, posture: Posture) -> TriangleMesh:
         """Return MANO's own surface at a posture [m], in the frame of the posture's position. The wrist is closed."""
-        skin, betas = _float64(self.data), torch.as_tensor(self.betas)[None]
+        skin, betas = make_skin(self.data), torch.as_tensor(self.betas)[None]
         rotations = rotations_from_joints(torch.as_tensor(self.frames), torch.as_tensor(posture.joint_positions)[None])
         origin = rest(skin, betas)[1][:, 0]
         vertices, _ = skin_vertices(skin, betas, rotations, -origin)
@@ -212,7 +210,7 @@ def load_mano(path: str | Path, betas: Sequence[float] = (), *, candidates: int 
     if len(betas) > len(shape) or not np.isfinite(list(betas)).all():
         raise HandError(f"{path}: {len(betas)} betas, expected at most {len(shape)} finite numbers")
     shape[: len(betas)] = betas
-    vertices, joints = (t[0].numpy() for t in rest(_float64(data), torch.as_tensor(shape)[None]))
+    vertices, joints = (t[0].numpy() for t in rest(make_skin(data), torch.as_tensor(shape)[None]))
     closed_faces(data)  # This refuses a mesh that cannot be closed before any planning.
     owner = data.weights.argmax(1)
     tips = _fingertips(vertices, joints, owner)
@@ -221,10 +219,6 @@ def load_mano(path: str | Path, betas: Sequence[float] = (), *, candidates: int 
     hand = _bare_hand(still)
     hand = replace(hand, adjacent=adjacent_links(hand), skins=_skins(hand, still))
     return ManoHand(with_candidates(hand, candidates), data, shape, still.frames)
-
-
-def _float64(data: ManoData) -> Skin:
-    return make_skin(data, dtype=torch.float64)
 
 
 def _fingertips(

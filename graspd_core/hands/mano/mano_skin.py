@@ -15,12 +15,13 @@ from torch import Tensor
 
 from graspd_core.errors import HandError
 from graspd_core.hands.mano.mano_file import PARENTS, ManoData
+from graspd_core.mesh.topology import face_edges
 from graspd_core.se3 import rotation_from_quaternion, safe_norm
 
 
 @dataclass(frozen=True, eq=False)
 class Skin:
-    """A MANO model as tensors on one device. Fields as in `ManoData`."""
+    """A MANO model as tensors. Fields as in `ManoData`."""
 
     template: Float[Tensor, "vertices 3"]
     shape_directions: Float[Tensor, "vertices 3 shapes"]
@@ -29,9 +30,9 @@ class Skin:
     weights: Float[Tensor, "vertices 16"]
 
 
-def make_skin(data: ManoData, device: torch.device | str = "cpu", dtype: torch.dtype = torch.float32) -> Skin:
+def make_skin(data: ManoData, dtype: torch.dtype = torch.float64) -> Skin:
     fields = (data.template, data.shape_directions, data.pose_directions, data.joint_regressor, data.weights)
-    return Skin(*(torch.as_tensor(array, device=device, dtype=dtype) for array in fields))
+    return Skin(*(torch.as_tensor(array, dtype=dtype) for array in fields))
 
 
 def rest(
@@ -78,28 +79,13 @@ def rotation_from_vector(vector: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*b
     return rotation_from_quaternion(torch.cat([half.cos(), 0.5 * torch.sinc(half / torch.pi) * vector], -1))
 
 
-def pose_from_components(
-    data: ManoData, coefficients: Float[Tensor, "batch components"], *, about_mean: bool = True
-) -> Float[Tensor, "batch 15 3"]:
-    """Return the pose for coefficients of the first principal components: axis-angle of bodies 1 to 15 [rad].
-
-    Raises HandError: there are more coefficients than components.
-    """
-    count = coefficients.shape[-1]
-    if count > len(data.components):
-        raise HandError(f"{data.path}: {count} pose coefficients, but {len(data.components)} components")
-    components, mean = (torch.as_tensor(a).to(coefficients) for a in (data.components, data.mean))
-    pose = coefficients @ components[:count] + (mean if about_mean else 0.0)
-    return pose.unflatten(-1, (15, 3))
-
-
 def wrist_loop(data: ManoData) -> Int[np.ndarray, "loop"]:
     """Return the vertices around the opening at the wrist, in edge direction. Empty for a closed mesh.
 
     Raises HandError: the boundary is not a single loop.
     """
-    edges = np.concatenate([data.faces[:, [0, 1]], data.faces[:, [1, 2]], data.faces[:, [2, 0]]])
-    present = set(map(tuple, edges.tolist()))
+    edges = face_edges(data.faces).tolist()
+    present = set(map(tuple, edges))
     if len(present) != len(edges):
         raise HandError(f"{data.path}: f: faces of opposite winding, or an edge of three faces")
     after = {a: b for a, b in present if (b, a) not in present}

@@ -61,7 +61,7 @@ class Source:
 
     def numbers(self, key: str, value: Any, count: int) -> Float[np.ndarray, "count"]:
         """Check a list of `count` numbers."""
-        if not isinstance(value, list) or len(value) != count or not all(map(_is_number, value)):
+        if not isinstance(value, list) or len(value) != count or not all(map(is_number, value)):
             raise self.error(key, f"expected {count} numbers, got {short_repr(value)}")
         return np.array(value, dtype=np.float64)
 
@@ -77,7 +77,7 @@ class Source:
         """Check a mapping of joint names to numbers."""
         values = self.mapping(key, value)
         for joint, number in values.items():
-            if not _is_number(number):
+            if not is_number(number):
                 raise self.error(f"{key}.{joint}", f"expected a number, got {short_repr(number)}")
         return {joint: float(number) for joint, number in values.items()}
 
@@ -85,7 +85,7 @@ class Source:
         """Check the effort: one positive number for all joints, or a mapping of joint names to positive numbers."""
         efforts = self.by_joint("effort", value) if isinstance(value, dict) else value
         values = list(efforts.values()) if isinstance(efforts, dict) else [efforts]
-        if not all(_is_number(number) and number > 0 for number in values):
+        if not all(is_number(number) and number > 0 for number in values):
             raise self.error("effort", f"expected positive numbers, got {short_repr(value)}")
         return efforts if isinstance(efforts, dict) else float(efforts)
 
@@ -134,7 +134,8 @@ class HandDescription:
     root: str | None = None
 
 
-def _is_number(value: object) -> bool:
+def is_number(value: object) -> bool:
+    """Return True for a number of a sensible size. True and False are no numbers."""
     return isinstance(value, int | float) and not isinstance(value, bool) and -_LARGEST <= value <= _LARGEST
 
 

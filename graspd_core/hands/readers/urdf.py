@@ -202,22 +202,33 @@ def _simpler(shape: Primitive, share: float) -> Primitive:
 
 def below_link(path: Path, root: ET.Element, link: str) -> None:
     """Keep only `link` and the links and joints below it. Raises HandError: the file has no such link."""
-    links = {str(element.get("name")): element for element in root.findall("link")}
+    links = [str(element.get("name")) for element in root.findall("link")]
     if link not in links:
         raise HandError(f"{path}: root: no link {link!r}; links: {', '.join(links) or 'none, it is no URDF'}")
-    ends = [(_end(joint, "parent"), str(_end(joint, "child")), joint) for joint in root.findall("joint")]
+    ends = [(joint_end(joint, "parent"), joint_end(joint, "child")) for joint in root.findall("joint")]
     kept, waiting = {link}, [link]
     while waiting:
         parent = waiting.pop()
-        below = {child for above, child, _ in ends if above == parent} - kept
+        below = {child for above, child in ends if above == parent} - kept
         kept |= below
         waiting += below
-    for name, element in links.items():
-        if name not in kept:
-            root.remove(element)
-    for parent, _, element in ends:
-        if parent not in kept:
-            root.remove(element)
+    keep_links(root, kept)
+
+
+def keep_links(root: ET.Element, kept: set[str]) -> None:
+    """Remove the other links from a URDF, and the joints that do not join two of `kept`."""
+    for link in root.findall("link"):
+        if link.get("name") not in kept:
+            root.remove(link)
+    for joint in root.findall("joint"):
+        if not {joint_end(joint, "parent"), joint_end(joint, "child")} <= kept:
+            root.remove(joint)
+
+
+def joint_end(joint: ET.Element, end: str) -> str:
+    """Return the link at an end of a joint, `parent` or `child`. Empty if the file does not name it."""
+    element = joint.find(end)
+    return "" if element is None else element.get("link") or ""
 
 
 def _refuse_xacro(path: Path, root: ET.Element) -> None:
@@ -239,9 +250,9 @@ def _below_world(
     """Drop links and joints that only place the hand in the world. Return the other links and joints, and warnings."""
     dropped: list[str] = []
     while True:
-        children = {_end(joint, "child") for joint in joints}
+        children = {joint_end(joint, "child") for joint in joints}
         roots = [link for link in links if link.get("name") not in children]
-        below = [joint for joint in joints if len(roots) == 1 and _end(joint, "parent") == roots[0].get("name")]
+        below = [joint for joint in joints if len(roots) == 1 and joint_end(joint, "parent") == roots[0].get("name")]
         if len(below) != 1 or any(roots[0].find(tag) is not None for tag in ("visual", "collision", "inertial")):
             break
         is_world = roots[0].get("name") == "world" and below[0].get("type") == "fixed"
@@ -251,7 +262,7 @@ def _below_world(
         joints = [joint for joint in joints if joint is not below[0]]
         dropped.append(
             f"link {roots[0].get('name')!r} and {below[0].get('type')} joint {below[0].get('name')!r} above the base "
-            f"{_end(below[0], 'child')!r} were dropped"
+            f"{joint_end(below[0], 'child')!r} were dropped"
         )
     for joint in joints:
         if joint.get("type") not in _KINDS:
@@ -259,19 +270,13 @@ def _below_world(
     return links, joints, dropped
 
 
-def _end(joint: ET.Element, end: str) -> str | None:
-    element = joint.find(end)
-    return None if element is None else element.get("link")
-
-
 def _read_joint(path: Path, joint: ET.Element) -> JointSpec:
-    ends = {end: _end(joint, end) for end in ("parent", "child")}
-    for end, link in ends.items():
-        if link is None:
-            raise wrong(path, joint, f"has no <{end} link=...>")
+    parent, child = (joint_end(joint, end) for end in ("parent", "child"))
+    if not (parent and child):
+        raise wrong(path, joint, f"has no <{'child' if parent else 'parent'} link=...>")
     kind = _KINDS[str(joint.get("type"))]
     rotation, translation = read_origin(path, joint)
-    name, parent, child = str(joint.get("name")), str(ends["parent"]), str(ends["child"])
+    name = str(joint.get("name"))
     if kind == "fixed":
         return JointSpec(name, parent, child, kind, rotation, translation)
     return JointSpec(name, parent, child, kind, rotation, translation, _axis(path, joint), *_limits(path, joint))

@@ -10,7 +10,6 @@ from __future__ import annotations
 
 import json
 from collections.abc import Mapping
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -35,21 +34,9 @@ _WHOLE = 1e-3
 # If the median depth is above this [m], the unit must be another.
 _FARTHEST = 50.0
 _SIMPLE = ("fx", "fy", "cx", "cy")
-
-
-@dataclass(frozen=True)
-class DepthCamera:
-    """A camera as described by its file.
-
-    Attributes:
-        camera: image size, camera matrix and lens distortion.
-        T_world_camera: pose of the camera (z forward, x right, y down). None if not in the file.
-        unit: metres per unit of its depth images. None if not in the file.
-    """
-
-    camera: PinholeCamera
-    T_world_camera: Float[np.ndarray, "4 4"] | None = None
-    unit: float | None = None
+# A camera, its pose `T_world_camera` (z forward, x right, y down), and metres per unit of its depth images. Pose and
+# unit are None if the camera's file does not give them.
+DepthCamera = tuple[PinholeCamera, Float[np.ndarray, "4 4"] | None, float | None]
 
 
 def is_depth_image(path: str | Path) -> bool:
@@ -69,11 +56,10 @@ def load_depth_view(image: str | Path, camera: str | Path, unit: float | None = 
     Raises:
         CloudError: a file cannot be read, is not a depth image or a camera, or the two do not fit each other.
     """
-    taken_by = load_depth_camera(camera)
-    pixels = _pixels(Path(image))
-    depth = _metres(pixels, unit or taken_by.unit, str(image))
+    taken_by, pose, told = load_depth_camera(camera)
+    depth = _metres(_pixels(Path(image)), unit or told, str(image))
     try:
-        return cloud_from_depth(depth, taken_by.camera, taken_by.T_world_camera)
+        return cloud_from_depth(depth, taken_by, pose)
     except CloudError as error:
         raise CloudError(f"{image}: {error} ({camera})") from None
 
@@ -110,7 +96,7 @@ def _camera_of(told: Mapping[str, Any]) -> DepthCamera:
     pose = None
     if "T_world_camera" in told:
         pose = rigid(_numbers(told["T_world_camera"], (4, 4), "T_world_camera"), "T_world_camera")
-    return DepthCamera(camera, pose, _unit(told["depth_unit"]) if "depth_unit" in told else None)
+    return camera, pose, _unit(told["depth_unit"]) if "depth_unit" in told else None
 
 
 def _matrix(told: Mapping[str, Any]) -> list[float]:

@@ -65,14 +65,12 @@ class Reconstruction:
     Attributes:
         mesh: the closed mesh, in the frame of the views [m].
         confidence: confidence of each vertex, 1 at seen surface, falling to 0 with the distance from seen surface.
-        method: "poisson" and the completion rule, e.g. "poisson, revolution".
         warnings: what was guessed, one sentence each.
         evidence: what the cameras saw, for other guesses of the hidden side.
     """
 
     mesh: TriangleMesh
     confidence: Float[np.ndarray, "vertices"]
-    method: str
     warnings: tuple[str, ...]
     evidence: Evidence
 
@@ -124,10 +122,9 @@ def reconstruct(
     by = guess.method or "closing the surface smoothly within the cameras' outlines"
     sides = "one side only" if len(views) == 1 else f"{len(views)} sides, not all round"
     warnings = (f"cloud: seen from {sides}; the rest is guessed by {by}",) if hidden else ()
-    method = f"poisson, {guess.method}" if guess.method else "poisson"
     evidence = Evidence(seen, free_space, step, rotation, origin, guess.method, settings, hidden)
     mesh = TriangleMesh(mesh.vertices @ rotation.T + origin, mesh.faces)
-    return Reconstruction(mesh, confidence, method, warnings, evidence)
+    return Reconstruction(mesh, confidence, warnings, evidence)
 
 
 def _in_frame(view: PointCloud, rotation: Float[np.ndarray, "3 3"], origin: Vector) -> PointCloud:

@@ -25,7 +25,6 @@ from graspd_core.hands.mano.mano_skin import (
     close_wrist,
     closed_faces,
     make_skin,
-    pose_from_components,
     rest,
     rotation_from_vector,
     skin_vertices,
@@ -60,7 +59,6 @@ def test_everything_is_read_back(model: dict[str, Any], tmp_path: Path) -> None:
     np.testing.assert_array_equal(data.joint_regressor, model["J_regressor"].toarray())
     np.testing.assert_array_equal(data.weights, model["weights"])
     np.testing.assert_array_equal(data.faces, model["f"])
-    np.testing.assert_array_equal(data.components, model["hands_components"])
     np.testing.assert_array_equal(data.mean, model["hands_mean"])
 
 
@@ -266,9 +264,6 @@ def test_numbers_that_are_none_are_refused_in_one_short_line(tmp_path: Path, con
     assert len(str(caught.value)) < 400
 
 
-DOUBLE = torch.float64
-
-
 @pytest.fixture(scope="module")
 def path(tmp_path_factory: pytest.TempPathFactory) -> Path:
     path = tmp_path_factory.mktemp("mano") / "MANO_RIGHT.pkl"
@@ -328,16 +323,18 @@ def draw(seed: int, shapes: int, batch: int = 2) -> tuple[torch.Tensor, torch.Te
 
 def test_forward_agrees_with_the_paper(data: ManoData) -> None:
     betas, pose, shift = draw(0, 10)
-    vertices, _ = skin_vertices(make_skin(data, dtype=DOUBLE), betas, rotation_from_vector(pose), shift)
+    vertices, _ = skin_vertices(make_skin(data), betas, rotation_from_vector(pose), shift)
     for row in range(2):
         expected = by_the_paper(data, betas[row].numpy(), pose[row].numpy(), shift[row].numpy())
         np.testing.assert_allclose(vertices[row], expected, atol=1e-12)
-    single, _ = skin_vertices(make_skin(data), betas.float(), rotation_from_vector(pose.float()), shift.float())
+    single, _ = skin_vertices(
+        make_skin(data, torch.float32), betas.float(), rotation_from_vector(pose.float()), shift.float()
+    )
     np.testing.assert_allclose(single, vertices, atol=2e-6)  # float32 over four joints in a row
 
 
 def test_gradients_are_those_of_finite_differences(data: ManoData) -> None:
-    skin = make_skin(data, dtype=DOUBLE)
+    skin = make_skin(data)
     weights = torch.as_tensor(np.random.default_rng(1).normal(size=data.template.shape))
     betas, pose, shift = (x[:1].requires_grad_(True) for x in draw(2, 10))
 
@@ -357,20 +354,6 @@ def test_rotation_vectors_are_those_of_rodrigues(seed: int, length: float) -> No
     np.testing.assert_allclose(rotation, rodrigues(vector.numpy()), atol=1e-12)
 
 
-def test_principal_components(data: ManoData) -> None:
-    coefficients = torch.as_tensor(np.random.default_rng(4).normal(size=(2, 6)))
-    flat = pose_from_components(data, coefficients, about_mean=False)
-    np.testing.assert_allclose(flat.flatten(1), coefficients.numpy() @ data.components[:6], atol=1e-14)
-    about = pose_from_components(data, coefficients)
-    np.testing.assert_allclose((about - flat).flatten(1), np.tile(data.mean, (2, 1)), atol=1e-14)
-    # All components reach every pose: they are a basis.
-    pose = np.random.default_rng(5).normal(size=45)
-    found = torch.as_tensor(np.linalg.solve(data.components.T, pose))[None]
-    np.testing.assert_allclose(pose_from_components(data, found, about_mean=False).flatten(), pose, atol=1e-12)
-    with pytest.raises(HandError, match="46 pose coefficients, but 45 components"):
-        pose_from_components(data, torch.zeros(1, 46))
-
-
 def test_the_wrist_is_closed(data: ManoData) -> None:
     faces, loop = closed_faces(data), wrist_loop(data)
     assert len(loop) >= 8
@@ -378,7 +361,7 @@ def test_the_wrist_is_closed(data: ManoData) -> None:
     betas, pose, shift = draw(6, 10, batch=1)
     for scale in (0.0, 0.3):
         rotations = rotation_from_vector(scale * pose)
-        vertices, _ = skin_vertices(make_skin(data, dtype=DOUBLE), betas, rotations, shift)
+        vertices, _ = skin_vertices(make_skin(data), betas, rotations, shift)
         mesh = trimesh.Trimesh(close_wrist(data, vertices)[0].numpy(), faces, process=False)
         assert mesh.is_watertight
         assert mesh.is_winding_consistent
@@ -410,7 +393,7 @@ def test_the_hands_links_are_the_skins_bodies(mano: ManoHand, seed: int) -> None
     hand = mano.model
     q = np.random.default_rng(seed).uniform(hand.lower, hand.upper)
     rotations, translations = link_poses(hand, q)
-    skin, betas = make_skin(mano.data, dtype=DOUBLE), torch.as_tensor(mano.betas)[None]
+    skin, betas = make_skin(mano.data), torch.as_tensor(mano.betas)[None]
     turned = mano_joints.rotations_from_joints(torch.as_tensor(mano.frames), torch.as_tensor(q)[None])
     origin = rest(skin, betas)[1][:, 0]
     _, joints = skin_vertices(skin, betas, turned, -origin)
