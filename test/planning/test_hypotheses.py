@@ -352,7 +352,7 @@ def test_what_speaks_against_a_scene_leaves_no_grasp_verified(monkeypatch):
 def test_seen_all_round_only_place_and_friction_are_in_doubt(monkeypatch):
     monkeypatch.delattr("graspd_core.verify.robustness._other_world")
     verified = [
-        grasp for grasp in plan(seen_all_round(), MASS_KNOWN.shapes).grasps if grasp.verdict is Verdict.VERIFIED
+        grasp for grasp in plan(seen_all_round(), SURE).grasps if grasp.verdict is Verdict.VERIFIED
     ]
     assert verified
     for grasp in verified:
@@ -391,7 +391,7 @@ def test_where_no_grasp_is_sure_enough_the_result_says_so_and_where_to_look_from
     monkeypatch.setattr(
         "graspd_core.verify.robustness.displaced", lambda grasp, *error: replace(grasp, pregrasp=grasp.squeeze)
     )
-    result = plan(seen(), MASS_KNOWN.shapes, rounds=1)
+    result = plan(seen(), SURE, rounds=1)
     assert result.tried
     assert not any(grasp.usable for grasp in result.tried)
     assert result.tried[0].verdict is Verdict.UNVERIFIED
