@@ -66,17 +66,15 @@ _HALF_TURN = (torch.pi, 0.0, 0.0)
 
 @dataclass(frozen=True)
 class Solutions:
-    """Joint values and the remaining error of the tip.
+    """Joint values, and which of them reach their targets.
 
     Attributes:
         q: joint values at the last step [rad] or [m].
         reached: True if the tip is within the tolerances of its target.
-        error: norm of position error and rotation error [m], where one radian counts as `RADIAN`.
     """
 
     q: Float[Tensor, "batch joints"]
     reached: Bool[Tensor, "batch"]
-    error: Float[Tensor, "batch"]
 
 
 def pose_error(target: SE3, tip: SE3) -> Float[Tensor, "batch 6"]:
@@ -112,7 +110,7 @@ def solve(
     """
     limits = [torch.as_tensor(limit).float() for limit in (arm.lower, arm.upper)]
     target, now, chain = SE3(target.rotation.float(), target.translation.float()), start.float(), tip_chain(arm)
-    q, error, reached = torch.empty(now.shape), torch.empty(len(now)), torch.zeros(len(now), dtype=torch.bool)
+    q, reached = torch.empty(now.shape), torch.zeros(len(now), dtype=torch.bool)
     rows = torch.arange(len(now))
     for step in range(steps + 1):
         tip, jacobian = tip_and_jacobian(chain, now)
@@ -120,7 +118,7 @@ def solve(
         away, turned = wrong[:, :3].norm(dim=-1), wrong[:, 3:].norm(dim=-1)
         there = (away < POSITION_TOLERANCE) & (turned < ROTATION_TOLERANCE)
         if step == steps or there.any():
-            q[rows], error[rows], reached[rows] = now, torch.hypot(away, RADIAN * turned), there
+            q[rows], reached[rows] = now, there
             ahead = torch.nonzero(~there).flatten()
             if step == steps or not len(ahead):
                 break
@@ -131,7 +129,7 @@ def solve(
     q = q.to(start)
     # Rounding may exceed a limit.
     q = q.clamp(*map(torch.as_tensor, (arm.lower, arm.upper))) if limited else q
-    return Solutions(q, reached, error.to(start))
+    return Solutions(q, reached)
 
 
 def _step(
