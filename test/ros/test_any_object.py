@@ -38,7 +38,7 @@ def places(answer: GraspArray) -> np.ndarray:
 
 def nearest(answer: GraspArray) -> int:
     """The row of PLACES that the contacts of the best grasp are nearest to."""
-    middle = np.mean([array_of(contact.position)[:2] for contact in answer.grasps[0].contacts], 0)
+    middle = np.mean([array_of(contact.position)[:2] for contact in list(answer.grasps)[0].contacts], 0)
     return int(np.linalg.norm(PLACES - middle, axis=1).argmin())
 
 
@@ -60,7 +60,7 @@ def test_any_object_is_taken_and_after_a_loss_another(client, start_node, make_c
     first = ask("first")
     assert first.status == GraspArray.SUCCEEDED, first.message
     np.testing.assert_allclose(places(first), PLACES, atol=0.04)
-    assert list(first.object_reasons) == ["", "not looked at"]
+    assert list(first.object_reasons) == ["", "not planned for"]
     assert nearest(first) == 0
     # The newest cloud that came is asked in the same way. Trials would only take time from here on.
     client.set_parameters(view_point=[x, y, z], verify="none")
@@ -74,7 +74,7 @@ def test_any_object_is_taken_and_after_a_loss_another(client, start_node, make_c
     np.testing.assert_allclose(places(second), PLACES[::-1] + np.array([SHIFT, 0.0]), atol=0.04)
     client.set_parameters(output_frame="")
     # One object is asked for as ever, and names no other.
-    one = ask("one", any_object=False, use_target_point=True, target_point=first.objects[0])
+    one = ask("one", any_object=False, use_target_point=True, target_point=list(first.objects)[0])
     assert nearest(one) == 0
     assert (list(one.objects), list(one.object_reasons)) == ([], [])
 
