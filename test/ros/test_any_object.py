@@ -38,7 +38,7 @@ def places(answer: GraspArray) -> np.ndarray:
 
 def nearest(answer: GraspArray) -> int:
     """The row of PLACES that the contacts of the best grasp are nearest to."""
-    middle = np.mean([array_of(contact.position)[:2] for contact in list(answer.grasps)[0].contacts], 0)
+    middle = np.mean([array_of(contact.position)[:2] for contact in next(iter(answer.grasps)).contacts], 0)
     return int(np.linalg.norm(PLACES - middle, axis=1).argmin())
 
 
@@ -74,7 +74,7 @@ def test_any_object_is_taken_and_after_a_loss_another(client, start_node, make_c
     np.testing.assert_allclose(places(second), PLACES[::-1] + np.array([SHIFT, 0.0]), atol=0.04)
     client.set_parameters(output_frame="")
     # One object is asked for as ever, and names no other.
-    one = ask("one", any_object=False, use_target_point=True, target_point=list(first.objects)[0])
+    one = ask("one", any_object=False, use_target_point=True, target_point=next(iter(first.objects)))
     assert nearest(one) == 0
     assert (list(one.objects), list(one.object_reasons)) == ([], [])
 
