@@ -68,8 +68,8 @@ MAX_PACKAGE_LINES = {
     "graspd_bench": 8_821,
     "graspd_dataset": 2_960,
     "graspd_viewer": 2_428,
-    "graspd_cell": 3_714,
-    "test": 33_015,
+    "graspd_cell": 3_773,
+    "test": 33_028,
 }
 # Lines that a program reaches through its imports, those inside functions too.
 # The layout aims at 22,000 of the node.
