@@ -5,6 +5,8 @@ from __future__ import annotations
 import argparse
 import atexit
 import gc
+import os
+from collections import Counter
 from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -12,12 +14,15 @@ from typing import TYPE_CHECKING, Any
 from graspd_core.cli.options import add_address
 from graspd_core.cli.output import answer, print_error, print_note, waiting
 from graspd_core.cli.running import EXIT_INTERRUPTED, EXIT_OK, Interrupt
-from graspd_core.errors import ConfigError
+from graspd_core.errors import ConfigError, GraspdError
 
 if TYPE_CHECKING:
     from graspd_cell.cell_view import LiveCell
     from graspd_cell.picker import Attempt
     from graspd_cell.referee import Report
+    from graspd_cell.simulated_robot import SimulatedRobot
+    from graspd_core.arms.arm import Arm
+    from graspd_core.hands.model import HandModel
 
 # Exit status if an object did not end in the place bin.
 EXIT_LEFT = 3
@@ -39,6 +44,9 @@ def add_command(commands: Any) -> None:
     parser.add_argument("--seed", type=int, default=0, help="of the things and of how they fall (default 0)")
     parser.add_argument("--preset", default="balanced", help="of graspd (default balanced)")
     parser.add_argument("--attempts", type=int, default=None, metavar="N", help="at most (default: two a thing)")
+    parser.add_argument(
+        "--picks", type=int, default=None, metavar="N", help="refill the bin until N attempts were made"
+    )
     parser.add_argument("--film", type=Path, default=None, metavar="PATH.png", help="eight frames of the first pick")
     parser.add_argument("--view", action="store_true", help="show the cell in a browser, in real time")
     parser.add_argument("--speed", type=float, default=1.0, metavar="X", help="of --view, times real time (default 1)")
@@ -49,13 +57,9 @@ def run(options: argparse.Namespace) -> int:
     """Empty the bin. Return 0 if no object is left, 3 if one is left, 130 after Ctrl-C."""
     import torch
 
-    from graspd_cell.cell_study import CellCase
     from graspd_cell.cell_view import Film, LiveCell, ToldSource
     from graspd_cell.grasp_source import InProcessGrasps
     from graspd_cell.picker import Cancelled, Ending, Picker, summary
-    from graspd_cell.simulated_robot import SETTLING, SimulatedRobot
-    from graspd_cell.things import find_sources
-    from graspd_cell.world import pile_cell
     from graspd_core.arms.arm import load_arm
     from graspd_core.hands.library import load_hand
 
@@ -63,13 +67,11 @@ def run(options: argparse.Namespace) -> int:
     torch.set_num_threads(1)
     # Objects still frozen at exit are never freed. OMPL prints many warnings about them.
     atexit.register(gc.unfreeze)
-    found = () if options.things == ["families"] else find_sources(options.things)
-    things = tuple((source.source, source.mass) for source in found)
-    case = CellCase(f"{options.arm}+{options.hand}", options.count, options.seed, options.preset, things)
     arm, hand = load_arm(options.arm), load_hand(options.hand)
-    world = pile_cell(arm, hand, case.sources(), options.seed)
-    robot = SimulatedRobot(world, seed=options.seed)
-    robot.wait(SETTLING)
+    if options.picks is not None:
+        return _many_picks(options, arm, hand)
+    robot = _filled_cell(options, arm, hand, options.seed)
+    world = robot.world
     live = LiveCell(robot, host=options.host, port=options.port, speed=options.speed) if options.view else None
     film = Film(robot) if options.film else None
     source = ToldSource(
@@ -104,6 +106,59 @@ def run(options: argparse.Namespace) -> int:
     return EXIT_LEFT if left else EXIT_OK
 
 
+def _filled_cell(options: argparse.Namespace, arm: Arm, hand: HandModel, seed: int) -> SimulatedRobot:
+    """Return the robot of a cell whose bin holds objects at rest."""
+    from graspd_cell.cell_study import CellCase
+    from graspd_cell.simulated_robot import SETTLING, SimulatedRobot
+    from graspd_cell.things import find_sources
+    from graspd_cell.world import pile_cell
+
+    found = () if options.things == ["families"] else find_sources(options.things)
+    things = tuple((source.source, source.mass) for source in found)
+    case = CellCase(f"{options.arm}+{options.hand}", options.count, seed, options.preset, things)
+    robot = SimulatedRobot(pile_cell(arm, hand, case.sources(), seed), seed=seed)
+    robot.wait(SETTLING)
+    return robot
+
+
+def _many_picks(options: argparse.Namespace, arm: Arm, hand: HandModel) -> int:
+    """Empty one bin after another until `--picks` attempts were made. Print each failure, the endings and the memory.
+
+    The seeds of the bins count up from `--seed`. Return the exit status.
+    """
+    from graspd_cell.grasp_source import InProcessGrasps
+    from graspd_cell.picker import Ending, Picker, summary
+
+    attempts, memory, ended = list[Attempt](), list[float](), Counter[str]()
+    with Interrupt() as interrupt:
+        # A bin may end without an attempt, so that the bins are counted too.
+        while len(attempts) < options.picks and len(memory) < options.picks and not interrupt.came():
+            robot, number = _filled_cell(options, arm, hand, options.seed + len(memory)), len(memory) + 1
+            source = InProcessGrasps(arm, hand, robot.world.layout, preset=options.preset, seed=options.seed)
+            picker = Picker(robot, source, arm, hand, robot.world.layout, cancelled=interrupt.came)
+            most = min(options.attempts or 2 * options.count + 3, options.picks - len(attempts))
+            try:
+                for attempt in waiting(picker.empty_the_bin(most), "pick"):
+                    attempts.append(attempt)
+                    if attempt.ending is not Ending.PICKED:
+                        print(f"bin {number}, attempt {attempt.number}: {attempt.ending}: {attempt.reason}", flush=True)
+            except GraspdError as error:
+                ended["the arm stayed where it was"] += 1
+                print(f"bin {number}: {error}", flush=True)
+            memory.append(resident_mb())
+    ended += Counter(str(attempt.ending) for attempt in attempts)
+    print("; ".join(f"{ending}: {count}" for ending, count in ended.most_common()))
+    told = f"{memory[0]:.0f} MB after the first bin, {memory[-1]:.0f} MB after the last" if memory else "no bin"
+    print(f"{summary(attempts)}; {len(memory)} bins; {told}", flush=True)
+    answer({"attempts": attempts, "endings": ended, "memory_mb": memory})
+    return EXIT_INTERRUPTED if interrupt.came() else EXIT_OK
+
+
+def resident_mb() -> float:
+    """Return the memory of this process that is resident [MB]."""
+    return int(Path("/proc/self/statm").read_text().split()[1]) * os.sysconf("SC_PAGE_SIZE") / 1e6
+
+
 def _refuse(options: argparse.Namespace) -> None:
     from graspd_cell.cell_study import MOST_THINGS
     from graspd_core.io.grasps_json import check_writable
@@ -114,6 +169,10 @@ def _refuse(options: argparse.Namespace) -> None:
         raise ConfigError(f"--seed {options.seed}: valid: 0 to 2^31 - 1")
     if options.attempts is not None and options.attempts < 1:
         raise ConfigError(f"--attempts {options.attempts}: valid: 1 or more")
+    if options.picks is not None and options.picks < 1:
+        raise ConfigError(f"--picks {options.picks}: valid: 1 or more")
+    if options.picks is not None and (options.view or options.film):
+        raise ConfigError("--picks: --view or --film is given too; give one of them")
     if not options.speed > 0:
         raise ConfigError(f"--speed {options.speed}: valid: more than zero")
     if options.film is not None:

@@ -10,10 +10,9 @@ connects only two states, and sends waypoints in between to a server.
 
 from __future__ import annotations
 
-import time
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
-from functools import cached_property, lru_cache
+from functools import cache, cached_property, lru_cache
 from itertools import pairwise
 from typing import Any
 
@@ -306,11 +305,16 @@ def dense(path: Path, step: float = _STEP) -> Path:
 _DEEPEST, ARM_DEEPEST = -0.02, -0.01
 
 
-def find_path(mover: Mover, start: Joints, goal: Joints, seconds: float = 5.0) -> Path:
+# Most checks of postures and straight lines in a search, and then to shorten its path. Counts, so that a busy machine
+# changes nothing.
+_CHECKS, _SHORTENING = 3000, 150
+
+
+def find_path(mover: Mover, start: Joints, goal: Joints, checks: int = _CHECKS) -> Path:
     """Return waypoints from one posture to another. Straight lines between them are collision-free.
 
     Raises:
-        NoMotionError: the goal is in collision, or no path was found in `seconds` of this thread's CPU time.
+        NoMotionError: the goal is in collision, or `checks` of postures and straight lines found no path.
     """
     ends = np.stack([start, goal])
     # Only the goal is checked. The arm is already at the start, even if it touches something there.
@@ -321,17 +325,26 @@ def find_path(mover: Mover, start: Joints, goal: Joints, seconds: float = 5.0) -
     allowed = mover.allowed(ends)
     if mover.clear(ends, allowed):
         return ends
-    found = _planned(mover, start, goal, allowed, seconds)
+    found = _planned(mover, start, goal, allowed, checks)
     if found is None:
-        raise NoMotionError(f"motion: no collision-free path of {mover.shape.arm.name} was found in {seconds:g} s")
+        raise NoMotionError(f"motion: {checks} checks found no collision-free path of {mover.shape.arm.name}")
     return _rounded(mover, found, allowed)
 
 
-def _planned(mover: Mover, start: Joints, goal: Joints, allowed: np.ndarray, seconds: float) -> Path | None:
+@cache
+def _seed_ompl() -> None:
+    """Fix the seed of OMPL's random numbers. OMPL takes a seed only once, before its first random number."""
     with Extra("cell"):
-        from ompl import base, geometric, util
+        from ompl import util
 
     util.setLogLevel(util.LogLevel.LOG_ERROR)
+    util.RNG.setSeed(1)
+
+
+def _planned(mover: Mover, start: Joints, goal: Joints, allowed: np.ndarray, checks: int) -> Path | None:
+    _seed_ompl()
+    from ompl import base, geometric
+
     arm, count = mover.shape.arm, len(start)
     space, bounds = base.RealVectorStateSpace(count), base.RealVectorBounds(count)
     for joint in range(count):
@@ -342,14 +355,21 @@ def _planned(mover: Mover, start: Joints, goal: Joints, allowed: np.ndarray, sec
     space.setBounds(bounds)
     about = base.SpaceInformation(space)
 
+    done = 0
+
     def values(state: Any) -> Joints:
         return np.array([state[joint] for joint in range(count)])
 
+    def is_clear(*states: Any) -> bool:
+        nonlocal done
+        done += 1
+        return mover.clear(np.stack([values(state) for state in states]), allowed)
+
     class Edges(base.MotionValidator):
         def checkMotion(self, first: Any, second: Any, *_: Any) -> bool:
-            return mover.clear(np.stack([values(first), values(second)]), allowed)
+            return is_clear(first, second)
 
-    about.setStateValidityChecker(lambda state: mover.clear(values(state)[None], allowed))
+    about.setStateValidityChecker(is_clear)
     about.setMotionValidator(Edges(about))
     about.setup()
     ends: list[Any] = [space.allocState() for _ in range(2)]
@@ -362,12 +382,10 @@ def _planned(mover: Mover, start: Joints, goal: Joints, allowed: np.ndarray, sec
     planner.setRange(0.6)
     planner.setProblemDefinition(problem)
     planner.setup()
-    # The limit is CPU time, so that a busy machine does not change the result.
-    end = time.thread_time() + seconds
-    if str(planner.solve(base.PlannerTerminationCondition(lambda: time.thread_time() > end))) != "Exact solution":
+    if str(planner.solve(base.PlannerTerminationCondition(lambda: done > checks))) != "Exact solution":
         return None
-    path: Any = problem.getSolutionPath()
-    geometric.PathSimplifier(about).simplify(path, 0.3)
+    path, most = problem.getSolutionPath(), done + _SHORTENING
+    geometric.PathSimplifier(about).simplify(path, base.PlannerTerminationCondition(lambda: done > most))
     return np.stack([values(state) for state in path.getStates()])
 
 

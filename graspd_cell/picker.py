@@ -33,11 +33,12 @@ from graspd_cell.motion import (
     timed,
 )
 from graspd_cell.robot import DepthView, JointMotion, JointReading, MotionAborted, Robot, never
-from graspd_core.arms.arm import Arm
+from graspd_core.arms.arm import Arm, tip_hand
 from graspd_core.arms.execution import Execution, ExecutionPace, execution_of
 from graspd_core.errors import GraspdError
 from graspd_core.hands.model import HandModel
 from graspd_core.mesh.mesh_files import surface_samples
+from graspd_core.perception.obstacles import held_hull
 
 
 class Ending(StrEnum):
@@ -268,7 +269,7 @@ class Picker:
         """Carry the object above the place bin. Return why it was lost, or an empty string if it is still held."""
         hold, here = taking.hold, self._arm_now()
         assert hold is not None
-        thing = self._surface_now(taking, here)
+        thing = self._held_now(taking, here)
         world = self._without_thing(taking)
         mover = self._mover(world, self._hand_now())
         mover = replace(mover, carried=held_balls(mover, here, thing))
@@ -332,13 +333,15 @@ class Picker:
         fingers = self._hand_now() if fingers is None else fingers
         return Mover(arm_shape(self._arm), world, hand_balls(self._arm, self._hand, fingers))
 
-    def _surface_now(self, taking: _Taking, here: np.ndarray) -> np.ndarray:
-        """Return surface points of the held object [m], raised as far as the tip rose since the grasp."""
-        assert taking.offer.surface is not None
-        mover = self._mover(taking.world)
-        points = surface_samples(taking.offer.surface, 1500, 0)[0]
-        at = taking.execution.arm[taking.execution.gates[1]]
-        return points + np.array([0.0, 0.0, mover.height(here) - mover.height(at)])
+    def _held_now(self, taking: _Taking, here: np.ndarray) -> np.ndarray:
+        """Return surface points of the held object's hull [m], which moves with the hand's base link."""
+        offer = taking.offer
+        assert offer.surface is not None
+        assert offer.grasp is not None
+        points = surface_samples(held_hull(offer.surface, offer.grasp.grasp), 1500, 0)[0]
+        mount, tip = tip_hand(self._arm, self._hand), tip_pose(self._mover(taking.world), here)
+        local = points @ mount.rotation.numpy().T + mount.translation.numpy()
+        return local @ tip[:3, :3].T + tip[:3, 3]
 
     def _without_thing(self, taking: _Taking) -> SeenWorld:
         """Return the obstacles without the points of the held object."""

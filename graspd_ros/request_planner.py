@@ -22,6 +22,7 @@ from jaxtyping import Float
 
 from graspd_core import HandModel, Scene, load_preset, plan_grasps, save_result
 from graspd_core.config import load_scene_config
+from graspd_core.perception.obstacles import held_hull
 from graspd_core.planning.any_thing import Failure, plan_any_thing, result_of_things
 from graspd_core.types import (
     Grasp,
@@ -33,6 +34,7 @@ from graspd_core.types import (
     Stage,
     StopHook,
     Timing,
+    TriangleMesh,
     Verdict,
 )
 from graspd_core.verify.prepared_grasp import arrival, make_metrics_context
@@ -79,6 +81,8 @@ class Planned:
         mass_assumed: True if the request gave no mass.
         objects: place [m] of each object seen, and why it has no verified grasp, for a request of any object. The first
             is the one of the grasps.
+        surface: the object's mesh in its own frame [m]. None if it was not loaded.
+        held: the object's hull in the base link's frame at the first grasp [m]. None without a usable grasp or mesh.
     """
 
     result: GraspResult
@@ -87,6 +91,8 @@ class Planned:
     mass: float = 0.0
     mass_assumed: bool = False
     objects: tuple[tuple[Float[np.ndarray, "3"], str], ...] = ()
+    surface: TriangleMesh | None = None
+    held: TriangleMesh | None = None
 
 
 @dataclass(frozen=True)
@@ -260,6 +266,9 @@ class Planner:
             moved = lambda progress: report(_with_found(progress, place))  # noqa: E731
             planned = self._search(request, excluded, reach, stop, moved)
         self._runs.keep(request, planned)
+        best = next(iter(planned.result.tried), None)
+        held = best is not None and best.usable and planned.surface is not None
+        planned = replace(planned, held=held_hull(planned.surface, best.grasp) if held else None)
         if T_out_object is None:
             return planned
         objects = tuple((moved_points(place[None], T_out_object)[0], reason) for place, reason in planned.objects)
@@ -300,7 +309,7 @@ class Planner:
         mass, assumed = result.mass or 0.0, False
         if scene is not None:
             mass, assumed = result.mass or scene.object.mass, scene.object.mass_assumed
-        planned = Planned(result, mass=mass, mass_assumed=assumed, objects=objects)
+        planned = Planned(result, mass=mass, mass_assumed=assumed, objects=objects, surface=scene and scene.object.mesh)
         if not settings.output_dir or stop():
             return planned
         path = Path(settings.output_dir) / f"{request.id}.json"

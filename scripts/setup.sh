@@ -87,7 +87,7 @@ echo "setup: compiling the messages of graspd_msgs (20 seconds)"
 # Against the very libraries that it will be loaded with; what it needs is installed by now.
 "${pip[@]}" --no-build-isolation --no-deps ./msg_defs
 # What comes with ROS and is not on PyPI: the type of /tf, MoveIt's grasp and collision object, two actions.
-for needed in tf2_msgs.msg:TFMessage object_recognition_msgs.msg:ObjectType moveit_msgs.msg:CollisionObject \
+for needed in tf2_msgs.msg:TFMessage object_recognition_msgs.msg:ObjectType moveit_msgs.msg:AttachedCollisionObject \
     grasping_msgs.action:GraspPlanning control_msgs.action:FollowJointTrajectory; do
     package=${needed%%.*}
     if ! "$venv/bin/python" -c "from ${needed%%:*} import ${needed##*:}" 2>/dev/null; then

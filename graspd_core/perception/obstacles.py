@@ -17,20 +17,21 @@ from jaxtyping import Float
 from scipy.spatial import ConvexHull, KDTree, QhullError
 
 from graspd_core.config import ObstacleConfig, SceneConfig
-from graspd_core.mesh.convex_parts import hull_surface
+from graspd_core.mesh.convex_parts import hull_surface, limited_hull
 from graspd_core.mesh.mesh_files import surface_samples
 from graspd_core.mesh.sdf import build_sdf, sample_sdf
 from graspd_core.mesh.surface_queries import winding_inside
 from graspd_core.mesh.topology import voxel_keys
 from graspd_core.perception.cloud.point_cloud import Points, Vector
 from graspd_core.perception.scene import Obstacle, Scene
-from graspd_core.se3 import perpendicular
-from graspd_core.types import Plane, TriangleMesh
+from graspd_core.se3 import perpendicular, rotation_from_quaternion
+from graspd_core.types import Plane, Posture, TriangleMesh
 
 GRID_RESOLUTION = 32
 # Maximum number of parts along each axis of a neighbour whose hull would contain the object.
 MAX_PARTS_ACROSS = 8
 _TARGET_SAMPLES = 2000
+_HELD_CORNERS = 128
 # A collision object is the target itself if their hulls overlap by at least this intersection over union. A box around
 # a ball has 0.5, and so has a box that is a quarter too large every way. Objects that only touch have 0.
 _SAME = 0.3
@@ -103,6 +104,15 @@ def padded_hull(points: Points, support: Plane | None, padding: float) -> Triang
         corners = corners[ConvexHull(corners).vertices]
     skin = padding * np.vstack([np.eye(3), -np.eye(3)])
     return hull_surface((corners[:, None] + skin).reshape(-1, 3))
+
+
+def held_hull(mesh: TriangleMesh, base: Posture) -> TriangleMesh:
+    """Return the convex hull of an object in the frame of the hand's base link at the posture `base` [m].
+
+    Of a round object it has 128 corners, so that motion planners stay fast.
+    """
+    rotation = rotation_from_quaternion(torch.as_tensor(base.quaternion_wxyz, dtype=torch.float64)).numpy()
+    return limited_hull((mesh.vertices - base.position) @ rotation, _HELD_CORNERS)
 
 
 def with_neighbours(

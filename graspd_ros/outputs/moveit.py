@@ -16,10 +16,21 @@ from typing import Any
 import numpy as np
 from geometry_msgs.msg import PoseStamped
 from graspd_msgs.msg import Grasp
+from shape_msgs.msg import Mesh, MeshTriangle
 from trajectory_msgs.msg import JointTrajectory
 
+from graspd_core import HandModel, TriangleMesh
 from graspd_core.errors import ConfigError, GraspdError
-from graspd_ros.convert import Matrix, matrix_of_pose, nanoseconds, pose_of_matrix, set_nanoseconds, vector_of
+from graspd_ros.convert import (
+    Matrix,
+    matrix_of_pose,
+    nanoseconds,
+    point_of,
+    pose_of,
+    pose_of_matrix,
+    set_nanoseconds,
+    vector_of,
+)
 
 # MoveIt's `min_distance` as a fraction of `desired_distance`.
 _LEAST_APPROACH = 0.5
@@ -87,6 +98,50 @@ def moveit_grasp(
         post_grasp_retreat=_translation(messages, up, retreat_frame, retreat_distance),
         allowed_touch_objects=list(touch),
     )
+
+
+def attached_object(
+    grasp: Grasp, hull: TriangleMesh, hand: HandModel, mass: float = 0.0, messages: ModuleType | None = None
+) -> Any:
+    """Return the object in the hand as a moveit_msgs/AttachedCollisionObject, from the squeeze of a grasp on.
+
+    The object is attached to the hand's base link, and all links of the hand may touch it. Its id is that of the
+    request. Detaching opens the hand to the pregrasp.
+
+    Args:
+        grasp: a grasp from ~/grasps.
+        hull: hull of the object in the frame of the base link at the grasp [m].
+        hand: the hand.
+        mass: mass of the object [kg]. 0 if unknown.
+        messages: module with the message classes. If None, `moveit_msgs.msg` is used.
+
+    Raises MoveItMissing: moveit_msgs is not installed, or is an old subset without this message.
+    """
+    kind = attached_kind(messages)
+    if kind is None:
+        raise MoveItMissing("moveit_msgs/AttachedCollisionObject is not installed; valid: moveit_msgs of ROS 2 Jazzy")
+    center = hull.vertices.mean(0)
+    shape = Mesh(
+        vertices=[point_of(vertex) for vertex in hull.vertices - center],
+        triangles=[MeshTriangle(vertex_indices=face.astype(np.uint32)) for face in hull.faces],
+    )
+    message = kind(link_name=grasp.base_link, touch_links=list(hand.link_names), weight=mass)
+    message.object.header.frame_id = grasp.base_link
+    message.object.header.stamp = grasp.header.stamp
+    message.object.id = grasp.id.rpartition("/")[0]
+    message.object.pose = pose_of(center, (1.0, 0.0, 0.0, 0.0))
+    message.object.meshes, message.object.mesh_poses = [shape], [pose_of(np.zeros(3), (1.0, 0.0, 0.0, 0.0))]
+    message.object.operation = message.object.ADD
+    message.detach_posture = _posture(grasp, deepcopy(grasp.trajectory.points[:1]))
+    return message
+
+
+def attached_kind(messages: ModuleType | None = None) -> type | None:
+    """Return the class moveit_msgs/AttachedCollisionObject. None if it is not installed."""
+    try:
+        return getattr(messages or _moveit_messages(), "AttachedCollisionObject", None)
+    except MoveItMissing:
+        return None
 
 
 def _posture(grasp: Grasp, points: list[Any], since: Any = None) -> JointTrajectory:

@@ -42,6 +42,7 @@ from graspd_ros.convert import pose_of_posture
 from graspd_ros.error_codes import ErrorCode, code_of, sentence_of
 from graspd_ros.outputs import messages
 from graspd_ros.outputs.messages import Pace, result_markers
+from graspd_ros.outputs.moveit import attached_kind, attached_object
 from graspd_ros.parameters import Settings
 from graspd_ros.request import MOST_ID, Listener, Request
 from graspd_ros.request_planner import Planned
@@ -236,12 +237,14 @@ class Publishers:
             String: node.create_publisher(String, "~/status", status),
             GraspProgress: node.create_publisher(GraspProgress, "~/progress", 50),
         }
-        self._publishers |= {kind: self._latched(kind) for kind in LATCHED}
+        self.attached = attached_kind()
+        self._shown = {**SHOWN, **({self.attached: "~/attached_object"} if self.attached else {})}
+        self._publishers |= {kind: self._latched(kind, topic) for kind, topic in (LATCHED | self._shown).items()}
 
-    def _latched(self, kind: type) -> Any:
+    def _latched(self, kind: type, topic: str) -> Any:
         return self._node.create_publisher(
             kind,
-            LATCHED[kind],
+            topic,
             QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL),
             qos_overriding_options=QoSOverridingOptions.with_default_policies(),
         )
@@ -264,9 +267,9 @@ class Publishers:
         Answers stay latched. Subscribers need a moment to find a new publisher and would miss the first answers.
         """
         with self._lock:
-            for kind in SHOWN:
+            for kind, topic in self._shown.items():
                 self._node.destroy_publisher(self._publishers[kind])
-                self._publishers[kind] = self._latched(kind)
+                self._publishers[kind] = self._latched(kind, topic)
 
     def close(self) -> None:
         with self._lock:
@@ -415,7 +418,9 @@ class Responses:
             latched.append(messages.joint_message(best.grasp, hand, request.stamp))
             header = Header(frame_id=request.frame_out, stamp=request.stamp)
             latched.append(PoseStamped(header=header, pose=pose_of_posture(best.grasp)))
-            latched.append(next(iter(answer.grasps)).trajectory)
+            latched.append(answer.grasps[0].trajectory)
+            if planned.held is not None and self.publishers.attached is not None:
+                latched.append(attached_object(answer.grasps[0], planned.held, hand, planned.mass))
         if request.settings.publish_markers and planned.worked_on:
             settings = request.settings
             look = {"most": settings.marker_grasps, "parts": settings.marker_parts, "solids": self.drawn(settings)}

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import re
 import time
 import urllib.request
 from collections.abc import Callable
@@ -38,6 +39,16 @@ def test_a_bin_is_emptied_in_a_line_a_pick_and_a_film(tmp_path: Path, capsys: py
     assert film.exists() == any(": picked" in line for line in lines)
 
 
+@pytest.mark.timeout(300)
+def test_an_empty_bin_is_filled_again_until_there_were_enough_picks(capsys: pytest.CaptureFixture[str]):
+    words = ("--hand", "parallel_gripper", "--things", "shape:box", "--count", "1", "--attempts", "1", "--picks", "2")
+    assert cell_command.run(_options(*words, "--preset", "fast")) == 0
+    *failures, endings, last = capsys.readouterr().out.splitlines()
+    assert all(line.startswith(("bin 1, attempt 1: ", "bin 2, attempt 1: ")) for line in failures)
+    assert sum(int(part.rpartition(": ")[2]) for part in endings.split("; ")) == 2
+    assert re.search(r"things in 2 attempts; .*; 2 bins; \d+ MB after the first bin, \d+ MB after the last", last)
+
+
 @pytest.mark.parametrize(
     ("words", "reason"),
     [
@@ -45,6 +56,8 @@ def test_a_bin_is_emptied_in_a_line_a_pick_and_a_film(tmp_path: Path, capsys: py
         (("--seed", "-1"), "--seed -1: valid: 0 to"),
         (("--speed", "0"), "--speed 0.0: valid: more than zero"),
         (("--attempts", "0"), "--attempts 0: valid: 1 or more"),
+        (("--picks", "0"), "--picks 0: valid: 1 or more"),
+        (("--picks", "9", "--view"), "--picks: --view or --film is given too; give one of them"),
         (("--things", "nothing"), "unknown thing 'nothing'"),
         (("--hand", "none"), "hand"),
     ],

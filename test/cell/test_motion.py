@@ -53,7 +53,7 @@ def test_a_way_around_a_pillar_of_points_keeps_clear_of_every_one_of_them(name: 
     points = tip + np.random.default_rng(1).uniform([-0.02, -0.02, -0.35], [0.02, 0.02, -0.02], (4000, 3))
     mover = mover_of(name, points)
     assert mover.clearances(dense(np.stack([start, goal]))).min() < 0
-    path = find_path(mover, start, goal, seconds=20.0)
+    path = find_path(mover, start, goal)
     np.testing.assert_allclose(path[[0, -1]], [start, goal])
     motion = timed(arm, path, Speeds())
     for q in np.vstack([start, motion.positions])[::3]:
@@ -100,8 +100,8 @@ def test_an_end_in_something_and_a_walled_in_goal_are_told_by_name():
     way = tip[:2] / np.linalg.norm(tip[:2])
     reach, height = np.meshgrid(np.linspace(0.13, 1.4, 150), np.linspace(0.02, 1.6, 150))
     wall = np.stack([reach.ravel() * way[0], reach.ravel() * way[1], height.ravel()], 1)
-    with pytest.raises(NoMotionError, match=r"no collision-free path of ur5e_like was found in 0\.3 s"):
-        find_path(mover_of("ur5e_like", wall), start, goal, seconds=0.3)
+    with pytest.raises(NoMotionError, match="100 checks found no collision-free path of ur5e_like"):
+        find_path(mover_of("ur5e_like", wall), start, goal, checks=100)
 
 
 @pytest.mark.parametrize("name", ARMS)

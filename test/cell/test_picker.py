@@ -58,9 +58,21 @@ def test_a_thing_goes_to_the_other_bin_and_the_gates_come_in_order(
             ends.append(motion.positions[-1])
         return follow(motion, *more)
 
+    held_now, away = Picker._held_now, list[float]()
+
+    def compared(self: Picker, *more) -> np.ndarray:
+        """Note how far the middle of the hull in the hand is from the true thing's [m]."""
+        points, pose = held_now(self, *more), robot.thing_poses()[0]
+        true = robot.world.things[0].seen.vertices @ pose[:3, :3].T + pose[:3, 3]
+        away.append(float(np.linalg.norm(points.min(0) + points.max(0) - true.min(0) - true.max(0)) / 2))
+        return points
+
     monkeypatch.setattr(robot, "follow", noted)
+    monkeypatch.setattr(Picker, "_held_now", compared)
     (attempt,) = picker_of(robot).empty_the_bin(most=1)
     assert (attempt.ending, attempt.reason) == (Ending.PICKED, "")
+    assert len(away) == 1
+    assert away[0] < 0.02
     report = robot.referee()
     assert dict(report.places) == {"box": "place bin"}
     assert report.hard("box") == {}

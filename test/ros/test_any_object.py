@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 from geometry_msgs.msg import Point, Pose, Quaternion, TransformStamped, Vector3
 from graspd_msgs.msg import GraspArray, GraspRequest
+from moveit_msgs.msg import AttachedCollisionObject
 from shape_msgs.msg import SolidPrimitive
 from std_msgs.msg import Header
 from tf2_msgs.msg import TFMessage
@@ -14,7 +15,7 @@ from tf2_msgs.msg import TFMessage
 from graspd_bench.rendering.depth_noise import DEFAULT
 from graspd_bench.rendering.tabletop import CAMERA, ring_poses, tabletop, views_of
 from graspd_core import PointCloud
-from graspd_ros.convert import array_of
+from graspd_ros.convert import array_of, matrix_of_pose
 
 pytestmark = pytest.mark.timeout(300)
 # The node's other frame is this far along x [m].
@@ -50,6 +51,7 @@ def test_any_object_is_taken_and_after_a_loss_another(client, start_node, make_c
     shift = TransformStamped(header=Header(frame_id="world"), child_frame_id="table")
     shift.transform.translation, shift.transform.rotation = Vector3(x=SHIFT), Quaternion(w=1.0)
     frames.publish(TFMessage(transforms=[shift]))
+    attached = client.late(AttachedCollisionObject, "/graspd/attached_object")
     x, y, z = view.viewpoint.tolist()
     there = {"cloud": cloud, "use_view_point": True, "view_point": Point(x=x, y=y, z=z), "any_object": True}
 
@@ -62,6 +64,11 @@ def test_any_object_is_taken_and_after_a_loss_another(client, start_node, make_c
     np.testing.assert_allclose(places(first), PLACES, atol=0.04)
     assert list(first.object_reasons) == ["", "not planned for"]
     assert nearest(first) == 0
+    # The object in the hand, for a motion planner: its middle is where the answer says, seen from the base link.
+    (held,) = client.spin_until(lambda: attached, "object in the hand")
+    assert (held.object.id, held.link_name, held.weight) == ("first", first.grasps[0].base_link, first.mass)
+    middle = matrix_of_pose(first.grasps[0].grasp_pose) @ matrix_of_pose(held.object.pose)
+    np.testing.assert_allclose(middle[:2, 3], PLACES[0], atol=0.02)
     # The newest cloud that came is asked in the same way. Trials would only take time from here on.
     client.set_parameters(view_point=[x, y, z], verify="none")
     client.show(lambda: client.send_cloud(cloud), cloud.header)

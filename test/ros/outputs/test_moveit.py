@@ -3,35 +3,43 @@
 import math
 import sys
 from copy import deepcopy
+from types import ModuleType
 from typing import Any
 
 import numpy as np
 import pytest
 from builtin_interfaces.msg import Time
 from geometry_msgs.msg import Point, Pose, Quaternion
+from moveit_msgs.msg import AttachedCollisionObject, CollisionObject
 from moveit_msgs.msg import Grasp as MoveItGrasp
 from sensor_msgs.msg import JointState
 from std_msgs.msg import Header
 
+from graspd_core import make_shape
 from graspd_core.errors import ConfigError
 from graspd_core.hands.library import load_hand
+from graspd_core.perception.obstacles import held_hull
 from graspd_core.types import Grasp, GraspMetrics, Posture, TrialResult, Verdict
 from graspd_ros.convert import matrix_of_pose, pose_of_matrix
+from graspd_ros.inputs.solids import updated_objects
 from graspd_ros.outputs.messages import Pace, grasp_message
-from graspd_ros.outputs.moveit import MoveItMissing, moveit_grasp
+from graspd_ros.outputs.moveit import MoveItMissing, attached_object, moveit_grasp
 
 HAND = load_hand("allegro_right")
 
 
-def message(verdict: Verdict = Verdict.VERIFIED) -> Any:
+def made(verdict: Verdict = Verdict.VERIFIED) -> Grasp:
     turned = np.array([math.cos(0.3), 0.0, math.sin(0.3), 0.0])
     far = Posture(np.array([0.0, 0.0, 0.30]), turned, HAND.open_posture)
     near = Posture(np.array([0.0, 0.0, 0.22]), turned, (HAND.open_posture + HAND.closed_posture) / 2)
     tight = Posture(np.array([0.0, 0.0, 0.22]), turned, HAND.closed_posture)
     metrics = GraspMetrics({"penetration": 1e-3, "epsilon": 0.25})
     trial = TrialResult("hold", verdict is Verdict.VERIFIED, 0.0, 0.0, "lost the object")
-    grasp = Grasp(far, near, tight, (), 1.0, metrics, (trial,))
-    return grasp_message(grasp, 0, "mesh-1", Header(frame_id="camera", stamp=Time(sec=3)), HAND, Pace())
+    return Grasp(far, near, tight, (), 1.0, metrics, (trial,))
+
+
+def message(verdict: Verdict = Verdict.VERIFIED) -> Any:
+    return grasp_message(made(verdict), 0, "mesh-1", Header(frame_id="camera", stamp=Time(sec=3)), HAND, Pace())
 
 
 UP = {"retreat": (0.0, 0.0, 2.0), "retreat_frame": "world"}
@@ -64,6 +72,31 @@ def test_every_field_is_filled_as_moveit_reads_it():
     assert (retreat.direction.header.frame_id, retreat.direction.vector.z) == ("world", 1.0)
     assert retreat.desired_distance == pytest.approx(0.2)
     assert ours == message(), "what it is made from stays as it is"
+
+
+def test_what_is_held_hangs_on_the_base_link_with_its_weight():
+    # A box whose corner is 1 cm from the origin, and a hand that looks at it along a turned axis.
+    box = make_shape("box")
+    grasp, ours = made(), message()
+    theirs = attached_object(ours, held_hull(box, grasp.grasp), HAND, 0.25)
+    assert isinstance(theirs, AttachedCollisionObject)
+    assert (theirs.link_name, theirs.object.header.frame_id, theirs.object.id) == (
+        HAND.base_link,
+        HAND.base_link,
+        "mesh-1",
+    )
+    assert (theirs.weight, theirs.object.operation) == (0.25, CollisionObject.ADD)
+    assert list(theirs.touch_links) == list(HAND.link_names)
+    assert list(theirs.detach_posture.points[0].positions) == list(ours.trajectory.points[0].positions)
+    # With the hand at the grasp it is where the box is. A planning scene reads it back.
+    T = matrix_of_pose(ours.grasp_pose)
+    (held,) = updated_objects({}, theirs.object).values()
+    placed = held.shapes[0].vertices @ held.T_frame_object[:3, :3].T + held.T_frame_object[:3, 3]
+    corners = placed @ T[:3, :3].T + T[:3, 3]
+    for end in (np.min, np.max):
+        np.testing.assert_allclose(end(corners, 0), end(box.vertices, 0), atol=1e-9)
+    with pytest.raises(MoveItMissing, match="AttachedCollisionObject is not installed"):
+        attached_object(ours, held_hull(box, grasp.grasp), HAND, messages=ModuleType("old"))
 
 
 def test_the_pose_is_that_of_the_arms_last_link():
