@@ -81,11 +81,19 @@ def _hold(world: World, grasp: Grasp, protocol: Protocol, worst: np.ndarray, sto
 
 
 def step_until_known(
-    world: World, data: Any, protocol: Protocol, worst: np.ndarray, steps: int, *, stop: Callable[[], bool]
+    world: World,
+    data: Any,
+    protocol: Protocol,
+    worst: np.ndarray,
+    steps: int,
+    *,
+    stop: Callable[[], bool],
+    check_every: int = CHECK_EVERY,
 ) -> str:
     """Simulate `steps` steps, or fewer if the stop rule knows that the object stays within the limits.
 
-    Return why the trial failed, empty if it did not. Update `worst`, the greatest travel [m] and rotation [rad].
+    Return why the trial failed, empty if it did not. Update `worst`, the greatest travel [m] and rotation [rad]. The
+    limits are checked after every `check_every` steps, a multiple of `LOOK_EVERY`.
     """
     rule, done = stop_rule(protocol, world.fingers), 0
     recent = deque[ObjectState](maxlen=1 + max(rule.windows) // LOOK_EVERY if rule else 0)
@@ -95,7 +103,7 @@ def step_until_known(
         count = min(LOOK_EVERY, steps - done)
         advance(world, data, count)
         done += count
-        checked = done % CHECK_EVERY == 0 or done == steps
+        checked = done % check_every == 0 or done == steps
         reason = breach(world, data, protocol, worst) if checked else ""
         if reason:
             return reason

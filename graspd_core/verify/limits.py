@@ -11,6 +11,7 @@ from collections.abc import Callable
 import numpy as np
 
 from graspd_core.types import Grasp, StopHook
+from graspd_core.verify.early_stop import LOOK_EVERY
 from graspd_core.verify.hold_trial import CHECK_EVERY, DIRECTIONS, close_hand, hold_trial, step_until_known
 from graspd_core.verify.world import Protocol, World, altered, at_friction, trial_data
 
@@ -61,7 +62,9 @@ def payload(
                 def holds(mass: float, direction: np.ndarray = direction) -> bool:
                     mujoco.mj_setState(world.model, data, closed, kind)
                     data.xfrc_applied[world.object_body, :3] = protocol.pull * mass * direction
-                    return not step_until_known(world, data, protocol, np.zeros(2), steps, stop=stop)
+                    # Half of the pulls end at a limit, which a look finds before the trial's own check.
+                    worst, often = np.zeros(2), LOOK_EVERY
+                    return not step_until_known(world, data, protocol, worst, steps, stop=stop, check_every=often)
 
                 if not held and not holds(least):
                     return 0.0

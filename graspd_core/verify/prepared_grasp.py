@@ -27,19 +27,20 @@ from graspd_core.hands.link_distance import (
 from graspd_core.hands.model import HandModel, Primitive
 from graspd_core.hands.surface_points import kept_dense_samples
 from graspd_core.mesh.mesh_files import surface_samples
-from graspd_core.mesh.sharp_features import crease_points, farthest_points
-from graspd_core.mesh.surface_queries import (
-    DistanceQuery,
-    inside,
-    make_distance_query,
-    signed_distance,
-    unsigned_distance,
-)
+from graspd_core.mesh.sharp_features import crease_points, farthest_points, neighbours_together
+from graspd_core.mesh.surface_queries import DistanceQuery, inside, unsigned_distance
 from graspd_core.mesh.topology import packed_rows
 from graspd_core.optimize.kernel.builds import kernel
 from graspd_core.perception.scene import ObjectModel
 from graspd_core.se3 import rotation_from_quaternion
 from graspd_core.types import Grasp, Plane, Posture
+from graspd_core.verify.compiled_overlap import (
+    CompiledQuery,
+    depth_in_hand,
+    make_query,
+    shared_volume,
+    signed_distance,
+)
 from graspd_core.verify.hold_trial import place_hand, start_penetration
 from graspd_core.verify.world import World, trial_data
 
@@ -59,12 +60,14 @@ class HandSurface:
         links: link index of each sample.
         areas: surface area that each sample represents [m²].
         kinematics: the hand's kinematics in float64.
+        order: an order of the samples in which neighbours follow each other, of int32.
     """
 
     points: Float[np.ndarray, "samples 3"]
     links: Int[np.ndarray, "samples"]
     areas: Float[np.ndarray, "samples"]
     kinematics: Kinematics
+    order: Int[np.ndarray, "samples"]
 
 
 @dataclass(frozen=True, eq=False)
@@ -80,7 +83,7 @@ class MetricsContext:
     target: ObjectModel
     hand: HandModel
     surface: HandSurface
-    query: DistanceQuery
+    query: CompiledQuery | DistanceQuery
     points: Float[np.ndarray, "points 3"]
     tree: Any
     world: World | None = None
@@ -92,7 +95,7 @@ def make_metrics_context(target: ObjectModel, hand: HandModel) -> MetricsContext
 
     creases = crease_points(target.mesh, _SAMPLES // 4, _SEED)
     points = np.concatenate([surface_samples(target.mesh, _SAMPLES, _SEED)[0], creases])
-    query = make_distance_query(target.mesh)
+    query = make_query(target.mesh)
     return MetricsContext(target, hand, hand_surface(hand), query, points, KDTree(points))
 
 
@@ -100,12 +103,14 @@ def make_metrics_context(target: ObjectModel, hand: HandModel) -> MetricsContext
 def hand_surface(hand: HandModel) -> HandSurface:
     """Return dense samples of the hand's collision surface."""
     points, links, areas = kept_dense_samples(hand, count=_SAMPLES, seed=_SEED)
-    return HandSurface(points, links, areas, make_kinematics(hand, "cpu", torch.float64))
+    of_link = [np.flatnonzero(links == link) for link in range(hand.num_links)]
+    order = np.concatenate([rows[neighbours_together(points[rows])] for rows in of_link]).astype(np.int32)
+    return HandSurface(points, links, areas, make_kinematics(hand, "cpu", torch.float64), order)
 
 
 # A hand sample nearer than this to the object's surface is in contact [m].
 CONTACT_DISTANCE = 0.002
-# Samples farther than this from the object's bounding box have no exact distance [m]. The widest contact is 10 mm.
+# Samples farther than this from the object have no exact distance [m]. The widest contact is 10 mm.
 _REACH = 0.015
 
 
@@ -129,6 +134,11 @@ class PlacedHand:
     rotations: Float[np.ndarray, "links 3 3"]
     translations: Float[np.ndarray, "links 3"]
 
+    @property
+    def poses(self) -> Float[np.ndarray, "links 12"]:
+        """Poses of the links, as rows of 3 x 4 matrices."""
+        return np.concatenate([self.rotations, self.translations[:, :, None]], -1).reshape(-1, 12)
+
 
 def placed_hand(context: MetricsContext, posture: Posture) -> PlacedHand:
     """Return the hand's samples at a posture, with each sample's distance to the object."""
@@ -139,7 +149,7 @@ def placed_hand(context: MetricsContext, posture: Posture) -> PlacedHand:
     rotations = base @ links.rotation.numpy()
     translations = links.translation.numpy() @ base.T + posture.position
     placed = np.einsum("nij,nj->ni", rotations[surface.links], surface.points) + translations[surface.links]
-    distance = signed_distance(context.query, placed, reach=_REACH)
+    distance = signed_distance(context.query, placed, order=surface.order, reach=_REACH)
     return PlacedHand(placed, surface.links, surface.areas, distance, rotations, translations)
 
 
@@ -167,6 +177,8 @@ _HALF_DIAGONAL = 0.5 * np.sqrt(3.0) * 1.001
 def penetration(context: MetricsContext, placed: PlacedHand) -> float:
     """Return the greatest depth of a hand sample inside the object, or of an object point inside a link [m]."""
     worst = float(max(0.0, -placed.distance.min()))
+    if isinstance(context.query, CompiledQuery):
+        return max(worst, depth_in_hand(context.query, context.hand, placed.poses, context.points))
     centers, radii = _link_balls(context.hand)
     centers = np.einsum("nij,nj->ni", placed.rotations, centers) + placed.translations
     for link, near in enumerate(context.tree.query_ball_point(centers, radii)):
@@ -229,6 +241,8 @@ def contact_depth(context: MetricsContext, posture: Posture) -> float | None:
 def self_penetration(context: MetricsContext, placed: PlacedHand) -> float:
     """Return the greatest depth of a hand sample inside a link that is not adjacent to the sample's link [m]."""
     hand, worst = context.hand, 0.0
+    if isinstance(context.query, CompiledQuery):
+        return depth_in_hand(context.query, hand, placed.poses, placed.points, placed.links)
     centers, radii = _link_balls(hand)
     centers = np.einsum("nij,nj->ni", placed.rotations, centers) + placed.translations
     apart = np.linalg.norm(centers[:, None] - centers, axis=-1) - radii[:, None] - radii
@@ -249,6 +263,8 @@ def intersection_volume(context: MetricsContext, placed: PlacedHand) -> float:
     object are treated as two facing half-spaces, which is exact for flat overlaps of any thickness. Volume that several
     primitives share is counted once.
     """
+    if isinstance(context.query, CompiledQuery):
+        return shared_volume(context.query, context.hand, placed.poses, _CELL)
     solids = _placed_solids(context.hand, placed)
     cells, which = _root_cells(solids, placed)
     size = 2**_HALVINGS
@@ -473,7 +489,7 @@ def prepare_grasp(context: MetricsContext, posture: Posture, max_contacts: int =
     return PreparedGrasp(context, posture, placed_hand(context, posture), max_contacts)
 
 
-def surface_normals(query: DistanceQuery, points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 3"]:
+def surface_normals(query: CompiledQuery | DistanceQuery, points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 3"]:
     """Return outward unit normals of the object's surface near points, by central differences of the distance."""
     probes = points[:, None, None] + _STEP * np.stack([np.eye(3), -np.eye(3)])
     distance = signed_distance(query, probes.reshape(-1, 3)).reshape(len(points), 2, 3)

@@ -1,6 +1,7 @@
 """Metrics of boxes and hands that can be worked out on paper: contact, penetration, overlap, wrench hull, copies."""
 
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -15,11 +16,12 @@ from scipy.spatial import ConvexHull
 from graspd_bench.studies.human_hand import CONTACT_DISTANCES, measure_skin
 from graspd_core import HandModel, load_hand, make_shape
 from graspd_core.hands.link_distance import depth_inside
-from graspd_core.mesh.surface_queries import make_distance_query
+from graspd_core.mesh.surface_queries import DistanceQuery, make_distance_query
 from graspd_core.optimize.kernel.builds import kernel
 from graspd_core.perception.scene import ObjectModel, build_scene
 from graspd_core.se3 import quaternion_from_rotation, random_rotations
 from graspd_core.types import Grasp, GraspMetrics, Posture, TriangleMesh
+from graspd_core.verify.compiled_overlap import CompiledQuery
 from graspd_core.verify.metrics import distinct, measure
 from graspd_core.verify.prepared_grasp import (
     PROTOCOL_CONTACTS,
@@ -204,6 +206,41 @@ def test_what_solids_of_every_kind_share_with_an_object_is_that_of_small_voxels(
         shared |= depth_inside(hand, link, local) > 0
     assert shared.sum() > 8000
     assert intersection_volume(context, placed) == pytest.approx(shared.sum() * MM3 / 8, rel=0.02)
+
+
+@pytest.mark.parametrize("holes", [0, 60])
+def test_the_kernel_measures_as_python_does(holes, at, tmp_path, monkeypatch):
+    # The bowl is one solid of 4,864 faces. Beside a hole, the winding number passes through one half.
+    trimesh.creation.icosphere(subdivisions=1, radius=0.015).export(tmp_path / "lump.stl")
+    (tmp_path / "hand.urdf").write_text(SOLIDS)
+    hand, bowl = load_hand(tmp_path / "hand.urdf", candidates=8), make_shape("bowl")
+    target = as_object(bowl)
+    mesh = TriangleMesh(bowl.vertices, bowl.faces[holes:])
+    target = replace(target, mesh=mesh)
+    compiled = make_metrics_context(target, hand)
+    with monkeypatch.context() as without:
+        without.setenv("GRASPD_KERNEL", "off")
+        reference = make_metrics_context(target, hand)
+    assert isinstance(reference.query, DistanceQuery)
+    if kernel().library is None:
+        pytest.skip(kernel().reason)
+    assert isinstance(compiled.query, CompiledQuery)
+    rng, volumes = np.random.default_rng(5), []
+    for _ in range(12):
+        turn = rng.normal(size=4)
+        where = bowl.vertices[rng.integers(len(bowl.vertices))] + rng.normal(0, 0.02, 3)
+        posture = at(where, (rng.uniform(-1, 1),), turn / np.linalg.norm(turn))
+        found, expected = placed_hand(compiled, posture), placed_hand(reference, posture)
+        near = np.abs(expected.distance) < 0.0149
+        assert (np.abs(found.distance[~near]) > 0.0149).all()
+        assert np.abs(found.distance[near]) == pytest.approx(np.abs(expected.distance[near]), abs=1e-12)
+        assert (np.sign(found.distance) != np.sign(expected.distance)).sum() <= (3 if holes else 0)
+        assert self_penetration(compiled, found) == pytest.approx(self_penetration(reference, found), abs=1e-9)
+        assert penetration(compiled, expected) == pytest.approx(penetration(reference, expected), abs=1e-9)
+        volumes.append([intersection_volume(context, found) for context in (compiled, reference)])
+    volume, expected = np.transpose(volumes)
+    assert (volume > 1e-7).sum() >= 3
+    assert volume == pytest.approx(expected, rel=0.01 if holes else 1e-9, abs=1e-15)
 
 
 @pytest.mark.parametrize("depth", [0.0, 0.001, 0.006])

@@ -22,7 +22,7 @@ BUILDS = {
     "baseline": frozenset(),
 }
 POLL = ctypes.CFUNCTYPE(ctypes.c_int32, ctypes.c_int64)
-_INT, _FLOAT, _AT = ctypes.c_int32, ctypes.c_float, ctypes.c_void_p
+_INT, _FLOAT, _DOUBLE, _AT = ctypes.c_int32, ctypes.c_float, ctypes.c_double, ctypes.c_void_p
 # Argument types of each function.
 _ARGUMENTS = {
     "graspd_evaluate": [_AT, _AT, _INT, _AT, _AT, _FLOAT, _INT, _INT, _INT, _AT, _AT, _AT, _INT],
@@ -32,6 +32,10 @@ _ARGUMENTS = {
     "graspd_nearest_features": [_AT, _INT, _AT, _AT, _AT, _AT, _INT],
     "graspd_self_overlap": [_AT, _INT, _AT, _AT, _INT],
     "graspd_wrench_hull": [_INT, _AT, _AT],
+    "graspd_build_surface": [_INT, _AT, _AT, _AT],
+    "graspd_signed_distance": [_AT, _INT, _AT, _AT, _DOUBLE, _AT],
+    "graspd_hand_depth": [_AT, _AT, _INT, _AT, _AT, _AT, _AT],
+    "graspd_shared_volume": [_AT, _AT, _AT, _DOUBLE, _AT],
     "graspd_run_steps": [_AT, _AT, _AT, _INT, _INT, _INT, _INT, POLL],
 }
 
@@ -202,8 +206,19 @@ class Pregrasp(ctypes.Structure):
     ]
 
 
+class Surface(ctypes.Structure):
+    _fields_ = _of(_AT, "nodes triangles")
+
+
+class Bodies(ctypes.Structure):
+    _fields_ = [*_of(_INT, "count links"), *_of(_AT, "pose ball core radius round link plane_start planes")]
+
+
 # In the order of `graspd_sizes`.
-STRUCTURES = (Hand, Points, Grid, Solids, Spheres, Object, Obstacles, Weights, Problem, Schedule, State, Pregrasp)
+STRUCTURES = (
+    *(Hand, Points, Grid, Solids, Spheres, Object, Obstacles, Weights, Problem, Schedule, State, Pregrasp),
+    *(Surface, Bodies),
+)
 
 
 def names_of(structure: type[ctypes.Structure]) -> list[str]:

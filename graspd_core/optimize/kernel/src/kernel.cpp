@@ -1,4 +1,5 @@
 // The C interface. Functions return 0, or 1 where memory is short; they never throw, and write only where told.
+#include "hand_overlap.hpp"
 #include "stages.hpp"
 #include "threads.hpp"
 #include "wrench_hull.hpp"
@@ -23,7 +24,7 @@ extern "C" {
 int32_t graspd_sizes(int32_t* sizes) {
     int32_t known[] = {sizeof(Hand),      sizeof(Points),  sizeof(Grid),    sizeof(Solids),   sizeof(Spheres), sizeof(Object),
                        sizeof(Obstacles), sizeof(Weights), sizeof(Problem), sizeof(Schedule), sizeof(State),
-                       sizeof(Pregrasp)};
+                       sizeof(Pregrasp),  sizeof(Surface), sizeof(Bodies)};
     memcpy(sizes, known, sizeof known);
     return sizeof known / sizeof known[0];
 }
@@ -121,5 +122,38 @@ int32_t graspd_wrench_hull(int32_t count, const double* wrenches, double* out) {
         out[0] = hull.nearest(out + 1);
         out[7] = hull.volume(out + 8);
     });
+}
+
+// The tree of a mesh of triangles (faces x 9): fewer than 2 faces x SurfaceNode, and the triangles in its order.
+int32_t graspd_build_surface(int32_t faces, const double* corners, void* nodes, void* triangles) {
+    return guarded([&] {
+        SurfaceBuilder((const Triangle*)corners, faces, (SurfaceNode*)nodes, (Triangle*)triangles).build();
+    });
+}
+
+// Signed distances of points to a mesh, in an order in which neighbours follow each other (null: as they stand). Outside
+// they are at most `reach`.
+int32_t graspd_signed_distance(const Surface* surface, int32_t count, const double* points, const int32_t* order,
+                               double reach, double* out) {
+    return guarded([&] {
+        SurfaceProbe probe(*surface);
+        for (int i = 0; i < count; i++) {
+            const int k = order ? order[i] : i;
+            out[k] = probe.signed_distance(at(points + 3 * k), reach);
+        }
+    });
+}
+
+// Greatest depth of points in the solids of a hand. `links`: their poses (links x 12). `link_of` (count) and `apart`
+// (links x links) say which solids a point meets; null for all.
+int32_t graspd_hand_depth(const Bodies* bodies, const double* links, int32_t count, const double* points,
+                          const int32_t* link_of, const uint8_t* apart, double* depth) {
+    return guarded([&] { *depth = depth_in_bodies(*bodies, links, count, points, link_of, apart); });
+}
+
+// Volume of a hand inside a mesh, in cells of this width.
+int32_t graspd_shared_volume(const Bodies* bodies, const double* links, const Surface* surface, double cell,
+                             double* volume) {
+    return guarded([&] { *volume = SharedVolume(*bodies, links, *surface, cell).measure(); });
 }
 }

@@ -108,6 +108,20 @@ struct State {
     float *x, *mean, *square, *radius, *best_x, *best_loss, *loss;
 };
 
+// A mesh as a tree of boxes (surface_tree.hpp), in doubles.
+struct Surface {
+    const void *nodes, *triangles;
+};
+
+// The solids of a hand in doubles, sorted by link: boxes and round ones as in `Solids`, and the planes of hulls.
+struct Bodies {
+    int32_t count, links;
+    const double *pose, *ball;  // count x 12: T_link_solid; count x 4: its bounding ball, in the solid's frame
+    const double *core, *radius;
+    const int32_t *round, *link, *plane_start;  // plane_start: count + 1
+    const double* planes;                       // outward unit normals and offsets, in the solid's frame
+};
+
 constexpr int TERMS = 6;
 
 }  // namespace graspd

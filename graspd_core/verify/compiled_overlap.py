@@ -1,0 +1,165 @@
+"""Distances to a mesh and overlaps of a placed hand by the compiled kernel. Other Python threads run meanwhile.
+
+`mesh/surface_queries` and `prepared_grasp` have the same in Python. They are the reference in tests, and run without a
+compiler. The kernel gives the same figures, but for rounding.
+"""
+
+from __future__ import annotations
+
+from ctypes import CDLL, byref
+from dataclasses import dataclass
+from functools import lru_cache
+
+import numpy as np
+from jaxtyping import Float, Int, UInt8
+
+from graspd_core.hands.link_distance import hull_planes
+from graspd_core.hands.model import HandModel, Primitive
+from graspd_core.mesh.surface_queries import DistanceQuery, make_distance_query
+from graspd_core.mesh.surface_queries import signed_distance as python_distance
+from graspd_core.mesh.topology import cut_long_faces
+from graspd_core.optimize.kernel.builds import Bodies, Surface, kernel
+from graspd_core.types import TriangleMesh
+
+# Size of a node of the tree, in doubles. A leaf has at least two faces, so there are no more nodes than faces.
+_NODE = 15
+
+
+@dataclass(frozen=True, eq=False)
+class CompiledQuery:
+    """A mesh prepared for distance queries by the kernel, safe to use from several threads.
+
+    Attributes:
+        library: the kernel.
+        surface: the tree, which points into `nodes` and `triangles`.
+    """
+
+    library: CDLL
+    surface: Surface
+    nodes: Float[np.ndarray, "nodes 15"]
+    triangles: Float[np.ndarray, "faces 9"]
+
+
+def make_query(mesh: TriangleMesh) -> CompiledQuery | DistanceQuery:
+    """Prepare a mesh for distance queries, by libigl where there is no kernel."""
+    library = kernel().library
+    if library is None:
+        return make_distance_query(mesh)
+    # A node is as wide as its longest face, and near nodes are summed face by face.
+    cut = cut_long_faces(mesh, float(np.ptp(mesh.vertices, axis=0).max()) / 3)
+    corners = np.ascontiguousarray(cut.vertices[cut.faces], dtype=float).reshape(-1, 9)
+    nodes, triangles = np.zeros((2 * len(corners), _NODE)), np.empty_like(corners)
+    if library.graspd_build_surface(len(corners), corners.ctypes.data, nodes.ctypes.data, triangles.ctypes.data):
+        raise MemoryError("no memory for the tree of a mesh")
+    return CompiledQuery(library, Surface(nodes.ctypes.data, triangles.ctypes.data), nodes, triangles)
+
+
+def signed_distance(
+    query: CompiledQuery | DistanceQuery,
+    points: Float[np.ndarray, "n 3"],
+    *,
+    order: Int[np.ndarray, "n"] | None = None,
+    reach: float = np.inf,
+) -> Float[np.ndarray, "n"]:
+    """Return the distance [m] to the nearest triangle, negative inside. Beyond `reach` [m] it is a lower bound.
+
+    Points are quicker in an `order` in which neighbours follow each other. It is of int32.
+    """
+    if isinstance(query, DistanceQuery):
+        return python_distance(query, points, reach=reach)
+    points, distance = np.ascontiguousarray(points, dtype=float), np.empty(len(points))
+    arguments = len(points), points.ctypes.data, None if order is None else order.ctypes.data, reach
+    if query.library.graspd_signed_distance(byref(query.surface), *arguments, distance.ctypes.data):
+        raise MemoryError("no memory for distances to a mesh")
+    return distance
+
+
+@dataclass(frozen=True, eq=False)
+class CompiledHand:
+    """The collision primitives of a hand as the kernel reads them.
+
+    Attributes:
+        bodies: the primitives, which point into `arrays`.
+        apart: whether two links may not touch, 1 or 0.
+    """
+
+    bodies: Bodies
+    arrays: tuple[np.ndarray, ...]
+    apart: UInt8[np.ndarray, "links links"]
+
+
+@lru_cache(maxsize=8)
+def compiled_hand(hand: HandModel) -> CompiledHand:
+    """Convert the collision primitives of a hand."""
+    solids = sorted(hand.primitives, key=lambda primitive: primitive.link)
+    poses = [np.column_stack([solid.rotation, solid.translation]).ravel() for solid in solids]
+    planes = [np.column_stack(hull_planes(solid)) if solid.kind == "hull" else np.zeros((0, 4)) for solid in solids]
+    starts = np.cumsum([0, *(len(some) for some in planes)])
+    cores = [_core(solid) for solid in solids]
+    arrays = (
+        *(_doubles(values) for values in (poses, [_ball(solid) for solid in solids], cores)),
+        _doubles([solid.size[0] if solid.kind in ("sphere", "capsule") else 0.0 for solid in solids]),
+        *(
+            np.array(values, dtype=np.int32)
+            for values in ([solid.kind == "cylinder" for solid in solids], [solid.link for solid in solids], starts)
+        ),
+        _doubles(np.concatenate([np.zeros((0, 4)), *planes])),
+    )
+    bodies = Bodies(len(solids), hand.num_links, *(array.ctypes.data for array in arrays))
+    return CompiledHand(bodies, arrays, np.ascontiguousarray(~hand.adjacent, dtype=np.uint8))
+
+
+def _doubles(values: object) -> np.ndarray:
+    return np.ascontiguousarray(values, dtype=float)
+
+
+def _core(solid: Primitive) -> tuple[float, ...]:
+    """Return half extents, or (radius, radius, half length) of a cylinder, without the radius of round ends [m]."""
+    if solid.kind == "box":
+        return solid.size
+    if solid.kind == "cylinder":
+        return (solid.size[0], *solid.size)
+    return (0.0, 0.0, solid.size[1] if solid.kind == "capsule" else 0.0)
+
+
+def _ball(solid: Primitive) -> tuple[float, ...]:
+    """Return centre and radius of a ball about a solid, in its own frame [m]."""
+    if solid.kind == "hull":
+        center = (solid.vertices.min(0) + solid.vertices.max(0)) / 2
+        return (*center, float(np.linalg.norm(solid.vertices - center, axis=1).max()))
+    reach = sum(solid.size) if solid.kind in ("sphere", "capsule") else float(np.linalg.norm(solid.size))
+    return (0.0, 0.0, 0.0, reach)
+
+
+# Poses of links, as rows of 3 x 4 matrices [m].
+_Links = Float[np.ndarray, "links 12"]
+
+
+def depth_in_hand(
+    query: CompiledQuery,
+    hand: HandModel,
+    links: _Links,
+    points: Float[np.ndarray, "n 3"],
+    link_of: Int[np.ndarray, "n"] | None = None,
+) -> float:
+    """Return the greatest depth of a point in a primitive [m], at least 0.
+
+    With `link_of`, the link of each point, only primitives count whose link may not touch that link.
+    """
+    compiled, depth, points = compiled_hand(hand), np.empty(1), _doubles(points)
+    of = None if link_of is None else np.ascontiguousarray(link_of, dtype=np.int32)
+    apart = None if of is None else compiled.apart.ctypes.data
+    of_at = None if of is None else of.ctypes.data
+    arguments = len(points), points.ctypes.data, of_at, apart, depth.ctypes.data
+    if query.library.graspd_hand_depth(byref(compiled.bodies), links.ctypes.data, *arguments):
+        raise MemoryError("no memory for the depth in a hand")
+    return float(depth[0])
+
+
+def shared_volume(query: CompiledQuery, hand: HandModel, links: _Links, cell: float) -> float:
+    """Return the volume of a hand inside a mesh [m³], in cells this wide [m]."""
+    volume = np.empty(1)
+    arguments = links.ctypes.data, byref(query.surface), cell, volume.ctypes.data
+    if query.library.graspd_shared_volume(byref(compiled_hand(hand).bodies), *arguments):
+        raise MemoryError("no memory for the volume of an overlap")
+    return float(volume[0])
