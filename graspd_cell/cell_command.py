@@ -127,15 +127,15 @@ def _many_picks(options: argparse.Namespace, arm: Arm, hand: HandModel) -> int:
     The seeds of the bins count up from `--seed`. Return the exit status.
     """
     from graspd_cell.grasp_source import InProcessGrasps
-    from graspd_cell.picker import Ending, Picker, summary
+    from graspd_cell.picker import Attempt, Ending, Picker, summary
 
     attempts, memory, ended = list[Attempt](), list[float](), Counter[str]()
     with Interrupt() as interrupt:
         # A bin may end without an attempt, so that the bins are counted too.
-        while len(attempts) < options.picks and len(memory) < options.picks and not interrupt.came():
+        while len(attempts) < options.picks and len(memory) < options.picks and not interrupt.is_interrupted():
             robot, number = _filled_cell(options, arm, hand, options.seed + len(memory)), len(memory) + 1
             source = InProcessGrasps(arm, hand, robot.world.layout, preset=options.preset, seed=options.seed)
-            picker = Picker(robot, source, arm, hand, robot.world.layout, cancelled=interrupt.came)
+            picker = Picker(robot, source, arm, hand, robot.world.layout, cancelled=interrupt.is_interrupted)
             most = min(options.attempts or 2 * options.count + 3, options.picks - len(attempts))
             try:
                 for attempt in waiting(picker.empty_the_bin(most), "pick"):
@@ -151,7 +151,7 @@ def _many_picks(options: argparse.Namespace, arm: Arm, hand: HandModel) -> int:
     told = f"{memory[0]:.0f} MB after the first bin, {memory[-1]:.0f} MB after the last" if memory else "no bin"
     print(f"{summary(attempts)}; {len(memory)} bins; {told}", flush=True)
     answer({"attempts": attempts, "endings": ended, "memory_mb": memory})
-    return EXIT_INTERRUPTED if interrupt.came() else EXIT_OK
+    return EXIT_INTERRUPTED if interrupt.is_interrupted() else EXIT_OK
 
 
 def resident_mb() -> float:

@@ -384,7 +384,8 @@ def _planned(mover: Mover, start: Joints, goal: Joints, allowed: np.ndarray, che
     planner.setup()
     if str(planner.solve(base.PlannerTerminationCondition(lambda: done > checks))) != "Exact solution":
         return None
-    path, most = problem.getSolutionPath(), done + _SHORTENING
+    path: Any = problem.getSolutionPath()
+    most = done + _SHORTENING
     geometric.PathSimplifier(about).simplify(path, base.PlannerTerminationCondition(lambda: done > most))
     return np.stack([values(state) for state in path.getStates()])
 

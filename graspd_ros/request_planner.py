@@ -266,9 +266,9 @@ class Planner:
             moved = lambda progress: report(_with_found(progress, place))  # noqa: E731
             planned = self._search(request, excluded, reach, stop, moved)
         self._runs.keep(request, planned)
-        best = next(iter(planned.result.tried), None)
-        held = best is not None and best.usable and planned.surface is not None
-        planned = replace(planned, held=held_hull(planned.surface, best.grasp) if held else None)
+        best, surface = next(iter(planned.result.tried), None), planned.surface
+        held = None if surface is None or best is None or not best.usable else held_hull(surface, best.grasp)
+        planned = replace(planned, held=held)
         if T_out_object is None:
             return planned
         objects = tuple((moved_points(place[None], T_out_object)[0], reason) for place, reason in planned.objects)

@@ -132,7 +132,7 @@ def attached_object(
     message.object.pose = pose_of(center, (1.0, 0.0, 0.0, 0.0))
     message.object.meshes, message.object.mesh_poses = [shape], [pose_of(np.zeros(3), (1.0, 0.0, 0.0, 0.0))]
     message.object.operation = message.object.ADD
-    message.detach_posture = _posture(grasp, deepcopy(grasp.trajectory.points[:1]))
+    message.detach_posture = _posture(grasp, [deepcopy(next(iter(grasp.trajectory.points)))])
     return message
 
 

@@ -418,9 +418,10 @@ class Responses:
             latched.append(messages.joint_message(best.grasp, hand, request.stamp))
             header = Header(frame_id=request.frame_out, stamp=request.stamp)
             latched.append(PoseStamped(header=header, pose=pose_of_posture(best.grasp)))
-            latched.append(answer.grasps[0].trajectory)
+            first = next(iter(answer.grasps))
+            latched.append(first.trajectory)
             if planned.held is not None and self.publishers.attached is not None:
-                latched.append(attached_object(answer.grasps[0], planned.held, hand, planned.mass))
+                latched.append(attached_object(first, planned.held, hand, planned.mass))
         if request.settings.publish_markers and planned.worked_on:
             settings = request.settings
             look = {"most": settings.marker_grasps, "parts": settings.marker_parts, "solids": self.drawn(settings)}
