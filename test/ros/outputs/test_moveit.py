@@ -87,7 +87,9 @@ def test_what_is_held_hangs_on_the_base_link_with_its_weight():
     )
     assert (theirs.weight, theirs.object.operation) == (0.25, CollisionObject.ADD)
     assert list(theirs.touch_links) == list(HAND.link_names)
-    assert list(theirs.detach_posture.points[0].positions) == list(ours.trajectory.points[0].positions)
+    assert list(next(iter(theirs.detach_posture.points)).positions) == list(
+        next(iter(ours.trajectory.points)).positions
+    )
     # With the hand at the grasp it is where the box is. A planning scene reads it back.
     T = matrix_of_pose(ours.grasp_pose)
     (held,) = updated_objects({}, theirs.object).values()
