@@ -126,8 +126,8 @@ def _report(options: argparse.Namespace, plan: Plan) -> None:
     with busy("report"):
         sections = report_of(plan, options.chart)
     # The tables of single objects are long, and the section `bench` repeats a part of `bench-all`.
-    shown = [written(parts) for name, parts in sections.items() if name not in ("bench-objects", "bench")]
-    print("\n\n".join(filter(None, shown)))
+    tables = [written(parts) for name, parts in sections.items() if name not in ("bench-objects", "bench")]
+    print("\n\n".join(filter(None, tables)))
     wrong = []
     for document in options.readme:
         try:
@@ -151,22 +151,22 @@ class Lines:
             print_note(f"{done} of {total} cases had finished before")
         if self.plan.missing and self.processes:
             minutes = self.plan.seconds(self.processes) / 60
-            told = f"{len(self.plan.missing)} cases, about {minutes:.0f} minutes on {self.processes} quiet cores"
-            print_note(told)
+            cost = f"{len(self.plan.missing)} cases, about {minutes:.0f} minutes on {self.processes} quiet cores"
+            print_note(cost)
         self._bar = bar("cases", total, done)
         return self
 
     def __call__(self, study: str, record: dict[str, Any]) -> None:
         from graspd_bench.study_registry import STUDIES
 
-        came = "; ".join(STUDIES[study].faults(record)) or STUDIES[study].came(record)
+        summary = "; ".join(STUDIES[study].faults(record)) or STUDIES[study].summary(record)
         if self._bar is not None:
-            self._bar.set_postfix_str(f"{study} {record['label']}: {came}")
+            self._bar.set_postfix_str(f"{study} {record['label']}: {summary}")
             self._bar.update()
         else:
             took = f"{record.get('case_cpu', 0.0):.1f} CPU s"
             where = f"{len(self.plan.done)}/{len(self.plan.jobs)} {study} {record['label']}"
-            print_note(f"{where}: {came}, {took}")
+            print_note(f"{where}: {summary}, {took}")
 
     def __exit__(self, *_: object) -> None:
         if self._bar is not None:

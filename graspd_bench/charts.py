@@ -115,8 +115,8 @@ def place_labels(
 
 
 def _place(point: np.ndarray, half: np.ndarray, distance: float, angle: float) -> np.ndarray:
-    way = np.array([np.cos(angle), np.sin(angle)])
-    return point + way * distance + np.sign(np.round(way, 6)) * half * np.abs(way) ** 0.5
+    corner = np.array([np.cos(angle), np.sin(angle)])
+    return point + corner * distance + np.sign(np.round(corner, 6)) * half * np.abs(corner) ** 0.5
 
 
 def _trouble(place: np.ndarray, half: np.ndarray, taken: Sequence[tuple[float, ...]], frame: Any) -> float:
@@ -206,21 +206,21 @@ def draw_charts(records: Sequence[Record], path: Path) -> dict[str, Path]:
 
 def about_records(records: Sequence[Record], kind: str) -> str:
     """Return two lines for a chart: hands and objects, then the number of grasps and the meaning of the bars."""
-    shown = [r for r in records if r.get("kind") == kind and not r["error"] and is_preset(r["name"])]
-    if not shown:
+    rows = [r for r in records if r.get("kind") == kind and not r["error"] and is_preset(r["name"])]
+    if not rows:
         return ""
-    hands, objects = ([*dict.fromkeys(Path(r[key]).name for r in shown)] for key in ("hand", "object"))
-    asked = Counter[str]()
-    for record in shown:
-        asked[record["name"]] += record["count"]
-    few, most = min(asked.values()), max(asked.values())
-    things = ", ".join(objects) if len(objects) <= _NAMED else f"{len(objects)} objects"
+    hands, objects = ([*dict.fromkeys(Path(r[key]).name for r in rows)] for key in ("hand", "object"))
+    counts = Counter[str]()
+    for record in rows:
+        counts[record["name"]] += record["count"]
+    few, most = min(counts.values()), max(counts.values())
+    names = ", ".join(objects) if len(objects) <= _NAMED else f"{len(objects)} objects"
     number = f"{few}" if few == most else f"{few} to {most}"
     # Times are measured per run, so planned grasps of a single object have no bars.
     bars = "objects" if len(objects) > 1 else "grasps" if kind == "raw" else ""
     shares = ", the 95 % interval of a share" if kind == "raw" else ""
-    told = f"; bars: quartiles over {bars}{shares}" if bars else ""
-    return f"{', '.join(hands)}; {things}\nn = {number} grasps a preset{told}"
+    note = f"; bars: quartiles over {bars}{shares}" if bars else ""
+    return f"{', '.join(hands)}; {names}\nn = {number} grasps a preset{note}"
 
 
 def draw_planned(presets: dict[str, list[Row]], path: Path, about: str = "") -> Path | None:
@@ -251,8 +251,8 @@ def draw_speed(presets: dict[str, list[Row]], path: Path, about: str = "") -> Pa
     with figure(4.6 * len(panels), 4.4, ncols=len(panels), squeeze=False) as (made, axes):
         fronts = [_draw_panel(axis, points, panel) for axis, (panel, points) in zip(axes[0], panels, strict=True)]
         made.supxlabel(f"CPU seconds per raw grasp (one thread, log scale)\n{about}".strip(), fontsize=9)
-        shown = [point for _, points in panels for point in points]
-        _legend(made, shown, front=max(fronts) > 1)
+        drawn = [point for _, points in panels for point in points]
+        _legend(made, drawn, front=max(fronts) > 1)
         for axis, (_, points) in zip(axes[0], panels, strict=True):
             names, colours = [short_name(p.name) for p in points], [method_row(p.method).colour for p in points]
             place_labels(axis, [(p.x[1], p.y[1]) for p in points], names, colours)
@@ -268,8 +268,8 @@ def points_of(presets: dict[str, list[Row]], time: str, panel: Panel) -> list[Po
             heights = (y.low, y.mean if panel.mean else y.median, y.high)
             if panel.mean:
                 low, high = share_interval(
-                    round(sum((row.values[panel.figure] or 0.0) * row.asked for row in group)),
-                    sum(row.asked for row in group),
+                    round(sum((row.values[panel.figure] or 0.0) * row.count for row in group)),
+                    sum(row.count for row in group),
                 )
                 heights = (min(low, y.mean), y.mean, max(high, y.mean))
             low, mid, high = (max(height * panel.factor, _LEAST if panel.log else 0.0) for height in heights)
@@ -314,8 +314,8 @@ def _draw_panel(axis: Any, points: Sequence[Point], panel: Panel) -> int:
     else:
         low, high = axis.get_ylim()
         axis.set_ylim((0.0, high) if panel.less_is_better else (max(0.0, low), 100.0))
-    way = "left and down" if panel.less_is_better else "left and up"
-    axis.set_title(f"better: {way}", fontsize=7.5, color="#666666")
+    better = "left and down" if panel.less_is_better else "left and up"
+    axis.set_title(f"better: {better}", fontsize=7.5, color="#666666")
     return len(front)
 
 

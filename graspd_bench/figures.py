@@ -72,7 +72,7 @@ class Row:
     """Figures of one name (preset, sweep value or hand) on one object, over all seeds.
 
     Attributes:
-        asked: number of requested grasps.
+        count: number of requested grasps.
         given: number of grasps found.
         held: number of grasps that passed the standard hold trial.
         spent: CPU time of the optimiser and of those trials [s].
@@ -85,7 +85,7 @@ class Row:
     name: str
     object: str
     method: str
-    asked: int
+    count: int
     given: int
     held: int
     spent: float
@@ -117,7 +117,7 @@ def rows(records: Iterable[Record], kind: str = "raw") -> list[Row]:
 
 
 def _row(group: Sequence[Record], ran: Collection[str]) -> Row:
-    asked, held = sum(r["count"] for r in group), sum(r["held"] for r in group)
+    count, held = sum(r["count"] for r in group), sum(r["held"] for r in group)
     grasps = [grasp for r in group for grasp in r["grasps"]]
     figures = [_grasp_figures(grasp) for grasp in grasps]
     names = _grasp_figures({})
@@ -127,19 +127,19 @@ def _row(group: Sequence[Record], ran: Collection[str]) -> Row:
     for trial in TRIAL_FIGURES:
         outcomes = [_inner(grasp, trial, "share" if trial == "noisy" else "passed") for grasp in grasps]
         tried = any(outcome is not None for outcome in outcomes) if grasps else trial in ran
-        values[trial] = sum(outcome or 0.0 for outcome in outcomes) / asked if tried else None
+        values[trial] = sum(outcome or 0.0 for outcome in outcomes) / count if tried else None
     # Planned runs have one total. Raw runs count what a plan would spend: the optimiser and the standard trial.
     spent = sum(r["cpu"].get("total", r["cpu"].get("optimise", 0.0) + r["cpu"].get("standard", 0.0)) for r in group)
-    values["cpu_per_grasp"] = sum(r["cpu"].get("optimise", r["cpu"].get("total", 0.0)) for r in group) / asked
+    values["cpu_per_grasp"] = sum(r["cpu"].get("optimise", r["cpu"].get("total", 0.0)) for r in group) / count
     prepared = sum(r["cpu"].get("scene", 0.0) for r in group)
-    values["cpu_with_scene"] = values["cpu_per_grasp"] + prepared / asked
+    values["cpu_with_scene"] = values["cpu_per_grasp"] + prepared / count
     values["cpu_per_verified"] = spent / held if held else None
     for clock in ("cpu", "wall"):
         values[f"first_{clock}"] = _median((r.get("first_verified") or {}).get(clock) for r in group)
     values["peak_mb"] = max((r["peak_mb"] for r in group), default=None)
     values["rounds"] = _median(float(r["rounds"]) if "rounds" in r else None for r in group)
     one, given = group[0], sum(r["given"] for r in group)
-    return Row(one["name"], one["object"], one["method"], asked, given, held, spent, values, quartiles)
+    return Row(one["name"], one["object"], one["method"], count, given, held, spent, values, quartiles)
 
 
 def spread(rows: Iterable[Row], figure: str) -> Spread | None:
@@ -154,12 +154,12 @@ def spread(rows: Iterable[Row], figure: str) -> Spread | None:
     return Spread(float(middle), float(low), float(high), float(np.mean(values)), len(values))
 
 
-def share_interval(held: int, asked: int) -> tuple[float, float]:
-    """Return the 95 % interval of the share `held` / `asked` (Wilson 1927)."""
-    z, share = 1.96, held / asked
-    middle = share + z * z / (2 * asked)
-    half = z * math.sqrt(share * (1 - share) / asked + z * z / (4 * asked * asked))
-    low, high = ((middle + side * half) / (1 + z * z / asked) for side in (-1.0, 1.0))
+def share_interval(held: int, count: int) -> tuple[float, float]:
+    """Return the 95 % interval of the share `held` / `count` (Wilson 1927)."""
+    z, share = 1.96, held / count
+    middle = share + z * z / (2 * count)
+    half = z * math.sqrt(share * (1 - share) / count + z * z / (4 * count * count))
+    low, high = ((middle + side * half) / (1 + z * z / count) for side in (-1.0, 1.0))
     return max(low, 0.0), min(high, 1.0)
 
 
@@ -252,10 +252,10 @@ def moves(old: Sequence[Record], new: Sequence[Record]) -> list[Move]:
 
 
 def _differences(
-    kind: str, name: str, thing: str, old: dict[str, float | None], new: dict[str, float | None]
+    kind: str, name: str, object_name: str, old: dict[str, float | None], new: dict[str, float | None]
 ) -> list[Move]:
     pairs = ((figure, old.get(figure), new.get(figure)) for figure in FIGURES)
-    return [Move(kind, name, thing, figure, a, b) for figure, a, b in pairs if _moved(figure, a, b)]
+    return [Move(kind, name, object_name, figure, a, b) for figure, a, b in pairs if _moved(figure, a, b)]
 
 
 def _moved(figure: str, old: float | None, new: float | None) -> bool:

@@ -34,7 +34,7 @@ from graspd_core.verify.hold_trial import hold_trial, noisy_share, pose_errors
 from graspd_core.verify.metrics import measure
 from graspd_core.verify.prepared_grasp import make_metrics_context
 from graspd_core.verify.world import PROTOCOLS, build_world
-from graspd_dataset.run_records import Stopwatch, thing_name
+from graspd_dataset.run_records import Stopwatch, object_name
 
 # Runs one trial of a grasp and returns its figures by name.
 Trial = Callable[[Grasp], dict[str, Any]]
@@ -151,9 +151,9 @@ class Cell(Case):
 
     @property
     def label(self) -> str:
-        return f"{self.kind} {self.name} {thing_name(self.object)} seed {self.seed}"
+        return f"{self.kind} {self.name} {object_name(self.object)} seed {self.seed}"
 
-    def asked(self) -> Record:
+    def inputs(self) -> Record:
         return {
             **{name: getattr(self, name) for name in ("kind", "name", "seed", "count")},
             "object": object_hash(self.object),
@@ -162,10 +162,10 @@ class Cell(Case):
             "trials": sorted(self.trials),
         }
 
-    def shown(self) -> Record:
+    def recorded(self) -> Record:
         return {
             **{name: getattr(self, name) for name in ("kind", "name", "hand", "seed", "count")},
-            "object": thing_name(self.object),
+            "object": object_name(self.object),
             "method": self.settings.method,
             "settings": to_mapping(self.settings),
         }
@@ -231,15 +231,15 @@ def run_verified(cell: Cell) -> dict[str, Any]:
     """Plan `count` verified grasps. Return how many were verified, and the CPU and wall time of the whole run [s]."""
     hand = load_hand(cell.hand)
     began = _now()
-    told = _First(began)
+    first = _First(began)
     scene = load_scene(cell.object, mass=PROTOCOL_MASS)
-    result = plan_grasps(scene, hand, count=cell.count, seed=cell.seed, preset=cell.settings, progress=told)
+    result = plan_grasps(scene, hand, count=cell.count, seed=cell.seed, preset=cell.settings, progress=first)
     taken = {name: value - began[name] for name, value in _now().items()}
     return {
         "given": len(result.tried),
         "held": sum(grasp.verdict is Verdict.VERIFIED for grasp in result.tried),
-        "first_verified": told.first,
-        "rounds": told.rounds,
+        "first_verified": first.first,
+        "rounds": first.rounds,
         "outcome": result.outcome.name,
         "cpu": {"total": taken["cpu"]},
         "wall": {"total": taken["wall"], "optimise": result.timing.optimise, "verify": result.timing.verify},

@@ -23,7 +23,7 @@ _COUNTED = ("baselines/*.py", "rendering/*.py", "trials.py")
 
 def case_key(study: str, case: Case) -> str:
     """Return the SHA-256 of the study's name and all inputs of a case, hexadecimal. The code version is not in it."""
-    return hashlib.sha256(json.dumps({"study": study, **case.asked()}, sort_keys=True).encode()).hexdigest()
+    return hashlib.sha256(json.dumps({"study": study, **case.inputs()}, sort_keys=True).encode()).hexdigest()
 
 
 def case_file(study: str, case: Case) -> str:
@@ -35,7 +35,7 @@ def case_file(study: str, case: Case) -> str:
 def head(study: str, case: Case, code: str) -> Record:
     """Return the fields of a record that are known before the run."""
     return {
-        **case.shown(),
+        **case.recorded(),
         "study": study,
         "label": case.label,
         "key": case_key(study, case),

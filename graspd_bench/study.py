@@ -17,7 +17,7 @@ from graspd_core.optimize.plan_config import PlanConfig, load_preset, to_mapping
 from graspd_core.perception.load_scene import load_scene
 from graspd_core.perception.scene import Scene
 from graspd_core.types import Grasp
-from graspd_dataset.run_records import thing_name
+from graspd_dataset.run_records import object_name
 
 Record = dict[str, Any]
 
@@ -45,20 +45,20 @@ class Case:
     def label(self) -> str:
         """Return the name of the case for progress lines and file names. It joins all fields that are not empty."""
         values = (getattr(self, field.name) for field in fields(self))
-        return " ".join(thing_name(value) for value in values if isinstance(value, str | int | float) and value != "")
+        return " ".join(object_name(value) for value in values if isinstance(value, str | int | float) and value != "")
 
-    def asked(self) -> Record:
+    def inputs(self) -> Record:
         """Return all inputs of the run except the code, JSON-ready. Cases with equal inputs share one record."""
         said = asdict(self)
         if "object" in said:
-            said["object"] = [thing_name(said["object"]), object_hash(said["object"])]
+            said["object"] = [object_name(said["object"]), object_hash(said["object"])]
         if "hand" in said:
             said["hand"] = [said["hand"], hand_hash(said["hand"])]
         if "preset" in said:
             said["settings"] = to_mapping(load_preset(said["preset"]))
         return said
 
-    def shown(self) -> Record:
+    def recorded(self) -> Record:
         """Return the fields of the case that its record holds."""
         return asdict(self)
 
@@ -138,7 +138,7 @@ class Study:
         takes: names of the `Request` fields that the study uses.
         seconds: returns the estimated CPU time of a case [s].
         faults: returns the faults of a record, one line per fault.
-        came: returns the result of a record without faults, in a few words.
+        summary: returns the result of a record without faults, in a few words.
         alone: whether every case gets a new process without warm-up.
         patience: returns the seconds until a case counts as hung.
         usual: whether `graspd bench all` includes the study. It must then need only shipped files.
@@ -153,7 +153,7 @@ class Study:
     takes: tuple[str, ...] = ()
     seconds: Callable[[Any], float] = lambda case: 10.0
     faults: Callable[[Record], tuple[str, ...]] = error_of
-    came: Callable[[Record], str] = held_of
+    summary: Callable[[Record], str] = held_of
     alone: bool = False
     patience: Callable[[Any], float] = lambda case: 3600.0
     usual: bool = True
@@ -168,9 +168,9 @@ def all_shapes() -> tuple[str, ...]:
 def find_objects(sources: Sequence[str]) -> tuple[str, ...]:
     """Return the objects that `object_sources` finds. Raises MeshError: no such object, or two with equal names."""
     found = object_sources(sources)
-    names = [thing_name(source) for source in found]
+    names = [object_name(source) for source in found]
     if twice := sorted({name for name in names if names.count(name) > 1}):
-        same = ", ".join(source for source in found if thing_name(source) == twice[0])
+        same = ", ".join(source for source in found if object_name(source) == twice[0])
         raise MeshError(f"objects {same} share the name {twice[0]!r}; rename one of them")
     return found
 
@@ -197,10 +197,10 @@ class ObjectCase(Case):
 
 def object_cases(request: Request, objects: Sequence[str], count: int, quick_count: int = 2) -> tuple[ObjectCase, ...]:
     """Return a case for each object and seed. A quick request takes one default object and `quick_count` grasps."""
-    things = find_objects(request.objects or objects[: 1 if request.quick else None])
+    objects_found = find_objects(request.objects or objects[: 1 if request.quick else None])
     count, hand = request.count or (quick_count if request.quick else count), request.hand or "allegro_right"
     seeds = request.seeds or (0,)
-    return tuple(ObjectCase(thing, request.preset(), hand, seed, count) for seed in seeds for thing in things)
+    return tuple(ObjectCase(source, request.preset(), hand, seed, count) for seed in seeds for source in objects_found)
 
 
 def raw_grasps(scene: Scene, hand: HandModel, config: PlanConfig, count: int, seed: int) -> tuple[Grasp, ...]:

@@ -79,7 +79,7 @@ STUDIES: dict[str, Study] = {
         ("studies/seen_objects.py",),
         _PLANS,
         seen_objects.seen_seconds,
-        came=lambda record: record.get("refused") or f"{record['held']} of {record['verified']} hold on the truth",
+        summary=lambda record: record.get("refused") or f"{record['held']} of {record['verified']} hold on the truth",
     ),
     "cameras": Study(
         "views by four kinds of cameras of things that nothing was fitted to, tried on the truth at their own mass",
@@ -89,7 +89,7 @@ STUDIES: dict[str, Study] = {
         ("studies/cameras.py", "studies/seen_objects.py", "rendering/*.py"),
         _PLANS,
         lambda case: 10.0,
-        came=lambda record: record.get("refused") or f"{record['held']} of {record['verified']} hold on the truth",
+        summary=lambda record: record.get("refused") or f"{record['held']} of {record['verified']} hold on the truth",
         usual=False,
     ),
     "piles": Study(
@@ -100,7 +100,7 @@ STUDIES: dict[str, Study] = {
         ("studies/piles.py",),
         ("presets", "objects", "cases", "seeds", "hand", "quick"),
         piles.pile_seconds,
-        came=piles.pile_came,
+        summary=piles.pile_summary,
     ),
     "robust": Study(
         "what ranking by noisy trials buys and costs",
@@ -129,7 +129,7 @@ STUDIES: dict[str, Study] = {
         ("presets", "cases", "quick"),
         lambda case: 6.0,
         stress_cases.stress_faults,
-        stress_cases.stress_came,
+        stress_cases.stress_summary,
         alone=True,
         patience=stress_cases.stress_patience,
         failures=True,
@@ -170,7 +170,7 @@ STUDIES: dict[str, Study] = {
         ("studies/arm_reach.py",),
         _PLANS,
         lambda case: 3.0,
-        came=arm_reach.came,
+        summary=arm_reach.summary,
     ),
     "throughput": Study(
         "verified grasps a second of a known object, on one thread and two (quiet cores, --processes 1)",
@@ -200,7 +200,7 @@ STUDIES: dict[str, Study] = {
         ("studies/dexgraspbench.py", "../graspd_dataset/*_grasps.py"),
         (*_PLANS, "checkout", "python", "armature", "grasps"),
         lambda case: 10.0 + 4.0 * case.count * (1 + case.armature),
-        came=dexgraspbench.bench_came,
+        summary=dexgraspbench.bench_summary,
         usual=False,
     ),
     "mano": Study(

@@ -24,9 +24,9 @@ def provenance(command: str, records: Sequence[Record]) -> str:
 
     failed = sum(bool(record["error"]) for record in records)
     minutes = sum(record.get("case_cpu", 0.0) for record in records) / 60
-    told = f"Made {of('made')} by `{command}` at commit {of('commit')} (code {of('code')}): "
-    told += f"{len(records)} cases, {minutes:.0f} CPU minutes on {of('machine')}."
-    return told + (f" {failed} cases failed and are in no figure." if failed else "")
+    line = f"Made {of('made')} by `{command}` at commit {of('commit')} (code {of('code')}): "
+    line += f"{len(records)} cases, {minutes:.0f} CPU minutes on {of('machine')}."
+    return line + (f" {failed} cases failed and are in no figure." if failed else "")
 
 
 def sourced(command: str, records: Sequence[Record], sections: Sections) -> dict[str, Sequence[str | Picture]]:
@@ -103,9 +103,9 @@ def summary_table(records: Sequence[Record]) -> str:
 def hands_table(records: Sequence[Record]) -> str:
     """Return a table with a row for each hand: means over objects, and the object on which fewest grasps held."""
     found = by_name(row for row in rows(records) if is_hand(row.name))
-    worst = [min(group, key=lambda row: row.held / row.asked) for group in found.values()]
+    worst = [min(group, key=lambda row: row.held / row.count) for group in found.values()]
     hands = {name.removeprefix("hand:"): group for name, group in found.items()}
-    return _summary("hand", hands, ("fewest held", [f"{row.object} {row.held}/{row.asked}" for row in worst]))
+    return _summary("hand", hands, ("fewest held", [f"{row.object} {row.held}/{row.count}" for row in worst]))
 
 
 def _summary(kind: str, found: Mapping[str, Sequence[Row]], last: tuple[str, list[str]] | None = None) -> str:
@@ -129,7 +129,7 @@ def object_tables(records: Sequence[Record]) -> str:
     for name, group in by_name(row for row in rows(records) if is_preset(row.name)).items():
         columns = [column for column in _columns() if _known({name: group}, column[1])]
         body = [
-            [row.object, *(_form(row.values[f], form) if f != "standard" else f"{row.held}/{row.asked}"
+            [row.object, *(_form(row.values[f], form) if f != "standard" else f"{row.held}/{row.count}"
                            for _, f, form in columns)]
             for row in group
         ]  # fmt: skip
@@ -142,10 +142,10 @@ def planned_table(records: Sequence[Record]) -> str:
     """Return a table of planned runs with a row for each preset: verified grasps, and their cost with trials."""
     body = []
     for name, group in by_name(rows(records, "verified")).items():
-        held, asked = sum(row.held for row in group), sum(row.asked for row in group)
+        held, count = sum(row.held for row in group), sum(row.count for row in group)
         first, worst = spread(group, "first_cpu"), max((r.values["first_cpu"] or 0.0 for r in group), default=0.0)
         body.append([
-            f"`{name}`", f"{held}/{asked}",
+            f"`{name}`", f"{held}/{count}",
             f"{first.median:.2f} ({worst:.2f})" if first else "–",
             *(_mean(group, figure, "{:.3g}") for figure in _PLANNED),
             f"{max(row.values['peak_mb'] or 0.0 for row in group):.0f}",
@@ -195,7 +195,7 @@ def decades_sections(records: Sequence[Record], chart: Path | None) -> Sections:
     for title, _, setting, values in DECADES:
         scale = 1e3 if "[mm]" in title else 1.0
         found = [groups.get(f"{setting}={value:g}", []) for value in values]
-        share = [f"{sum(r.held for r in group)}/{sum(r.asked for r in group)}" if group else "–" for group in found]
+        share = [f"{sum(r.held for r in group)}/{sum(r.count for r in group)}" if group else "–" for group in found]
         blocks.append(markdown_table([title, *(f"{v * scale:g}" for v in values)], [[f"`{setting}`", *share]]))
     return {"decades": blocks}
 

@@ -138,4 +138,4 @@ def _tell(live: LiveCell | None, attempt: Attempt, report: Report) -> None:
     )
     print(line, flush=True)
     if live is not None:
-        live.page.tell(f"{out} of {len(report.places)} things out", line)
+        live.page.write(f"{out} of {len(report.places)} things out", line)

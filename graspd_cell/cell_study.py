@@ -296,7 +296,7 @@ def _times(records: Sequence[Record]) -> str:
     return f"Medians: {told}; a whole attempt {whole:.1f} s of the robot's clock."
 
 
-def cell_came(record: Record) -> str:
+def cell_summary(record: Record) -> str:
     """Return a one-line summary: objects in the place bin and attempts."""
     there = [name for name, place in record["dropped"].items() if place == "pick bin"]
     out = sum(record["ended"][name] == "place bin" for name in there)
@@ -311,6 +311,6 @@ STUDY = Study(
     ("../graspd_cell/*.py", "rendering/*.py"),
     ("presets", "objects", "cases", "seeds", "quick"),
     cell_seconds,
-    came=cell_came,
+    summary=cell_summary,
     usual=False,
 )

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import numpy as np
 
-from graspd_bench.rendering.families import FAMILIES, PREFIX, draw_thing
+from graspd_bench.rendering.families import FAMILIES, PREFIX, draw_object
 from graspd_core.errors import ConfigError, MeshError
 from graspd_core.mesh.mesh_files import MESH_ENDINGS, simplify
 from graspd_core.mesh.shapes import SHAPES
@@ -123,7 +123,7 @@ def load_thing(source: ThingSource) -> Thing:
     kind, _, rest = source.source.partition(":")
     if f"{kind}:" == PREFIX:
         family, _, seed = rest.partition(":")
-        drawn = draw_thing(family, int(seed or 0))
+        drawn = draw_object(family, int(seed or 0))
         model = load_scene(drawn.mesh, mass=drawn.mass).object
     else:
         model = load_scene(source.source, mass=source.mass).object

@@ -70,10 +70,10 @@ def make_block(block: Block, hand: bytes, shared: bytes) -> MadeBlock:
     grasps = result.tried if block.measure != "all" else all_measured(scene, model, result.tried)
     # If the hand cannot lift the assumed mass, the trials use a smaller one. The rows hold that mass.
     target = scene.object if result.mass is None else scene.object.at_mass(result.mass)
-    asked = {"block": block.key, "asked": block.asked, "outcome": result.outcome.name, "message": result.message}
+    row = {"block": block.key, "asked": block.inputs, "outcome": result.outcome.name, "message": result.message}
     return MadeBlock(
         object_sha256=scene.object.sha256,
-        file=parquet_bytes(_table(block, target, model, grasps), asked),
+        file=parquet_bytes(_table(block, target, model, grasps), row),
         rows=len(grasps),
         verified=sum(grasp.verdict is Verdict.VERIFIED for grasp in grasps),
         failures=dict(Counter(failure_kind(grasp) for grasp in grasps if grasp.verdict is Verdict.FAILED)),
@@ -189,8 +189,8 @@ def dry_run(blocks: Sequence[Block], limits: Limits, workers: int | None) -> str
     for hand, (block, made) in measured.items():
         share = wanted[hand] / block.count
         cpu, size, tried = cpu + share * made.cpu, size + share * len(made.file), tried + share * made.rows
-        told = f"{made.verified} of {made.rows} verified, {made.cpu:.1f} CPU s, {len(made.file) / 1024:.0f} kB"
-        lines.append(f"{block.hand}: one block of {block.object.source}: {told}, {made.peak_mb:.0f} MB at the peak")
+        counts = f"{made.verified} of {made.rows} verified, {made.cpu:.1f} CPU s, {len(made.file) / 1024:.0f} kB"
+        lines.append(f"{block.hand}: one block of {block.object.source}: {counts}, {made.peak_mb:.0f} MB at the peak")
     hours = f"{cpu / 3600:.3g} CPU hours, {cpu / 3600 / workers:.3g} hours on {workers} cores"
     lines.append(f"{len(blocks)} blocks, {sum(wanted.values())} grasps wanted, about {tried:.0f} tried: {hours}")
     return "\n".join([*lines, f"about {size / 2**20:.1f} MB"])

@@ -18,7 +18,7 @@ from graspd_core.mesh.shapes import object_hash, object_sources
 from graspd_core.optimize.plan_config import PlanConfig, load_preset, to_mapping
 from graspd_core.planning.plan_grasps import check_request
 from graspd_dataset.dataset_store import SCHEMA_VERSION
-from graspd_dataset.run_records import thing_name
+from graspd_dataset.run_records import object_name
 
 Measured = Literal["verified", "all", "none"]
 MEASURED: tuple[str, ...] = get_args(Measured)
@@ -26,9 +26,9 @@ MEASURED: tuple[str, ...] = get_args(Measured)
 _DIGITS = 32
 
 
-def content_key(asked: Any) -> str:
+def content_key(inputs: Any) -> str:
     """Return the key of JSON-ready values: the first 128 bits of their SHA-256 in hexadecimal."""
-    return hashlib.sha256(json.dumps(asked, sort_keys=True).encode()).hexdigest()[:_DIGITS]
+    return hashlib.sha256(json.dumps(inputs, sort_keys=True).encode()).hexdigest()[:_DIGITS]
 
 
 @dataclass(frozen=True)
@@ -50,14 +50,14 @@ class DatasetObject:
     friction: float
 
     @property
-    def asked(self) -> dict[str, Any]:
+    def inputs(self) -> dict[str, Any]:
         """Inputs that identify the object, JSON-ready. Names of files are not among them."""
         return {"content": self.content, "scale": self.scale, "mass": self.mass, "friction": self.friction}
 
     @cached_property
     def key(self) -> str:
-        """Key of the object: a hash of `asked`."""
-        return content_key(self.asked)
+        """Key of the object: a hash of `inputs`."""
+        return content_key(self.inputs)
 
 
 @dataclass(frozen=True)
@@ -89,14 +89,14 @@ class Block:
     @property
     def hand_name(self) -> str:
         """Name of the hand, as in the folder `hand=NAME` of the data set."""
-        return thing_name(self.hand)
+        return object_name(self.hand)
 
     @property
-    def asked(self) -> dict[str, Any]:
+    def inputs(self) -> dict[str, Any]:
         """All inputs of the rows except the code version, JSON-ready."""
         return {
             "schema": SCHEMA_VERSION,
-            "object": self.object.asked,
+            "object": self.object.inputs,
             "hand": self.hand_content,
             "settings": to_mapping(self.config),
             "verify": self.verify,
@@ -107,8 +107,8 @@ class Block:
 
     @cached_property
     def key(self) -> str:
-        """Key of the block: a hash of `asked`. The block's file has this name."""
-        return content_key(self.asked)
+        """Key of the block: a hash of `inputs`. The block's file has this name."""
+        return content_key(self.inputs)
 
 
 @dataclass(frozen=True)
@@ -168,8 +168,8 @@ def blocks_of(request: DatasetRequest) -> tuple[Block, ...]:
     preset = Path(request.preset).stem if request.preset.endswith((".yaml", ".yml")) else request.preset
     counts = _split(request.per_object, request.block)
     return tuple(
-        Block(thing, hand, hashed, preset, config, request.verify, request.measure, request.seed + number, count)
-        for thing in _objects(request)
+        Block(found, hand, hashed, preset, config, request.verify, request.measure, request.seed + number, count)
+        for found in _objects(request)
         for hand, hashed in hands.items()
         for number, count in enumerate(counts)
     )
@@ -193,8 +193,8 @@ def _objects(request: DatasetRequest) -> list[DatasetObject]:
     for source in object_sources(request.objects):
         content = object_hash(source)
         for scale in (*request.scales, *_drawn_scales(content, request)):
-            thing = DatasetObject(source, content, scale, request.mass, request.friction)
-            found.setdefault(thing.key, thing)
+            made = DatasetObject(source, content, scale, request.mass, request.friction)
+            found.setdefault(made.key, made)
     return list(found.values())
 
 

@@ -73,8 +73,8 @@ def complete_grasps(
                 faults.append("no squeeze can be computed: fewer than two links touch the object")
             else:
                 grasps.append(_merged(theirs, ours))
-    doubt = frame_doubt(scene, hand, [grasp.grasp for grasp in kept if grasp.closed])
-    return CompletedGrasps(tuple(grasps), dict(Counter(filter(None, faults))), doubt)
+    warning = frame_doubt(scene, hand, [grasp.grasp for grasp in kept if grasp.closed])
+    return CompletedGrasps(tuple(grasps), dict(Counter(filter(None, faults))), warning)
 
 
 def frame_doubt(scene: Scene, hand: HandModel, postures: Sequence[Posture]) -> str:

@@ -97,9 +97,9 @@ def _make(options: argparse.Namespace) -> int:
     if options.dry_run:
         from graspd_dataset.block_rows import dry_run
 
-        told = dry_run(missing, limits, options.workers)
-        print(told)
-        answer({"blocks": len(missing), "estimate": told})
+        text = dry_run(missing, limits, options.workers)
+        print(text)
+        answer({"blocks": len(missing), "estimate": text})
         return EXIT_OK
     record = begin_run(store, request, len(blocks), any_code=options.any_code)
     with Interrupt() as interrupt:
@@ -109,7 +109,7 @@ def _make(options: argparse.Namespace) -> int:
     write_run(store, with_unrecorded(store, record))
     _finish(store)
     if interrupt.is_interrupted():
-        print_error(f"interrupted; the same command continues, {store.shown} keeps finished blocks")
+        print_error(f"interrupted; the same command continues, {store.label} keeps finished blocks")
         return EXIT_INTERRUPTED
     return EXIT_FAULTS if lines.wrong else EXIT_OK
 
@@ -148,7 +148,7 @@ def _finish(store: DatasetStore) -> None:
         stats = stats_of(store)
     store.write("README.md", data_card(store, stats).encode())
     print(stats_table(stats))
-    answer({"dataset": store.shown, **vars(stats)})
+    answer({"dataset": store.label, **vars(stats)})
 
 
 def _request(options: argparse.Namespace) -> DatasetRequest:
@@ -171,7 +171,7 @@ class Lines:
     def __init__(self, blocks: int) -> None:
         self.wrong = 0
         self._blocks, self._done, self._rows, self._verified = blocks, 0, 0, 0
-        self._cpu = self._peak = self._told = 0.0
+        self._cpu = self._peak = self._reported = 0.0
         self._failures: Counter[str] = Counter()
         self._files: dict[str, str] = {}
         self._began = time.monotonic()
@@ -197,15 +197,15 @@ class Lines:
         if self._bar is not None:
             self._bar.set_postfix_str(self._text())
             self._bar.update(self._done - self._bar.n)
-        elif time.monotonic() > self._told + _LINES:
-            self._told = time.monotonic()
+        elif time.monotonic() > self._reported + _LINES:
+            self._reported = time.monotonic()
             print_note(f"{self._done}/{self._blocks} blocks, {self._text()}")
 
     def _text(self) -> str:
         seconds = max(time.monotonic() - self._began, 1e-9)
         reasons = ", ".join(f"{number} {reason}" for reason, number in self._failures.most_common(2))
-        told = f"{self._verified} of {self._rows} verified, {self._verified / seconds:.1f}/s"
-        return f"{told}; {reasons}" if reasons else told
+        text = f"{self._verified} of {self._rows} verified, {self._verified / seconds:.1f}/s"
+        return f"{text}; {reasons}" if reasons else text
 
     def added_to(self, record: RunRecord, wall: float) -> RunRecord:
         """Return the record with the work of this session added. `wall` is its duration [s]."""
@@ -225,7 +225,7 @@ def _stats(options: argparse.Namespace, stores: list[DatasetStore]) -> int:
     with busy("count"):
         stats = stats_of(stores[0])
     print("\n".join([stats_table(stats), "", *reason_lines(stats)]))
-    answer({"dataset": stores[0].shown, **vars(stats)})
+    answer({"dataset": stores[0].label, **vars(stats)})
     return EXIT_OK
 
 
@@ -237,10 +237,10 @@ def _validate(options: argparse.Namespace, stores: list[DatasetStore]) -> int:
     if not faults:
         paths, known = stores[0].list("grasps"), recorded_hashes(stores[0])
         without = sum(path not in known for path in paths)
-        told = f"; {without} without a hash on record" if without else ""
-        print(f"{stores[0].shown}: {len(paths)} blocks, no fault{told}")
+        warning = f"; {without} without a hash on record" if without else ""
+        print(f"{stores[0].label}: {len(paths)} blocks, no fault{warning}")
     print("\n".join(faults), end="\n" if faults else "")
-    answer({"dataset": stores[0].shown, "faults": faults})
+    answer({"dataset": stores[0].label, "faults": faults})
     return EXIT_FAULTS if faults else EXIT_OK
 
 
@@ -253,7 +253,7 @@ def _merge(options: argparse.Namespace, stores: list[DatasetStore]) -> int:
     out = DatasetStore(options.out)
     with busy("merge"):
         copied, common = merge(stores, out)
-    print(f"{out.shown}: {copied} blocks copied, {common} were there or in several")
+    print(f"{out.label}: {copied} blocks copied, {common} were there or in several")
     _finish(out)
     return EXIT_OK
 

@@ -32,8 +32,8 @@ def parquet_bytes(table: Any, metadata: Mapping[str, Any]) -> bytes:
     """Return the bytes of a Parquet file with a pyarrow table. `metadata` holds JSON-ready values."""
     import pyarrow.parquet as pq
 
-    told = json.dumps({"format": FORMAT, "version": SCHEMA_VERSION, **metadata}, sort_keys=True)
-    kept = {**(table.schema.metadata or {}), _METADATA: told.encode()}
+    text = json.dumps({"format": FORMAT, "version": SCHEMA_VERSION, **metadata}, sort_keys=True)
+    kept = {**(table.schema.metadata or {}), _METADATA: text.encode()}
     buffer = BytesIO()
     pq.write_table(table.replace_schema_metadata(kept), buffer, compression="zstd", write_page_checksum=True)
     return buffer.getvalue()
@@ -83,7 +83,7 @@ class DatasetStore:
         self._system: Any = None
 
     @property
-    def shown(self) -> str:
+    def label(self) -> str:
         """The directory, or the address without access keys and options, for messages and records."""
         kind, there, rest = self.where.partition("://")
         return f"{kind}://{rest.partition('?')[0].rpartition('@')[2]}" if there else self.where
@@ -143,7 +143,7 @@ class DatasetStore:
             try:
                 self._system = FileSystem.from_uri(address)
             except (ArrowException, OSError, ValueError) as error:
-                raise StorageError(f"{self.shown}: {error}; valid: a directory, s3://bucket/path, …") from None
+                raise StorageError(f"{self.label}: {error}; valid: a directory, s3://bucket/path, …") from None
         return self._system
 
     def __getstate__(self) -> dict[str, Any]:
@@ -153,7 +153,7 @@ class DatasetStore:
         try:
             return work()
         except OSError as error:
-            raise StorageError(f"{self.shown}: {path}: {error.strerror or error}") from None
+            raise StorageError(f"{self.label}: {path}: {error.strerror or error}") from None
 
     def _tried(self, path: str, work: Callable[[], T]) -> T:
         """Do a server request. Repeat it, after growing pauses, if it fails."""
@@ -162,8 +162,8 @@ class DatasetStore:
                 return work()
             except OSError as error:
                 if number + 1 == _TRIES or isinstance(error, FileNotFoundError):
-                    told = " ".join(str(error).split())
-                    raise StorageError(f"{self.shown}: {path}: {told}") from None
+                    text = " ".join(str(error).split())
+                    raise StorageError(f"{self.label}: {path}: {text}") from None
                 time.sleep(_PAUSE * 2**number)
         raise AssertionError("not reached")
 
@@ -190,7 +190,7 @@ def read_record(store: DatasetStore, path: str) -> dict[str, Any]:
     except ValueError:
         record = None
     if not isinstance(record, dict) or not isinstance(record.get("files", {}), dict):
-        raise FormatError(f"{store.shown}/{path}: not a record of a run or a failure; expected a JSON object")
+        raise FormatError(f"{store.label}/{path}: not a record of a run or a failure; expected a JSON object")
     return record
 
 

@@ -135,9 +135,9 @@ def write_dexgraspbench(
         save_bytes(out / row["hand_name"] / name / f"{number}.npy", buffer.getvalue())
     folder = out / "objects" / name
     model = load_scene(mesh, mass=rows[0]["mass"]).object
-    told = {"mass": model.mass, "density": model.mass / model.volume, "scale": 1.0}
-    told["gravity_center"] = model.center_of_mass.tolist()
-    save_text(folder / "info" / "simplified.json", json.dumps(told, indent=1) + "\n")
+    values = {"mass": model.mass, "density": model.mass / model.volume, "scale": 1.0}
+    values["gravity_center"] = model.center_of_mass.tolist()
+    save_text(folder / "info" / "simplified.json", json.dumps(values, indent=1) + "\n")
     save_text(folder / "mesh" / "simplified.obj", obj_text(mesh))
     far = far_centre(model.mesh.vertices)
     for number, part in enumerate(object_parts(moved_object(model, -far))):

@@ -260,8 +260,8 @@ def read_isaac(path: Path, text: bytes, hand: HandModel, mesh: str | None) -> li
     except ValueError as error:
         raise FormatError(f"{path}: not YAML: {error}") from None
     if entry(document, "format", f"{path}") != "isaac_grasp" or document.get("format_version") != 1.0:
-        told = f"{short_repr(document['format'])} {short_repr(document.get('format_version'))}"
-        raise FormatError(f"{path}: format {told}; valid: isaac_grasp 1.0")
+        given = f"{short_repr(document['format'])} {short_repr(document.get('format_version'))}"
+        raise FormatError(f"{path}: format {given}; valid: isaac_grasp 1.0")
     # Isaac Sim writes keys that end with `_frame_link`, Isaac ROS documents keys that end with `_frame`.
     target, frame = (document.get(f"{of}_frame_link", document.get(f"{of}_frame")) for of in ("object", "gripper"))
     mesh = mesh or find_beside(target, path, f"{path}: object_frame_link")

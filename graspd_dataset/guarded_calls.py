@@ -163,8 +163,8 @@ def failed_report(store: DatasetStore, job: Job, error: BaseException) -> Report
     from graspd_dataset.run_records import failure
 
     record = failure(error, _KINDS.get(type(error), "raised"))
-    told = {"key": job.key, "asked": job.asked, **record}
-    store.write(f"failed/{job.key}.json", (json.dumps(told, indent=1) + "\n").encode())
+    entry = {"key": job.key, "asked": job.asked, **record}
+    store.write(f"failed/{job.key}.json", (json.dumps(entry, indent=1) + "\n").encode())
     return Report(job.key, failed=record["failed"], error=record["error"])
 
 

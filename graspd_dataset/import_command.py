@@ -93,8 +93,8 @@ def _result(scene: Scene, hand: HandModel, imported: Sequence[ImportedGrasp], co
     moved = [grasp.squeeze_moved for grasp in imported if grasp.squeeze_moved > _MOVED]
     warnings = [*hand.named_warnings, *filter(None, [completed.frame_doubt])]
     if moved:
-        told = f"{len(moved)} squeezes move the base, by up to {max(moved) * 1000:.1f} mm"
-        warnings.append(f"{told}; here the base stays at the grasp's pose")
+        warning = f"{len(moved)} squeezes move the base, by up to {max(moved) * 1000:.1f} mm"
+        warnings.append(f"{warning}; here the base stays at the grasp's pose")
     return result_of(
         grasps,
         len(imported),

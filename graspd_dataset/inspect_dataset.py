@@ -60,17 +60,17 @@ def tables_of(store: DatasetStore, columns: Sequence[str] | None = None) -> Iter
     """
     paths = store.list("grasps")
     if not paths:
-        raise FormatError(f"{store.shown}: no data set; expected .parquet files below grasps/")
+        raise FormatError(f"{store.label}: no data set; expected .parquet files below grasps/")
     for path in paths:
         content = store.read(path)
-        yield path, content, *read_parquet(content, f"{store.shown}/{path}", columns)
+        yield path, content, *read_parquet(content, f"{store.label}/{path}", columns)
 
 
 def stats_of(store: DatasetStore) -> DatasetStats:
     """Count the rows of a data set. Raises FormatError: there is no block, or a block is damaged."""
     stats, there = DatasetStats(), set[str]()
-    for path, content, table, told in tables_of(store, ("object_sha256", "verdict", "code", "trials")):
-        there.add(told["block"])
+    for path, content, table, header in tables_of(store, ("object_sha256", "verdict", "code", "trials")):
+        there.add(header["block"])
         stats.codes.update(table["code"].unique().to_pylist())
         # The path gives the hand, because a block may have no rows.
         hand = stats.hands.setdefault(path.split("/")[1].removeprefix("hand="), HandCount())
@@ -119,7 +119,7 @@ def faults_of_dataset(store: DatasetStore) -> Iterator[str]:
     """Yield the faults of a data set, one line per fault. Raises FormatError: there is no data set."""
     paths, meshes = store.list("grasps"), {key_of(path) for path in store.list("objects")}
     if not paths:
-        raise FormatError(f"{store.shown}: no data set; expected .parquet files below grasps/")
+        raise FormatError(f"{store.label}: no data set; expected .parquet files below grasps/")
     known: dict[str, set[str]] = {}
     try:
         known = recorded_hashes(store)
@@ -131,12 +131,12 @@ def faults_of_dataset(store: DatasetStore) -> Iterator[str]:
     for path in paths:
         content = store.read(path)
         try:
-            table, told = read_parquet(content, path)
+            table, header = read_parquet(content, path)
         except FormatError as error:
             yield str(error)
             continue
         yield from _changed(path, content, known)
-        yield from (f"{path}: {fault}" for fault in _file_faults(path, table, told, meshes))
+        yield from (f"{path}: {fault}" for fault in _file_faults(path, table, header, meshes))
         for digest in row_digests(table):
             if digest in seen:
                 yield f"{path}: a grasp is also in {seen[digest]}"
@@ -179,7 +179,7 @@ def count_by_content(store: DatasetStore) -> tuple[int, int]:
     return len(digests), len(set(digests))
 
 
-def _file_faults(path: str, table: Any, told: dict[str, Any], meshes: set[str]) -> Iterator[str]:
+def _file_faults(path: str, table: Any, header: dict[str, Any], meshes: set[str]) -> Iterator[str]:
     """Yield the faults of one block. `meshes` are the keys of the meshes in `objects/`."""
     import numpy as np
 
@@ -187,8 +187,8 @@ def _file_faults(path: str, table: Any, told: dict[str, Any], meshes: set[str]) 
         names = set(table.schema.names) ^ set(arrow_schema().names)
         yield f"its columns are not those of the schema: {', '.join(sorted(names)) or 'other types'}"
         return
-    if content_key(told.get("asked")) != key_of(path) or told.get("block") != key_of(path):
-        yield f"its metadata does not match its name: it is of block {told.get('block')}"
+    if content_key(header.get("asked")) != key_of(path) or header.get("block") != key_of(path):
+        yield f"its metadata does not match its name: it is of block {header.get('block')}"
     if not table.num_rows:
         return
     hand, target = table["hand_name"][0].as_py(), table["object_sha256"][0].as_py()

@@ -30,7 +30,7 @@ def merge(sources: Sequence[DatasetStore], out: DatasetStore) -> tuple[int, int]
         for path, content, table, _ in tables_of(source):
             name = path.rpartition("/")[2]
             if name in there:
-                _refuse_conflict(table, out, there[name], f"{source.shown}/{path}")
+                _refuse_conflict(table, out, there[name], f"{source.label}/{path}")
                 common += 1
                 continue
             out.write(path, content)
@@ -49,9 +49,9 @@ def merge(sources: Sequence[DatasetStore], out: DatasetStore) -> tuple[int, int]
 
 
 def _refuse_conflict(table: Any, out: DatasetStore, path: str, where: str) -> None:
-    other, _ = read_parquet(out.read(path), f"{out.shown}/{path}")
+    other, _ = read_parquet(out.read(path), f"{out.label}/{path}")
     if not table.drop_columns(list(_NAMES)).equals(other.drop_columns(list(_NAMES))):
-        raise FormatError(f"{where}: rows differ from {out.shown}/{path}, which has the same key; keep only one")
+        raise FormatError(f"{where}: rows differ from {out.label}/{path}, which has the same key; keep only one")
 
 
 def sample(store: DatasetStore, count: int, seed: int, verdict: str | None = None) -> tuple[bytes, int]:
@@ -69,10 +69,10 @@ def sample(store: DatasetStore, count: int, seed: int, verdict: str | None = Non
         raise ConfigError(f"count: {count} rows; valid: 1 or more")
     drawn: list[tuple[int, str, int]] = []
     # The first pass reads two columns and draws rows. The second pass reads the files that hold drawn rows.
-    for path, _, table, told in tables_of(store, ("row", "verdict")):
+    for path, _, table, header in tables_of(store, ("row", "verdict")):
         for row, said in zip(table["row"].to_pylist(), table["verdict"].to_pylist(), strict=True):
             if verdict in (None, said):
-                digest = hashlib.sha256(f"{seed} {told['block']} {row}".encode()).digest()
+                digest = hashlib.sha256(f"{seed} {header['block']} {row}".encode()).digest()
                 item = (-int.from_bytes(digest[:8]), path, row)
                 heapq.heappush(drawn, item) if len(drawn) < count else heapq.heappushpop(drawn, item)
     rows: dict[str, list[int]] = {}

@@ -106,13 +106,13 @@ def pickled_hand(block: Block) -> bytes:
     return pickle.dumps(load_hand(block.hand, candidates=block.config.problem.fine_candidates))
 
 
-def object_job(thing: DatasetObject, config: PlanConfig) -> Job:
-    return Job(thing.key, {"object": thing.source, **thing.asked}, pickle.dumps((thing, config)))
+def object_job(source: DatasetObject, config: PlanConfig) -> Job:
+    return Job(source.key, {"object": source.source, **source.inputs}, pickle.dumps((source, config)))
 
 
 def block_job(block: Block) -> Job:
-    asked = {"object": block.object.source, "hand": block.hand, **block.asked}
-    return Job(block.key, asked, pickle.dumps(block), block.hand_name)
+    inputs = {"object": block.object.source, "hand": block.hand, **block.inputs}
+    return Job(block.key, inputs, pickle.dumps(block), block.hand_name)
 
 
 class RayEngine:
@@ -136,11 +136,11 @@ class RayEngine:
         """Return the number of tasks that can run at the same time."""
         return max(1, int(self._ray.cluster_resources().get("CPU", 1)))
 
-    def submit_object(self, thing: DatasetObject, config: PlanConfig) -> tuple[Any, Any]:
+    def submit_object(self, source: DatasetObject, config: PlanConfig) -> tuple[Any, Any]:
         """Submit an object. Return the handles of its report and of its `ReadyObject.shared`."""
-        shape = thing.source.startswith("shape:")
-        content = Path(thing.source).read_bytes() if self._ship and not shape else None
-        return tuple(self._prepare.remote(object_job(thing, config), content, self._store, self._limits))
+        shape = source.source.startswith("shape:")
+        content = Path(source.source).read_bytes() if self._ship and not shape else None
+        return tuple(self._prepare.remote(object_job(source, config), content, self._store, self._limits))
 
     def submit_block(self, block: Block, shared: Any) -> Any:
         """Submit a block. Return the handle of its report. `shared` is the second handle of `submit_object`."""

@@ -79,22 +79,22 @@ def begin_run(store: DatasetStore, request: DatasetRequest, blocks: int, *, any_
     records = run_records(store)
     others = sorted({record.code for record in records} - {code})
     if others and not any_code:
-        raise ConfigError(f"{store.shown}: made by code {others[0]}, this is {code}; to add to it give --any-code")
+        raise ConfigError(f"{store.label}: made by code {others[0]}, this is {code}; to add to it give --any-code")
     machine = f"{os.cpu_count()} cores, {platform.machine()}, Python {platform.python_version()}"
-    new = RunRecord(command_of(request, store.shown), code, commit(), date.today().isoformat(), machine, blocks)
+    new = RunRecord(command_of(request, store.label), code, commit(), date.today().isoformat(), machine, blocks)
     return next((replace(record, blocks=blocks) for record in records if record.path == new.path), new)
 
 
 def write_run(store: DatasetStore, record: RunRecord) -> None:
-    told = {"format": FORMAT, "version": SCHEMA_VERSION, **asdict(record)}
-    store.write(record.path, (json.dumps(told, indent=1) + "\n").encode())
+    content = {"format": FORMAT, "version": SCHEMA_VERSION, **asdict(record)}
+    store.write(record.path, (json.dumps(content, indent=1) + "\n").encode())
 
 
 def run_records(store: DatasetStore) -> list[RunRecord]:
     """Read the records of all commands that wrote to a data set."""
     names = {item.name for item in fields(RunRecord)}
-    told = [read_record(store, path) for path in store.list("runs")]
-    return [RunRecord(**{key: value for key, value in record.items() if key in names}) for record in told]
+    records = [read_record(store, path) for path in store.list("runs")]
+    return [RunRecord(**{key: value for key, value in record.items() if key in names}) for record in records]
 
 
 def with_unrecorded(store: DatasetStore, record: RunRecord) -> RunRecord:

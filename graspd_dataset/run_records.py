@@ -63,8 +63,8 @@ def peak_mb() -> float:
 def failure(error: BaseException, kind: str = "raised") -> dict[str, Any]:
     """Return the record of a failure: its kind (raised, died, hung), the error, and the traceback."""
     where = "".join(traceback.format_exception(error))
-    told = " ".join(str(error).split())
-    return {"failed": kind, "error": f"{type(error).__name__}: {told}", "traceback": where}
+    message = " ".join(str(error).split())
+    return {"failed": kind, "error": f"{type(error).__name__}: {message}", "traceback": where}
 
 
 @lru_cache
@@ -99,7 +99,7 @@ def commit() -> str:
     return done.stdout.strip()
 
 
-def thing_name(source: Any) -> str:
+def object_name(source: Any) -> str:
     """Return a short name: that of a shape, or of a file without its ending. Other values become text."""
     text = f"{source:g}" if isinstance(source, float) else str(source)
     path = Path(text)

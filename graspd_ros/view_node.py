@@ -79,14 +79,14 @@ class Follower:
 
     def _on_progress(self, message: Any) -> None:
         line = f"{message.request_id}: {message.stage} {message.step} of {message.of}, {message.verified} verified"
-        self._viewer.do("progress", lambda: self._viewer.tell(line, min(message.fraction, 0.99)))
+        self._viewer.do("progress", lambda: self._viewer.show_progress(line, min(message.fraction, 0.99)))
 
     def _on_answer(self, message: Any) -> None:
         from graspd_core import PlanConfig
         from graspd_viewer.session import Session, make_session
 
         ending = message.message or f"{len(message.grasps)} grasps"
-        self._viewer.do("progress", lambda: self._viewer.tell(ending, 1.0))
+        self._viewer.do("progress", lambda: self._viewer.show_progress(ending, 1.0))
         if not message.grasps:
             return
         try:

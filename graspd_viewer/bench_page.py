@@ -40,7 +40,7 @@ from graspd_core.verify.verification import trial_context
 from graspd_viewer.server import may_connect
 from graspd_viewer.session import Session, make_session
 
-Tell = Callable[[str, float], None]
+ShowProgress = Callable[[str, float], None]
 _TIMES = {"cpu_per_grasp": "CPU seconds per raw grasp", "cpu_per_verified": "CPU seconds per verified grasp"}
 # Figures of a grasp that the page shows: heading, key of the metric, factor, digits.
 _FIGURES = (
@@ -112,8 +112,8 @@ def _grasp(grasp: dict[str, Any]) -> dict[str, Any]:
     return {"held": bool(tried.get("passed")), "reason": str(tried.get("reason", "")), "figures": figures}
 
 
-def plan_again(record: Record, show: Callable[[Session], None], tell: Tell, stop: StopHook) -> None:
-    """Repeat the planning of a run, then simulate, measure and show its grasps. `tell` receives progress (0 to 1).
+def plan_again(record: Record, show: Callable[[Session], None], report: ShowProgress, stop: StopHook) -> None:
+    """Repeat the planning of a run, then simulate, measure and show its grasps. `report` receives progress (0 to 1).
 
     Raises GraspdError: the object or the hand of the run is not available.
     """
@@ -123,20 +123,20 @@ def plan_again(record: Record, show: Callable[[Session], None], tell: Tell, stop
     title = f"{record['name']}, {record['object']}, seed {record['seed']}"
     session = make_session(title, hand, (), scene, config, np.zeros((0, 3)), ())
     show(session)
-    count, hooks = record["count"], Hooks(lambda step, of, _: tell(f"searching {step} of {of}", step / of), stop)
+    count, hooks = record["count"], Hooks(lambda step, of, _: report(f"searching {step} of {of}", step / of), stop)
     found = find_candidates(PlannerInput(scene, hand, count, record["seed"], config, hooks)).grasps[:count]
     worlds = trial_context(scene, hand, "standard")
     context, grasps = make_metrics_context(scene.object, hand), []
     for grasp in found:
         if stop():
             break
-        tell(f"trying {len(grasps)} of {len(found)}", len(grasps) / len(found))
+        report(f"trying {len(grasps)} of {len(found)}", len(grasps) / len(found))
         trials = grasp_trials(worlds, grasp, stop)
         grasps.append(replace(grasp, trials=trials, metrics=measure(context, grasp.grasp)))
     held = sum(grasp.verdict is Verdict.VERIFIED for grasp in grasps)
     line = f"{held} of {count} held; {record['held']} did in the benchmark, by graspd {record.get('code')}"
     show(make_session(title, hand, tuple(grasps), scene, config, session.seen, (line,)))
-    tell(line, 1.0)
+    report(line, 1.0)
 
 
 @contextmanager

@@ -96,11 +96,11 @@ def force_parts(positions: Float[np.ndarray, "n 3"], forces: Float[np.ndarray, "
 def weakest_parts(push: Float[np.ndarray, "6"], target: ObjectModel) -> list[Part]:
     """Return arrows of the disturbance that a grasp resists least: its force, and the axis of its torque."""
     center, parts = target.center_of_mass, []
-    for name, way, colour in (("weakest/force", push[:3], WEAKEST), ("weakest/turn", push[3:], TURN)):
-        share = float(np.linalg.norm(way))
+    for name, part, colour in (("weakest/force", push[:3], WEAKEST), ("weakest/turn", push[3:], TURN)):
+        share = float(np.linalg.norm(part))
         if share > 0.05:
             length = target.radius * (PUSH_LENGTH[0] + PUSH_LENGTH[1] * share)
-            parts.append(Part(name, arrows(center[None], (center + length * way / share)[None], 1.5 * _SHAFT), colour))
+            parts.append(Part(name, arrows(center[None], (center + length * part / share)[None], 1.5 * _SHAFT), colour))
     return parts
 
 

@@ -25,11 +25,11 @@ class LiveView:
     Args:
         jobs: queue of the drawing thread.
         nodes: nodes to draw.
-        told: shows progress as a line and the fraction of the stage that is done.
+        show: shows progress as a line and the fraction of the stage that is done.
     """
 
-    def __init__(self, jobs: LatestJobs, nodes: SceneNodes, told: Callable[[str, float], None]) -> None:
-        self._jobs, self._nodes, self._told = jobs, nodes, told
+    def __init__(self, jobs: LatestJobs, nodes: SceneNodes, show: Callable[[str, float], None]) -> None:
+        self._jobs, self._nodes, self._show = jobs, nodes, show
         self._hand: HandModel | None = None
         self._origin = np.zeros(3)
         self._drawn = -float("inf")
@@ -48,7 +48,7 @@ class LiveView:
         found = f", {progress.verified} verified" if progress.verified else ""
         line = f"{_WORDS.get(progress.stage, progress.stage)} {progress.step} of {progress.of}{found}"
         share = progress.step / progress.of if progress.of else 0.0
-        self._jobs.submit("progress", lambda: self._told(f"{line}, {progress.elapsed:.1f} s", share), self._wait())
+        self._jobs.submit("progress", lambda: self._show(f"{line}, {progress.elapsed:.1f} s", share), self._wait())
 
     def watch(self, seen: Snapshot) -> None:
         """Draw a snapshot. This is the watch hook of `plan_grasps`. It returns at once."""

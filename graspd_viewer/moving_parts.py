@@ -76,7 +76,7 @@ class MovingParts:
         """Replace the drawn camera points [m]."""
         self._jobs.submit("points", lambda: self._nodes.draw_points(points))
 
-    def tell(self, *lines: str) -> None:
+    def write(self, *lines: str) -> None:
         """Replace the lines of text."""
         text = "<br>".join(map(html.escape, lines))
         self._jobs.submit("text", lambda: setattr(self._text, "content", f"{BLOCK}{text}</div>"))

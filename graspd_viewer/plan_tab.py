@@ -190,7 +190,7 @@ class PlanTab:
             if self._saved is not None and event.client is not None:
                 event.client.send_file_download("grasps.json", self._saved, save_immediately=True)
 
-    def tell(self, line: str, share: float) -> None:
+    def show_progress(self, line: str, share: float) -> None:
         """Show a line and the progress (0 to 1) of a run. Call it in the drawing thread."""
         self._status.content, self._bar.value = f"{BLOCK}{html.escape(line)}</div>", 100.0 * min(max(share, 0.0), 1.0)
 

@@ -108,8 +108,8 @@ def name_tab(server: Any, title: str) -> None:
     """Set the title of every visitor's browser tab. viser has no public API for this."""
     from viser._messages import RunJavascriptMessage
 
-    told = RunJavascriptMessage(source=f"document.title = {json.dumps(title)}")
-    server.gui._websock_interface.queue_message(told)
+    script = RunJavascriptMessage(source=f"document.title = {json.dumps(title)}")
+    server.gui._websock_interface.queue_message(script)
 
 
 def quiet() -> contextlib.AbstractContextManager[Any]:

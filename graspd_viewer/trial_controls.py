@@ -187,9 +187,9 @@ class TrialControls:
     def stop(self) -> bool:
         """End the replay. Return True if a trial was shown. Call it in the drawing thread."""
         self._jobs.drop("play")
-        shown, self._recording, self._time.disabled = self._recording is not None, None, True
+        recorded, self._recording, self._time.disabled = self._recording is not None, None, True
         self._nodes.draw("trial", ())
-        return shown
+        return recorded
 
     def play(self) -> None:
         """Run the trial and play it from the start."""
@@ -243,10 +243,10 @@ class TrialControls:
             self._nodes.draw(planned, ())
         parts = force_parts(frame.contacts, frame.forces)
         self._nodes.draw("trial", parts)
-        self._text.content = _told(recording, index, frame.stage)
+        self._text.content = _caption(recording, index, frame.stage)
 
 
-def _told(recording: Recording, index: int, stage: str) -> str:
+def _caption(recording: Recording, index: int, stage: str) -> str:
     """Return time, stage and the trial's result as HTML."""
     result, seconds = recording.result, recording.seconds
     end = seconds * (len(recording.frames) - 1)

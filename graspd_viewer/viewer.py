@@ -81,7 +81,7 @@ class Viewer:
             self._status = gui.add_html("", visible=False)
             self._grasps = GraspTab(self._server, self._jobs, self._nodes)
         self._planner: PlanTab | None = None
-        self.live = LiveView(self._jobs, self._nodes, self.tell)
+        self.live = LiveView(self._jobs, self._nodes, self.show_progress)
         if plan:
             with tabs.add_tab("Plan"):
                 self._planner = PlanTab(self._server, self.live, self.show, self.say)
@@ -126,13 +126,13 @@ class Viewer:
 
     def say(self, line: str, share: float = 0.0) -> None:
         """Show a line and the progress (0 to 1) of a run. Thread-safe."""
-        self._jobs.submit("progress", lambda: self.tell(line, share))
+        self._jobs.submit("progress", lambda: self.show_progress(line, share))
 
-    def tell(self, line: str, share: float) -> None:
+    def show_progress(self, line: str, share: float) -> None:
         """Show a line and the progress (0 to 1) of a run. Call it in the drawing thread."""
         self._status.content, self._status.visible = f"{BLOCK}{html.escape(line)}</div>", share < 1.0
         if self._planner is not None:
-            self._planner.tell(line, share)
+            self._planner.show_progress(line, share)
 
     def close(self) -> None:
         """End runs, threads and the server."""

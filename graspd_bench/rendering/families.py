@@ -30,7 +30,7 @@ _CELLS, _FACES = 96, 8000
 
 
 @dataclass(frozen=True)
-class Thing:
+class RandomObject:
     """A random object.
 
     Attributes:
@@ -43,7 +43,7 @@ class Thing:
 
 
 @lru_cache(maxsize=64)
-def draw_thing(family: str, seed: int) -> Thing:
+def draw_object(family: str, seed: int) -> RandomObject:
     """Return the random object of a family and seed. Raises MeshError: unknown family."""
     families = FAMILIES | OTHERS
     if family not in families:
@@ -51,7 +51,7 @@ def draw_thing(family: str, seed: int) -> Thing:
     rng = np.random.default_rng([sum(map(ord, family)), seed])
     field, size, (light, heavy) = families[family](rng)
     mesh = simplify(_surface(field, np.asarray(size, dtype=float)), _FACES)
-    return Thing(mesh, float(rng.uniform(light, heavy) * mass_properties(mesh)[0]))
+    return RandomObject(mesh, float(rng.uniform(light, heavy) * mass_properties(mesh)[0]))
 
 
 def _surface(field: Field, half: Float[np.ndarray, "3"]) -> TriangleMesh:

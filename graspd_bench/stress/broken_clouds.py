@@ -172,10 +172,10 @@ def bled() -> Views:
     stage = tabletop("mug", yaw=_YAW)
     ((depth, label),) = depth_views(stage, CAMERA, _POSES[:1], DEFAULT)
     (view,) = views_of(stage, CAMERA, _POSES[:1], DEFAULT)
-    shown = label[depth > 0]
+    seen = label[depth > 0]
     x, y, z = view.points.T
-    patch = (shown == 1) & (np.hypot(x, y) < 0.06) & (z > 0.0015)
-    return [replace(view, points=view.points[(shown == 0) | patch])]
+    patch = (seen == 1) & (np.hypot(x, y) < 0.06) & (z > 0.0015)
+    return [replace(view, points=view.points[(seen == 0) | patch])]
 
 
 def _dropped(views: Views, share: float) -> Views:

@@ -129,15 +129,15 @@ def run_case(case: Case, preset: str = "balanced") -> StressEnding:
             options = {"count": 2, "deadline": case.deadline, "preset": preset} | case.options
             result = plan_grasps(scene, hand, **options)
         except GraspdError as error:
-            told = str(error).replace(f"{folder}/", "")
+            message = str(error).replace(f"{folder}/", "")
             loading = (loaded if loaded > began else time.perf_counter()) - began
-            return StressEnding(case.name, type(error).__name__, told, loading, memory=peak_mb())
+            return StressEnding(case.name, type(error).__name__, message, loading, memory=peak_mb())
         planned = time.perf_counter()
         verified = [grasp for grasp in result.tried if grasp.verdict is Verdict.VERIFIED]
         return StressEnding(
             case.name,
             GRASP if verified else result.outcome.name,
-            _told(result, folder),
+            _printed(result, folder),
             loaded - began,
             planned - loaded,
             peak_mb(),
@@ -149,9 +149,9 @@ def run_case(case: Case, preset: str = "balanced") -> StressEnding:
         )
 
 
-def _told(result: GraspResult, folder: str) -> str:
-    told = (result.outcome.value, result.message, *result.warnings)
-    return "; ".join(filter(None, told)).replace(f"{folder}/", "")
+def _printed(result: GraspResult, folder: str) -> str:
+    lines = (result.outcome.value, result.message, *result.warnings)
+    return "; ".join(filter(None, lines)).replace(f"{folder}/", "")
 
 
 def _hold_again(case: Case, result: GraspResult, scene: Scene, hand: Any, folder: Path, preset: str) -> int:

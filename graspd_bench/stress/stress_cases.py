@@ -66,7 +66,7 @@ def stress_faults(record: Record) -> tuple[str, ...]:
     return faults(CASES[record["name"]], ending_of(record))
 
 
-def stress_came(record: Record) -> str:
+def stress_summary(record: Record) -> str:
     """Return the ending and its duration, in a few words."""
     ending = ending_of(record)
     return f"{ending.ending}, {ending.loading + ending.planning:.1f} s"
@@ -117,8 +117,8 @@ def _share(family: str, whole: Sequence[tuple[Case, StressEnding]]) -> str:
 def _line(case: Case, ending: StressEnding) -> list[str]:
     good = ending.ending in case.expect
     # The column of the ending already shows success.
-    told = ending.message.removeprefix(Outcome.SUCCEEDED.value).removeprefix("; ")
-    told = told.replace("|", "\\|").replace("\n", " ")
+    message = ending.message.removeprefix(Outcome.SUCCEEDED.value).removeprefix("; ")
+    message = message.replace("|", "\\|").replace("\n", " ")
     return [
         f"`{case.name}`",
         case.about,
@@ -129,5 +129,5 @@ def _line(case: Case, ending: StressEnding) -> list[str]:
         f"{ending.verified}/{ending.tried}" if ending.tried else "–",
         str(ending.again) if ending.verified else "–",
         "–" if ending.true is None or not ending.verified else str(ending.true),
-        told if len(told) <= _MESSAGE else f"{told[:_MESSAGE].rstrip()} …",
+        message if len(message) <= _MESSAGE else f"{message[:_MESSAGE].rstrip()} …",
     ]

@@ -85,11 +85,11 @@ class ReachCase(ObjectCase):
 def reach_cases(request: Request) -> tuple[ArmCase | ReachCase, ...]:
     """Return an inverse kinematics case for every arm, and a request for every arm, object and seed."""
     arms = [ArmCase(arm, 256 if request.quick else POSES) for arm in arm_names()]
-    things = find_objects(request.objects or [f"shape:{name}" for name in SHAPES])
+    objects = find_objects(request.objects or [f"shape:{name}" for name in SHAPES])
     seeds = request.seeds or ((0,) if request.objects else (0, 1))
     cases = [
-        ReachCase(thing, request.preset(), request.hand or "allegro_right", seed, request.count or 4, arm)
-        for thing in things
+        ReachCase(source, request.preset(), request.hand or "allegro_right", seed, request.count or 4, arm)
+        for source in objects
         for seed in seeds
         for arm in arm_names()
     ]
@@ -164,7 +164,7 @@ class _Timed(BoundRestriction):
             self.seconds.append(time.thread_time() - began)
 
 
-def came(record: Record) -> str:
+def summary(record: Record) -> str:
     """Return the results of a case, in a few words."""
     if "own" in record:
         return f"{record['own']['reached']:.1%} of the poses reached"
@@ -173,10 +173,10 @@ def came(record: Record) -> str:
 
 def reach_sections(records: Sequence[Record], chart: Path | None) -> Sections:
     """Return the table of inverse kinematics, and the table and refusals of the requests."""
-    alone, asked = ([r for r in records if key in r] for key in ("own", "filtered"))
+    alone, filtered = ([r for r in records if key in r] for key in ("own", "filtered"))
     return {
         "inverse-kinematics": [_alone_table(alone)] if alone else [],
-        "reach": [_asked_table(asked), _reasons(asked)] if asked else [],
+        "reach": [_filtered_table(filtered), _reasons(filtered)] if filtered else [],
     }
 
 
@@ -191,7 +191,7 @@ def _alone_table(records: Sequence[Record]) -> str:
     return markdown_table(headings, rows)
 
 
-def _asked_table(records: Sequence[Record]) -> str:
+def _filtered_table(records: Sequence[Record]) -> str:
     headings = ["arm", "requests", "filter", "with a verified grasp in reach", "the best one is", "CPU s to the first"]
     headings += ["filter's share of that time"]
     rows: list[list[str]] = []
@@ -219,8 +219,8 @@ def _reasons(records: Sequence[Record]) -> str:
         for reason, count in record["filtered"]["refused"].items():
             kind = next((kind for kind in _KINDS if kind in reason), reason)
             kinds[kind] = kinds.get(kind, 0) + count
-    told = ", ".join(f"{count} {kind}" for kind, count in sorted(kinds.items(), key=lambda item: -item[1]))
-    return f"Refused before any trial: {told or 'none'}."
+    counts = ", ".join(f"{count} {kind}" for kind, count in sorted(kinds.items(), key=lambda item: -item[1]))
+    return f"Refused before any trial: {counts or 'none'}."
 
 
 # Words by which reasons are grouped, whatever link or joint they name. The first that occurs counts.

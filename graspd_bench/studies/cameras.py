@@ -17,7 +17,7 @@ from pathlib import Path
 import numpy as np
 
 from graspd_bench.rendering.depth_noise import CAMERAS
-from graspd_bench.rendering.families import FAMILIES, OTHERS, draw_thing
+from graspd_bench.rendering.families import FAMILIES, OTHERS, draw_object
 from graspd_bench.rendering.render import render_scene
 from graspd_bench.rendering.tabletop import TabletopScene, crowded, moved, on_table, resting_pose, ring_poses, views_of
 from graspd_bench.studies.seen_objects import calibration, reconstruction_error
@@ -37,7 +37,7 @@ from graspd_core.runtime import disk_cache
 from graspd_core.types import TriangleMesh, Verdict
 from graspd_core.verify.hold_trial import hold_trial, out_of_place
 from graspd_core.verify.world import PROTOCOLS, altered, build_world
-from graspd_dataset.run_records import markdown_table, thing_name
+from graspd_dataset.run_records import markdown_table, object_name
 
 # Families and shapes from which the shares of verified grasps were computed, with seeds from 0. This study uses others.
 CHOSEN_ON = (
@@ -83,8 +83,8 @@ class CameraView(Case):
         """Return the kind of object: "irregular" (a family), "regular" (a shape) or "scan"."""
         return "irregular" if self.thing in FAMILIES | OTHERS else "scan" if Path(self.thing).suffix else "regular"
 
-    def shown(self) -> Record:
-        return {**super().shown(), "thing": thing_name(self.thing), "kind": self.kind}
+    def recorded(self) -> Record:
+        return {**super().recorded(), "thing": object_name(self.thing), "kind": self.kind}
 
 
 def camera_cases(request: Request) -> tuple[CameraView, ...]:
@@ -104,10 +104,10 @@ def camera_cases(request: Request) -> tuple[CameraView, ...]:
     )
 
 
-def thing_of(case: CameraView) -> tuple[TriangleMesh, float]:
+def object_of(case: CameraView) -> tuple[TriangleMesh, float]:
     """Return the true mesh of the object in its own frame [m], and its mass [kg]."""
     if case.kind == "irregular":
-        drawn = draw_thing(case.thing, case.seed)
+        drawn = draw_object(case.thing, case.seed)
         return drawn.mesh, drawn.mass
     rng = np.random.default_rng([case.seed, len(case.thing)])
     if case.kind == "scan":
@@ -121,13 +121,13 @@ def thing_of(case: CameraView) -> tuple[TriangleMesh, float]:
 
 def view_of(case: CameraView) -> tuple[TabletopScene, PointCloud, float, Target | None]:
     """Return the scene, its view, the object's mass [kg], and in a crowd the target that selects the object."""
-    rng = np.random.default_rng([case.seed, sum(map(ord, thing_name(case.thing) + case.camera)), case.crowd])
-    mesh, mass = thing_of(case)
+    rng = np.random.default_rng([case.seed, sum(map(ord, object_name(case.thing) + case.camera)), case.crowd])
+    mesh, mass = object_of(case)
     target = moved(mesh, resting_pose(mesh, rng))
     others: tuple[TriangleMesh, ...] = ()
     if case.crowd:
         names = rng.choice(list(FAMILIES), 2, replace=False)
-        drawn = [draw_thing(str(name), case.seed + 1000).mesh for name in names]
+        drawn = [draw_object(str(name), case.seed + 1000).mesh for name in names]
         others = crowded(target, [*drawn, make_shape(str(rng.choice(["box", "cylinder", "mug"])))], rng)
     scene, camera = on_table(target, others), CAMERAS[case.camera]
 

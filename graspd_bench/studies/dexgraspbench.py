@@ -36,7 +36,7 @@ from graspd_core.types import Grasp, Verdict
 from graspd_core.verify.world import Protocol
 from graspd_dataset.export_grasps import refuse_hand, write_dexgraspbench
 from graspd_dataset.foreign_grasps import STAGES, npy_dictionary, numbers_of, plain_entry
-from graspd_dataset.run_records import markdown_table, thing_name
+from graspd_dataset.run_records import markdown_table, object_name
 
 NAME = "dexgraspbench"
 # DexGraspBench's object mass [kg], and its limits of displacement [m] and rotation [deg].
@@ -84,11 +84,11 @@ class BenchCase(ObjectCase):
 
     @property
     def label(self) -> str:
-        return f"{thing_name(self.object)} {self.preset} {thing_name(self.hand)} seed {self.seed} {self.armature:d}"
+        return f"{object_name(self.object)} {self.preset} {object_name(self.hand)} seed {self.seed} {self.armature:d}"
 
-    def asked(self) -> Record:
+    def inputs(self) -> Record:
         """Return all inputs except the code. Files count by content, not by path."""
-        return {name: value for name, value in super().asked().items() if name not in ("checkout", "python", "grasps")}
+        return {name: value for name, value in super().inputs().items() if name not in ("checkout", "python", "grasps")}
 
 
 def bench_cases(request: Request) -> tuple[BenchCase, ...]:
@@ -105,8 +105,8 @@ def bench_cases(request: Request) -> tuple[BenchCase, ...]:
     refuse_hand(load_hand(hand, candidates=1).name)
     python = shutil.which(request.python) if request.python else None
     if python is None:
-        told = f"{request.python!r} is not a program" if request.python else "not given"
-        raise ConfigError(f"python: {told}; give --python PATH of an environment with DexGraspBench's requirements")
+        fault = f"{request.python!r} is not a program" if request.python else "not given"
+        raise ConfigError(f"python: {fault}; give --python PATH of an environment with DexGraspBench's requirements")
     python = os.path.abspath(python)
     objects = request.objects or all_shapes()[: 1 if request.quick else None]
     if request.grasps:
@@ -122,9 +122,9 @@ def bench_cases(request: Request) -> tuple[BenchCase, ...]:
     count = request.count or (2 if request.quick else 8)
     where = {"checkout": str(checkout), "python": python, "armature": request.armature}
     return tuple(
-        BenchCase(thing, request.preset(), hand, seed, count, grasps=request.grasps, content=content, **where)
+        BenchCase(source, request.preset(), hand, seed, count, grasps=request.grasps, content=content, **where)
         for seed in request.seeds or (0,)
-        for thing in find_objects(objects)
+        for source in find_objects(objects)
     )
 
 
@@ -192,12 +192,12 @@ def evaluate(case: BenchCase, written: Path, xml: Path, paths: Sequence[Path]) -
     places = {"save_root": results, "grasp_dir": written, "eval_dir": results / "evaluation", "hand.xml_path": xml}
     options |= {name: "'" + str(path).replace("'", "\\'") + "'" for name, path in places.items()}
     command = [case.python, str(Path(case.checkout, _MAIN)), *(f"{name}={value}" for name, value in options.items())]
-    told = _run(command, results, _START + _GRASP * len(paths))
+    output = _run(command, results, _START + _GRASP * len(paths))
     found = []
     for path in paths:
         file = results / "evaluation" / path
         if not file.is_file():
-            raise ConfigError(f"DexGraspBench gave no result for grasp {path}: {told}")
+            raise ConfigError(f"DexGraspBench gave no result for grasp {path}: {output}")
         try:
             values = npy_dictionary(file, file.read_bytes())
             held, travel, turn = (
@@ -247,7 +247,7 @@ def why_failed(there: Record) -> str:
     return f"the object turned more than {_TURN:g}°"
 
 
-def bench_came(record: Record) -> str:
+def bench_summary(record: Record) -> str:
     """Return how many of our verified grasps hold in DexGraspBench."""
     pairs = [pair for pair in _pairs([record], AS_IS) if pair[0]]
     return f"{sum(there['held'] for _, there in pairs)} of {len(pairs)} verified hold there"
@@ -267,7 +267,7 @@ def bench_sections(records: Sequence[Record], chart: Path | None) -> Sections:
     """Return a table by object and variant of the Allegro, the reasons of failure, and the known differences."""
     headings = ["object", "its Allegro", "tried", "verified", "held by both", "by ours only", "by theirs only"]
     headings += ["by neither", "of the verified"]
-    groups = [(thing_name(record["object"]), [record]) for record in records]
+    groups = [(object_name(record["object"]), [record]) for record in records]
     groups += [("**all**", list(records))] if len(records) > 1 else []
     variants = [name for name in (AS_IS, ARMATURE) if any(name in record["theirs"] for record in records)]
     body, reasons = [], []
@@ -280,6 +280,6 @@ def bench_sections(records: Sequence[Record], chart: Path | None) -> Sections:
             body.append([name, variant, *map(str, numbers), share])
     for variant in variants:
         lost = [there for verified, there in _pairs(records, variant) if verified and not there["held"]]
-        told = "; ".join(f"{count}: {why}" for why, count in Counter(map(why_failed, lost)).most_common())
-        reasons.append(f"Held by ours only, {variant}: {told or 'none'}.")
+        counts = "; ".join(f"{count}: {why}" for why, count in Counter(map(why_failed, lost)).most_common())
+        reasons.append(f"Held by ours only, {variant}: {counts or 'none'}.")
     return {NAME: [markdown_table(headings, body), "\n".join(reasons), DIFFERENCES]}

@@ -113,7 +113,7 @@ def trials_of(hand: HandModel, scene: Scene) -> Mapping[str, Trial]:
 def early_sections(records: Sequence[Record], chart: Path | None) -> Sections:
     """Return a table of disagreements and CPU time by trial, and a list of all disagreements."""
     groups: dict[str, list[Record]] = {}
-    told = []
+    text = []
     for record in records:
         for row in record["rows"]:
             names = [row["group"]]
@@ -123,11 +123,11 @@ def early_sections(records: Sequence[Record], chart: Path | None) -> Sections:
                 groups.setdefault(name, []).append(row)
             if row["early"].get("passed") != row["late"].get("passed"):
                 early, late = (row[way]["reason"] or "holds" for way in ("early", "late"))
-                told.append(f"* {record['label']}, grasp {row['index']}, {row['group']}: early {early}; in full {late}")
+                text.append(f"* {record['label']}, grasp {row['index']}, {row['group']}: early {early}; in full {late}")
     headings = ["group", "trials", "passed", "wrongly verified", "at most (95 %)", "wrongly failed"]
     headings += ["CPU ms, all: full, early", "passing: full, early"]
     body = [[name, str(len(rows)), *_figures(rows)] for name, rows in groups.items()]
-    return {"early-ends": [markdown_table(headings, body), "\n".join(told)] if body else []}
+    return {"early-ends": [markdown_table(headings, body), "\n".join(text)] if body else []}
 
 
 def _run(trial: Trial, grasp: Grasp, full: bool, error: Any) -> Record:

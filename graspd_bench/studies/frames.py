@@ -46,8 +46,8 @@ class Frame(Case):
     def label(self) -> str:
         return f"{Path(self.folder).name} {self.preset}"
 
-    def asked(self) -> Record:
-        return {**super().asked(), "folder": Path(self.folder).name}
+    def inputs(self) -> Record:
+        return {**super().inputs(), "folder": Path(self.folder).name}
 
 
 def frame_cases(request: Request) -> tuple[Frame, ...]:

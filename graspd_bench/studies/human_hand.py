@@ -31,7 +31,7 @@ from graspd_core.perception.scene import object_parts
 from graspd_core.types import TriangleMesh
 from graspd_core.verify.hold_trial import hold_trial
 from graspd_core.verify.world import PROTOCOLS, build_world
-from graspd_dataset.run_records import markdown_table, thing_name
+from graspd_dataset.run_records import markdown_table, object_name
 
 # Distances within which skin counts as touching [m]: ours, and two that other projects use.
 CONTACT_DISTANCES = (0.002, 0.005, 0.010)
@@ -119,7 +119,7 @@ class HumanGrasps(ObjectCase):
     def config(self) -> PlanConfig:
         return override(load_preset(self.preset), {"problem.softness": self.softness})
 
-    def asked(self) -> Record:
+    def inputs(self) -> Record:
         return {**asdict(self), "hand": "", "object": object_hash(self.object), "settings": to_mapping(self.config)}
 
 
@@ -165,7 +165,7 @@ def mano_sections(records: Sequence[Record], chart: Path | None) -> Sections:
     for softness in dict.fromkeys(r["softness"] for r in records):
         alike = [r for r in records if r["softness"] == softness]
         for thing in dict.fromkeys(r["object"] for r in alike):
-            body.append(_row(thing_name(thing), softness, [r for r in alike if r["object"] == thing]))
+            body.append(_row(object_name(thing), softness, [r for r in alike if r["object"] == thing]))
         body.append(_row("**mean**", softness, alike))
     for name, (area, volume, ratio, moved) in PAPER.items():
         body.append([f"{name}, as published", "", f"{area}", f"{volume:.2f}", f"{ratio}", f"{moved}", "", ""])

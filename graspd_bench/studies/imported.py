@@ -29,7 +29,7 @@ from graspd_core.verify.metrics import METRICS, measure
 from graspd_core.verify.prepared_grasp import make_metrics_context
 from graspd_dataset.complete_grasps import by_object, complete_grasps
 from graspd_dataset.foreign_grasps import ImportedGrasp, foreign_files, read_foreign
-from graspd_dataset.run_records import markdown_table, thing_name
+from graspd_dataset.run_records import markdown_table, object_name
 
 # Sources of grasps, in the order of the table.
 SOURCES = {"imported": "imported", "ranked": "graspd, as ranked", "planned": "graspd, verified"}
@@ -64,14 +64,14 @@ class ImportedCase(ObjectCase):
 
     @property
     def label(self) -> str:
-        return f"{_name(self.object)} scale {self.scale:g} {thing_name(self.hand)} seed {self.seed}"
+        return f"{_name(self.object)} scale {self.scale:g} {object_name(self.hand)} seed {self.seed}"
 
-    def asked(self) -> Record:
+    def inputs(self) -> Record:
         """Return all inputs except the code. Files count by content, not by path."""
-        return {name: value for name, value in super().asked().items() if name not in ("files", "mesh")}
+        return {name: value for name, value in super().inputs().items() if name not in ("files", "mesh")}
 
-    def shown(self) -> Record:
-        return {name: value for name, value in super().shown().items() if name != "files"}
+    def recorded(self) -> Record:
+        return {name: value for name, value in super().recorded().items() if name != "files"}
 
 
 def imported_cases(request: Request) -> tuple[ImportedCase, ...]:
@@ -152,9 +152,9 @@ def imported_sections(records: Sequence[Record], chart: Path | None) -> Sections
         for why, count in record["refused"].items():
             whys[why] = whys.get(why, 0) + count
     refused = "; ".join(f"{count} refused: {why}" for why, count in whys.items())
-    told = "Shares are of all grasps of an object, also of those that were refused or not found; others are medians."
-    doubts = [f"{_name(record['object'])}: {record['frame_doubt']}." for record in records if _doubted(record)]
-    return {"imported": [markdown_table(headings, body), " ".join(filter(None, (told, refused, *doubts)))]}
+    note = "Shares are of all grasps of an object, also of those that were refused or not found; others are medians."
+    warnings = [f"{_name(record['object'])}: {record['frame_doubt']}." for record in records if _doubted(record)]
+    return {"imported": [markdown_table(headings, body), " ".join(filter(None, (note, refused, *warnings)))]}
 
 
 def _doubted(record: Record) -> bool:
@@ -163,11 +163,11 @@ def _doubted(record: Record) -> bool:
 
 def _name(source: str) -> str:
     path = Path(source)
-    return (path.parents[1].name if path.stem == "simplified" else thing_name(source))[:16]
+    return (path.parents[1].name if path.stem == "simplified" else object_name(source))[:16]
 
 
 def _row(name: str, records: Sequence[Record], source: str, trials: Sequence[str], width: int) -> list[str]:
-    asked = sum(record["count"] for record in records)
+    count = sum(record["count"] for record in records)
     grasps = [grasp for record in records for grasp in record["grasps"][source]]
 
     def median(values: Sequence[float | None], digits: int) -> str:
@@ -176,12 +176,12 @@ def _row(name: str, records: Sequence[Record], source: str, trials: Sequence[str
 
     if source == "imported" and any(map(_doubted, records)):
         # Figures of poses in a wrong frame say nothing about the grasps.
-        return [name, "imported, frame in doubt", f"{len(grasps)} of {asked}", *["–"] * (width - 3)]
-    cells = [name, SOURCES[source], f"{len(grasps)} of {asked}"]
+        return [name, "imported, frame in doubt", f"{len(grasps)} of {count}", *["–"] * (width - 3)]
+    cells = [name, SOURCES[source], f"{len(grasps)} of {count}"]
     for trial in trials:
         if trial in _PASSED:
             passed = [grasp[trial]["passed"] for grasp in grasps if grasp[trial]]
-            cells.append(f"{sum(passed) / asked:.0%}" if passed or not grasps else "–")
+            cells.append(f"{sum(passed) / count:.0%}" if passed or not grasps else "–")
     for trial in trials:
         if trial in _FIGURES:
             _, key, digits = _FIGURES[trial]

@@ -40,7 +40,7 @@ from graspd_core.se3 import rotation_from_quaternion
 from graspd_core.types import Grasp, GraspResult, Posture, TriangleMesh, Verdict
 from graspd_core.verify.lift_trial import LiftSettings
 from graspd_core.verify.world import PROTOCOLS, FreeBody
-from graspd_dataset.run_records import markdown_table, thing_name
+from graspd_dataset.run_records import markdown_table, object_name
 
 # Numbers of objects in a scene, and their limit.
 SIZES, MOST_THINGS = (3, 5, 8, 12), 24
@@ -70,8 +70,8 @@ class PileCase(Case):
     def config(self) -> PlanConfig:
         return load_preset(self.preset)
 
-    def asked(self) -> Record:
-        return {**super().asked(), "objects": [[thing_name(thing), object_hash(thing)] for thing in self.objects]}
+    def inputs(self) -> Record:
+        return {**super().inputs(), "objects": [[object_name(thing), object_hash(thing)] for thing in self.objects]}
 
 
 def pile_cases(request: Request) -> tuple[PileCase, ...]:
@@ -93,7 +93,7 @@ def pile_seconds(case: PileCase) -> float:
     return 4.0 * case.size + 0.3 * case.size**2
 
 
-def drawn_things(case: PileCase) -> list[str]:
+def drawn_objects(case: PileCase) -> list[str]:
     """Return the objects of a scene: all in random order, repeated if there are fewer than `case.size`."""
     rng = np.random.default_rng((case.seed, case.size))
     order: list[str] = []
@@ -104,7 +104,7 @@ def drawn_things(case: PileCase) -> list[str]:
 
 def dropped_pile(case: PileCase) -> tuple[FreeBody, ...]:
     """Return the pile: objects that were dropped into a fence and are at rest after its removal."""
-    things = drawn_things(case)
+    things = drawn_objects(case)
     models = {thing: load_scene(thing, mass=MASS).object for thing in set(things)}
     wall = 0.5 * _FENCE * float(np.sqrt(case.size)) + 0.05
     return dropped([models[thing] for thing in things], 1000 * case.seed + case.size, wall)
@@ -159,7 +159,7 @@ class _Run:
 def run_pile(case: PileCase) -> Record:
     """Clear one pile. Return its record."""
     hand = load_hand(case.hand, candidates=case.config.problem.fine_candidates)
-    things, bodies = drawn_things(case), dropped_pile(case)
+    things, bodies = drawn_objects(case), dropped_pile(case)
     run, look_s, looks = _Run(list(range(case.size)), bodies), [], 0
     run.frames.append(_frame(run))
     while run.present and looks < 3 * case.size:
@@ -172,9 +172,9 @@ def run_pile(case: PileCase) -> Record:
             break
     lifts = [attempt for attempt in run.attempts if "lift" in attempt]
     return {
-        "things": [thing_name(thing) for thing in things],
+        "things": [object_name(thing) for thing in things],
         "cleared": case.size - len(run.present),
-        "left": [thing_name(things[k]) for k in run.present],
+        "left": [object_name(things[k]) for k in run.present],
         "attempts": run.attempts,
         "looks": looks,
         "look_s": look_s,
@@ -258,8 +258,8 @@ def _planned(
 
 def _why_none(result: GraspResult) -> str:
     reasons = Counter(re.sub(r"-?\d+(\.\d+)?", "…", grasp.reason.split(" (")[0]) for grasp in result.tried)
-    told = "; ".join(f"{reason}: {count}" for reason, count in reasons.most_common(3))
-    return told or result.message or str(result.outcome.value)
+    counts = "; ".join(f"{reason}: {count}" for reason, count in reasons.most_common(3))
+    return counts or result.message or str(result.outcome.value)
 
 
 def _execute(hand: HandModel, run: _Run, grasp: Grasp, attempt: Record) -> None:
@@ -318,7 +318,7 @@ _COLOURS = (
 _HAND, _TABLE = (0.35, 0.38, 0.42), (0.93, 0.92, 0.89)
 
 
-def pile_came(record: Record) -> str:
+def pile_summary(record: Record) -> str:
     """Return the result of a pile, in a few words."""
     return f"{record['cleared']} of {record['size']} taken out in {len(record['attempts'])} attempts"
 
@@ -398,7 +398,7 @@ def film_strip(record: Record) -> UInt8[np.ndarray, "height width 3"]:
     """
     names = ("size", "preset", "hand", "seed", "views")
     case = PileCase(tuple(record["objects"]), **{name: record[name] for name in names})
-    meshes = [load_scene(thing, mass=MASS).object.mesh for thing in drawn_things(case)]
+    meshes = [load_scene(thing, mass=MASS).object.mesh for thing in drawn_objects(case)]
     hand = load_hand(case.hand, candidates=1)
     frames = [_drawn(frame, meshes, hand) for frame in record["frames"]]
     frames += [np.full_like(frames[0], 255)] * (-len(frames) % min(_ROW, len(frames)))

@@ -21,7 +21,7 @@ from graspd_core.planning.plan_grasps import plan_grasps
 from graspd_core.types import Verdict
 from graspd_core.verify.hold_trial import noisy_share, pose_errors
 from graspd_core.verify.world import PROTOCOLS, at_friction, build_world
-from graspd_dataset.run_records import markdown_table, thing_name
+from graspd_dataset.run_records import markdown_table, object_name
 
 # Shapes for which some grasps fail if the hand is displaced by 5 mm and 5°.
 SHAPES = ("shape:box", "shape:plate", "shape:torus", "shape:bottle", "shape:l_block", "shape:hammer")
@@ -53,7 +53,7 @@ def run_robust(case: ObjectCase) -> Record:
     world, errors = build_world(hand, scene.object, parts, protocol), pose_errors(EVALUATION_SEED, EVALUATIONS)
     verified = [g for g in plain.tried if g.verdict is Verdict.VERIFIED]
     return {
-        "shape": thing_name(case.object),
+        "shape": object_name(case.object),
         "plan_cpu_s": between - began,
         "ranked_plan_cpu_s": ended - between,
         # These lists are in the order of the score, in which the plan without ranking returns the grasps.
@@ -78,11 +78,11 @@ def robust_sections(records: Sequence[Record], chart: Path | None) -> Sections:
         gains = (score[0], noise[0], best[0], score[:4].mean(), noise[:4].mean())
         body.append([shape, *(f"{cost:.1f}" for cost in costs), *(f"{gain:.1%}" for gain in gains)])
     score, noise = (correlation(rows, key) for key in ("score", "ranked_by"))
-    told = f"Rank correlation with the share held, within a plan, mean: score {score:.2f}, noise {noise:.2f}."
+    line = f"Rank correlation with the share held, within a plan, mean: score {score:.2f}, noise {noise:.2f}."
     picture = None
     if chart is not None:
         picture = Picture("What ranking buys at each place", draw_robust(rows, chart.with_name("robust")))
-    return {"robust": [picture, markdown_table(headings, body), told]}
+    return {"robust": [picture, markdown_table(headings, body), line]}
 
 
 def orders(

@@ -34,7 +34,7 @@ from graspd_core.types import Grasp, GraspResult, Verdict
 from graspd_core.verify.hold_trial import hold_trial, out_of_place
 from graspd_core.verify.lift_trial import lift_trial
 from graspd_core.verify.world import PROTOCOLS, build_world
-from graspd_dataset.run_records import markdown_table, thing_name
+from graspd_dataset.run_records import markdown_table, object_name
 
 SHAPES = ("sphere", "box", "cylinder", "capsule", "torus", "mug", "bowl", "bottle", "l_block", "hammer")
 # Numbers of cameras. 0 plans on the true mesh.
@@ -156,7 +156,7 @@ def _grasps(case: Seen, scene: Scene, stage: TabletopScene, hand: HandModel) -> 
     lifts = [lift_trial(table, hand, grasp, protocol) for grasp, hold in holds if hold.passed]
     # Unverified grasps with a probability are tried as well, to calibrate the probability.
     guessed = [grasp for grasp in many.tried if grasp.probability is not None]
-    told = [(grasp.probability, hold_trial(world, grasp, protocol).passed) for grasp in guessed]
+    stated = [(grasp.probability, hold_trial(world, grasp, protocol).passed) for grasp in guessed]
     timing = first.timing
     return {
         "first_s": None if timing.first_verified is None else timing.first_verified - timing.load - timing.sdf,
@@ -167,7 +167,7 @@ def _grasps(case: Seen, scene: Scene, stage: TabletopScene, hand: HandModel) -> 
         "lifted": sum(lift.passed for lift in lifts),
         "reasons": [trial.reason for trial in (*(hold for _, hold in holds), *lifts) if not trial.passed],
         "warnings": list(many.warnings),
-        "told": told,
+        "told": stated,
     }
 
 
@@ -203,14 +203,14 @@ def rgbd_sections(records: Sequence[Record], chart: Path | None) -> Sections:
     body = [[NAMES[views], *_row(own, full)] for views, own in rows.items()]
     shown = [views for views in NAMES if views in rows]
     objects = [
-        [thing_name(thing), *(_marks([r for r in rows[views] if r["object"] == thing]) for views in shown)]
+        [object_name(thing), *(_marks([r for r in rows[views] if r["object"] == thing]) for views in shown)]
         for thing in dict.fromkeys(r["object"] for r in records)
     ]
-    told = "Verified grasps that hold on the truth, by object (* first grasp holds, one mark a case):"
+    heading = "Verified grasps that hold on the truth, by object (* first grasp holds, one mark a case):"
     return {
         "rgbd": [
             markdown_table(_HEADINGS, body),
-            told,
+            heading,
             markdown_table(["object", *(NAMES[views] for views in shown)], objects),
             *calibration([pair for r in records for pair in r.get("told", ())]),
         ]
@@ -246,14 +246,14 @@ def _marks(own: Sequence[Record]) -> str:
     return f"{sum(r['held'] for r in own)}/{sum(r['verified'] for r in own)} {marks}"
 
 
-def calibration(told: Sequence[tuple[float, bool]], where: str = "") -> list[str]:
-    """Return the Brier score and the share held at each stated probability. `told`: pairs (probability, held)."""
-    if not told:
+def calibration(stated: Sequence[tuple[float, bool]], where: str = "") -> list[str]:
+    """Return the Brier score and the share held at each stated probability. `stated`: pairs (probability, held)."""
+    if not stated:
         return []
-    levels = sorted({probability for probability, _ in told}, reverse=True)
-    held = {level: [hold for probability, hold in told if probability == level] for level in levels}
+    levels = sorted({probability for probability, _ in stated}, reverse=True)
+    held = {level: [hold for probability, hold in stated if probability == level] for level in levels}
     body = [[f"{level:.0%}", f"{np.mean(holds):.0%} of {len(holds)}"] for level, holds in held.items()]
-    brier = float(np.mean([(probability - hold) ** 2 for probability, hold in told]))
+    brier = float(np.mean([(probability - hold) ** 2 for probability, hold in stated]))
     return [
         f"Stated probability{where and f', {where}'} against what held on the truth, less sure grasps among them; "
         f"Brier score {brier:.3f}:",

@@ -20,7 +20,7 @@ from graspd_core.errors import ConfigError
 from graspd_core.perception.scene import object_parts
 from graspd_core.verify.hold_trial import displaced, hold_trial, pose_error
 from graspd_core.verify.world import PROTOCOLS, build_world
-from graspd_dataset.run_records import markdown_table, thing_name
+from graspd_dataset.run_records import markdown_table, object_name
 
 # Duration of each pull in both simulators [s]. MuJoCo also runs the full duration.
 PULL = 0.5
@@ -75,19 +75,19 @@ def simulator_sections(records: Sequence[Record], chart: Path | None) -> Section
         ],
     )
     differ = [
-        f"* {thing_name(thing)}, {'displaced' if t['displaced'] else 'as planned'}: "
+        f"* {object_name(thing)}, {'displaced' if t['displaced'] else 'as planned'}: "
         f"MuJoCo {_said(t['mujoco'])}; PyBullet {_said(t['bullet'])}"
         for thing, t in rows
         if t["mujoco"]["passed"] != t["bullet"]["passed"]
     ]
     pairs = np.array([[t["sd_bullet"], t["sd_mujoco"]] for _, t in rows]) * 100
-    told = f"**{agreed:.1%}** of {len(rows)} have the same verdict; MuJoCo has that of pulls of 2 s for {same}."
+    line = f"**{agreed:.1%}** of {len(rows)} have the same verdict; MuJoCo has that of pulls of 2 s for {same}."
     moved = (
         f"Displacement trial: mean {pairs[:, 0].mean():.2f} cm in PyBullet, {pairs[:, 1].mean():.2f} cm in MuJoCo, "
         f"median {np.median(pairs[:, 0]):.2f} and {np.median(pairs[:, 1]):.2f} cm; within 5 mm of each other on "
         f"{(np.abs(pairs[:, 0] - pairs[:, 1]) < 0.5).mean():.1%}."
     )
-    return {"simulators": [told, table, "\n".join(differ), moved]}
+    return {"simulators": [line, table, "\n".join(differ), moved]}
 
 
 def _said(hold: Record) -> str:

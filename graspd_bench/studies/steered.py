@@ -23,7 +23,7 @@ from graspd_core.planning.plan_grasps import plan_grasps
 from graspd_core.planning.regions import Box, entered
 from graspd_core.planning.steering import Steering
 from graspd_core.types import Grasp, Verdict
-from graspd_dataset.run_records import markdown_table, thing_name
+from graspd_dataset.run_records import markdown_table, object_name
 
 SHAPES = ("box", "bottle", "mug", "hammer", "torus", "plate", "cylinder", "l_block", "bowl", "capsule")
 HANDS = ("allegro_right", "leap_right", "barrett_like", "parallel_gripper")
@@ -56,7 +56,7 @@ def steered_cases(request: Request) -> tuple[SteeredCase, ...]:
     )
 
 
-def drawn_wish(case: SteeredCase, scene: Scene) -> Steering:
+def drawn_constraint(case: SteeredCase, scene: Scene) -> Steering:
     """Draw the steering constraint of a case. It depends only on seed, object, hand and kind."""
     rng = np.random.default_rng([case.seed, zlib.crc32(f"{case.object} {case.hand} {case.wish}".encode())])
     direction, angle = rng.normal(size=3), float(rng.uniform(*_ANGLES))
@@ -89,12 +89,12 @@ def run_steered(case: SteeredCase) -> Record:
     """Plan with and without the constraint. Return costs, numbers of verified grasps, and the greatest violations."""
     hand, scene = case.load()
     object_parts(scene.object)
-    wish = drawn_wish(case, scene)
+    steering = drawn_constraint(case, scene)
     plain, plain_s = _timed(case, scene, hand, ())
-    found, steered_s = _timed(case, scene, hand, (wish,))
+    found, steered_s = _timed(case, scene, hand, (steering,))
     good = [grasp for grasp in found.tried if grasp.verdict is Verdict.VERIFIED]
     return {
-        "shape": thing_name(case.object),
+        "shape": object_name(case.object),
         "plain_cpu_s": plain_s,
         "steered_cpu_s": steered_s,
         "plain": sum(grasp.verdict is Verdict.VERIFIED for grasp in plain.tried),
@@ -103,9 +103,9 @@ def run_steered(case: SteeredCase) -> Record:
         "refused": dict(found.refused),
         "message": found.message,
         # Greatest violation of each constraint. It is negative if all grasps obey.
-        "beyond_cone_rad": max((beyond_cone(hand, grasp, wish) for grasp in good), default=None),
-        "beyond_region_m": max((beyond_region(grasp, wish) for grasp in good), default=None),
-        "in_boxes": sum(_in_boxes(hand, grasp, wish) for grasp in good),
+        "beyond_cone_rad": max((beyond_cone(hand, grasp, steering) for grasp in good), default=None),
+        "beyond_region_m": max((beyond_region(grasp, steering) for grasp in good), default=None),
+        "in_boxes": sum(_in_boxes(hand, grasp, steering) for grasp in good),
     }
 
 
@@ -117,27 +117,27 @@ def _timed(case: SteeredCase, scene: Scene, hand: HandModel, restrictions: Seque
     return found, time.process_time() - began
 
 
-def beyond_cone(hand: HandModel, grasp: Grasp, wish: Steering) -> float:
+def beyond_cone(hand: HandModel, grasp: Grasp, goal: Steering) -> float:
     """Return the angle by which a grasp's approach direction is outside the cone [rad]. Negative if inside."""
-    if wish.approach_direction is None:
+    if goal.approach_direction is None:
         return -np.pi
     w, x, y, z = grasp.grasp.quaternion_wxyz
     approach = Rotation.from_quat([x, y, z, w]).apply(hand.approach)
-    return float(np.arccos(np.clip(approach @ np.asarray(wish.approach_direction), -1, 1))) - wish.approach_angle
+    return float(np.arccos(np.clip(approach @ np.asarray(goal.approach_direction), -1, 1))) - goal.approach_angle
 
 
-def beyond_region(grasp: Grasp, wish: Steering) -> float:
+def beyond_region(grasp: Grasp, goal: Steering) -> float:
     """Return how far the farthest contact is outside the region [m]. Negative if all are inside."""
-    if not isinstance(wish.region, Box):
+    if not isinstance(goal.region, Box):
         return -1.0
     beyond = (
-        np.abs(np.array([c.position for c in grasp.contacts]) - wish.region.center) - np.array(wish.region.size) / 2
+        np.abs(np.array([c.position for c in grasp.contacts]) - goal.region.center) - np.array(goal.region.size) / 2
     )
     return float(beyond.max())
 
 
-def _in_boxes(hand: HandModel, grasp: Grasp, wish: Steering) -> bool:
-    return bool(entered(hand, [grasp.pregrasp, grasp.grasp, grasp.squeeze], wish.avoid).any())
+def _in_boxes(hand: HandModel, grasp: Grasp, goal: Steering) -> bool:
+    return bool(entered(hand, [grasp.pregrasp, grasp.grasp, grasp.squeeze], goal.avoid).any())
 
 
 def steered_sections(records: Sequence[Record], chart: Path | None) -> Sections:
@@ -159,8 +159,8 @@ def _row(wish: str, here: Sequence[Record]) -> list[str]:
     if not here:
         return []
     share = lambda key: f"{np.mean([r[key] > 0 for r in here]):.1%}"  # noqa: E731
-    asked = sum(r["count"] for r in here)
-    grasps = lambda key: f"{sum(r[key] for r in here) / asked:.1%}"  # noqa: E731
+    count = sum(r["count"] for r in here)
+    grasps = lambda key: f"{sum(r[key] for r in here) / count:.1%}"  # noqa: E731
     seconds = lambda key: f"{np.median([r[key] for r in here]):.2f}"  # noqa: E731
     cones = [r["beyond_cone_rad"] for r in here if r["beyond_cone_rad"] is not None and "cone" in r["wish"]]
     regions = [r["beyond_region_m"] for r in here if r["beyond_region_m"] is not None and "region" in r["wish"]]

@@ -17,7 +17,7 @@ from graspd_bench.study import ObjectCase, Record, Request, Sections, object_cas
 from graspd_core.mesh.shapes import SHAPES
 from graspd_core.planning.plan_grasps import plan_grasps
 from graspd_core.types import Verdict
-from graspd_dataset.run_records import markdown_table, thing_name
+from graspd_dataset.run_records import markdown_table, object_name
 
 THREADS = (1, 2)
 # Grasps of a first plan with another seed. It fills the caches with the object's SDF grid, convex parts and worlds.
@@ -62,8 +62,8 @@ def throughput_sections(records: Sequence[Record], chart: Path | None) -> Sectio
     headings = ["object", "tried for one verified"]
     for threads in THREADS:
         headings += [f"verified a second, {threads} thread{'s' if threads > 1 else ''}", "CPU ms each"]
-    things = list(dict.fromkeys(thing_name(row["object"]) for row in rows))
-    figures = {thing: _figures([row for row in rows if thing_name(row["object"]) == thing]) for thing in things}
+    things = list(dict.fromkeys(object_name(row["object"]) for row in rows))
+    figures = {thing: _figures([row for row in rows if object_name(row["object"]) == thing]) for thing in things}
     figures["**mean**"] = np.nanmean(list(figures.values()), axis=0).tolist()
     body = [[name, f"{tried:.2f}", *(f"{value:.1f}" for value in others)] for name, (tried, *others) in figures.items()]
     return {"throughput": [markdown_table(headings, body)]}

@@ -12,7 +12,7 @@ import torch
 from graspd_core.config import SceneConfig
 from graspd_core.errors import CloudError
 from graspd_core.perception.cloud.point_cloud import PointCloud, Points
-from graspd_core.perception.cloud.viewpoint_check import check_scene, check_thing, fits_nowhere
+from graspd_core.perception.cloud.viewpoint_check import check_scene, check_viewpoint, fits_nowhere
 from graspd_core.perception.obstacles import make_obstacles
 from graspd_core.perception.reconstruct.merge_views import Evidence, is_all_round, is_unposed
 from graspd_core.perception.reconstruct.reconstruct import Reconstruction, reconstruct
@@ -130,7 +130,7 @@ def _camera_doubts(seen: Segmentation, views: Sequence[PointCloud]) -> tuple[str
     by_eye = {tuple(view.viewpoint.astype(float)): view for view in views}
     up = None if seen.support is None else np.asarray(seen.support.normal, dtype=float)
     try:
-        told = [check_thing(thing, by_eye[tuple(thing.viewpoint.astype(float))], up) for thing in seen.views]
+        told = [check_viewpoint(thing, by_eye[tuple(thing.viewpoint.astype(float))], up) for thing in seen.views]
     except CloudError:
         if _needs_no_camera(seen.views):
             return ()

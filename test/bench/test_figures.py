@@ -43,7 +43,7 @@ PLANNED = """\
 
 def test_a_grasp_that_was_not_found_counts_as_failed(record):
     (row,) = rows([record()])
-    assert (row.asked, row.given, row.held) == (4, 3, 2)
+    assert (row.count, row.given, row.held) == (4, 3, 2)
     assert row.values["standard"] == 0.5
     assert row.values["hard"] == 0.25
     assert row.values["noisy"] is None
@@ -101,7 +101,7 @@ def test_what_the_means_leave_out_is_said(record):
 
 def test_seeds_are_pooled_and_cells_that_raised_left_out(record):
     found = rows([record(seed=0), record(seed=1, held=4), record("fast"), record("worse", error="died")])
-    assert [(row.name, row.asked, row.held) for row in found] == [("balanced", 8, 6), ("fast", 4, 2)]
+    assert [(row.name, row.count, row.held) for row in found] == [("balanced", 8, 6), ("fast", 4, 2)]
     assert set(by_name(found)) == {"balanced", "fast"}
 
 

@@ -13,7 +13,7 @@ from graspd_bench.studies.piles import (
     DROPPED,
     NO_GRASP,
     PileCase,
-    drawn_things,
+    drawn_objects,
     dropped_pile,
     film_strip,
     pile_cases,
@@ -39,8 +39,8 @@ def test_a_scene_is_a_number_of_things():
 
 
 def test_things_repeat_only_where_there_are_too_few():
-    assert sorted(drawn_things(scene(3))) == sorted(SHAPES)
-    assert sorted(drawn_things(scene(6))) == sorted(2 * SHAPES)
+    assert sorted(drawn_objects(scene(3))) == sorted(SHAPES)
+    assert sorted(drawn_objects(scene(6))) == sorted(2 * SHAPES)
 
 
 def test_every_point_that_is_seen_knows_its_thing():

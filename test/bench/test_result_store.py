@@ -98,7 +98,7 @@ def test_objects_hands_and_presets_count_by_their_content(tmp_path: Path):
         folder.mkdir()
         save_mesh(folder / "thing.obj", mesh)
         (folder / "mine.yaml").write_text(f"resolution: {resolution}\n")
-        asked = Plain(str(folder / "thing.obj"), str(folder / "mine.yaml")).asked()
+        asked = Plain(str(folder / "thing.obj"), str(folder / "mine.yaml")).inputs()
         return json.dumps({**asked, "preset": ""})
 
     first = keys("a", make_shape("box"), 32)

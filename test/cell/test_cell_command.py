@@ -77,7 +77,7 @@ def test_a_page_shows_the_cell_as_it_moves(robot_of: Callable[..., SimulatedRobo
             assert answer.status == 200
         robot.wait(1.0)
         live.page.draw_points(np.zeros((5, 3)))
-        live.page.tell("1 of 1 things out", "<script>")
+        live.page.write("1 of 1 things out", "<script>")
         box = robot.solids().index(next(solid for solid in robot.solids() if solid[0] == "box"))
         nodes = live.page._nodes._groups
         end = time.monotonic() + 60.0

@@ -108,7 +108,7 @@ def test_the_tables_count_what_they_say():
     assert "| 0.85 to 0.95 | 1 | 0.90 | 1 (100 %) |" in curve
     assert "| no way for the arm | no | 1 |" in endings
     assert "from there to the closed hand 3.0 s" in times
-    assert STUDY.came(_record(PAIRS[0])) == "1 of 2 out in 3 attempts"
+    assert STUDY.summary(_record(PAIRS[0])) == "1 of 2 out in 3 attempts"
 
 
 @pytest.mark.slow

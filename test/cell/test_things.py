@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from graspd_bench.rendering.families import draw_thing
+from graspd_bench.rendering.families import draw_object
 from graspd_cell.things import SHAPE_DENSITY, family_sources, find_sources, load_thing
 from graspd_core.errors import ConfigError
 from graspd_core.mesh.mesh_files import save_mesh
@@ -17,7 +17,7 @@ def test_a_drawn_thing_weighs_what_it_was_drawn_with():
     (source,) = find_sources(["family:pear:3"])
     thing = load_thing(source)
     assert (source.name, thing.name) == ("pear 3", "pear 3")
-    assert thing.model.mass == draw_thing("pear", 3).mass
+    assert thing.model.mass == draw_object("pear", 3).mass
     assert len(thing.parts) >= 1
     assert len(thing.seen.faces) <= 2000
     assert [s.name for s in family_sources((1, 2), ("jar", "pan"))] == ["jar 1", "pan 1", "jar 2", "pan 2"]

@@ -62,8 +62,8 @@ def test_a_server_that_is_gone_or_a_bucket_that_is_not_there_is_one_line_and_tel
     with pytest.raises(StorageError, match="nowhere://x"):
         DatasetStore("nowhere://x").list("grasps")
     remote = DatasetStore("s3://key:secret@bucket/x?region=us-east-1")
-    assert "secret" not in remote.shown
-    assert remote.shown == "s3://bucket/x"
+    assert "secret" not in remote.label
+    assert remote.label == "s3://bucket/x"
 
 
 def test_a_full_disk_leaves_no_part_of_a_file(tmp_path: Path):

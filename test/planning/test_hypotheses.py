@@ -351,9 +351,7 @@ def test_what_speaks_against_a_scene_leaves_no_grasp_verified(monkeypatch):
 
 def test_seen_all_round_only_place_and_friction_are_in_doubt(monkeypatch):
     monkeypatch.delattr("graspd_core.verify.robustness._other_world")
-    verified = [
-        grasp for grasp in plan(seen_all_round(), SURE).grasps if grasp.verdict is Verdict.VERIFIED
-    ]
+    verified = [grasp for grasp in plan(seen_all_round(), SURE).grasps if grasp.verdict is Verdict.VERIFIED]
     assert verified
     for grasp in verified:
         assert [trial.name for trial in grasp.trials] == ["hold", "lift", ROBUSTNESS]

@@ -14,7 +14,7 @@ from graspd_core.config import SegmentationConfig
 from graspd_core.errors import CloudError
 from graspd_core.mesh.mesh_files import mass_properties, surface_samples
 from graspd_core.perception.cloud.camera import PinholeCamera, camera_rays, cloud_from_depth, reaches_image_border
-from graspd_core.perception.cloud.viewpoint_check import check_scene, check_thing, fits_nowhere, seen_from
+from graspd_core.perception.cloud.viewpoint_check import check_scene, check_viewpoint, fits_nowhere, seen_from
 from graspd_core.perception.reconstruct.merge_views import is_all_round
 
 CAMERA = PinholeCamera(320, 240, 308.0, 308.0, 159.5, 119.5)
@@ -45,7 +45,7 @@ def seen(shape: str, elevation: float) -> tuple[np.ndarray, np.ndarray, np.ndarr
 def is_refused(thing: PointCloud, cloud: PointCloud) -> bool:
     try:
         check_scene([cloud])
-        check_thing(thing, cloud)
+        check_viewpoint(thing, cloud)
     except CloudError as error:
         return re.search("hidden from there|plane of the table|seen from behind", str(error)) is not None
     return False
@@ -58,7 +58,7 @@ def test_the_true_place_is_taken_and_the_places_of_robots_are_refused(shape, ele
     cloud = PointCloud(points, place)
     check_scene([cloud])
     thing = points[(np.abs(points[:, :2]) < 0.08).all(1) & (points[:, 2] > 0.008)]
-    assert check_thing(PointCloud(thing, place), cloud, np.array([0.0, 0.0, 1.0])) == ""
+    assert check_viewpoint(PointCloud(thing, place), cloud, np.array([0.0, 0.0, 1.0])) == ""
     for base in BASES.values():
         with pytest.raises(CloudError, match="its pixels show it at") as refused:
             seen_from(grid, np.array(base))
@@ -76,7 +76,7 @@ def test_an_object_alone_from_all_round_needs_no_camera():
     assert evidence is not None
     assert evidence.doubts == ()
     with pytest.raises(CloudError, match=r"did not stand at the origin of its frame: .*sensor_frame or view_point"):
-        check_thing(cloud, cloud)
+        check_viewpoint(cloud, cloud)
 
 
 @pytest.mark.parametrize("shape", ["box", "bowl", "mug", "bottle"])
@@ -131,16 +131,16 @@ def test_a_cloud_that_many_places_fit_is_doubted_unless_its_pixels_tell():
     plate = np.c_[rng.uniform(-0.06, 0.06, (4000, 2)), rng.normal(0.0, 0.0005, 4000)]
     cloud = PointCloud(plate, np.array([0.1, 0.0, 0.5]))
     up = np.array([0.0, 0.0, 1.0])
-    assert "of all places for the camera fit the cloud as well as (0.1, 0, 0.5)" in check_thing(cloud, cloud, up)
-    assert check_thing(cloud, replace(cloud, posed=True)) == ""
+    assert "of all places for the camera fit the cloud as well as (0.1, 0, 0.5)" in check_viewpoint(cloud, cloud, up)
+    assert check_viewpoint(cloud, replace(cloud, posed=True)) == ""
 
 
 def test_a_thing_without_its_table_is_doubted_from_right_behind():
     _, points, place = seen("cylinder", 0.8)
     thing = points[(np.abs(points[:, :2]) < 0.06).all(1) & (points[:, 2] > 0.008)]
-    assert check_thing(PointCloud(thing, place), PointCloud(thing, place)) == ""
+    assert check_viewpoint(PointCloud(thing, place), PointCloud(thing, place)) == ""
     mirrored = PointCloud(thing, 2 * thing.mean(0) - place)
-    assert "the object is hollow, or seen from the back of its surface" in check_thing(mirrored, mirrored)
+    assert "the object is hollow, or seen from the back of its surface" in check_viewpoint(mirrored, mirrored)
 
 
 def test_numbers_of_32_and_of_64_bits_are_the_same_scene():

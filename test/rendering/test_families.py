@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from graspd_bench.rendering.depth_noise import CAMERAS, add_noise
-from graspd_bench.rendering.families import FAMILIES, OTHERS, draw_thing
+from graspd_bench.rendering.families import FAMILIES, OTHERS, draw_object
 from graspd_bench.rendering.tabletop import crowded, moved, resting_pose
 from graspd_core.errors import MeshError
 from graspd_core.mesh.mesh_files import mass_properties, surface_samples
@@ -16,26 +16,26 @@ from graspd_core.perception.scene import heavy_mass
 
 @pytest.mark.parametrize("family", FAMILIES | OTHERS)
 def test_things_are_closed_turned_outwards_and_of_a_hand_s_size(family: str):
-    thing, other = draw_thing(family, 100), draw_thing(family, 101)
+    thing, other = draw_object(family, 100), draw_object(family, 101)
     assert is_closed(thing.mesh)
     a, b, c = thing.mesh.vertices[thing.mesh.faces].transpose(1, 0, 2)
     assert np.einsum("ij,ij->", a, np.cross(b, c)) > 0
     assert 0.05 < np.ptp(thing.mesh.vertices, axis=0).max() < 0.36
     assert 0.003 < thing.mass < 2.0 * heavy_mass(mass_properties(thing.mesh)[0])
-    draw_thing.cache_clear()
-    assert np.array_equal(draw_thing(family, 100).mesh.vertices, thing.mesh.vertices)
+    draw_object.cache_clear()
+    assert np.array_equal(draw_object(family, 100).mesh.vertices, thing.mesh.vertices)
     assert abs(other.mass - thing.mass) > 1e-6
 
 
 def test_an_unknown_family_is_named_with_the_valid_ones():
     with pytest.raises(MeshError, match="unknown family 'teapot'; valid: pear"):
-        draw_thing("teapot", 0)
+        draw_object("teapot", 0)
 
 
 @pytest.mark.parametrize("seed", range(4))
 def test_what_rests_stands_on_what_lies_below_its_centre(seed: int):
     rng = np.random.default_rng(seed)
-    mesh = draw_thing("spray", seed).mesh
+    mesh = draw_object("spray", seed).mesh
     resting = moved(mesh, resting_pose(mesh, rng))
     assert resting.vertices[:, 2].min() == pytest.approx(0.0, abs=1e-9)
     from scipy.spatial import ConvexHull
@@ -53,7 +53,7 @@ def test_what_rests_stands_on_what_lies_below_its_centre(seed: int):
 def test_neighbours_stand_apart_and_near():
     rng = np.random.default_rng(3)
     target = moved(make_shape("mug"), resting_pose(make_shape("mug"), rng))
-    others = crowded(target, [draw_thing("pear", 1).mesh, make_shape("box")], rng)
+    others = crowded(target, [draw_object("pear", 1).mesh, make_shape("box")], rng)
     for other in others:
         gap = surface_distance(make_surface(target), surface_samples(other, 2000, 0)[0]).min()
         assert 0.015 < gap < 0.08

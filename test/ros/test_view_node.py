@@ -31,7 +31,7 @@ class Watched:
     def do(self, kind, work) -> None:
         work()
 
-    def tell(self, line: str, share: float) -> None:
+    def show_progress(self, line: str, share: float) -> None:
         self.lines.append(line)
 
 

@@ -105,7 +105,7 @@ def check_scene(views: Sequence[PointCloud]) -> None:
             raise _refusal(view.viewpoint, "it lies in the plane of the table, or objects stand on the far side of it")
 
 
-def check_thing(thing: PointCloud, view: PointCloud, up: Vector | None = None) -> str:
+def check_viewpoint(thing: PointCloud, view: PointCloud, up: Vector | None = None) -> str:
     """Check that a view of an object can have been seen from its viewpoint: not from behind, nor through surfaces.
 
     Args:
