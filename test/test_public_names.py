@@ -2,8 +2,10 @@
 
 import ast
 import compileall
+import doctest
 import inspect
 import os
+import re
 import shutil
 import subprocess
 import sys
@@ -24,6 +26,23 @@ def test_a_public_name_is_there_and_documented(name: str):
     value = getattr(graspd_core, name)
     # Registries are dictionaries: their module describes them.
     assert name.isupper() or inspect.getdoc(value)
+
+
+EXAMPLES = PACKAGE.parent / "examples" / "library.pycon"
+
+
+def test_the_examples_of_the_reference_run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.chdir(tmp_path)
+    ran = doctest.testfile(str(EXAMPLES), module_relative=False)
+    assert (ran.failed, ran.attempted > 60) == (0, True)
+
+
+def test_every_public_name_has_an_example():
+    code = "".join(example.source for example in doctest.DocTestParser().get_examples(EXAMPLES.read_text()))
+    used = {node.id for node in ast.walk(ast.parse(code)) if isinstance(node, ast.Name)}
+    assert set(graspd_core.__all__) - used == set()
+    page = (PACKAGE.parent / "docs" / "api.md").read_text()
+    assert all(f"library.pycon:{part}" in page for part in re.findall(r"\[start:(\w+)\]", EXAMPLES.read_text()))
 
 
 def test_type_checkers_see_the_same_names_as_users():
