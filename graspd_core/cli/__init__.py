@@ -1,7 +1,7 @@
 """The command line. Each command has its own module and imports heavy libraries only when it runs.
 
-graspd_core provides synthesize, replay, reconstruct, library, hands, doctor and completion. Other packages add commands
-by entry points of the group `graspd.commands`: view, bench, dataset, import and cell.
+graspd_core provides synthesize, replay, reconstruct, library, hands, methods, presets, metrics, doctor and completion.
+Other packages add commands by entry points of the group `graspd.commands`: view, bench, dataset, import and cell.
 """
 
 from __future__ import annotations
@@ -76,6 +76,7 @@ _COMMANDS = {
     "reconstruct": "graspd_core.cli.reconstruct_command",
     "library": "graspd_core.cli.library_command",
     "hands": "graspd_core.cli.hands_command",
+    **dict.fromkeys(("methods", "presets", "metrics"), "graspd_core.cli.names_command"),
     "doctor": "graspd_core.doctor",
     "completion": "graspd_core.cli.completion_command",
 }
@@ -86,6 +87,9 @@ _SUMMARIES = {
     "reconstruct": "turn a point cloud into a closed mesh",
     "library": "keep verified grasps of known objects in a file",
     "hands": "list the built-in hands, or inspect one",
+    "methods": "list the methods that find grasps",
+    "presets": "list the built-in presets",
+    "metrics": "list the metrics of a grasp",
     "doctor": "check the installation",
     "completion": "print a script that lets bash, zsh or tcsh complete commands and options",
     "view": "show hands, grasps and results in a browser",
@@ -117,8 +121,9 @@ def build_parser(command: str = "") -> argparse.ArgumentParser:
             raise ConfigError(f"{command}: {SIBLINGS[command]} is not installed; run: pip install graspd")
         raise ConfigError(f"unknown command {command!r}; {choices(command, modules)}")
     commands = parser.add_subparsers(required=True, metavar="COMMAND", dest="command", action=_Commands)
-    for name in [command] if command else modules:
-        importlib.import_module(modules[name]).add_command(commands)
+    # One module may hold several commands.
+    for module in dict.fromkeys([modules[command]] if command else modules.values()):
+        importlib.import_module(module).add_command(commands)
     for runs in runnable(parser):
         add_output_options(runs)
     return parser

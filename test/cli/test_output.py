@@ -107,6 +107,10 @@ def test_json_of_lists(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
         hand = document("hands", *words)
         assert [joint["name"] for joint in hand["joints"]]
         assert len(hand["palm_normal"]) == 3
+    for command, name in (("methods", "closed_form"), ("presets", "fast"), ("metrics", "epsilon")):
+        rows = {row["name"]: row["about"] for row in document(command, "--json")}
+        assert rows[name]
+        assert all(about and "\n" not in about for about in rows.values())
     library = str(tmp_path / "known.grasps")
     built = document("library", "build", "shape:sphere", "--out", library, "-n", "1", "--preset", "fast", "--json")
     assert built["objects"] == [{"source": "shape:sphere", "scale": 1.0, "grasps": 1}]
