@@ -69,7 +69,7 @@ MAX_PACKAGE_LINES = {
     "graspd_dataset": 2_960,
     "graspd_viewer": 2_428,
     "graspd_cell": 3_774,
-    "test": 33_088,
+    "test": 33_089,
 }
 # Lines that a program reaches through its imports, those inside functions too.
 # The layout aims at 22,000 of the node.

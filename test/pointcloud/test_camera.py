@@ -145,8 +145,7 @@ def test_any_layout_comes_back_in_metres(encoding, order, padding, height, width
     pixels = millimetres.astype("u2") if encoding != "32FC1" else (millimetres / 1000).astype("f4")
     data, step = as_bytes(pixels, order, padding)
     sizes = {"width": width, "height": height, "step": step}
-    image = SimpleNamespace(data=data, encoding=encoding, is_bigendian=order == ">", **sizes)
-    depth = depth_from_message(image)
+    depth = depth_from_message(SimpleNamespace(data=data, encoding=encoding, is_bigendian=order == ">", **sizes))
     assert depth == pytest.approx(millimetres / 1000, rel=1e-6)
 
 
