@@ -267,7 +267,7 @@ def _near(
     settings: SegmentationConfig,
     support: FlatPart | None,
 ) -> bool:
-    """Return True if two clusters, the larger first, are near enough to be one object. Hanging ones may be farther."""
+    """Return True if two clusters, the larger first, are near enough to be one object: farther apart if one hangs."""
     if support is None:  # two objects behind each other look like two sides of one object
         return apart <= settings.unsupported_reach
     if apart <= max(link, settings.gap) or _share_within(b, a, support) >= OUTLINE_SHARE:
