@@ -82,7 +82,7 @@ class Check:
     Attributes:
         name: name of the checked library or part.
         ok: whether the check passed.
-        detail: a version or a figure if the check passed, else the error in one line.
+        detail: a version or a number if the check passed, else the error in one line.
         hint: what to do if the check failed.
         needed: whether graspd cannot work without it.
     """

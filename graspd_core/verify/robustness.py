@@ -203,7 +203,7 @@ def begin_other_worlds(
 def robustness_checks_of(
     scene: Scene, others: Sequence[LaterWorld], trials: TrialContext, probability: float
 ) -> RobustnessChecks | None:
-    """Return the checks that a grasp must pass to reach the requested `probability`. None if there are none.
+    """Return the checks that a grasp must pass to reach the requested `probability`. None if it needs no check.
 
     `others` comes from `begin_other_worlds`. If the mass is known, a grasp must hold on all displaced poses and with
     less friction.
@@ -354,7 +354,7 @@ def _other_world(scene: Scene, hand: HandModel, protocol: Protocol, rule: str) -
 
 
 def other_scene(evidence: Evidence, rule: str, likeliest: ObjectModel) -> Scene | None:
-    """Return a scene with the hidden side guessed by `rule`, equal mass and friction. None without a guess."""
+    """Return a scene with the hidden side guessed by `rule`, at the same mass and friction. None if that fails."""
     from graspd_core.perception.reconstruct.hidden_side import other_shape
 
     mesh = other_shape(evidence, rule, likeliest.mesh)

@@ -120,7 +120,7 @@ def add_others(spec: Any, others: Sequence[FreeBody], friction: Friction) -> tup
 
 
 def add_support(spec: Any, hand: HandModel, parts: Sequence[TriangleMesh], friction: Friction, support: Plane) -> None:
-    """Add gravity, a plane for the hand, and one at the bottom of `parts`. Without parts, both share the plane."""
+    """Add gravity, a plane for the hand, and a plane for the object at the bottom of `parts` (none without parts)."""
     spec.option.gravity = -_GRAVITY * support.normal
     add_plane(spec, TABLE, support, friction)
     for link in hand.link_names:
@@ -173,7 +173,7 @@ def add_mesh(spec: Any, name: str, vertices: np.ndarray, faces: np.ndarray) -> N
 
 
 def full_inertia(inertia: Float[np.ndarray, "3 3"], floor: float) -> list[float]:
-    """Return xx yy zz xy xz yz of a valid inertia [kg·m²]: moments of at least `floor`, triangle inequality kept."""
+    """Return xx yy zz xy xz yz of a valid inertia [kg·m²]: moments ≥ `floor`, each below the sum of the others."""
     moments, axes = np.linalg.eigh(0.5 * (inertia + inertia.T))
     moments = np.maximum(moments, floor)
     moments[2] = min(moments[2], 0.999 * (moments[0] + moments[1]))
