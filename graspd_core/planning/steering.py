@@ -272,5 +272,5 @@ def _part_of_object(scene: Scene, region: Region, avoid: Sequence[Box]) -> Float
         )
     for number, box in enumerate(avoid):
         if (box.distance(inside) <= 0.0).all():
-            raise ConfigError(f"region: avoid box {number} covers all of the object in it; move box or region")
+            raise ConfigError(f"region: avoid box {number} covers the object in the region; move one of them")
     return inside[:: len(inside) // _MOST_PLACES + 1]
