@@ -27,7 +27,7 @@ PROTOCOL_MASS = 0.1
 
 @dataclass(frozen=True)
 class Picture:
-    """A chart on disk, with a title that says what it shows."""
+    """A chart on disk, and its title."""
 
     title: str
     png: Path

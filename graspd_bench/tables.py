@@ -223,7 +223,7 @@ def metrics_table() -> str:
 
 
 def missing(records: Sequence[Record]) -> str:
-    """Return a sentence that names presets whose means lack some objects, or "" if there is no such preset."""
+    """Return a sentence that names presets without results for some objects, or "" if there is no such preset."""
     found = by_name(row for row in rows(records) if is_preset(row.name))
     objects = {r["object"] for r in records if r["kind"] == "raw" and is_preset(r["name"])}
     fewer = [f"`{name}` of {len(group)}" for name, group in found.items() if len(group) < len(objects)]

@@ -1,6 +1,6 @@
 """`graspd doctor`: check the installation and name the remedy for each failure.
 
-Each library is imported in a subprocess, so that a library that aborts on import does not end the report. The ROS check
+Each library is imported in a subprocess, because a library that aborts on import would end the report. The ROS check
 also runs in a subprocess, so that rclpy is never loaded here.
 """
 

@@ -2,8 +2,8 @@
 
     graspd bench --import FOLDER --hand NAME
 
-The study ignores whether a file marks a grasp as failed. Grasps that the import refuses or that our planner does not
-find count as failed. Shares refer to all imported grasps of an object, or to the first `--count` of them.
+The study ignores whether a file marks a grasp as failed. Grasps that the import refuses, and grasps that our planner
+does not find, count as failed. Shares refer to all imported grasps of an object, or to the first `--count` of them.
 """
 
 from __future__ import annotations

@@ -185,7 +185,7 @@ def known_grasps(
         count: greatest number of grasps.
         restrictions: as for `plan_grasps`.
         verify: trials that the grasps must have passed. Stricter trials count too.
-        wanted: function that selects the stored grasps that may be returned.
+        wanted: function that filters the stored grasps.
         stop: asked during the trials. True ends them.
 
     Raises:

@@ -198,7 +198,7 @@ class BoundSteering(BoundRestriction):
         return np.all([box.distance(palm) > 0.0 for box in self.steering.avoid for palm in palms], axis=0)
 
     def admit(self, grasps: Sequence[Grasp]) -> Sequence[Grasp | Refusal]:
-        """Return each candidate that meets all constraints, else a refusal that names the first violated one."""
+        """Return each candidate that meets all constraints. For the others, return the first violated constraint."""
         if not grasps:
             return grasps
         steering, wanted, missed = self.steering, self.wanted, dict[str, Bool[np.ndarray, "grasps"]]()

@@ -244,7 +244,7 @@ PROTOCOLS: dict[str, Protocol] = {
 def at_friction(protocol: Protocol, friction: float) -> Protocol:
     """Return the protocol for an object of this friction, with all three coefficients scaled by friction / 0.6.
 
-    The scale is at most 1, so that no grasp passes because of high friction that nobody measured.
+    The scale is at most 1, so that no grasp passes because of an assumed high friction.
     """
     share = min(friction / Protocol.friction[0], 1.0)
     sliding, torsional, rolling = protocol.friction
@@ -275,7 +275,7 @@ class World:
         fingers: number of the hand's fingertips.
         others: body ids of the other free bodies.
         spare: `mujoco.MjData` of ended trials, which `trial_data` reuses.
-        closed: squeeze, protocol and closed-hand state of the last grasps that held, which `payload` reuses.
+        closed: squeeze, protocol and closed-hand state of the last grasps that held. `payload` reuses them.
         watch: called with the `mujoco.MjData` after every step of a trial. None in planning.
     """
 

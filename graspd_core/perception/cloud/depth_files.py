@@ -40,7 +40,7 @@ DepthCamera = tuple[PinholeCamera, Float[np.ndarray, "4 4"] | None, float | None
 
 
 def is_depth_image(path: str | Path) -> bool:
-    """Return True if the ending of a path is that of an image, which needs a camera to become points."""
+    """Return True if a path has the ending of a depth image. Such a file needs a camera file."""
     return Path(path).suffix.lower().lstrip(".") in IMAGE_ENDINGS
 
 

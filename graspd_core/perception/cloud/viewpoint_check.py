@@ -180,8 +180,8 @@ def _said(viewpoint: Vector) -> str:
 def hidden_share(points: Points, viewpoint: Vector, nearer: Float[np.ndarray, "points"], tree: Any) -> float:
     """Return the fraction of points that a surface hides from the viewpoint.
 
-    A hidden point is surrounded in the image by points that are nearer by `nearer` [m], and so are most of its
-    neighbours in space. `tree` is the KD-tree of the points.
+    In the image, points that are nearer by `nearer` [m] surround a hidden point and most of its neighbours in space.
+    `tree` is the KD-tree of the points.
     """
     from scipy.spatial import KDTree
 

@@ -3,7 +3,7 @@
 Occlusion splits one object into several clusters: the far wall of a cup lies behind the near wall, a rim above the
 bottom. Two clusters are joined only if they touch in some camera's image, because the edge between them is then an
 occlusion. They must also be near each other, or one must lie within the other's outline on the support. A cluster that
-ends above the support belongs to the nearest standing cluster, unless it may be an object whose foot is hidden.
+ends above the support belongs to the nearest standing cluster, unless it may be an object with a hidden foot.
 
 Touching objects form one cluster. A concave seam or a narrow waist between two standing parts suggests two objects.
 Objects of equal height that touch along a line are connected by a narrow bridge of points across their tops. One object
