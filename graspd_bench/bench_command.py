@@ -1,4 +1,4 @@
-"""The command `graspd bench`: it runs or resumes studies, and writes their figures, tables, charts and pages."""
+"""The command `graspd bench`: it runs or resumes studies, and writes their results, tables, charts and pages."""
 
 from __future__ import annotations
 

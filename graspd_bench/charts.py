@@ -141,12 +141,12 @@ _SUCCESS, _TIME = method_row("closed_form").colour, method_row("graspd2022").col
 
 @dataclass(frozen=True)
 class Panel:
-    """Chart panel that plots one figure against time.
+    """Chart panel that plots one value against time.
 
     Attributes:
-        figure: name of the figure in `figures.Row.values`.
+        figure: name of the value in `figures.Row.values`.
         label: label of the vertical axis.
-        factor: conversion factor from the figure's unit to the label's unit.
+        factor: conversion factor from the value's unit to the label's unit.
         less_is_better: True if smaller values are better.
         mean: if True, plot the mean over objects instead of the median. The median of a success rate hides failures.
         log: True for a logarithmic vertical axis.
@@ -241,7 +241,7 @@ def draw_planned(presets: dict[str, list[Row]], path: Path, about: str = "") -> 
 
 
 def draw_speed(presets: dict[str, list[Row]], path: Path, about: str = "") -> Path | None:
-    """Draw each accuracy figure against CPU seconds per raw grasp. Return the PNG's path, None without data.
+    """Draw each measure of accuracy against CPU seconds per raw grasp. Return the PNG's path, None without data.
 
     `about` is the text below the chart, from `about_records`.
     """
@@ -260,7 +260,7 @@ def draw_speed(presets: dict[str, list[Row]], path: Path, about: str = "") -> Pa
 
 
 def points_of(presets: dict[str, list[Row]], time: str, panel: Panel) -> list[Point]:
-    """Return a point for each preset that has both the time and the panel's figure, in the panel's unit."""
+    """Return a point for each preset that has both the time and the panel's value, in the panel's unit."""
     points = []
     for name, group in presets.items():
         x, y = spread(group, time), spread(group, panel.figure)

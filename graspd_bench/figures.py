@@ -1,4 +1,4 @@
-"""Figures of records: by name (preset, sweep value or hand) and object, over objects, and against an earlier run."""
+"""Numbers from benchmark records, for each name (preset, sweep value or hand) and object. Also compares two runs."""
 
 from __future__ import annotations
 
@@ -33,12 +33,12 @@ def hand_row(hand: str) -> str:
 
 
 def is_hand(name: str) -> bool:
-    """Return whether a name is of a hand's cells, such as `hand:leap_right`."""
+    """Return True if a name is that of a hand's cells, such as `hand:leap_right`."""
     return name.startswith("hand:")
 
 
 def is_preset(name: str) -> bool:
-    """Return whether a name is of a preset, and not of a sweep value or a hand."""
+    """Return True if a name is that of a preset, and not of a sweep value or a hand."""
     return not is_sweep_value(name) and not is_hand(name)
 
 
@@ -48,7 +48,7 @@ def is_few(name: str) -> bool:
 
 
 def is_sweep_value(name: str) -> bool:
-    """Return whether a name is of a sweep value, such as `steps=90`."""
+    """Return True if a name is that of a sweep value, such as `steps=90`."""
     return "=" in name
 
 
@@ -69,17 +69,17 @@ _DISPLACEMENTS = {"sd_cm": "sd", "gravity_cm": "gravity"}
 
 @dataclass(frozen=True)
 class Row:
-    """Figures of one name (preset, sweep value or hand) on one object, over all seeds.
+    """Results of one name (preset, sweep value or hand) on one object, over all seeds.
 
     Attributes:
         count: number of requested grasps.
         given: number of grasps found.
         held: number of grasps that passed the standard hold trial.
         spent: CPU time of the optimiser and of those trials [s].
-        values: figures by name, None if not measured. They are medians of `_grasp_figures` over grasps, shares of
+        values: numbers by name, None if not measured. They are medians of `_grasp_figures` over grasps, shares of
             requested grasps by `TRIAL_FIGURES`, and seconds: `cpu_per_grasp` of the optimiser, `cpu_with_scene`,
             `cpu_per_verified` (`spent` / `held`), `first_cpu` and `first_wall` until the first verified grasp.
-        quartiles: lower and upper quartile over the grasps, by figure.
+        quartiles: lower and upper quartile of each value over the grasps.
     """
 
     name: str
@@ -95,7 +95,7 @@ class Row:
 
 @dataclass(frozen=True)
 class Spread:
-    """Median, quartiles (`low`, `high`) and mean of a figure over objects, and the number of objects."""
+    """Median, quartiles (`low`, `high`) and mean of a value over objects, and the number of objects."""
 
     median: float
     low: float
@@ -143,7 +143,7 @@ def _row(group: Sequence[Record], ran: Collection[str]) -> Row:
 
 
 def spread(rows: Iterable[Row], figure: str) -> Spread | None:
-    """Return the spread of a figure over the rows. With one row, quartiles are over its grasps. None without values."""
+    """Return the spread of a value over the rows. With one row, quartiles are over its grasps. None without values."""
     known = [row for row in rows if row.values.get(figure) is not None]
     values = [row.values[figure] or 0.0 for row in known]
     if not values:
@@ -222,7 +222,7 @@ FIGURES = {
 
 @dataclass(frozen=True)
 class Move:
-    """Change of one figure between two runs. `old` or `new` is None if that run has no such figure."""
+    """Change of one value between two runs. `old` or `new` is None if that run lacks the value."""
 
     kind: str
     name: str
@@ -233,7 +233,7 @@ class Move:
 
 
 def moves(old: Sequence[Record], new: Sequence[Record]) -> list[Move]:
-    """Return the changed figures of each name: over the objects that both runs have ("all"), then by object."""
+    """Return the changed values of each name: means over the objects of both runs ("all"), then for each object."""
     found: list[Move] = []
     for kind in ("raw", "verified"):
         before = {(row.name, row.object): row for row in rows(old, kind)}
@@ -273,7 +273,7 @@ def _mean(group: Sequence[Row], figure: str) -> float | None:
 
 
 def comparison(old: Sequence[Record], new: Sequence[Record]) -> str:
-    """Return a text table of the changed figures. Below it are the cells that only one of the two runs has."""
+    """Return a text table of the changed values. Below it are the cells that only one of the two runs has."""
     old, new = ([record for record in records if "kind" in record] for records in (old, new))
     lines = [f"{'cells':9} {'preset':32} {'object':22} {'figure':22} {'old':>9} {'new':>9}  change"]
     for move in moves(old, new):

@@ -1,6 +1,6 @@
 """Cells of the suites, and the functions that run them. A cell is a kind of run with settings, object, hand and seed.
 
-Trials have the names that `--trials` accepts (docs/metrics.md). Suffixes of figures give their units, such as `_cm`.
+Trials have the names that `--trials` accepts (docs/metrics.md). Suffixes of names are units, such as `_cm`.
 """
 
 from __future__ import annotations
@@ -172,7 +172,7 @@ class Cell(Case):
 
 
 def run_cell(cell: Cell) -> Record:
-    """Run a cell of any kind. Return its figures."""
+    """Run a cell of any kind. Return its results."""
     return {"raw": run_raw, "verified": run_verified, "pace": run_pace, "start": run_start}[cell.kind](cell)
 
 

@@ -27,7 +27,7 @@ PROTOCOL_MASS = 0.1
 
 @dataclass(frozen=True)
 class Picture:
-    """A chart on disk, with a title that says what it shows."""
+    """A chart on disk, and its title."""
 
     title: str
     png: Path
@@ -132,9 +132,9 @@ class Study:
     Attributes:
         about: the question of the study, in one line.
         cases: returns the cases of a request. Raises GraspdError if the request has unknown names.
-        run: runs a case and returns its figures. It must be a module-level function, because workers unpickle it.
+        run: runs a case and returns its results. It must be a module-level function, because workers unpickle it.
         sections: returns page sections from records and a path prefix for charts. With None it draws no charts.
-        sources: glob patterns of the files in graspd_bench that its figures depend on.
+        sources: glob patterns of the files in graspd_bench that its results depend on.
         takes: names of the `Request` fields that the study uses.
         seconds: returns the estimated CPU time of a case [s].
         faults: returns the faults of a record, one line per fault.

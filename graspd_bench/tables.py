@@ -17,7 +17,7 @@ from graspd_dataset.run_records import markdown_table
 
 
 def provenance(command: str, records: Sequence[Record]) -> str:
-    """Return a sentence on the origin of figures: command, dates, commits, code versions, machines and CPU time."""
+    """Return a sentence on the origin of results: command, dates, commits, code versions, machines and CPU time."""
 
     def of(name: str) -> str:
         return ", ".join(sorted({str(record.get(name) or "unknown") for record in records}))
@@ -82,7 +82,7 @@ _SUMMARY = ("standard", "hard", "sd_cm", "penetration_mm", "contact_area_cm2", "
 
 
 def _columns() -> list[tuple[str, str, str]]:
-    """Return the columns of the tables: heading, name of the figure in `Row.values`, and number format."""
+    """Return the columns of the tables: heading, key in `Row.values`, and number format."""
     return [
         ("held", "standard", "{:.0%}"),
         ("held, hard", "hard", "{:.0%}"),
@@ -155,7 +155,7 @@ def planned_table(records: Sequence[Record]) -> str:
 
 
 def pace_table(records: Sequence[Record]) -> str:
-    """Return a table of the optimiser's cost per raw grasp, and of the first verified grasp of a new process."""
+    """Return a table of computing times: of each raw grasp, and of a new process until its first verified grasp."""
     body = []
     for r in records:
         if r["error"]:
@@ -206,7 +206,7 @@ def hands_sections(records: Sequence[Record], chart: Path | None) -> Sections:
 
 
 def drawn_charts(records: Sequence[Record], chart: Path | None) -> Mapping[str, Picture]:
-    """Draw the charts for which the records have figures. Return them by name. Draw none if `chart` is None."""
+    """Draw the charts for which the records have data. Return them by name. Draw none if `chart` is None."""
     if chart is None:
         return {}
     from graspd_bench.charts import draw_charts
@@ -223,7 +223,7 @@ def metrics_table() -> str:
 
 
 def missing(records: Sequence[Record]) -> str:
-    """Return a sentence that names presets whose means lack some objects, or "" if there is no such preset."""
+    """Return a sentence that names presets without results for some objects, or "" if there is no such preset."""
     found = by_name(row for row in rows(records) if is_preset(row.name))
     objects = {r["object"] for r in records if r["kind"] == "raw" and is_preset(r["name"])}
     fewer = [f"`{name}` of {len(group)}" for name, group in found.items() if len(group) < len(objects)]

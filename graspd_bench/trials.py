@@ -1,6 +1,6 @@
 """More trials in MuJoCo: displacement under gravity with a frozen and with a driven hand, and lifts out of a pile.
 
-`displacement_trial` repeats PyBullet's displacement trial in MuJoCo, to show how much its figure depends on the engine.
+`displacement_trial` repeats PyBullet's displacement trial in MuJoCo, to show how much its result depends on the engine.
 Hand, mass and steps are the same: a frozen hand, 1 kg, 35 steps of 1/240 s, 9.8 m/s². The friction of a pair is the
 product of Bullet's two coefficients, 3 times 3. Nothing bounces. In Bullet the hand's restitution of 0 prevents it.
 
@@ -225,8 +225,8 @@ def settle(
 
     Args:
         bodies: objects at their start poses. They must not overlap.
-        wall: half the side of a square fence around the origin [m]. Objects fall slowly within it. None: there is no
-            fence, and the objects already lie on the table.
+        wall: half the side of a square fence around the origin [m]. Objects fall slowly within it. If None, there is
+            no fence, and the objects already lie on the table.
         seconds: limit of the simulated time [s].
         protocol: physics settings. None takes those of the standard trial.
 

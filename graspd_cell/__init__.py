@@ -1,1 +1,1 @@
-"""A robot cell: a simulated arm, hand and camera that speak as real drivers do, and a picker that empties a bin."""
+"""A robot cell: a simulated arm, hand and camera with interfaces of real drivers, and a picker that empties a bin."""

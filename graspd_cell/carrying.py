@@ -76,7 +76,7 @@ def dropped_box(thing: Points) -> Box:
 
 
 def release_posture(mover: Mover, q: Joints, thing: Points, bin_: Bin, number: int) -> Joints | None:
-    """Return the nearest clear posture with the object above a bin, rotated about the vertical only. None if none.
+    """Return the nearest clear posture with the object above a bin, rotated about the vertical only. Otherwise None.
 
     Args:
         mover: arm and hand with the object in the hand.

@@ -189,7 +189,7 @@ class AttemptWatch:
         return record
 
     def _target(self, place: np.ndarray) -> str:
-        """Return the name of the object in the pick bin that is nearest to `place`, base frame [m]. Empty if none."""
+        """Return the name of the object in the pick bin that is nearest to `place`, base frame [m]. "" if empty."""
         world = self._robot.world
         surfaces = [
             (np.linalg.norm((thing.seen.vertices @ pose[:3, :3].T + pose[:3, 3]) - place, axis=1).min(), thing.name)

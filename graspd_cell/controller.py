@@ -42,7 +42,7 @@ class JointLimits:
 
 @dataclass(frozen=True)
 class Tolerances:
-    """Default tolerances of a controller, for motions without tolerances of their own.
+    """Default tolerances of a controller, for motions that give none.
 
     Attributes:
         path: greatest error of a joint during the motion [rad] or [m].

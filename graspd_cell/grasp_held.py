@@ -1,8 +1,8 @@
 """Detection of a held object from joint positions and efforts, which real hands report.
 
 A joint presses if its squeeze target lies beyond the grasp. An object in the hand stops it before the target. A joint
-that reaches its target presses on nothing, and its effort drops. Fingers that press on each other also stop early, as
-do jaws between which an object rotates. Surface points of the fingers distinguish these two cases.
+that reaches its target presses on nothing, and its effort drops. Fingers also stop early if they press on each other,
+or if an object rotates between jaws. Surface points of the fingers distinguish these two cases.
 """
 
 from __future__ import annotations

@@ -106,7 +106,7 @@ def place_of(world: CellWorld, data: Any, index: int) -> str:
 def thing_in_hand(world: CellWorld, data: Any) -> int | None:
     """Return the index of the held object. None if there is none.
 
-    The hand presses on a held object, and table and bins do not touch it. Of several, the most pressed one counts.
+    The hand presses on a held object, and table and bins do not touch it. Of several, take the one pressed hardest.
     """
     forces = _pair_forces(world, data)
     pressed = {b - THING: force for (a, b), force in forces.items() if a == HAND and b >= THING and force > _TOUCH}

@@ -62,7 +62,7 @@ class DepthView:
 class JointMotion:
     """Timed trajectory of the joints of the arm, the hand, or both.
 
-    If a tolerance is None, the controller's own applies. A hand has none, because an object stops its fingers.
+    If a tolerance is None, the controller's default applies. A hand has none, because an object stops its fingers.
 
     Attributes:
         names: joint names.
@@ -71,7 +71,7 @@ class JointMotion:
         velocities: joint velocities, one row per waypoint [rad/s] or [m/s]. If None, waypoints are joined linearly.
         path_tolerance: greatest joint error during the motion, for all or for each joint [rad] or [m].
         goal_tolerance: greatest joint error at the end, for all or for each joint [rad] or [m].
-        goal_time: time allowed after the last waypoint to reach the goal [s]. If None, the controller's own applies.
+        goal_time: time allowed after the last waypoint to reach the goal [s]. None takes the controller's default.
     """
 
     names: tuple[str, ...]

@@ -341,7 +341,7 @@ def motion_of(goal: Any, controller: TrajectoryController) -> JointMotion:
 
 
 def _tolerances(given: Any, names: tuple[str, ...], usual: float, field: str) -> np.ndarray | None:
-    """Return one tolerance per joint. Zero means the controller's own, a negative value none. None if none is given."""
+    """Return one tolerance per joint, or None if `given` is empty. 0 means the default, a negative value no limit."""
     if not given:
         return None
     allowed = np.full(len(names), usual)

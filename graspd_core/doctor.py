@@ -1,6 +1,6 @@
 """`graspd doctor`: check the installation and name the remedy for each failure.
 
-Each library is imported in a subprocess, so that a library that aborts on import does not end the report. The ROS check
+Each library is imported in a subprocess, because a library that aborts on import would end the report. The ROS check
 also runs in a subprocess, so that rclpy is never loaded here.
 """
 
@@ -82,7 +82,7 @@ class Check:
     Attributes:
         name: name of the checked library or part.
         ok: whether the check passed.
-        detail: a version or a figure if the check passed, else the error in one line.
+        detail: a version or a number if the check passed, else the error in one line.
         hint: what to do if the check failed.
         needed: whether graspd cannot work without it.
     """

@@ -78,7 +78,7 @@ def complete_grasps(
 
 
 def frame_doubt(scene: Scene, hand: HandModel, postures: Sequence[Posture]) -> str:
-    """Return a warning if 80 % of at least five hands are deep in the object, or 80 % are off it. Otherwise ""."""
+    """Return a warning if 80 % of at least five hands are deep in the object, or 80 % far from it. Otherwise ""."""
     if len(postures) < _FEWEST:
         return ""
     points = [
@@ -98,7 +98,7 @@ def frame_doubt(scene: Scene, hand: HandModel, postures: Sequence[Posture]) -> s
 
 
 def beyond_limits(grasp: ImportedGrasp, hand: HandModel) -> str:
-    """Return a sentence that names the joint farthest beyond its limits at grasp or pregrasp. Empty if none is."""
+    """Return a sentence on the joint farthest beyond its limits at grasp or pregrasp. Empty if all are within."""
     for posture in filter(None, (grasp.grasp, grasp.pregrasp)):
         beyond = np.maximum(hand.lower - posture.joint_positions, posture.joint_positions - hand.upper)
         if beyond.max(initial=0.0) > _BEYOND:

@@ -40,7 +40,7 @@ def parquet_bytes(table: Any, metadata: Mapping[str, Any]) -> bytes:
 
 
 def read_parquet(content: bytes, where: str, columns: Sequence[str] | None = None) -> tuple[Any, dict[str, Any]]:
-    """Return the pyarrow table and graspd's metadata of a Parquet file. `columns` None reads all columns.
+    """Return the pyarrow table and graspd's metadata of a Parquet file. If `columns` is None, read all columns.
 
     Raises FormatError: the file is not from graspd, has an unknown version, or is damaged. `where` names it.
     """

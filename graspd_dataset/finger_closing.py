@@ -38,8 +38,8 @@ class ClosingState:
 
     Attributes:
         poses: current poses of the hands, in the object frame.
-        floor: smallest allowed gap of each link, to the object and to the hand itself [m]. Negative if it was at the
-            start.
+        floor: smallest allowed gap of each link, to the object and to the hand itself [m]. Negative if the hand
+            overlapped at the start.
         stride: fraction of a full step that each joint tries next, equal for the joints of a finger.
         blamed: links that would have gone below their smallest gap in the last refused step.
         stopped: joints that have arrived.
@@ -177,7 +177,7 @@ def link_gaps(problem: Problem, poses: Poses, sphere_links: Int[Tensor, "spheres
 
 
 def sphere_overlap(problem: Problem, placed: HandPlacement) -> Float[Tensor, "batch spheres"]:
-    """Return how deep each proxy sphere overlaps spheres of non-adjacent links at most [m]. Zero without overlap."""
+    """Return each proxy sphere's greatest overlap with spheres of non-adjacent links [m]. Zero without overlap."""
     centers = place_points(problem.hand.spheres.matrix, placed.links)
     reach = problem.hand.spheres.radii[:, None] + problem.hand.spheres.radii[None, :]
     depth = (reach - torch.cdist(centers, centers)).clamp_min(0.0) * (problem.hand.spheres.weight > 0)

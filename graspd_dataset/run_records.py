@@ -69,7 +69,7 @@ def failure(error: BaseException, kind: str = "raised") -> dict[str, Any]:
 
 @lru_cache
 def code_version(sources: tuple[str, ...] = ()) -> str:
-    """Return the package's version and a hash of the sources that figures depend on.
+    """Return the package's version and a hash of the sources that results depend on.
 
     These are all Python and C++ sources of graspd_core except `_BESIDE`. `sources` adds files by glob patterns relative
     to the parent folder of graspd_core.

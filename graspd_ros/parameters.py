@@ -266,7 +266,7 @@ def parameter_warnings(settings: Settings) -> list[str]:
 
 
 def _unknown_frames(settings: Settings, changed: Collection[str], known: Sequence[str]) -> list[str]:
-    """Return a warning for each changed frame that is not in /tf. Without any transform yet, there is no warning."""
+    """Return a warning for each changed frame that is not in /tf. If /tf is still empty, there is no warning."""
     found = []
     for name in ("sensor_frame", "output_frame", "fixed_frame", "arm_base_frame"):
         frame = getattr(settings, name).removeprefix("/")

@@ -60,7 +60,7 @@ class Request:
         T_frame_object: pose of the object's own frame in `frame` [m]. None if both are the same.
         only_newest: if True, a newer request of this kind replaces this one while it waits.
         listener: receives the request's messages in addition to the topics. May be None.
-        timeless: True if the request has no stamp of its own. Then the newest transforms are used.
+        timeless: True if the request has no stamp. Then the newest transforms are used.
         object_key: equal for requests of the same object in the same measurement. An empty key equals no other.
         exclude: ids of grasps. The answer must contain no similar grasp.
         exclude_poses: frames and base-link poses of grasps to exclude in the same way.

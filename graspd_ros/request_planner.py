@@ -79,8 +79,8 @@ class Planned:
         worked_on: False if the request ended before any run.
         mass: object's mass in the trials [kg]. 0 without trials.
         mass_assumed: True if the request gave no mass.
-        objects: place [m] of each object seen, and why it has no verified grasp, for a request of any object. The first
-            is the one of the grasps.
+        objects: for a request for any object, the place [m] of each object seen, and why it has no verified grasp. The
+            grasps belong to the first.
         surface: the object's mesh in its own frame [m]. None if it was not loaded.
         held: the object's hull in the base link's frame at the first grasp [m]. None without a usable grasp or mesh.
     """

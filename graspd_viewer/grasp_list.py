@@ -1,4 +1,4 @@
-"""List of grasps beside the scene: filter, order and figures as text and HTML.
+"""List of grasps beside the scene: filter, order and values as text and HTML.
 
 Names and reasons may come from untrusted files, so all of them are escaped.
 """
@@ -41,7 +41,7 @@ def standing(grasp: Grasp) -> str:
 
 
 def listed(grasps: Sequence[Grasp], which: str, by: str) -> list[int]:
-    """Return the ranks of the grasps that pass filter `which`, sorted best first by `by`. Missing figures come last.
+    """Return the ranks of the grasps that pass filter `which`, sorted best first by `by`. Missing values come last.
 
     An unknown filter or order counts as the first one. Only a forged message can contain it.
     """
@@ -55,7 +55,7 @@ def listed(grasps: Sequence[Grasp], which: str, by: str) -> list[int]:
 
 
 def _value(grasp: Grasp, rank: int, by: str) -> float | None:
-    """Return the sort key of a grasp (smaller is better). None if the grasp lacks the figure."""
+    """Return the sort key of a grasp (smaller is better). None if the grasp lacks the value."""
     if by == "score":
         return -grasp.score
     if by == "probability":
@@ -104,7 +104,7 @@ def table_html(grasps: Sequence[Grasp], ranks: Sequence[int], chosen: int | None
 
 
 def figures_html(grasp: Grasp, rank: int) -> str:
-    """Return all figures of one grasp. Each has its description as a tooltip."""
+    """Return a table of all values of one grasp. Each has its description as a tooltip."""
     r, g, b = (round(255 * channel) for channel in VERDICTS[grasp.verdict])
     reason = f": {html.escape(grasp.reason)}" if grasp.reason else ""
     head = f"<b>#{rank} <span style='color:rgb({r},{g},{b})'>{standing(grasp)}</span></b>{reason}"

@@ -119,7 +119,7 @@ class Viewer:
         self._jobs.submit(kind, work)
 
     def run(self, work: Callable[[StopHook], None]) -> None:
-        """Stop the present run and call `work` in the planning thread. Without `plan` it does nothing."""
+        """Stop the present run and call `work` in the planning thread. Do nothing if visitors may not plan."""
         if self._planner is not None:
             self._planner.close()
             self._planner.begin(work)

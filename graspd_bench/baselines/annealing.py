@@ -4,8 +4,8 @@ Eigengrasps are the principal components of human hand postures. No recordings o
 Here the components are those of seeded random postures between open and closed, in which the fingers mostly close
 together. The first component is the closing of the hand, the next ones are differences between fingers.
 
-The state of a chain is the base pose and the amplitudes of a few eigengrasps. Its energy is that of GraspIt!. It is a
-mean over contact locations i on the inside of the hand, of their distance and how far they face away:
+The state of a chain is the base pose and the amplitudes of a few eigengrasps. Its energy is that of GraspIt!, a mean
+over contact locations i on the inside of the hand. It grows with their distance, and if they face away:
 
     E = mean_i |d_i| + α (1 − n_i · o_i)        α = 50 mm, o_i: unit direction from location i to the object
 

@@ -4,7 +4,7 @@ The URDF of the hand is written from the HandModel and not read from the hand's 
 same solids, masses and joint frames. The object consists of convex parts.
 
 A BulletWorld is plain data, from which every trial builds its own simulation. Bullet keeps contacts and solver state
-between trials, so with a shared simulation a figure would depend on earlier trials.
+between trials, so with a shared simulation a result would depend on earlier trials.
 """
 
 from __future__ import annotations
@@ -329,7 +329,7 @@ def bullet_displacement(
 
     The hand is frozen in its grasp. This is ObMan's protocol (Hasson et al., CVPR 2019), which papers report,
     implemented from its parameters. docs/metrics.md lists the deviations. An object in free fall moves 10.7 cm, so a
-    figure near 10.7 cm only says that the hand does not hold.
+    result near 10.7 cm only says that the hand does not hold.
     """
     return float(displacements(world, posture, directions).mean())
 

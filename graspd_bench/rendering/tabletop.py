@@ -91,7 +91,7 @@ def on_table(target: TriangleMesh, others: Sequence[TriangleMesh] = ()) -> Table
 def lowest_pose(mesh: TriangleMesh) -> Float[np.ndarray, "4 4"]:
     """Return the pose on z = 0 with the lowest centre of mass. It is always stable.
 
-    The mesh rests on the facet of its convex hull nearest to the centre of mass, whose projection is in that facet.
+    The mesh rests on the facet of its convex hull that is nearest to the centre of mass.
     """
     from scipy.spatial import ConvexHull
 

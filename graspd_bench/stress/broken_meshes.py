@@ -282,7 +282,7 @@ def _shape(name: str, **settings: Any) -> Callable[[Path], Scene]:
 
 
 def _poisoned(channel: int, value: float) -> Callable[[Path], Scene]:
-    """Return a loader of a scene whose SDF has a bad value at a node on the surface, where fingers sample it."""
+    """Return a loader of a scene with a bad value in its SDF, at a grid node on the surface, which fingers sample."""
 
     def scene(folder: Path) -> Scene:
         clean = load_scene("shape:cylinder")

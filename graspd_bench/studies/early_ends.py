@@ -138,7 +138,7 @@ def _run(trial: Trial, grasp: Grasp, full: bool, error: Any) -> Record:
 
 
 def _figures(rows: Sequence[Record]) -> list[str]:
-    """Return the cells of one trial's row. A trial of a figure (gravity) gets its greatest difference."""
+    """Return the cells of one trial's row. For a trial that measures a length, give the greatest difference."""
     from scipy.stats import beta
 
     if "figure" in rows[0]["early"]:

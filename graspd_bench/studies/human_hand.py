@@ -160,7 +160,7 @@ def run_mano(case: HumanGrasps) -> Record:
 
 
 def mano_sections(records: Sequence[Record], chart: Path | None) -> Sections:
-    """Return a table with rows for the objects, their mean, and the paper's figures."""
+    """Return a table with rows for the objects, their mean, and the results of the paper."""
     body = []
     for softness in dict.fromkeys(r["softness"] for r in records):
         alike = [r for r in records if r["softness"] == softness]

@@ -2,8 +2,8 @@
 
     graspd bench --import FOLDER --hand NAME
 
-What a file says about its own success is ignored. Refused grasps count as failed, as do grasps that our planner does
-not find. Shares refer to all imported grasps of an object, or to the first `--count` of them.
+The study ignores whether a file marks a grasp as failed. Grasps that the import refuses, and grasps that our planner
+does not find, count as failed. Shares refer to all imported grasps of an object, or to the first `--count` of them.
 """
 
 from __future__ import annotations
@@ -127,7 +127,7 @@ def _theirs(case: ImportedCase, hand: HandModel) -> tuple[ImportedGrasp, ...]:
 
 
 def tried(scene: Scene, hand: HandModel, grasps: Sequence[Grasp], trials: Sequence[str]) -> list[dict[str, Any]]:
-    """Return for every grasp its metrics, and the figures of each trial by name."""
+    """Return for every grasp its metrics, and the results of each trial by name."""
     context, parts = make_metrics_context(scene.object, hand), object_parts(scene.object)
     results: list[dict[str, Any]] = [{"metrics": dict(measure(context, grasp.grasp))} for grasp in grasps]
     for name in trials if grasps else ():

@@ -247,7 +247,7 @@ def _marks(own: Sequence[Record]) -> str:
 
 
 def calibration(stated: Sequence[tuple[float, bool]], where: str = "") -> list[str]:
-    """Return the Brier score and the share held at each stated probability. `stated`: pairs (probability, held)."""
+    """Return the Brier score and the share held at each stated probability. `stated` has pairs (probability, held)."""
     if not stated:
         return []
     levels = sorted({probability for probability, _ in stated}, reverse=True)

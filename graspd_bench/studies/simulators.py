@@ -81,7 +81,7 @@ def simulator_sections(records: Sequence[Record], chart: Path | None) -> Section
         if t["mujoco"]["passed"] != t["bullet"]["passed"]
     ]
     pairs = np.array([[t["sd_bullet"], t["sd_mujoco"]] for _, t in rows]) * 100
-    line = f"**{agreed:.1%}** of {len(rows)} have the same verdict; MuJoCo has that of pulls of 2 s for {same}."
+    line = f"**{agreed:.1%}** of {len(rows)} have the same verdict; for {same}, MuJoCo's equals that of full pulls."
     moved = (
         f"Displacement trial: mean {pairs[:, 0].mean():.2f} cm in PyBullet, {pairs[:, 1].mean():.2f} cm in MuJoCo, "
         f"median {np.median(pairs[:, 0]):.2f} and {np.median(pairs[:, 1]):.2f} cm; within 5 mm of each other on "

@@ -142,11 +142,11 @@ def _in_boxes(hand: HandModel, grasp: Grasp, goal: Steering) -> bool:
 
 def steered_sections(records: Sequence[Record], chart: Path | None) -> Sections:
     """Return a table of success and cost by kind of constraint."""
-    headings = ["wish", "requests", "with a verified grasp", "without the wish", "grasps of those asked for"]
+    headings = ["constraint", "requests", "with a verified grasp", "without it", "grasps of those asked for"]
     headings += [
-        "without the wish",
+        "without it",
         "CPU s, median",
-        "without the wish",
+        "without it",
         "beyond cone, at worst",
         "beyond region",
         "in boxes",

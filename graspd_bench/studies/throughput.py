@@ -1,6 +1,6 @@
 """Study `throughput`: verified grasps per second of wall time for a known object, on one and on two threads.
 
-Cases that run at the same time share the cores, so the figures are valid only with `--processes 1` on an idle machine.
+Cases that run at the same time share the cores, so the results are valid only with `--processes 1` on an idle machine.
 """
 
 from __future__ import annotations
@@ -70,7 +70,7 @@ def throughput_sections(records: Sequence[Record], chart: Path | None) -> Sectio
 
 
 def _figures(rows: Sequence[Record]) -> list[float]:
-    """Return tried per verified grasp, then for each number of threads: verified per second, CPU ms per verified."""
+    """Return tried grasps per verified one. For each number of threads add verified grasps per second, CPU ms each."""
     found = [sum(row["tried"] for row in rows) / sum(row["verified"] for row in rows)]
     for threads in THREADS:
         here = [row for row in rows if row["threads"] == threads]

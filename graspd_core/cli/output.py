@@ -89,7 +89,7 @@ def print_error(text: object) -> None:
 
 
 def bar(what: str, total: int | None, done: int = 0, **settings: Any) -> Any:
-    """Return a tqdm progress bar on a terminal. Return None elsewhere and with `--quiet`."""
+    """Return a tqdm progress bar. Return None with `--quiet` or without a terminal."""
     if not _draws():
         return None
     from tqdm import tqdm
@@ -139,7 +139,7 @@ def waiting(items: Iterable[T], what: str, total: int | None = None) -> Iterator
 
 
 class Reporter:
-    """Progress display of a run: a bar on a terminal, elsewhere one line per stage."""
+    """Progress display of a run: a bar on a terminal, otherwise one line per stage."""
 
     def __enter__(self) -> Reporter:
         self._bar: Any = None

@@ -50,8 +50,8 @@ def coerced(
 def yaml_values(path: Path) -> Iterator[Any]:
     """Yield the values of a YAML file, an empty mapping for an empty file.
 
-    If a ConfigError raised inside the block begins with a dotted key, with or without the file's name, it gets the path
-    and the line of that key. Raises ConfigError if the file is missing or malformed.
+    A ConfigError that begins with a dotted key and is raised inside the block gets the file's path and the key's line.
+    Raises ConfigError if the file is missing or malformed.
     """
     try:
         node, values = parse_yaml(path.read_text(encoding="utf-8"))

@@ -1,4 +1,4 @@
-"""Planning settings that all methods share, and the certainty that a verified grasp of a seen object needs."""
+"""Planning settings of all methods, and the certainty required of grasps of objects that cameras saw."""
 
 from __future__ import annotations
 

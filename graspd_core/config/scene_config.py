@@ -89,7 +89,7 @@ class ReconstructionConfig:
         open_share: the hidden side is guessed only if at least this fraction of the surface is missing.
         revolution_share: least fraction of the seen surface that a body of revolution must explain.
         symmetry_worth: symmetries with a lower score are ignored as chance. The highest score is 2.6.
-        poisson: solver for the surface: "open3d", or "grid", which uses Open3D only if its own surface does not fit.
+        poisson: solver for the surface: "open3d", or "grid" with Open3D as fallback if its surface does not fit.
         poisson_cell: approximate width of the finest cells of Open3D's solver, twice the camera's noise [m].
         min_cell: least cell width of the grid that the surface is closed on, also twice the noise [m].
         fit_distance: a mesh is refused unless 85 % of the seen points are this near to it [m].

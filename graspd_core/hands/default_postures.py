@@ -109,7 +109,7 @@ def around_ball(
 def _missed(
     fingers: Fingers, goal: FingertipGoal, away: Float[Tensor, "starts tips 3"]
 ) -> tuple[Float[Tensor, "starts"], Float[Tensor, "starts"]]:
-    """Return two costs of fingertips at `away` from the ball [m]: squared error [finger lengths²], one-sidedness."""
+    """Return two costs of fingertips at `away` from the ball's centre [m]: squared error [finger lengths²], bias."""
     if goal.directions is not None:
         missed = ((away - goal.radius * torch.as_tensor(goal.directions)) / fingers.length).square().sum(-1)
         mean = missed.mean(-1) if goal.weights is None else missed @ torch.as_tensor(goal.weights)
@@ -205,7 +205,7 @@ def _along(hand: HandModel, fingers: Fingers) -> Float[np.ndarray, "3"]:
 def _first_bends(
     hand: HandModel, fingers: Fingers, q: Float[np.ndarray, "joints"], along: Float[np.ndarray, "3"]
 ) -> Float[np.ndarray, "tips 3"]:
-    """Return for each finger the position of its first joint that does not turn it about `along`, base frame [m]."""
+    """Return for each finger its first joint that does not turn the finger about `along`, base frame [m]."""
     rotations, translations = link_poses(hand, q)
     places = fingers.roots.copy()
     for finger, tip in enumerate(fingers.links):

@@ -173,7 +173,7 @@ def solid_distance(
 def solid_bound(
     solids: CollisionTensors, links: SE3, points: Float[Tensor, "batch points 3"]
 ) -> Float[Tensor, "batch points solids"]:
-    """Return a cheap lower bound of `solid_distance` [m]: the largest coordinate of the offset from the box."""
+    """Return a cheap lower bound of `solid_distance` [m]: the largest offset from the solid's box along its axes."""
 
     def whole(links: SE3, points: Tensor) -> Tensor:
         return (_to_solids(solids, links, points).abs() - (solids.core + solids.radius[:, None])).amax(-1)
@@ -202,7 +202,7 @@ def _to_solids(
 def pair_distance(
     solids: CollisionTensors, links: SE3, points: Float[Tensor, "batch pairs 3"], which: Int[Tensor, "batch pairs"]
 ) -> Float[Tensor, "batch pairs"]:
-    """Return the signed distance [m] of each base-frame point to its own solid `which`."""
+    """Return the signed distance [m] of each base-frame point to the solid with its index in `which`."""
     rows = torch.arange(len(points), device=points.device)[:, None]
     in_link = links[rows, solids.link[which]].apply_inverse(points[..., None, :])
     local = SE3(solids.rotation, solids.translation)[which].apply_inverse(in_link).squeeze(-2)

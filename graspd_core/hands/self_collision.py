@@ -145,7 +145,7 @@ def link_overlaps(
 
 
 def deepest_overlap(hand: HandModel, q: Float[np.ndarray, "postures joints"]) -> Float[np.ndarray, "postures"]:
-    """Return the greatest depth [m] of a contact candidate inside a link that is not adjacent to its own."""
+    """Return the greatest depth [m] of a contact candidate inside a link not adjacent to the candidate's link."""
     overlap = link_overlaps(hand, q, hand.candidate_points, hand.candidate_link)
     return np.where(hand.adjacent, 0.0, overlap).max((1, 2))
 

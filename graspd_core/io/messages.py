@@ -1,4 +1,4 @@
-"""Conversion of ROS messages to arrays: for live and recorded messages and all objects with the same attributes."""
+"""Conversion of ROS messages to arrays. Messages may be live, recorded, or other objects with the same attributes."""
 
 from __future__ import annotations
 
@@ -73,7 +73,7 @@ def finite_points(pixels: Float[np.ndarray, "height width 3"]) -> Float[np.ndarr
 
 
 def pixels_from_message(message: Any) -> Float[np.ndarray, "height width 3"]:
-    """Return all points of a PointCloud2 as an image, including NaN and infinite ones. Raises CloudError as above."""
+    """Return the points of a PointCloud2 as an image, NaN and infinity too. Raises CloudError: empty or malformed."""
     width, height, data = message.width, message.height, memoryview(message.data)
     if width == 0 or height == 0:
         raise CloudError(f"the cloud is empty: width={width}, height={height}")
@@ -233,7 +233,7 @@ def image_size(message: Any) -> tuple[int, int]:
         bins = max(message.binning_x, 1), max(message.binning_y, 1)
         return (message.roi.width or message.width) // bins[0], (message.roi.height or message.height) // bins[1]
     if hasattr(message, "format"):
-        return _size_of_compressed(memoryview(message.data))
+        return _size_of_compressed(memoryview(message.data), message.format)
     return message.width, message.height
 
 
@@ -260,9 +260,9 @@ def depth_from_message(image: Any) -> DepthImage:
     return depth_in_metres(pixels.astype(dtype.newbyteorder("=")), image.encoding)
 
 
-def _size_of_compressed(data: memoryview) -> tuple[int, int]:
+def _size_of_compressed(data: memoryview, told: str) -> tuple[int, int]:
     """Return width and height [pixels] of the PNG in a CompressedImage. Raises CloudError if there is no usable PNG."""
-    at = _png_begins(data) + 16
+    at = _png_begins(data, told) + 16
     if len(data) < at + _PNG_SIZES.size:
         raise CloudError(f"depth image: its PNG is cut off, the message has {len(data)} bytes")
     width, height = _PNG_SIZES.unpack_from(data, at)
@@ -281,15 +281,15 @@ def _depth_from_compressed(data: memoryview, told: str) -> DepthImage:
 
     encoding = told.partition(";")[0].strip() if ";" in told else "16UC1"
     kind, unit = depth_encoding(encoding)
-    _size_of_compressed(data)
-    begins = _png_begins(data)
+    _size_of_compressed(data, told)
+    begins = _png_begins(data, told)
     try:
         with Image.open(io.BytesIO(data[begins:])) as picture:
             mode, pixels = picture.mode, np.asarray(picture)
     except Exception as error:  # for a broken file, the library may raise any exception
         raise CloudError(f"depth image: a broken PNG ({error})") from None
     if not mode.startswith("I"):
-        raise CloudError(f"depth image: format {told[:64]!r} holds a PNG of mode {mode}; one of 16 bits is depth")
+        raise CloudError(f"depth image: format {told[:64]!r} holds a PNG of mode {mode}; valid: 16 bits a pixel")
     if kind[0] == "u":
         return depth_in_metres(pixels.astype(np.uint16), encoding)
     if not begins:
@@ -300,14 +300,11 @@ def _depth_from_compressed(data: memoryview, told: str) -> DepthImage:
     return depth_in_metres(np.where(pixels > 0, depth, np.float32(0)).astype(np.float32), "32FC1")
 
 
-def _png_begins(data: memoryview) -> int:
+def _png_begins(data: memoryview, told: str) -> int:
     for at in (_QUANTISED.size, 0):
         if bytes(data[at : at + len(_PNG)]) == _PNG:
             return at
-    raise CloudError(
-        "depth image: a CompressedImage without a PNG; valid: compressedDepth of format png (rvl is not read, jpeg is "
-        "no depth)"
-    )
+    raise CloudError(f"depth image: format {told[:64]!r}, and the data is no PNG; valid: '16UC1; compressedDepth png'")
 
 
 def depth_and_camera(image: Any, info: Any, *, rectified: bool = False) -> tuple[DepthImage, PinholeCamera]:
@@ -341,7 +338,7 @@ def cloud_from_depth_message(image: Any, info: Any, *, rectified: bool = False) 
 
 
 def add_transforms(buffer: TransformBuffer, message: Any, *, static: bool) -> tuple[str, ...]:
-    """Add the transforms of a tf2_msgs/TFMessage to a buffer. Skip invalid ones and return an error line for each."""
+    """Add the valid transforms of a tf2_msgs/TFMessage to a buffer. Return one error line for each invalid one."""
     refused = []
     for item in message.transforms:
         try:

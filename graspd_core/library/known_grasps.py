@@ -1,6 +1,6 @@
 """Find stored grasps of a known object for the present scene. Missing grasps are planned and added to the library.
 
-A name or a mesh file identifies the object. If the library does not have it, the error lists what it has. A stored
+A name or a mesh file identifies the object. If the library lacks it, the error lists the known objects. A stored
 grasp is checked against support and obstacles. If the hand would collide, the grasp is refused. If the hand comes near,
 the trials are repeated. Otherwise the stored trials remain valid.
 """
@@ -102,7 +102,7 @@ def entry_by_file(
     *,
     required: bool = True,
 ) -> LibraryEntry | None:
-    """Return the entry of a mesh file, or of shape:NAME, at a scale. None if there is none and it is not required.
+    """Return the entry of a mesh file, or of shape:NAME, at a scale. None if it is missing and not required.
 
     Raises:
         ConfigError: the library has no entry of this content, scale, hand and physics.
@@ -185,7 +185,7 @@ def known_grasps(
         count: greatest number of grasps.
         restrictions: as for `plan_grasps`.
         verify: trials that the grasps must have passed. Stricter trials count too.
-        wanted: function that selects the stored grasps that may be returned.
+        wanted: function that filters the stored grasps.
         stop: asked during the trials. True ends them.
 
     Raises:
@@ -325,7 +325,7 @@ def _held(
 
 
 def clearance(scene: Scene, hand: HandModel, grasps: Sequence[Grasp]) -> Float[np.ndarray, "grasps"]:
-    """Return each hand's least distance [m] to support and obstacles from retreat to squeeze. Infinite without any."""
+    """Return each hand's least distance [m] to support and obstacles from retreat to squeeze. Infinite without both."""
     obstacles = make_obstacle_tensors(scene, hand, "cpu", torch.float64)
     if obstacles is None or not grasps:
         return np.full(len(grasps), np.inf)

@@ -1,8 +1,8 @@
 """Approximate convex decomposition of an object by greedy planar cuts, in the object frame [m]. Hollows stay hollow.
 
 Each part is the convex hull of a cluster of surface points. The bulge of a cluster is how far its hull extends outside
-the object, by the signed distance grid. The cluster with the largest bulge is cut by the plane that leaves the least
-bulge, until all bulges are within tolerance or there are enough parts. Then touching clusters are joined again.
+the object, by the signed distance grid. Each cut divides the cluster with the largest bulge, by the plane that leaves
+least bulge. It ends once all bulges are within tolerance or there are enough parts. Touching clusters are then joined.
 """
 
 from __future__ import annotations
@@ -160,7 +160,7 @@ def _bulge_left(sdf: GridSDF, points: Points, cut: _Cut) -> float:
 
 
 def _join(sdf: GridSDF, clusters: list[Points], tolerance: float, most: int) -> list[Points]:
-    """Join touching clusters, least bulge first, while that is within `tolerance` [m] or over `most` clusters exist."""
+    """Join touching clusters, least bulge first, while it is within `tolerance` [m] or over `most` clusters remain."""
     alive = dict(enumerate(clusters))
     boxes = {name: (cluster.min(0), cluster.max(0) + OVERLAP) for name, cluster in alive.items()}
     heap: list[tuple[float, bool, int, int]] = []

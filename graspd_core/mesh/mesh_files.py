@@ -1,7 +1,7 @@
 """Mesh files: reading, checking, cleaning, writing and mass properties. Lengths are in metres.
 
-A file that holds no mesh, or a part of one, raises an error that says what it holds. A guess at the unit of a file only
-goes into a message and is never applied.
+If a file holds no mesh, or only a part of one, the error says what it holds. A guess at the unit of a file only goes
+into a message and is never applied.
 """
 
 from __future__ import annotations

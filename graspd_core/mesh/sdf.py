@@ -155,10 +155,10 @@ def is_solid(sdf: GridSDF) -> bool:
 
 
 def _closest_to_nodes(surface: Surface, nodes: _Vectors, spacing: float) -> tuple[_Vectors, _Vectors]:
-    """Return a surface point for each node and its face normal. Within `BAND`, the point is exactly the closest one.
+    """Return a surface point for each grid node and its face normal. Within `BAND`, it is exactly the closest point.
 
-    Beyond `BAND`, normals are zero. The middle node of each block is exact too, and bounds the distances of the block's
-    other nodes from below. Nodes that cannot lie in the band start with the surface point of their middle node.
+    Beyond `BAND`, normals are zero. The grid is divided into blocks. The exact distance of a block's middle node gives
+    lower bounds for the block's other nodes. Nodes beyond `BAND` by this bound start with the middle node's point.
     """
     counts = nodes.shape[1:]
     middles = [np.minimum(np.arange(_BLOCK // 2, n + _BLOCK // 2, _BLOCK), n - 1) for n in counts]

@@ -147,7 +147,7 @@ def assemble(
 
 
 def finished(problem: Problem, hand: HandModel, some: Staged) -> list[Grasp]:
-    """Return the grasps of staged poses with their scores, in the same order."""
+    """Return the grasps of the poses that `staged` has prepared, with their scores, in the same order."""
     scores = score(problem, some)
     if problem.obstacles is not None:
         depth = -gap_on_path(problem.obstacles, problem.hand.kinematics, some.opened, some.poses)
@@ -159,7 +159,7 @@ def finished(problem: Problem, hand: HandModel, some: Staged) -> list[Grasp]:
 def staged(
     problem: Problem, hand: HandModel, poses: Poses, config: PlanConfig, stop: Callable[[], bool] = lambda: False
 ) -> Staged:
-    """Compute contacts, squeeze and pregrasp of every pose. The caller limits the batch to what fits in memory."""
+    """Compute contacts, squeeze and pregrasp of every pose. The caller must choose batches that fit in memory."""
     poses = settle(problem, poses, stop)
     contact_set = find_contacts(problem, poses, config.grasp_stages.touch_reach)
     effort = torch.as_tensor(hand.effort).to(problem.hand.lower)

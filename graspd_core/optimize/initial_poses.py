@@ -87,8 +87,8 @@ def draw_starts(
     As in Grasp'D, the palm faces a random surface point with a random roll. Points are on the hull, so that no palm
     starts inside a hollow. Narrow cross-sections are preferred. A share `fingertips` of the starts has half-closed
     fingers, with the fingertips at the point instead of the palm. An open hand does not reach objects that are small or
-    low on a table. Poses are unlikely if the hand penetrates an obstacle there or at its retreat. With restrictions, at
-    most `_MOST_POOLS` pools are drawn. If they allow too few starts, the result has fewer than `count`, perhaps none.
+    low on a table. Poses are unlikely if the hand, or its retreat, penetrates an obstacle. With restrictions, at most
+    `_MOST_POOLS` pools are drawn. If they allow too few starts, the result has fewer than `count`, perhaps none.
     """
     generator = torch.Generator().manual_seed(seed)
     obstacles = make_obstacle_tensors(scene, hand, "cpu", torch.float64)
@@ -207,7 +207,7 @@ def _allowed(draw: Callable[[int], StartPool], wanted: int, seed: int, restricti
 def raise_clear(obstacles: ObstacleTensors, base: SE3, links: SE3) -> tuple[Positions, Values]:
     """Lift hands off the support by at most `_HIGHEST_LIFT`. `links` are the link poses in the base frame.
 
-    Returns the lifted base origins [m], and each hand's greatest depth in obstacles, there or at the retreat [m].
+    Returns the lifted base origins [m], and each hand's greatest depth in obstacles at start or retreat [m].
     """
     translation = base.translation
     if obstacles.normal is not None:
@@ -219,7 +219,7 @@ def raise_clear(obstacles: ObstacleTensors, base: SE3, links: SE3) -> tuple[Posi
 
 
 def depth_of_starts(scene: Scene, hand: HandModel, count: int, restrictions: BoundRestrictions) -> float:
-    """Return the depth in the obstacles [m] of the best of `count` starts, there or at the retreat. 0 without any."""
+    """Return the depth in the obstacles [m] of the best of `count` starts, at start or retreat. 0 without obstacles."""
     obstacles = make_obstacle_tensors(scene, hand, "cpu", torch.float64)
     if obstacles is None:
         return 0.0
@@ -233,7 +233,7 @@ def half_widths(
 ) -> Values:
     """Return the object's greatest distance from the grip, measured along the closing direction of the fingers [m].
 
-    Only the slab between the fingers counts, as wide as a hand and as deep as the fingers reach. Infinite if empty.
+    Only points between the fingers count, in a slab as wide as a hand. Infinite if the slab has no point.
     """
     normal = torch.as_tensor(hand.palm_normal)
     closing = torch.as_tensor(closing_axis(hand))

@@ -105,7 +105,7 @@ class BoundRestriction:
         return type(self).__name__
 
     def why_none(self, others: BoundRestrictions) -> str:
-        """Return why no candidate satisfies this restriction and the run's `others`. Empty if none is needed."""
+        """Return why no candidate satisfies this restriction and the run's `others`. Empty if there is no reason."""
         return ""
 
     @property
@@ -145,7 +145,7 @@ class BoundRestrictions:
 
     @property
     def impossible(self) -> str:
-        """The reason of the first restriction that can admit no grasp. Empty if each may admit one."""
+        """The reason of the first restriction that can admit no grasp. Empty if every restriction may admit grasps."""
         return next((one.impossible for one in self.each if one.impossible), "")
 
     @property
@@ -186,7 +186,7 @@ def restrictions_in_words(restrictions: BoundRestrictions, refused: Mapping[str,
     """Return a sentence about the refused candidates, most frequent reason first. Empty if none was refused.
 
     Example: "12 candidates held, 9 refused: 7 outside the approach cone, 2 with a contact outside the region".
-    If no candidate was found, it names the restrictions. `held` counts good grasps, `tried` admitted candidates.
+    If no candidate was found, it names the restrictions. `held` candidates held. `tried` candidates were admitted.
     """
     if refused:
         reasons = ", ".join(f"{n} {reason}" for reason, n in sorted(refused.items(), key=lambda item: -item[1]))

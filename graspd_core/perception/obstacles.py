@@ -167,7 +167,7 @@ def _hull_corners(points: Float[np.ndarray, "_ 3"]) -> Float[np.ndarray, "_ 3"]:
 
 
 def _points_within(shape: TriangleMesh, low: Vector, high: Vector) -> Float[np.ndarray, "_ 3"]:
-    """Return points whose hull is that of a shape's part inside a box: surface points, and corners of the box."""
+    """Return points that span the hull of a shape's part inside a box: surface points, and corners of the box."""
     from trimesh.intersections import slice_faces_plane
 
     vertices, faces = shape.vertices, shape.faces

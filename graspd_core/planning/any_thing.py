@@ -164,7 +164,7 @@ def result_of_things(things: Sequence[ThingPlan], seed: int = 0) -> GraspResult:
         ConfigError: no object meets the restrictions.
     """
     if not things:
-        raise NoObjectError("cloud: no object is seen that is no known solid; valid: a cloud with a graspable object")
+        raise NoObjectError("cloud: no object is seen, except known solids; valid: a cloud with a graspable object")
     best, results = things[0], [thing.result for thing in things if thing.result is not None]
     if best.grasp is not None and best.result is not None:
         return best.result

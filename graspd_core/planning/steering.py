@@ -198,7 +198,7 @@ class BoundSteering(BoundRestriction):
         return np.all([box.distance(palm) > 0.0 for box in self.steering.avoid for palm in palms], axis=0)
 
     def admit(self, grasps: Sequence[Grasp]) -> Sequence[Grasp | Refusal]:
-        """Return each candidate that meets all constraints, else a refusal that names the first violated one."""
+        """Return each candidate that meets all constraints. For the others, return the first violated constraint."""
         if not grasps:
             return grasps
         steering, wanted, missed = self.steering, self.wanted, dict[str, Bool[np.ndarray, "grasps"]]()
@@ -272,5 +272,5 @@ def _part_of_object(scene: Scene, region: Region, avoid: Sequence[Box]) -> Float
         )
     for number, box in enumerate(avoid):
         if (box.distance(inside) <= 0.0).all():
-            raise ConfigError(f"region: avoid box {number} covers its whole part of the object; move one of them")
+            raise ConfigError(f"region: avoid box {number} covers the object in the region; move one of them")
     return inside[:: len(inside) // _MOST_PLACES + 1]

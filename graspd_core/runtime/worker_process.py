@@ -161,7 +161,7 @@ _child: WorkerProcess | None = None
 def start_worker_process(*modules: str) -> None:
     """Start the child of `run_isolated`, so that its calls do not block other threads.
 
-    The child first imports `modules`. If there already is a child, the function does nothing.
+    The child first imports `modules`. Do nothing if there already is a child.
     """
     global _child
     if _child is None:

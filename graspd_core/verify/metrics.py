@@ -81,7 +81,7 @@ _ROWS = (
     ),
     Metric(
         "self_penetration", "mm", 1e3, lambda g: self_penetration(g.context, g.placed),
-        "greatest depth of a sample inside a link that is not adjacent to its own; links are adjacent when a joint "
+        "greatest depth of a sample inside a link not adjacent to the sample's link; links are adjacent when a joint "
         "joins them, or when they overlap by design",
     ),
     Metric(
@@ -107,7 +107,7 @@ _ROWS = (
     ),
     Metric(
         "contact_links", "", 1.0, lambda g: contact_links(g.placed),
-        "links with a sample outside by at most 2 mm, or inside", 0,
+        "number of links with a sample inside the object or within 2 mm", 0,
     ),
     Metric(
         "epsilon", "", 1.0, lambda g: g.wrench_hull.epsilon,
@@ -122,7 +122,7 @@ _ROWS = (
     ),
     Metric(
         "least_friction", "", 1.0, None,
-        "least sliding friction at which it passes the hold trial; measured with `robust.friction` only",
+        "least sliding friction at which the grasp passes the hold trial; measured with `robust.friction` only",
     ),
     Metric(
         "robustness", "", 1.0, None,

@@ -71,7 +71,7 @@ def results_in_order(
         work: function of an item and a stop hook. With one thread, the calling thread runs it. Otherwise a pool does.
         items: the items to work on.
         threads: number of threads, at least 1.
-        needed: returns how many more results the caller needs at least. So many items are started ahead.
+        needed: returns the least number of further results that the caller needs. That many are started ahead.
         known_over: also ends running work. All threads call it.
     """
     if min(threads, len(items)) <= 1:
@@ -137,7 +137,7 @@ class CheckStage:
     Attributes:
         items: the checks, in the order in which they run.
         least: number of checks that a grasp must pass. If there are fewer possible checks, it must pass all.
-        though_failed: probability that a grasp that fails this stage still holds on the true object.
+        though_failed: probability that a grasp holds on the true object although it fails this stage.
     """
 
     items: tuple[RobustnessCheck, ...]
@@ -168,7 +168,7 @@ class RobustnessChecks:
 
     Attributes:
         stages: displaced poses and less friction, which are cheap to try, then other shapes.
-        probability: probability that a grasp that passes all stages holds on the true object.
+        probability: probability that a grasp holds on the true object if it passes all stages.
         waited_for: set once a trial waits for its world, so that other trials may start.
         doubts: reasons to doubt the scene or its mass. If there are any, no check runs and no grasp passes.
     """
@@ -203,7 +203,7 @@ def begin_other_worlds(
 def robustness_checks_of(
     scene: Scene, others: Sequence[LaterWorld], trials: TrialContext, probability: float
 ) -> RobustnessChecks | None:
-    """Return the checks that a grasp must pass to reach the requested `probability`. None if there are none.
+    """Return the checks that a grasp must pass to reach the requested `probability`. None if it needs no check.
 
     `others` comes from `begin_other_worlds`. If the mass is known, a grasp must hold on all displaced poses and with
     less friction.
@@ -354,7 +354,7 @@ def _other_world(scene: Scene, hand: HandModel, protocol: Protocol, rule: str) -
 
 
 def other_scene(evidence: Evidence, rule: str, likeliest: ObjectModel) -> Scene | None:
-    """Return a scene with the hidden side guessed by `rule`, equal mass and friction. None without a guess."""
+    """Return a scene with the hidden side guessed by `rule`, at the same mass and friction. None if that fails."""
     from graspd_core.perception.reconstruct.hidden_side import other_shape
 
     mesh = other_shape(evidence, rule, likeliest.mesh)

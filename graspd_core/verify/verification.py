@@ -287,7 +287,7 @@ def _best_first(
 
 
 def _at_once(threads: int, stage: CheckStage, grasp: Grasp, stop: StopHook) -> Results:
-    """Run the checks that are needed in any case in parallel, then the others one by one."""
+    """Run the checks that every grasp needs in parallel, then the others one by one."""
     first, others = stage.items[: stage.least], stage.items[stage.least :]
     yield from results_in_order(stop, lambda item, ended: item.hold(grasp, ended), first, threads, lambda: len(first))
     yield from one_by_one(replace(stage, items=others), grasp, stop)

@@ -120,7 +120,7 @@ def add_others(spec: Any, others: Sequence[FreeBody], friction: Friction) -> tup
 
 
 def add_support(spec: Any, hand: HandModel, parts: Sequence[TriangleMesh], friction: Friction, support: Plane) -> None:
-    """Add gravity, a plane for the hand, and one at the bottom of `parts`. Without parts, both share the plane."""
+    """Add gravity, a plane for the hand, and a plane for the object at the bottom of `parts` (none without parts)."""
     spec.option.gravity = -_GRAVITY * support.normal
     add_plane(spec, TABLE, support, friction)
     for link in hand.link_names:
@@ -173,7 +173,7 @@ def add_mesh(spec: Any, name: str, vertices: np.ndarray, faces: np.ndarray) -> N
 
 
 def full_inertia(inertia: Float[np.ndarray, "3 3"], floor: float) -> list[float]:
-    """Return xx yy zz xy xz yz of a valid inertia [kg·m²]: moments of at least `floor`, triangle inequality kept."""
+    """Return xx yy zz xy xz yz of a valid inertia [kg·m²]: moments ≥ `floor`, each below the sum of the others."""
     moments, axes = np.linalg.eigh(0.5 * (inertia + inertia.T))
     moments = np.maximum(moments, floor)
     moments[2] = min(moments[2], 0.999 * (moments[0] + moments[1]))
@@ -244,7 +244,7 @@ PROTOCOLS: dict[str, Protocol] = {
 def at_friction(protocol: Protocol, friction: float) -> Protocol:
     """Return the protocol for an object of this friction, with all three coefficients scaled by friction / 0.6.
 
-    The scale is at most 1, so that no grasp passes because of high friction that nobody measured.
+    The scale is at most 1, so that no grasp passes because of an assumed high friction.
     """
     share = min(friction / Protocol.friction[0], 1.0)
     sliding, torsional, rolling = protocol.friction
@@ -275,7 +275,7 @@ class World:
         fingers: number of the hand's fingertips.
         others: body ids of the other free bodies.
         spare: `mujoco.MjData` of ended trials, which `trial_data` reuses.
-        closed: squeeze, protocol and closed-hand state of the last grasps that held, which `payload` reuses.
+        closed: squeeze, protocol and closed-hand state of the last grasps that held. `payload` reuses them.
         watch: called with the `mujoco.MjData` after every step of a trial. None in planning.
     """
 

@@ -343,9 +343,9 @@ class SourceInput:
 
 @dataclass(frozen=True)
 class Source:
-    """Source of objects. Its name in capitals is the constant in the message.
+    """Source of objects. GraspRequest has a constant with its name in capitals.
 
-    `find` returns the request without reading the object. It raises GraspdError if that is missing, old or forbidden.
+    `find` returns the request without reading the object. Raises GraspdError: the object is missing, old or forbidden.
     """
 
     name: str

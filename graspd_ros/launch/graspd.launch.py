@@ -2,7 +2,7 @@
 
 `ros2 launch graspd_ros graspd.launch.py points:=/camera/depth/color/points hand:=allegro_right output_frame:=base_link`
 
-An argument that is also a parameter of the node overrides the parameter file if it is given.
+A given argument overrides the parameter of the same name in the parameter file.
 """
 
 from launch import LaunchDescription

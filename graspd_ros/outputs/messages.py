@@ -112,7 +112,7 @@ class AnswerEnding:
     """End of a request for a GraspArray. The grasps of `result` are in the answer's frame.
 
     `mass` is the object's mass in the trials [kg], 0 without trials. `mass_assumed` is True if no mass was given.
-    `objects` has the place [m] of each object seen and why it has no verified grasp, for a request of any object.
+    For a request for any object, `objects` has the place [m] of each object seen, and why it has no verified grasp.
     """
 
     status: int
@@ -295,9 +295,9 @@ def _number(value: float, otherwise: float = UNMEASURED) -> float:
 
 
 def trajectory_of(grasp: Grasp, hand: HandModel, pace: Pace) -> JointTrajectory:
-    """Return the trajectory through pregrasp, grasp and squeeze. Its zero stamp means start on receipt, from anywhere.
+    """Return the trajectory through pregrasp, grasp and squeeze. Its stamp is zero, so it starts on receipt.
 
-    It contains only the driven joints, because controllers refuse others. Coupled joints follow without a command.
+    It contains only the driven joints, because controllers refuse others. Coupled joints follow. Any start is valid.
     Positions are within the joint limits. The last point is a target inside the object, which joints do not reach.
     """
     times = posture_times(grasp, hand, pace)
@@ -334,7 +334,7 @@ def _move_time(start: Posture, end: Posture, speed: np.ndarray, pace: Pace) -> f
 
 
 def _greatest_speeds(hand: HandModel, pace: Pace) -> np.ndarray:
-    """Return the speed limit of each actuated joint [rad/s] or [m/s], which also keeps its coupled joints in limits."""
+    """Return the speed limit of each actuated joint [rad/s] or [m/s], reduced so that coupled joints keep theirs."""
     speed = np.minimum(np.where(hand.slides, pace.base_speed, pace.joint_speed), hand.velocity)
     for mimic in hand.mimics:
         own = pace.base_speed if hand.joint_kind[mimic.link] == "prismatic" else pace.joint_speed

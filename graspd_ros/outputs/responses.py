@@ -1,7 +1,7 @@
 """Outcomes of requests as messages: one GraspArray per request, and events for clients without graspd_msgs.
 
-Only a cloud without a request that a newer cloud replaces gets no answer. It is counted. The node publishes its health
-and its counts since the start on /diagnostics.
+A cloud that comes without a request gets no answer if a newer cloud replaces it. Such clouds are counted. The node
+publishes its health and its counts since the start on /diagnostics.
 """
 
 from __future__ import annotations
@@ -109,7 +109,7 @@ class Health:
 
 
 class Counters:
-    """Thread-safe counts by name, and the figures of the last request."""
+    """Thread-safe counts by name, and the times of the last request."""
 
     def __init__(self) -> None:
         self._lock = threading.Lock()
@@ -510,7 +510,7 @@ def progress_event(progress: Progress) -> dict[str, Any]:
 
 
 def result_event(result: GraspResult) -> dict[str, Any]:
-    """Return outcome, counts, timing and the best grasp's figures. `best` is None if no grasp may be published."""
+    """Return outcome, counts, timing and the best grasp's metrics. `best` is None if no grasp may be published."""
     best = presentable(result)
     return {
         "outcome": result.outcome.name.lower(),

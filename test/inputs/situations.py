@@ -173,7 +173,7 @@ CLOUDS = (
     Situation(
         "a target where nothing is",
         array_file("a.npy", grid_of),
-        "target: nothing within 0.05 m",
+        "target: no object within 0.05 m",
         "atenpas/gpd/issues/57",
         {"target": in_camera(np.array([0.25, 0.25, 0.1]))},
     ),

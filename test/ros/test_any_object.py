@@ -95,4 +95,4 @@ def test_any_object_is_taken_and_after_a_loss_another(client, start_node, make_c
     assert nowhere.message.count("region: no part of the object lies") == 2
     bare = ask("bare", cloud=make_cloud(view.points[view.points[:, 2] < 0.003], "table"))
     assert bare.error_code == "NO_OBJECT"
-    assert bare.message.startswith("cloud: no object is seen that is no known solid")
+    assert bare.message.startswith("cloud: no object is seen, except known solids")

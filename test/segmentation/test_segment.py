@@ -238,8 +238,8 @@ def test_an_empty_table_says_what_was_seen():
 @pytest.mark.parametrize(
     ("target", "complaint"),
     [
-        (Target(point=np.array([0.0, 0.0, 0.5])), r"nothing within 0.05 m of the point .* 3 things are seen, the l"),
-        (Target(box=(np.array([0.2, 0.2, 0.2]), np.array([0.3, 0.3, 0.3]))), r"nothing in the box .* 3 things"),
+        (Target(point=np.array([0.0, 0.0, 0.5])), r"no object within 0.05 m of the point .* 3 objects are seen, the l"),
+        (Target(box=(np.array([0.2, 0.2, 0.2]), np.array([0.3, 0.3, 0.3]))), r"nothing in the box .* 3 objects"),
     ],
 )
 def test_nothing_at_the_target_lists_what_there_is(target, complaint):
@@ -250,7 +250,7 @@ def test_nothing_at_the_target_lists_what_there_is(target, complaint):
 
 def test_what_is_too_large_to_be_grasped_is_told_as_that():
     view, _ = seen(THREE.meshes)
-    with pytest.raises(NoObjectError, match=r"3 things are seen, .* each is larger than largest_object=0.03 m"):
+    with pytest.raises(NoObjectError, match=r"3 objects are seen, .* each is larger than largest_object=0.03 m"):
         segment([view], settings=SegmentationConfig(largest_object=0.03))
 
 
@@ -266,7 +266,7 @@ def test_a_first_view_that_shows_nothing_does_not_choose(blind, forward):
 
 def test_a_mask_of_background_finds_nothing():
     view, label = seen(THREE.meshes)
-    with pytest.raises(NoObjectError, match="nothing but background under the mask; 3 things"):
+    with pytest.raises(NoObjectError, match="nothing but background under the mask; 3 objects"):
         segment([view], target=Target(mask=(label == 3) & (np.abs(view.points[:, 0]) > 0.25)))
 
 

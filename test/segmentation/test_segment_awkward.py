@@ -71,7 +71,7 @@ def test_the_lower_level_of_a_stepped_table_is_what_the_object_stands_on():
 
 
 def test_an_object_at_the_border_of_the_picture_is_told():
-    assert any("reaches the border of what view 1 shows" in w for w in segment(half_out_of_view("box")).warnings)
+    assert any("reaches the border of view 1" in w for w in segment(half_out_of_view("box")).warnings)
     assert segment([view_of_box()]).warnings == ()
 
 

@@ -98,7 +98,7 @@ def efforts(joints: Float[np.ndarray, "16 3"], tips: Float[np.ndarray, "5 3"]) -
 
 
 def palm_normal(data: ManoData, joints: Float[np.ndarray, "16 3"]) -> Float[np.ndarray, "3"]:
-    """Return the unit direction out of the palm at rest, model frame. The side is that of the bent mean pose."""
+    """Return the unit direction out of the palm at rest, model frame. Fingers of the mean pose bend to this side."""
     wrist, index, little = joints[0], joints[1], joints[7]
     normal = np.cross(index - wrist, little - wrist)
     normal /= np.linalg.norm(normal)

@@ -83,7 +83,7 @@ def inside_exists(path: Path) -> bool:
 
 
 def corners_each(meshes: int) -> int:
-    """Return the greatest number of corners of each hull in a hand with this number of meshes."""
+    """Return the number of corners that each hull may have in a hand with this number of meshes."""
     return int(np.clip(_ALL_CORNERS // max(meshes, 1), _FEWEST_CORNERS, _CORNERS))
 
 

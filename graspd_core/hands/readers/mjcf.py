@@ -321,7 +321,7 @@ def _read_body(parts: _Parts, body: Any, parent: str | None) -> None:
 
 
 def _moving(parts: _Parts, joint: Any, placed: JointSpec) -> JointSpec:
-    """Return the moving joint. `placed` is a fixed joint in its place, with its name and links."""
+    """Return a MuJoCo joint as a `JointSpec`. `placed` is a fixed joint with its pose, name and links."""
     model, number = parts.model, joint.id
     kind = _KINDS.get(_type_name(joint))
     if kind is None:

@@ -216,7 +216,7 @@ def below_link(path: Path, root: ET.Element, link: str) -> None:
 
 
 def keep_links(root: ET.Element, kept: set[str]) -> None:
-    """Remove the other links from a URDF, and the joints that do not join two of `kept`."""
+    """Keep only the links in `kept` of a URDF, and the joints between two of them."""
     for link in root.findall("link"):
         if link.get("name") not in kept:
             root.remove(link)

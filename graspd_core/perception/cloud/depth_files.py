@@ -40,7 +40,7 @@ DepthCamera = tuple[PinholeCamera, Float[np.ndarray, "4 4"] | None, float | None
 
 
 def is_depth_image(path: str | Path) -> bool:
-    """Return True if the ending of a path is that of an image, which needs a camera to become points."""
+    """Return True if a path has the ending of a depth image. Such a file needs a camera file."""
     return Path(path).suffix.lower().lstrip(".") in IMAGE_ENDINGS
 
 
@@ -107,7 +107,7 @@ def _matrix(told: Mapping[str, Any]) -> list[float]:
         return _numbers(told["intrinsic_matrix"], (9,), "intrinsic_matrix").reshape(3, 3).T.reshape(-1).tolist()
     lost = [key for key in _SIMPLE if key not in told]
     if lost:
-        raise CloudError(f"K is missing, and so is {lost[0]} of fx, fy, cx, cy; it has {_keys(told)}")
+        raise CloudError(f"{lost[0]} is missing; valid: K, or fx, fy, cx and cy; it has {_keys(told)}")
     fx, fy, cx, cy = (float(_numbers(told[key], (), key)) for key in _SIMPLE)
     return [fx, 0.0, cx, 0.0, fy, cy, 0.0, 0.0, 1.0]
 
@@ -119,7 +119,7 @@ def _unit(told: Any) -> float:
         return _UNITS[word[0]]
     unit = 0.0 if isinstance(told, str) else float(_numbers(told, (), "depth_unit"))
     if not 0 < unit <= 1:
-        raise CloudError(f"depth_unit: {short_repr(told)}; valid: metres per unit up to 1, or {', '.join(_UNITS)}")
+        raise CloudError(f"depth_unit: {short_repr(told)}; valid: metres per unit in (0, 1], or {', '.join(_UNITS)}")
     return unit
 
 

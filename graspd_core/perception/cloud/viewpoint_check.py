@@ -2,8 +2,8 @@
 
 An organised cloud shows this itself: a homography maps the pixels of a pinhole camera to the lines of sight, and depth
 errors only move points along these lines. Without pixels, two things are checked. A camera sees no surface through
-another surface, and no surface from behind. If the given position is wrong, points around some points seem to hide
-them, and a part of each curved surface seems to face away from the camera.
+another surface, and no surface from behind. If the given position is wrong, some points seem to be hidden behind other
+points, and a part of each curved surface seems to face away from the camera.
 """
 
 from __future__ import annotations
@@ -72,7 +72,7 @@ def seen_from(pixels: Pixels, viewpoint: Vector, forward: Vector | None = None) 
     NaN points are kept. An image of one row or column is not checked.
 
     Raises:
-        CloudError: the pixels show that the camera stood elsewhere. The error says where.
+        CloudError: the pixels show that the camera stood at another position. The error says where.
     """
     fits = None if min(pixels.shape[:2]) < 2 else _pinhole_fits(pixels, viewpoint)
     place = _pinhole_place(pixels) if fits is False else None
@@ -180,8 +180,8 @@ def _said(viewpoint: Vector) -> str:
 def hidden_share(points: Points, viewpoint: Vector, nearer: Float[np.ndarray, "points"], tree: Any) -> float:
     """Return the fraction of points that a surface hides from the viewpoint.
 
-    A hidden point is surrounded in the image by points that are nearer by `nearer` [m], and so are most of its
-    neighbours in space. `tree` is the KD-tree of the points.
+    In the image, points that are nearer by `nearer` [m] surround a hidden point and most of its neighbours in space.
+    `tree` is the KD-tree of the points.
     """
     from scipy.spatial import KDTree
 

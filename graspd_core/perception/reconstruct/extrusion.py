@@ -1,4 +1,4 @@
-"""Guessed surfaces between an object and its support: walls beneath the outline seen from above, and the base."""
+"""Guessed surfaces between an object and its support: walls beneath the outline seen from above, and the bottom."""
 
 from __future__ import annotations
 
@@ -71,7 +71,7 @@ def with_foot(surfels: Surfels, free_space: FreeSpace, step: float) -> Surfels:
 
 
 def stand(surfels: Surfels, free_space: FreeSpace, step: float) -> Surfels:
-    """Return the walls between the lowest seen points and the support, and the base between these walls."""
+    """Return the walls between the lowest seen points and the support, and the bottom between these walls."""
     lowest = float(np.percentile(surfels.points[:, 2], 1))
     band = take(surfels, surfels.points[:, 2] < lowest + 3 * step)
     wall = np.abs(band.normals[:, 2]) < MAX_WALL_COSINE
@@ -91,7 +91,7 @@ def stand(surfels: Surfels, free_space: FreeSpace, step: float) -> Surfels:
 
 
 def _column(surfels: Surfels, free_space: FreeSpace, step: float) -> Surfels:
-    """Return walls and base beneath an object seen only high above the support, and walls beneath its higher parts."""
+    """Return walls and bottom of an object seen only high above the support, and walls beneath its higher parts."""
     order = np.argsort(surfels.points[:, 2])
     height = surfels.points[order, 2]
     level = np.cumsum(np.diff(height, prepend=height[:1]) > MAX_FOOT_HEIGHT_M)
@@ -128,7 +128,7 @@ def _walls(
 
 
 def _base(feet: Float[np.ndarray, "n 2"], free_space: FreeSpace, step: float) -> Surfels:
-    """Return the base: hidden support surface within the hull of the walls' lower ends, facing down."""
+    """Return points of the object's hidden bottom, on the support within the hull of the walls' lower ends."""
     from scipy.spatial import KDTree
 
     hull = convex_hull(feet)

@@ -1,4 +1,4 @@
-"""The hidden side of an object: the next view that would show most of it, and other shapes that it may have.
+"""The hidden side of an object: the view that would show most of it, and its other possible shapes.
 
 The other shapes come from the completion rules that the reconstruction did not choose.
 """

@@ -151,7 +151,7 @@ def march(value: Grid, axes: Sequence[Float[np.ndarray, "_"]]) -> TriangleMesh:
 
 
 def _signed(surface: TriangleMesh, nodes: Nodes, cell: float) -> Grid:
-    """Return the signed distance [m] at the nodes near the surface, and plus or minus `BAND_CELLS` cells elsewhere.
+    """Return the signed distance [m] at nodes near the surface, and plus or minus `BAND_CELLS` cells at other nodes.
 
     The surface has no border within the grid, so it divides the grid into regions. Each region takes the sign of most
     of its nodes next to the surface, which comes from the normal of the nearest face.

@@ -1,8 +1,8 @@
 """Reconstruction of a closed mesh from one or more views of an object, with the confidence of each part.
 
 The hidden part is guessed first, by the symmetry, revolution or extrusion that fits the views best. Then screened
-Poisson fits a surface to the points, with normals towards each camera. The grid solver comes first, and Open3D's if the
-grid's surface does not fit. Space that the cameras saw to be empty is cut away.
+Poisson fits a surface to the points, with normals towards each camera. It is computed on a grid, and again by Open3D if
+the first surface does not fit. Space that the cameras saw to be empty is cut away.
 """
 
 from __future__ import annotations
@@ -146,7 +146,7 @@ def _closed(
     settings: ReconstructionConfig,
     cells: int,
 ) -> TriangleMesh:
-    """Close the surface by the grid solver, or by Open3D's if `settings` ask for it or the grid's does not fit."""
+    """Close the surface by the grid solver. Use Open3D's if `settings` ask for it or the first surface does not fit."""
     adaptive = partial(poisson_field, finest=settings.poisson_cell)
     small = float(np.ptp(seen.points, axis=0).max()) < _LEAST_CELLS * settings.min_cell
     if settings.poisson == "grid" and not small:

@@ -217,7 +217,7 @@ def revolve(surfels: Surfels, free_space: FreeSpace, axis: Axis, step: float) ->
 
 
 def _ends(profile: Rows, axis: Axis, right, up, free_space: FreeSpace, step: float) -> list[Rows]:
-    """Return the rows that close a profile which ends away from the axis: a flat cap, or a curve down to the support.
+    """Return the rows that close the profile if it ends away from the axis: a flat cap, or a curve down to the support.
 
     A cap is added only if the cameras saw empty space beyond the rim. Neither may contradict the cameras.
     """

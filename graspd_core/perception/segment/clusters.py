@@ -3,7 +3,7 @@
 Occlusion splits one object into several clusters: the far wall of a cup lies behind the near wall, a rim above the
 bottom. Two clusters are joined only if they touch in some camera's image, because the edge between them is then an
 occlusion. They must also be near each other, or one must lie within the other's outline on the support. A cluster that
-ends above the support belongs to the nearest standing cluster, unless it may be an object whose foot is hidden.
+ends above the support belongs to the nearest standing cluster, unless it may be an object with a hidden foot.
 
 Touching objects form one cluster. A concave seam or a narrow waist between two standing parts suggests two objects.
 Objects of equal height that touch along a line are connected by a narrow bridge of points across their tops. One object
@@ -267,7 +267,7 @@ def _near(
     settings: SegmentationConfig,
     support: FlatPart | None,
 ) -> bool:
-    """Return True if two clusters, the larger first, are near enough to be one object. Hanging ones may be farther."""
+    """Return True if two clusters, the larger first, are near enough to be one object: farther apart if one hangs."""
     if support is None:  # two objects behind each other look like two sides of one object
         return apart <= settings.unsupported_reach
     if apart <= max(link, settings.gap) or _share_within(b, a, support) >= OUTLINE_SHARE:

@@ -51,7 +51,7 @@ class Segmentation:
         obstacles: downsampled points of each other object or surface nearby [m].
         warnings: warnings for the user.
         cut: whether the object reaches the border of an image or of the workspace.
-        beside: why the segment may be larger than the target or another object. Empty without such a reason.
+        beside: why the segment may be larger than the target or another object. Empty if there is no doubt.
     """
 
     views: tuple[PointCloud, ...]
@@ -107,9 +107,9 @@ def segment(
 def find_things(
     views: Sequence[PointCloud], settings: SegmentationConfig | None = None
 ) -> tuple[Float[np.ndarray, "_ 3"], ...]:
-    """Return the points [m] of each object from which `segment` would select. Touching objects are split at seams.
+    """Return the points [m] of each object that `segment` can select. Touching objects are split at seams.
 
-    A point of the result, given as target, selects its object. The result may be empty.
+    To select an object, give any of its points as target. The result is empty if no object is found.
 
     Raises:
         CloudError: a cloud is empty, all NaN, or has too few points.
@@ -223,7 +223,7 @@ def _doubts(parted: _Parted, chosen: Mask, crowded: bool) -> tuple[str, ...]:
     for k in range(len(scene.rows) if surrounded else 0):
         part = scene.of_view(k)
         if reaches_image_border(scene.points[part], parted.eyes[k], chosen[scene.voxel[part]], settings.border_width):
-            doubts.append(f"cloud: the object reaches the border of what view {k + 1} shows; it may go on beyond")
+            doubts.append(f"cloud: the object reaches the border of view {k + 1}, and may extend beyond it")
     if _cut_off(scene, chosen, settings):
         doubts.append("cloud: the object reaches the border of the workspace; the rest of it is not seen")
     return tuple(doubts)

@@ -143,7 +143,7 @@ def seen(scene: VoxelScene, label: Labels) -> str:
 def _thing_of(
     point: Vector, scene: VoxelScene, label: Labels, views: Sequence[PointCloud], settings: SegmentationConfig
 ) -> int:
-    """Return the object that a point selects: the object that contains the point, else the nearest within reach.
+    """Return the object that a point selects: the one that contains it, else the nearest within `target_reach`.
 
     A point is inside an object if the object's hull contains it or the object hides it from a camera, and if its depth
     is at most half the object's length. Deeper than `MIDDLE_SHARE` of the length, a nearer object is preferred.
@@ -163,8 +163,8 @@ def _thing_of(
     ]
     near = [k for k in order[:1] if depth[k] <= settings.target_reach]
     if not inside + near:
-        reach = f"within {settings.target_reach:g} m of the point {_place(point)}"
-        raise NoObjectError(f"target: nothing {reach}, or around it; {seen(scene, label)}")
+        reach = f"within {settings.target_reach:g} m of the point {_place(point)}, and none contains it"
+        raise NoObjectError(f"target: no object {reach}; {seen(scene, label)}")
     middle = [k for k in inside if depth[k] <= MIDDLE_SHARE * length[k]]
     return min(middle or near or inside, key=lambda k: depth[k] / length[k])
 

@@ -134,7 +134,7 @@ def test_depth_comes_packed_too(message, off: float):
 @pytest.mark.parametrize(
     ("message", "culprit"),
     [
-        (CompressedImage(format="16UC1; compressedDepth rvl", data=bytes(40)), "without a PNG; valid: compressedDepth"),
+        (CompressedImage(format="16UC1; compressedDepth rvl", data=bytes(40)), "the data is no PNG; valid: "),
         (CompressedImage(format="16UC1; compressedDepth png", data=packed(DEPTH).data[:60]), "a broken PNG"),
         (CompressedImage(format="16UC1; compressedDepth png", data=packed(DEPTH).data[:30]), "its PNG is cut off"),
         (
