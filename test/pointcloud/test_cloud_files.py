@@ -56,7 +56,7 @@ def test_a_ply_with_faces_is_a_mesh(tmp_path):
         (
             "a.npy",
             lambda p: np.save(p, np.array({"points": 1}, dtype=object)),
-            r"a pickled object of Python, .*np.savez\(path",
+            r"a pickled Python object, .*np.savez\(path",
         ),
         ("a.xyz", lambda p: p.write_text("0,0,1\n0,1,1\n"), "its numbers are separated by commas"),
         (

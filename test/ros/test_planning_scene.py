@@ -174,11 +174,11 @@ def test_a_message_that_cannot_be_meant_is_refused_by_name(culprit: str):
 
 
 def test_there_is_an_end_of_things():
-    wall = changed_things({}, message(**crate()))["wall"]
+    wall = updated_objects({}, message(**crate()))["wall"]
     many = {str(number): wall for number in range(MOST_OBJECTS)}
     with pytest.raises(GraspdError, match="1000 collision objects are kept already"):
-        changed_things(many, message(**crate()))
-    assert changed_things(many, message(name="7", **crate()))
+        updated_objects(many, message(**crate()))
+    assert updated_objects(many, message(name="7", **crate()))
 
 
 def request(things: Mapping[str, SceneObject], pose: np.ndarray | None = None) -> Request:

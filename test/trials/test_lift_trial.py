@@ -211,7 +211,7 @@ def test_a_lift_goes_up(context, closing):
 
 
 def test_a_trial_that_does_not_apply_is_refused(context, closing):
-    with pytest.raises(ConfigError, match="'lift': valid for this scene: hold"):
+    with pytest.raises(ConfigError, match="trial 'lift'; valid for this scene: hold"):
         record_trial(replace(context, around=None), closing(*GOOD), "lift")
 
 
