@@ -23,7 +23,7 @@ MAX_DISTANCE_IN_SIZES = 1e3
 CAMERA_PLACE_TOLERANCE_M = 1e-5
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class PointCloud:
     """Points that one camera saw. Several views of a scene are several point clouds in one frame.
 

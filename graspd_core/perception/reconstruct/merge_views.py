@@ -11,6 +11,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import lru_cache
 
 import numpy as np
 from jaxtyping import Float
@@ -183,6 +184,8 @@ def is_unposed(view: PointCloud, axis_known: bool = False) -> bool:
     return bool((far - near > MAX_RISE_CELLS * cell).mean() > most)
 
 
+# Several checks of one cloud ask this. The cache hashes clouds by identity.
+@lru_cache(maxsize=2)
 def is_all_round(view: PointCloud) -> bool:
     """Return True if points enclose a body.
 
