@@ -160,7 +160,7 @@ def gravity_trial(world: World, grasp: Grasp, protocol: Protocol, *, stop: Calla
 
 
 def _fall(world: World, data: Any, protocol: Protocol, stop: Callable[[], bool]) -> float:
-    """Simulate gravity for 2 s, or until the final displacement is known or the object lost. Return it [m]."""
+    """Simulate gravity for 2 s, until the final displacement is known or the object is lost. Return it [m]."""
     import mujoco
 
     checks, states = round(DURATION / protocol.timestep / CHECK_EVERY), list[ObjectState]()

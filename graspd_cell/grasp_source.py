@@ -93,7 +93,7 @@ class InProcessGrasps:
     Args:
         arm, hand, layout: parts of the cell.
         preset: name of graspd's preset.
-        most: greatest number of objects planned for in one view. A count, so that a busy machine changes nothing.
+        most: greatest number of objects planned for in one view. Unlike a time limit, it gives equal results.
         seed: seed of the optimiser.
         tries: failed grasps of an object before it is given up.
     """

@@ -41,7 +41,7 @@ def standing(grasp: Grasp) -> str:
 
 
 def listed(grasps: Sequence[Grasp], which: str, by: str) -> list[int]:
-    """Return the ranks of the grasps that pass filter `which`, sorted best first by `by`. Missing values come last.
+    """Return the ranks of the grasps that pass filter `which`, sorted by `by`, best first. Missing values come last.
 
     An unknown filter or order counts as the first one. Only a forged message can contain it.
     """

@@ -1,4 +1,4 @@
-"""`graspd methods`, `graspd presets` and `graspd metrics`: list the names of each, with a line about every name."""
+"""`graspd methods`, `graspd presets` and `graspd metrics`: list names, each with a description of one line."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ def add_command(commands: Any) -> None:
 
 
 def run(rows: Callable[[], dict[str, str]], options: argparse.Namespace) -> int:
-    """Print each name with its line."""
+    """Print each name with its description."""
     found = rows()
     width = max(map(len, found))
     for name, about in found.items():

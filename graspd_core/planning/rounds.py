@@ -49,8 +49,8 @@ def enough_memory(what: str) -> Iterator[None]:
 def rounds_of(scene: Scene, config: PlanConfig, verify: str) -> list[PlanConfig]:
     """Return the settings of all rounds, with increasing effort.
 
-    The first round is cheap only if failures are cheap to find: by a hold trial, on an object of known shape without
-    support or obstacles.
+    The first round has less effort only for an object of known shape without support or obstacles. A hold trial then
+    shows failures quickly.
     """
     rounds = config.rounds
     cheap = verify != "none" and scene.support is None and not scene.obstacles and scene.confidence is None

@@ -142,7 +142,7 @@ class RequestBuilder:
     def from_loader(
         self, request_id: str, header: Header, settings: Settings, load: Callable[[], Scene], listener: Listener | None
     ) -> Request:
-        """Return the request for a GraspPlanning object. If the header's frame is empty, it is in `mesh_frame`."""
+        """Return the request for a GraspPlanning object. Without a frame in the header, `mesh_frame` applies."""
         timeless = nanoseconds(header.stamp) == 0
         stamp = self._now() if timeless else header.stamp
         frame = header.frame_id or settings.mesh_frame

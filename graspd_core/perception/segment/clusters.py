@@ -178,7 +178,7 @@ def _normals(points: Points, near: Int[np.ndarray, "n near"], eyes: Eyes) -> Poi
 
 
 def _outline(points: Points, normals: Points, near: Int[np.ndarray, "n near"]) -> Bool[np.ndarray, "n"]:
-    """Return which points have a wide sector around them in the surface without neighbours (-1 in `near` is none)."""
+    """Return which points have a wide sector without neighbours in the surface. -1 in `near` is no neighbour."""
     near = near[:, 1 : 1 + _OUTLINE_NEIGHBOURS]
     way = points[near] - points[:, None]
     right = np.cross(normals, np.eye(3)[np.abs(normals).argmin(1)])
