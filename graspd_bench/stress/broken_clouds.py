@@ -306,7 +306,7 @@ def thrice(shape: str) -> Views:
 
 
 def zero_filled(shape: str) -> Views:
-    """Return a view in which two thirds of the points lie at the camera's position, as drivers fill missing depth."""
+    """Return a view with two thirds of its points at the camera, because drivers fill in zeros for missing depth."""
     (view,) = _seen(tabletop(shape, yaw=_YAW))
     lost = np.random.default_rng(_SEED).random(len(view.points)) < 2 / 3
     return [replace(view, points=np.where(lost[:, None], view.viewpoint, view.points))]

@@ -199,7 +199,7 @@ def _take_one(
     truth: Int[np.ndarray, "points"],
     seen: Sequence[Float[np.ndarray, "_ 3"]],
 ) -> bool:
-    """Execute the first verified grasp of a segment, fewest failures and highest first. Return whether there is one."""
+    """Plan for the segments, those with fewest failures first. Execute one verified grasp. Return False without one."""
     cloud = KDTree(np.vstack([view.points for view in views]))
     order = sorted(seen, key=lambda points: (run.failed_before(points.mean(0)), -float(points[:, 2].max())))
     for points in order:

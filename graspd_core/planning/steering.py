@@ -178,7 +178,7 @@ class BoundSteering(BoundRestriction):
 
     @property
     def impossible(self) -> str:
-        """Why the approach direction is impossible: the hand would come through the support. Else empty."""
+        """The reason, if the hand would pass through the support on its approach. Otherwise empty."""
         if self.scene.support is None or self.wanted.direction is None:
             return ""
         depth = depth_of_starts(self.scene, self.hand, _PROBES, BoundRestrictions((self,)))

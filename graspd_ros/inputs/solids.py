@@ -28,12 +28,12 @@ _SIZES = {SolidPrimitive.BOX: 3, SolidPrimitive.SPHERE: 1, SolidPrimitive.CYLIND
 
 
 def mesh_shapes(shapes: Collection[Mesh], poses: Collection[Pose], owner: str) -> list[TriangleMesh]:
-    """Return meshes at their poses, or at the origin without poses. Raises RequestError: invalid. It names `owner`."""
+    """Return meshes at their poses, or at the origin without poses. Raises RequestError, naming `owner`: invalid."""
     return _placed("mesh", _mesh, shapes, poses, owner)
 
 
 def primitive_shapes(shapes: Collection[SolidPrimitive], poses: Collection[Pose], owner: str) -> list[TriangleMesh]:
-    """Return the meshes of primitives at their poses. Raises RequestError: invalid. It names `owner`."""
+    """Return the meshes of primitives at their poses. Raises RequestError, naming `owner`: invalid shape."""
     return _placed("primitive", _primitive, shapes, poses, owner)
 
 

@@ -267,7 +267,7 @@ def _confirmed_and_wrong(rows: Rows, axis: Axis, right, up, free_space: FreeSpac
 
 
 def _profile(rows: Float[np.ndarray, "n 4"], step: float) -> Float[np.ndarray, "m 4"]:
-    """Return the mean row of each cell of height, radius and facing direction."""
+    """Group rows by height, radius and facing direction. Return the mean row of each group."""
     side = np.where(np.abs(rows[:, 2]) > np.abs(rows[:, 3]), 2 + (rows[:, 2] > 0), rows[:, 3] > 0)
     cells = np.column_stack([np.floor(rows[:, :2] / step).astype(int), side.astype(int)])
     _, which, count = np.unique(packed_rows(cells), return_inverse=True, return_counts=True)
