@@ -1,7 +1,7 @@
-"""The main job, end to end over DDS: a mug as a mesh path and as an RGB-D camera's cloud, verified grasps back.
+"""Request verified grasps of a mug from the node over DDS, by its mesh and by the cloud of an RGB-D camera.
 
-Starts the node in a process of its own, talks to it as any ROS program would, and leaves in demo/: `mug.obj`,
-`grasps.json`, `grasp.png` (the mesh request, two views), `grasp_from_cloud.png` and the node's log.
+The program starts the node in another process and uses its topics. It writes to demo/: `mug.obj`, `grasps.json`,
+`grasp.png` (grasp of the mesh, two views), `grasp_from_cloud.png` and the node's log.
 Run it with `make demo`, or `python examples/demo.py [DIRECTORY]`.
 """
 
@@ -43,11 +43,11 @@ Event = dict[str, Any]
 
 
 class DemoError(Exception):
-    """The demo cannot go on; says why in one line."""
+    """The demo cannot continue. The message says why in one line."""
 
 
 class Robot:
-    """The other side of the topics: publishes objects, waits for grasps."""
+    """Client of the node: it publishes objects and waits for grasps."""
 
     def __init__(self, node_process: subprocess.Popen) -> None:
         self._process = node_process
@@ -73,7 +73,7 @@ class Robot:
         self.pose = message
 
     def wait_for(self, condition: Callable[[], Any], what: str) -> Any:
-        """Spin until the condition gives something true, and return that."""
+        """Spin until the condition returns a true value, and return that."""
         end = time.monotonic() + TIMEOUT
         while not (found := condition()):
             error = next((event for event in self.events if event["event"] == "error"), None)
@@ -90,7 +90,7 @@ class Robot:
         return self.wait_for(lambda: next((e for e in self.events if e["event"] == name), None), f"event {name}")
 
     def request(self, title: str, send: Callable[[], None]) -> tuple[Event, TriangleMesh]:
-        """Send an object, print what comes, return the result event and the hand as received."""
+        """Send an object and print the answers. Return the result event and the hand as received."""
         self.events.clear()
         self.joints = self.pose = None
         begun = time.monotonic()
@@ -115,7 +115,7 @@ class Robot:
 
 
 def hand_in_object_frame(joints: JointState, stamped: PoseStamped) -> TriangleMesh:
-    """The hand at the joints and the pose that came over the topics."""
+    """Return the hand at the received joint values and pose."""
     hand = load_hand("allegro_right")
     value_of = dict(zip(joints.name, joints.position, strict=True))
     at, turn = stamped.pose.position, stamped.pose.orientation
@@ -136,7 +136,7 @@ def describe(best: dict[str, Any]) -> str:
 
 
 def cloud_of(mug: TriangleMesh) -> PointCloud2:
-    """What a depth camera sees of the mug: one side, in the camera's optical frame."""
+    """Return a cloud of one side of the mug, as a depth camera sees it, in the camera's optical frame."""
     points = cloud_from_depth(render_depth(mug, CAMERA, T_MUG_CAMERA), CAMERA).points.astype("<f4")
     fields = [PointField(name=n, offset=4 * i, datatype=PointField.FLOAT32, count=1) for i, n in enumerate("xyz")]
     cloud = PointCloud2(height=1, width=len(points), fields=fields, point_step=12, row_step=12 * len(points))
@@ -146,19 +146,19 @@ def cloud_of(mug: TriangleMesh) -> PointCloud2:
 
 
 def to_mug_frame(mesh: TriangleMesh) -> TriangleMesh:
-    """From the camera's frame to the mug's."""
+    """Return a mesh in the camera's frame moved to the mug's frame."""
     return TriangleMesh(mesh.vertices @ T_MUG_CAMERA[:3, :3].T + T_MUG_CAMERA[:3, 3], mesh.faces)
 
 
 def picture(mug: TriangleMesh, hand: TriangleMesh, path: Path) -> None:
-    """Two views side by side."""
+    """Write a picture with two views side by side."""
     scene = [(mug, MUG_COLOUR), (hand, HAND_COLOUR)]
     views = [render_shaded(scene, T_world_camera=look_at(eye, (0.0, 0.0, 0.0))) for eye in VIEWS]
     save_png(path, np.hstack(views))
 
 
 def start_node(directory: Path) -> subprocess.Popen:
-    """`graspd_node` as a user starts it; its output goes to demo/node.log."""
+    """Start `graspd_node` as a user does. Its output goes to demo/node.log."""
     parameters = [f"num_grasps:={GRASPS}", "mesh_roots:=['.']", "output_dir:=results"]
     arguments = [part for parameter in parameters for part in ("-p", parameter)]
     with (directory / "node.log").open("w") as log:
@@ -176,7 +176,7 @@ def stop_node(process: subprocess.Popen) -> None:
 
 
 def run(directory: Path, process: subprocess.Popen) -> None:
-    """Both requests, and what they leave behind."""
+    """Make both requests and write their files."""
     begun = time.monotonic()
     robot = Robot(process)
     robot.wait_for_event("ready")
@@ -199,7 +199,7 @@ def run(directory: Path, process: subprocess.Popen) -> None:
 
 
 def main() -> int:
-    """0 when both requests brought a grasp, 1 when not, 130 when interrupted."""
+    """Return 0 if both requests gave a grasp, 1 if not, 130 if interrupted."""
     directory = Path(sys.argv[1] if len(sys.argv) > 1 else "demo").resolve()
     directory.mkdir(parents=True, exist_ok=True)
     os.environ.update(ROS_DOMAIN_ID=DOMAIN, ROS_AUTOMATIC_DISCOVERY_RANGE="LOCALHOST")

@@ -1,7 +1,7 @@
-"""A depth image in, grasps out: python examples/grasp_a_cloud.py [depth.png camera.json].
+"""Plan grasps on a depth image: python examples/grasp_a_cloud.py [depth.png camera.json].
 
-The camera's file has `width`, `height`, `K` and perhaps `T_world_camera` (docs/clouds.md): the target is in that world.
-Without files, a cylinder on a table is rendered. The object is cut out and made whole; the table stays in the way.
+The camera's file has `width`, `height`, `K` and optionally `T_world_camera` (docs/clouds.md). The target is in the
+world frame. Without files, a cylinder on a table is rendered. The object is completed, and the table is an obstacle.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ from graspd_core import (
 
 
 def rendered_view() -> PointCloud:
-    """What a camera sees of a cylinder on a table: its points, and where it stood."""
+    """Return the view of a camera on a cylinder on a table: points and camera position."""
     camera = PinholeCamera(320, 240, fx=300.0, fy=300.0, cx=159.5, cy=119.5)
     (pose,) = ring_poses(1, elevation=0.6)
     ((depth, _),) = depth_views(tabletop("cylinder"), camera, [pose])
@@ -36,7 +36,7 @@ def rendered_view() -> PointCloud:
 
 
 def main(arguments: Sequence[str]) -> int:
-    """0 when there is a verified grasp, 1 when not, 2 when the view shows no object."""
+    """Return 0 if there is a verified grasp, 1 if not, 2 if the view shows no object."""
     view = load_depth_view(arguments[0], arguments[1]) if arguments else rendered_view()
     try:
         # Several views of one scene go into the list; Target also takes a box or a mask.

@@ -1,6 +1,6 @@
-"""A mesh in, verified grasps out: python examples/grasp_a_mesh.py [mug.obj] [grasps.json].
+"""Plan verified grasps of a mesh: python examples/grasp_a_mesh.py [mug.obj] [grasps.json].
 
-Coordinates of the file are metres; `scale=0.001` reads millimetres. Without a file a built-in mug is grasped.
+Coordinates of the file are metres. `scale=0.001` reads millimetres. Without a file, the object is a built-in mug.
 """
 
 from __future__ import annotations
@@ -24,13 +24,13 @@ from graspd_core import (
 
 
 def report(progress: Progress) -> None:
-    """Called while planning, here once at the end of a stage."""
+    """Print progress at the end of each stage. `plan_grasps` calls this."""
     if progress.step == progress.of:
         print(f"  {progress.elapsed:5.2f} s  {progress.stage}: {progress.verified} verified so far")
 
 
 def main(arguments: Sequence[str]) -> int:
-    """0 when there is a verified grasp, else 1."""
+    """Return 0 if there is a verified grasp, else 1."""
     source = arguments[0] if arguments else "shape:mug"
     out = arguments[1] if len(arguments) > 1 else "grasps.json"
     scene = load_scene(source, mass=0.3, friction=0.6)

@@ -1,7 +1,7 @@
-"""Your own loss weights, compared with a preset's: python examples/loss_weights.py [OBJECT] [my_preset.yaml].
+"""Compare your own loss weights with those of a preset: python examples/loss_weights.py [OBJECT] [my_preset.yaml].
 
-Every number of a preset has a dotted name: `override` changes some of them, a YAML file of the same form is a preset of
-your own. docs/method.md says what each term of the loss is.
+Every setting of a preset has a dotted name. `override` changes settings. A YAML file of the same form is a preset of
+your own. docs/method.md describes the terms of the loss.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ COUNT = 4
 
 
 def gentle(config: PlanConfig) -> PlanConfig:
-    """Less depth in the object while polishing, at the price of resistance."""
+    """Return settings that reduce depth in the object while polishing, at the cost of resistance."""
     return override(
         config,
         {
@@ -29,7 +29,7 @@ def gentle(config: PlanConfig) -> PlanConfig:
 
 
 def row(name: str, config: PlanConfig, source: str) -> str:
-    """A line of the table: how many grasps held, and their mean depth and resistance."""
+    """Return a line of the table: how many grasps held, and their mean depth and resistance."""
     result = plan_grasps(load_scene(source), load_hand("allegro_right"), count=COUNT, seed=0, preset=config)
     held = [grasp for grasp in result.grasps if grasp.verdict is Verdict.VERIFIED]
 
@@ -43,7 +43,7 @@ def row(name: str, config: PlanConfig, source: str) -> str:
 
 
 def main(arguments: Sequence[str]) -> int:
-    """Returns 0."""
+    """Print the comparison. Return 0."""
     source = arguments[0] if arguments else "shape:mug"
     fast = load_preset("fast")
     settings = {"fast": fast, "gentle": gentle(fast)}

@@ -1,7 +1,7 @@
-"""Grasps for a folder of objects: python examples/many_objects.py OUT OBJECT ... (files, folders or shape:NAME).
+"""Plan for a folder of objects: python examples/many_objects.py OUT OBJECT ... (files, folders or shape:NAME).
 
-One JSON file an object and one table of all; an object that cannot be used costs a line, not the run. What is done
-already is skipped, so that the same command resumes. Several processes, each on one core, share the work.
+The program writes a JSON file for each object, and a table. An unusable object gives a line and does not end the run.
+The same command resumes a stopped run. Several processes, each on one core, share the work.
 """
 
 from __future__ import annotations
@@ -25,13 +25,13 @@ HAND, PRESET, COUNT = "allegro_right", "fast", 4
 
 @cache
 def hand() -> graspd.HandModel:
-    """Loaded once a process; one thread, since the processes fill the cores."""
+    """Load the hand once per process. Use one thread, because the processes fill the cores."""
     torch.set_num_threads(1)
     return graspd.load_hand(HAND)
 
 
 def objects(arguments: Sequence[str]) -> Iterator[str]:
-    """Every object that the arguments name."""
+    """Return every object that the arguments name."""
     for argument in arguments:
         folder = Path(argument)
         if folder.is_dir():
@@ -41,12 +41,12 @@ def objects(arguments: Sequence[str]) -> Iterator[str]:
 
 
 def verified(grasps: Sequence[graspd.Grasp]) -> int:
-    """How many grasps held."""
+    """Return how many grasps held."""
     return sum(grasp.verdict is graspd.Verdict.VERIFIED for grasp in grasps)
 
 
 def plan(out: Path, source: str) -> tuple[str, int, str]:
-    """The object, how many grasps of it were verified, and how that ended."""
+    """Plan for an object. Return the object, its number of verified grasps, and the outcome."""
     path = out / f"{source.replace('shape:', '').replace('/', '_')}.json"
     try:
         if path.exists():
@@ -60,7 +60,7 @@ def plan(out: Path, source: str) -> tuple[str, int, str]:
 
 
 def main(arguments: Sequence[str], processes: int | None = None) -> int:
-    """The number of objects without a verified grasp."""
+    """Return the number of objects without a verified grasp."""
     out, *named = arguments or ["grasps"]
     out, sources = Path(out), list(objects(named or ["shape:mug", "shape:box"]))
     with ProcessPoolExecutor(processes or os.cpu_count(), mp_context=get_context("spawn")) as pool:

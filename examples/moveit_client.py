@@ -1,4 +1,4 @@
-"""Asks a running graspd_node for MoveIt's grasps of a box: `moveit_client.py [WIDTH DEPTH HEIGHT]`, in metres."""
+"""Request MoveIt grasps of a box from a running graspd_node: `moveit_client.py [WIDTH DEPTH HEIGHT]`, in metres."""
 
 from __future__ import annotations
 

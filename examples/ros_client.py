@@ -1,7 +1,7 @@
 """A client of the node: python examples/ros_client.py mug.obj, beside `graspd_node --ros-args -p mesh_roots:="['.']"`.
 
-Asks for grasps by the action /graspd/synthesize, shows the progress, and prints what a robot would do. A path is
-relative to the node's `mesh_roots`; to grasp what a camera sees, set `source=GraspRequest.LATEST_CLOUD` instead.
+It requests grasps by the action /graspd/synthesize, shows progress, and prints what a robot must execute. A path is
+relative to the node's `mesh_roots`. To grasp what a camera sees, set `source=GraspRequest.LATEST_CLOUD` instead.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ TIMEOUT = 120.0  # [s]
 
 
 def ask(node: Any, request: GraspRequest) -> GraspArray:
-    """Send a goal and wait for its answer; raises TimeoutError and RuntimeError."""
+    """Send a goal and wait for its answer. Raises TimeoutError and RuntimeError."""
     client = ActionClient(node, SynthesizeGrasps, "/graspd/synthesize")
     if not client.wait_for_server(timeout_sec=TIMEOUT):
         raise TimeoutError("no graspd_node answers; is it running, in the same ROS_DOMAIN_ID?")
@@ -42,7 +42,7 @@ def ask(node: Any, request: GraspRequest) -> GraspArray:
 
 
 def show_grasp(grasp: Grasp) -> None:
-    """What to execute: move the arm so that `base_link` is at the pregrasp pose, then run the trajectory."""
+    """Print what to execute: move the arm so that `base_link` is at the pregrasp pose, then run the trajectory."""
     at, touch, press = grasp.grasp_pose.position, grasp.grasp_joints, grasp.squeeze_joints
     print(f"#{grasp.rank} {grasp.base_link} at ({at.x:.3f}, {at.y:.3f}, {at.z:.3f}) m in {grasp.header.frame_id!r}")
     for name, value, target in zip(touch.name, touch.position, press.position, strict=True):
@@ -50,7 +50,7 @@ def show_grasp(grasp: Grasp) -> None:
 
 
 def main(arguments: Sequence[str]) -> int:
-    """0 when the node answered with a verified grasp, else 1."""
+    """Return 0 if the node answered with a verified grasp, else 1."""
     rclpy.init()
     node = rclpy.create_node("graspd_example_client")
     try:

@@ -1,7 +1,7 @@
 """Train a small network on a data set of `graspd dataset`: python examples/train_on_dataset.py DIR [HAND [EPOCHS]].
 
-It learns which candidates hold, before any trial, from the object's surface as the hand sees it and from the joints.
-A quarter of the objects is held out: there the share that holds is told of all and of the best half by the network.
+It learns to predict which candidates hold, from the object's surface in the hand's frame and from the joints. A quarter
+of the objects is held out. The program prints the share that holds, of all their candidates and of the best half.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ POINTS = 128
 
 
 def surface(vertices: Sequence[np.ndarray], faces: Sequence[np.ndarray], rng: np.random.Generator) -> np.ndarray:
-    """Points spread evenly over a mesh, object frame [m]."""
+    """Return points spread evenly over a mesh, object frame [m]."""
     corners = np.stack(list(vertices))[np.stack(list(faces))]
     area = np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1)
     weights = rng.dirichlet(np.ones(3), POINTS)
@@ -27,7 +27,7 @@ def surface(vertices: Sequence[np.ndarray], faces: Sequence[np.ndarray], rng: np
 
 
 def read(where: str, hand: str) -> tuple[Tensor, Tensor, Tensor, np.ndarray]:
-    """Of every candidate: the object's points in the hand's frame [m], the joints, whether it held, and the object."""
+    """Return for every candidate the object's points in the hand's frame [m], joints, whether it held, and object."""
     rows = pd.read_parquet(f"{where}/grasps", filters=[("hand", "=", hand)])
     meshes, rng = pd.read_parquet(f"{where}/objects"), np.random.default_rng(0)
     columns = (meshes[name] for name in ("object_sha256", "vertices", "faces"))
@@ -41,7 +41,7 @@ def read(where: str, hand: str) -> tuple[Tensor, Tensor, Tensor, np.ndarray]:
 
 
 class Network(nn.Module):
-    """The greatest of each feature over the points, beside the joints, to the logit of holding."""
+    """Network that computes the logit of holding from the joints and the maximum of each feature over the points."""
 
     def __init__(self, joints: int) -> None:
         super().__init__()

@@ -1,7 +1,7 @@
-"""A trial of somebody else's grasp: python examples/try_your_grasp.py [OBJECT].
+"""Try a grasp of another planner: python examples/try_your_grasp.py [OBJECT].
 
-Another planner gives the pose of a gripper and the width of what it holds. `verify_grasps` tries it in MuJoCo and
-measures it exactly as graspd's own are. For a hand of many joints, give its three postures in the same way.
+The other planner gives a gripper's pose and opening width. `verify_grasps` tries the grasp in MuJoCo and measures it
+like graspd's own grasps. For a hand with many joints, give its three postures in the same way.
 """
 
 from __future__ import annotations
@@ -19,12 +19,12 @@ OPENING, PRESS = 0.015, 0.010  # by how much each jaw opens before, and wants to
 
 @dataclass(frozen=True)
 class GripperGrasp:
-    """What another planner gives.
+    """A grasp of another planner.
 
     Attributes:
-        position: of the gripper's base in the object's frame [m].
-        quaternion_wxyz: of the gripper's base; z is the way it approaches, the jaws close along y.
-        width: between the jaws where they touch [m].
+        position: origin of the gripper's base in the object's frame [m].
+        quaternion_wxyz: orientation of the base. It approaches along z, and the jaws close along y.
+        width: distance between the jaws when they touch [m].
     """
 
     position: tuple[float, float, float]
@@ -43,7 +43,7 @@ GRASPS = {
 
 
 def as_graspd(grasp: GripperGrasp, hand: HandModel) -> Grasp:
-    """The same as three postures: open and clear, touching, and the targets that press."""
+    """Return the grasp as three postures: open away from the object, touching, and the targets that press."""
     touch = grasp.width / 2
     jaws = [np.clip([jaw], hand.lower, hand.upper) for jaw in (touch + OPENING, touch, touch - PRESS)]
     position, quaternion = np.array(grasp.position), np.array(grasp.quaternion_wxyz)
@@ -52,7 +52,7 @@ def as_graspd(grasp: GripperGrasp, hand: HandModel) -> Grasp:
 
 
 def main(arguments: Sequence[str]) -> int:
-    """How many of the grasps failed."""
+    """Return how many of the grasps failed."""
     scene, hand = load_scene(*(arguments or ["shape:box"]), mass=0.2, friction=0.6), load_hand("parallel_gripper")
     tried = verify_grasps(scene, hand, [as_graspd(grasp, hand) for grasp in GRASPS.values()], verify="standard")
     for name, grasp in zip(GRASPS, tried, strict=True):

@@ -1,7 +1,7 @@
-"""Your own hand from its URDF: python examples/your_own_hand.py [my_hand.urdf].
+"""Use your own hand from its URDF: python examples/your_own_hand.py [my_hand.urdf].
 
-A bare URDF loads with a guessed palm and guessed postures; a description in YAML beside it says what is known better.
-`graspd hands inspect my_hand.urdf --picture hand.png` shows it. Without a file, a claw is written and used.
+If a URDF has no description, palm and postures are guessed. A description in YAML beside it corrects the guesses.
+`graspd hands inspect my_hand.urdf --picture hand.png` shows the hand. Without a file, the program writes a claw.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ FINGERS = {"left": ("0 0.05 0.03", "1 0 0"), "right": ("0 -0.05 0.03", "-1 0 0")
 
 
 def claw() -> str:
-    """A URDF of a palm with three fingers of two links each."""
+    """Return a URDF of a palm with three fingers of two links each."""
     parts = [LINK.format(name="palm", mass=0.4, at="0 0 0", size="0.12 0.12 0.06")]
     for finger, (root, axis) in FINGERS.items():
         for place, parent, at in (("lower", "palm", root), ("upper", f"{finger}_lower", "0 0 0.06")):
@@ -31,7 +31,7 @@ def claw() -> str:
 
 
 def described(urdf: Path, joints: Sequence[str]) -> HandModel:
-    """The hand with a description: what the palm is, and how the hand looks open and closed."""
+    """Return the hand with a description of its palm and its open and closed postures."""
     postures = {
         name: ", ".join(f"{joint}: {angle}" for joint in joints) for name, angle in (("open", -0.3), ("closed", 0.5))
     }
@@ -46,7 +46,7 @@ def described(urdf: Path, joints: Sequence[str]) -> HandModel:
 
 
 def main(arguments: Sequence[str]) -> int:
-    """0 when the hand holds a sphere in a trial, else 1."""
+    """Return 0 if the hand holds a sphere in a trial, else 1."""
     with tempfile.TemporaryDirectory() as folder:
         urdf = Path(arguments[0]) if arguments else Path(folder) / "claw.urdf"
         if not arguments:

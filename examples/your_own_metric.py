@@ -18,7 +18,7 @@ TOUCHING = 0.002  # distance to the object that counts as contact [m]
 
 
 def contact_offset(grasp: PreparedGrasp) -> float | None:
-    """Distance of the contacts' centroid, weighted by area, to the centre of mass [m]; None without a contact."""
+    """Return the distance of the contacts' centroid, weighted by area, from the centre of mass [m], or None."""
     touching = np.abs(grasp.placed.distance) <= TOUCHING
     if not touching.any():
         return None
@@ -27,7 +27,7 @@ def contact_offset(grasp: PreparedGrasp) -> float | None:
 
 
 def main(arguments: Sequence[str]) -> int:
-    """0 when there is a verified grasp, else 1."""
+    """Return 0 if there is a verified grasp, else 1."""
     METRICS["contact_offset"] = Metric(
         name="contact_offset",
         unit="mm",
