@@ -233,7 +233,7 @@ class Move:
 
 
 def moves(old: Sequence[Record], new: Sequence[Record]) -> list[Move]:
-    """Return the changed values of each name: means over the objects of both runs ("all"), then for each object."""
+    """Return what changed between two runs, per name: the mean over common objects ("all"), then each object."""
     found: list[Move] = []
     for kind in ("raw", "verified"):
         before = {(row.name, row.object): row for row in rows(old, kind)}

@@ -39,7 +39,7 @@ class DatasetObject:
         source: shape:NAME or a mesh file.
         content: hash of the shape's or the file's content.
         scale: factor on the file's coordinates.
-        mass: mass [kg]. None assumes the upper end of what the volume allows.
+        mass: mass [kg]. If None, the largest plausible mass of its volume.
         friction: Coulomb coefficient.
     """
 
@@ -125,7 +125,7 @@ class DatasetRequest:
         scales: factors on every object's coordinates.
         random_scales: number of additional random factors per object, and their least and greatest value. Their
             logarithms are drawn uniformly.
-        mass: mass of every object [kg]. None assumes the upper end of what each volume allows.
+        mass: mass of every object [kg]. If None, the largest plausible mass of each volume.
         friction: Coulomb coefficient.
         verify: name of the trials.
         measure: which grasps get metrics: verified, all or none.

@@ -59,7 +59,8 @@ def ray_running(address: str | None, workers: int | None, folder: Path | None = 
         try:
             ray.init(**{"address": address, **options})
         except (ConnectionError, ValueError, RuntimeError) as error:
-            raise ConfigError(f"address: {address}: {' '.join(str(error).split())[-200:]}") from None
+            said = " ".join(str(error).split())[-200:]
+            raise ConfigError(f"address: no connection to Ray at {address}; does the cluster run? ({said})") from None
         try:
             yield ray
         finally:

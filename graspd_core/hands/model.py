@@ -201,7 +201,7 @@ class HandModel:
 
     @cached_property
     def link_multiplier(self) -> Float[np.ndarray, "links"]:
-        """Travel of the joint above each link per radian or metre of `link_joint`. One if that joint is actuated."""
+        """Motion of each link's parent joint per unit motion of `link_joint`. 1 if the parent is actuated."""
         multiplier = np.ones(self.num_links)
         for mimic in self.mimics:
             multiplier[mimic.link] = mimic.multiplier

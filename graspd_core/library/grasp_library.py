@@ -1,7 +1,8 @@
 """Store verified grasps in an SQLite file, with one transaction per record.
 
-The content of mesh and hand and the physics of the trials identify an entry. A write-ahead log lets readers work while
-another process writes. A killed writer loses only its own record. Each call opens and closes the file.
+The key of an entry has the content of the mesh, that of the hand, and the physics of the trials. A write-ahead log lets
+readers work while another process writes. A killed writer loses only its own record. Each call opens and closes the
+file.
 """
 
 from __future__ import annotations

@@ -169,7 +169,9 @@ def plan_config(values: Any, where: str = "config") -> PlanConfig:
     unknown = set(values) - set(hints) if isinstance(values, Mapping) else ()
     # `method_names` searches other packages, which is slow. So it is called only for an unknown key.
     if others := sorted(name for name in unknown if name in method_names()):
-        raise ConfigError(f"{where}.{others[0]}: not used by method: {named}; valid: {named}, or method: {others[0]}")
+        raise ConfigError(
+            f"{where}.{others[0]}: the method is {named}; set method: {others[0]}, or remove these settings"
+        )
     found = coerced(hints, values, where)
     return PlanConfig(**{("settings" if key == named else key): value for key, value in found.items()})
 

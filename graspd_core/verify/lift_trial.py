@@ -50,8 +50,8 @@ class LiftSettings:
     """Settings of a lift trial, in addition to the physics and limits of `world.Protocol`.
 
     Attributes:
-        retreat: distance from the retreat to the pregrasp, along the hand's approach [m].
-        approach_time: duration from the retreat to the pregrasp [s].
+        retreat: distance of the start pose behind the pregrasp, along the hand's approach [m].
+        approach_time: duration from the start pose to the pregrasp [s].
         lift_height: height of the lift [m].
         lift_time: duration of the lift [s].
         hold_time: duration of the hold after the lift [s].

@@ -207,7 +207,7 @@ def _check_camera_and_mask(message: GraspRequest) -> None:
         near(message.view_point, "view_point")
     if message.target_mask.height and (message.use_target_point or message.alone):
         other = "target_point" if message.use_target_point else "alone"
-        raise bad_request(f"target_mask: {other} is given too; give only one of target_point, target_mask, alone")
+        raise bad_request(f"target_mask: cannot be combined with {other}; remove one of them")
     _check_mask_source(message, "target_mask", message.target_mask.height)
 
 
@@ -303,7 +303,7 @@ def _region(message: GraspRequest, T_object_header: Matrix) -> Box | Sphere | No
         return None
     if solid.type == SolidPrimitive.SPHERE:
         if len(solid.dimensions) != 1:
-            raise bad_request(f"region: {len(solid.dimensions)} dimensions; valid: the radius of a SPHERE")
+            raise bad_request(f"region: {len(solid.dimensions)} dimensions; valid for a SPHERE: one, its radius")
         pose = T_object_header @ pose_matrix(message.region_pose, "region_pose")
         return Sphere(pose[:3, 3], float(solid.dimensions[0]))
     return _box("region", solid, message.region_pose, T_object_header)

@@ -91,7 +91,7 @@ def postures() -> tuple[Float[np.ndarray, "45"], Float[np.ndarray, "45"]]:
 
 
 def efforts(joints: Float[np.ndarray, "16 3"], tips: Float[np.ndarray, "5 3"]) -> Float[np.ndarray, "45"]:
-    """Return the greatest joint torques [N·m]: those with which a straight finger presses with `_TIP_FORCE`."""
+    """Return the joint torque limits [N·m]: a straight finger needs them to press `_TIP_FORCE` with its tip."""
     reach = np.linalg.norm(np.repeat(tips, 3, axis=0) - joints[1:], axis=1)
     lever = np.maximum(np.column_stack([reach, reach, np.full(15, _TWIST_LEVER)]), _LEAST_LEVER)
     return (_TIP_FORCE * lever).ravel()

@@ -229,8 +229,10 @@ def _read_included(path: Path, holder: Path, place: ET.Element, seen: set[Path])
     found = next((folder / name for folder in (path.parent, holder.parent) if inside_exists(folder / name)), None)
     if found is None:
         raise wrong(path, place, f"{told}: no such file beside {path.name}")
-    if found.resolve() in seen or len(seen) >= _MOST_FILES:
-        raise wrong(path, place, f"{told}: included twice, or one of more than {_MOST_FILES} files")
+    if found.resolve() in seen:
+        raise wrong(path, place, f"{told}: included twice; valid: once")
+    if len(seen) >= _MOST_FILES:
+        raise wrong(path, place, f"{told}: too many included files; valid: at most {_MOST_FILES}")
     seen.add(found.resolve())
     root = read_xml(found)
     if root.tag not in ("mujoco", "mujocoinclude"):

@@ -68,7 +68,7 @@ def read_ply_points(data: bytes) -> Points:
         raise ValueError("it has no element 'vertex'")
     missing = [name for name in "xyz" if name not in element.names]
     if missing:
-        raise ValueError(f"its vertices have no {missing[0]!r}")
+        raise ValueError(f"element 'vertex' has no property {missing[0]!r}; needed: x, y, z")
     places = [element.names.index(name) for name in "xyz"]
     if not order:
         return _numbers_of_text(body, start, element.count, len(element.names))[:, places]

@@ -165,7 +165,7 @@ def _metres(pixels: np.ndarray, unit: float | None, name: str) -> DepthImage:
     """Return depth [m], 0 for missing depth. Raises CloudError if pixels hold no depth or the unit seems wrong."""
     if pixels.ndim != 2 or pixels.dtype.kind not in "iuf" or pixels.dtype.itemsize < 2:
         size = f"{' × '.join(map(str, pixels.shape))} of {pixels.dtype}"
-        raise CloudError(f"{name}: {size} is no depth image; valid: one number of 16 bits or more a pixel")
+        raise CloudError(f"{name}: {size} is no depth image; valid: one channel of 16 bits or more")
     unit = unit or (1.0 if pixels.dtype.kind == "f" else _WHOLE)
     # Values too large for float32 become infinite, which means missing depth.
     with np.errstate(over="ignore", invalid="ignore"):

@@ -466,7 +466,7 @@ def test_a_box_may_be_the_region(tmp_path):
         ({"approach_direction": DOWN, "roll": 0.5}, "roll: use_roll is false"),
         ({"use_roll": True}, "roll: needs approach_direction"),
         ({"region": solid(BOX, 0.1)}, "region: type 1 of 1 dimensions; valid: BOX=1 or SPHERE=2"),
-        ({"region": solid(BALL, 0.1, 0.1)}, "region: 2 dimensions; valid: the radius of a SPHERE"),
+        ({"region": solid(BALL, 0.1, 0.1)}, "region: 2 dimensions; valid for a SPHERE: one, its radius"),
         ({"region": solid(BALL, -0.1)}, "sphere radius: -0.1 m; valid: above 0"),
         ({"region": solid(SolidPrimitive.CONE, 0.1, 0.1)}, "region: type 4 of 2 dimensions"),
         ({"region": solid(BALL, 0.1), "region_pose": Pose(position=Point(x=float("inf")))}, "region_pose: position"),

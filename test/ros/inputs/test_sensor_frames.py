@@ -420,8 +420,11 @@ def test_a_mask_shows_where_contacts_may_be(scene):
     ("fields", "culprit"),
     [
         ({"use_view_point": True, "view_point": Point(x=float("nan"))}, "view_point: [nan"),
-        ({"target_mask": Image(height=1), "alone": True}, "target_mask: alone is given too"),
-        ({"target_mask": Image(height=1), "use_target_point": True}, "target_mask: target_point is given too"),
+        ({"target_mask": Image(height=1), "alone": True}, "target_mask: cannot be combined with alone"),
+        (
+            {"target_mask": Image(height=1), "use_target_point": True},
+            "target_mask: cannot be combined with target_point",
+        ),
         ({"target_mask": Image(height=1), "source": GraspRequest.MESH}, "target_mask: with source 1"),
     ],
 )
