@@ -247,15 +247,18 @@ def _marks(own: Sequence[Record]) -> str:
 
 
 def calibration(stated: Sequence[tuple[float, bool]], where: str = "") -> list[str]:
-    """Return the Brier score and the share held at each stated probability. `stated` has pairs (probability, held)."""
+    """Return the Brier score and the share held per tenth of probability. `stated` has pairs (probability, held)."""
     if not stated:
         return []
-    levels = sorted({probability for probability, _ in stated}, reverse=True)
-    held = {level: [hold for probability, hold in stated if probability == level] for level in levels}
-    body = [[f"{level:.0%}", f"{np.mean(holds):.0%} of {len(holds)}"] for level, holds in held.items()]
+    body = []
+    for tenth in range(9, -1, -1):
+        some = [pair for pair in stated if min(int(10 * pair[0]), 9) == tenth]
+        if some:
+            mean, held = np.mean(some, 0)
+            body.append([f"{10 * tenth} to {10 * tenth + 10}%", f"{mean:.0%}", f"{held:.0%} of {len(some)}"])
     brier = float(np.mean([(probability - hold) ** 2 for probability, hold in stated]))
     return [
         f"Stated probability{where and f', {where}'} against what held on the truth, less sure grasps among them; "
         f"Brier score {brier:.3f}:",
-        markdown_table(["stated", "held"], body),
+        markdown_table(["stated", "mean", "held"], body),
     ]
