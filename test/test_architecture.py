@@ -65,7 +65,7 @@ MAY_IMPORT = {
 MAX_PACKAGE_LINES = {
     "graspd_core": 27_504,
     "graspd_ros": 5_267,
-    "graspd_bench": 8_821,
+    "graspd_bench": 8_824,
     "graspd_dataset": 2_961,
     "graspd_viewer": 2_428,
     "graspd_cell": 3_774,

@@ -170,7 +170,7 @@ def plan_config(values: Any, where: str = "config") -> PlanConfig:
     # `method_names` searches other packages, which is slow. So it is called only for an unknown key.
     if others := sorted(name for name in unknown if name in method_names()):
         raise ConfigError(
-            f"{where}.{others[0]}: the method is {named}; set method: {others[0]}, or remove these settings"
+            f"{where}.{others[0]}: not a setting of method: {named}; remove it, or set method: {others[0]}"
         )
     found = coerced(hints, values, where)
     return PlanConfig(**{("settings" if key == named else key): value for key, value in found.items()})

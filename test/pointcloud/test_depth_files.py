@@ -122,7 +122,7 @@ def test_a_camera_that_says_something_else_is_named(tmp_path: Path, keys: dict[s
 @pytest.mark.parametrize(
     ("name", "pixels", "told"),
     [
-        ("color.png", np.zeros((240, 320, 3), "u1"), r"240 × 320 × 3 of uint8 is no depth image; valid: one number"),
+        ("color.png", np.zeros((240, 320, 3), "u1"), r"240 × 320 × 3 of uint8 is no depth image; valid: one channel"),
         ("gray.png", np.zeros((240, 320), "u1"), "is no depth image"),
         ("small.png", np.full((120, 160), 500, "u2"), "160 x 120 pixels, but its camera has 320 x 240"),
         ("far.npy", np.full((240, 320), 850.0), "beyond 850 m at 1 m a unit; say the unit: --units mm, or depth_unit"),
