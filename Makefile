@@ -100,7 +100,7 @@ $(SANITIZED): $(KERNEL)
 # Leaks are not looked for: Python keeps memory until it ends.
 sanitize: setup $(SANITIZED)  ## the kernel's tests with reads and writes checked (g++ or clang)
 	LD_PRELOAD="$$($(or $(CXX),c++) -print-file-name=libasan.so) $$($(or $(CXX),c++) -print-file-name=libstdc++.so)" \
-		ASAN_OPTIONS=detect_leaks=0 GRASPD_KERNEL=$(SANITIZED) $(RUN)/python -m pytest -q test/kernel
+		ASAN_OPTIONS=detect_leaks=0 GRASPD_KERNEL=$(SANITIZED) $(RUN)/python -m pytest -q test/kernel test/metrics
 
 fuzz: setup  ## throw mutated files and messages at the parsers for MINUTES (10), findings to results/fuzz
 	$(RUN)/python benchmarks/fuzz.py --minutes $(or $(MINUTES),10)
