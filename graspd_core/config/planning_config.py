@@ -138,8 +138,8 @@ class CertaintyConfig:
     """How certain a grasp of an object seen by cameras must be to count as verified.
 
     Attributes:
-        probability: least probability of holding on the true object. With 0, only the likeliest shape is tried. Higher
-            values require further trials (docs/clouds.md).
+        probability: least probability of holding on the true object, if it weighs no more than in the trials. With 0,
+            only the likeliest shape is tried. Higher values require further trials (docs/clouds.md).
 
     Raises:
         ConfigError: the probability is higher than any trials can ensure.

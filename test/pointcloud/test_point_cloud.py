@@ -1,4 +1,4 @@
-"""Clouds: refused, cleaned and moved; any layout of their messages. More: test/ros/inputs/test_sensor_frames.py."""
+"""Clouds are refused, cleaned and moved, in messages of any layout. More: test/ros/inputs/test_sensor_frames.py."""
 
 from types import SimpleNamespace
 
@@ -89,7 +89,7 @@ def fields_of(places: dict[str, tuple[int, int]]) -> list[SimpleNamespace]:
 
 
 def message_of(points: np.ndarray, code: str, step: int, row_padding: int) -> SimpleNamespace:
-    """A PointCloud2: coordinates one after the other at the end of each point; what lies before and between is junk."""
+    """Return a PointCloud2 with the coordinates at the end of each point. All other bytes are junk."""
     height, width, _ = points.shape
     size, row_step = int(code[2]), width * step + row_padding
     data = np.random.default_rng(1).integers(0, 256, height * row_step, dtype=np.uint8)

@@ -1,4 +1,4 @@
-"""A request for any object over DDS: the answer names the object of its grasps and all others; a loss comes last."""
+"""Request any object over DDS. The answer names the object of its grasps first, and lost objects last."""
 
 from dataclasses import replace
 from typing import Any
