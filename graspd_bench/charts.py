@@ -224,7 +224,7 @@ def about_records(records: Sequence[Record], kind: str) -> str:
 
 
 def draw_planned(presets: dict[str, list[Row]], path: Path, about: str = "") -> Path | None:
-    """Draw CPU seconds per verified grasp against those to the first one. Return the PNG's path, None without data."""
+    """Draw CPU seconds per verified grasp against those to the first such grasp. Return the PNG's path, or None."""
     panel = Panel("cpu_per_verified", "CPU seconds per verified grasp, all included")
     points = points_of(presets, "first_cpu", panel)
     if not points:

@@ -1,4 +1,4 @@
-"""Numbers from benchmark records, for each name (preset, sweep value or hand) and object. Also compares two runs."""
+"""Compute numbers of benchmark records by name (preset, sweep value or hand) and object, and compare two runs."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ def is_preset(name: str) -> bool:
 
 
 def is_few(name: str) -> bool:
-    """Return whether a preset is on the first page: one of `FEW`, or a user's own."""
+    """Return True if the short table and chart show a preset: it is one of `FEW`, or a user's own."""
     return is_preset(name) and (name in FEW or name not in preset_names())
 
 
@@ -76,9 +76,9 @@ class Row:
         given: number of grasps found.
         held: number of grasps that passed the standard hold trial.
         spent: CPU time of the optimiser and of those trials [s].
-        values: numbers by name, None if not measured. They are medians of `_grasp_figures` over grasps, shares of
-            requested grasps by `TRIAL_FIGURES`, and seconds: `cpu_per_grasp` of the optimiser, `cpu_with_scene`,
-            `cpu_per_verified` (`spent` / `held`), `first_cpu` and `first_wall` until the first verified grasp.
+        values: numbers by name, None if not measured: medians over grasps (`_grasp_figures`), shares of the requested
+            grasps (`TRIAL_FIGURES`), and times [s]. `cpu_per_grasp` is that of the optimiser, `cpu_per_verified` is
+            `spent` / `held`. `first_cpu` and `first_wall` are the times to the first verified grasp.
         quartiles: lower and upper quartile of each value over the grasps.
     """
 

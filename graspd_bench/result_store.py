@@ -53,7 +53,7 @@ def write_record(folder: Path, study: str, case: Case, record: Record) -> None:
 
 
 def read_record(folder: Path, study: str, case: Case, code: str | None, *, failed: bool = False) -> Record | None:
-    """Return the record of a case made by `code` (None: any version), or None. Skip failed records unless `failed`."""
+    """Return the record of a case by code version `code` (None: any), or None. Skip failed records unless `failed`."""
     try:
         record = json.loads((folder / case_file(study, case)).read_text(encoding="utf-8"))
     except (OSError, ValueError):

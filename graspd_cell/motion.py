@@ -417,7 +417,7 @@ _PERIOD = 0.02
 
 
 def timed(arm: Arm, path: Path, speeds: Speeds) -> JointMotion:
-    """Return the fastest motion along a path within the limits, from rest to rest. Raises NoMotionError: none found."""
+    """Return the fastest motion from rest to rest along a path within the limits. Raises NoMotionError: none exists."""
     import toppra
     from toppra.algorithm import TOPPRA
     from toppra.constraint import JointAccelerationConstraint, JointVelocityConstraint

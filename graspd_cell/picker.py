@@ -214,7 +214,7 @@ class Picker:
         return Ending.PICKED, ""
 
     def world_of(self, view: DepthView) -> SeenWorld:
-        """Build the obstacles from the points of a view without the robot's, and the known solids of the cell."""
+        """Build the obstacles from a view's points that are not on the robot, and from the known solids of the cell."""
         points = cloud_of(view).points
         mover = self._mover(SeenWorld(0.0))
         balls, carried = mover.placed(self._arm_now())

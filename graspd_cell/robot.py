@@ -16,7 +16,7 @@ from graspd_core.errors import ConfigError, GraspdError
 
 
 class MotionAborted(GraspdError):
-    """A motion did not end as commanded. The message of a joint out of tolerance names joint, error and tolerance."""
+    """A motion did not end as commanded. If a joint was off, the message names joint, error and tolerance."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -62,7 +62,7 @@ class DepthView:
 class JointMotion:
     """Timed trajectory of the joints of the arm, the hand, or both.
 
-    If a tolerance is None, the controller's default applies. A hand has none, because an object stops its fingers.
+    If a tolerance is None, the controller's default applies. A hand has no default, because objects stop its fingers.
 
     Attributes:
         names: joint names.

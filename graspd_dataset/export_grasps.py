@@ -59,7 +59,7 @@ def export(store: DatasetStore, kind: str, out: Path) -> tuple[int, int]:
 
 
 def isaac_grasp(rows: Sequence[Row], mesh: str) -> str:
-    """Return grasps as isaac_grasp 1.0 YAML. The format has no squeeze. `mesh` is the path that it names."""
+    """Return grasps as isaac_grasp 1.0 YAML. The format has no squeeze. The file names the mesh by the path `mesh`."""
 
     def joints(row: Row, stage: str) -> dict[str, float]:
         return dict(zip(row["joint_names"], row[f"{stage}_joint_positions"], strict=True))

@@ -310,7 +310,7 @@ def read_graspgen(path: Path, text: bytes, hand: HandModel, mesh: str | None) ->
     scale = float(numbers_of(entry(target, "scale", f"{path}: object"), (), f"{path}: object: scale"))
     poses, held = (entry(grasps, key, f"{path}: grasps") for key in ("transforms", "object_in_gripper"))
     if not isinstance(poses, list) or not isinstance(held, list) or len(poses) != len(held):
-        raise FormatError(f"{path}: grasps: transforms and object_in_gripper; valid: two lists of equal length")
+        raise FormatError(f"{path}: grasps: transforms and object_in_gripper must be two lists of equal length")
     found = []
     for number, (pose, good) in enumerate(zip(poses, held, strict=True)):
         where = f"{path}: grasp {number}"

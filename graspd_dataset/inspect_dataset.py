@@ -167,7 +167,7 @@ def _changed(path: str, content: bytes, known: Mapping[str, set[str]]) -> Iterat
 
 
 def row_digests(table: Any) -> list[bytes]:
-    """Return for every row the SHA-256 of its object, hand and grasp posture. The block does not count."""
+    """Return for every row the SHA-256 of its object, hand and grasp posture, whatever its block."""
     names = ("object_sha256", "hand_sha256", "grasp_position", "grasp_quaternion_wxyz", "grasp_joint_positions")
     rows = zip(*(table[name].to_pylist() for name in names), strict=True)
     return [hashlib.sha256(repr(row).encode()).digest() for row in rows]

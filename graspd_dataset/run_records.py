@@ -1,4 +1,4 @@
-"""What records of runs hold: code version, commit, failure, CPU time and peak memory. Also Markdown tables."""
+"""Content of run records: code version, commit, failure, CPU time and peak memory. Also Markdown tables."""
 
 from __future__ import annotations
 

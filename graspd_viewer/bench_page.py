@@ -1,7 +1,7 @@
 """HTML page of a benchmark: charts of speed against accuracy. A click on a point opens its runs and their grasps.
 
 The page is one file without network access or libraries. Results contain metrics of grasps, but no postures. To show
-the grasps of a run, the server repeats the planning with its settings and seed. The same code finds the same grasps.
+the grasps of a run, the server plans again with the run's settings and seed. The same code finds the same grasps.
 """
 
 from __future__ import annotations

@@ -106,7 +106,7 @@ def best_view(
 ) -> tuple[Float[np.ndarray, "3"], Float[np.ndarray, "3"], Float[np.ndarray, "3"]]:
     """Return eye position, target position [m] and up direction of the best view on object and hand.
 
-    The view maximises the lower of both bodies' visibilities: pixel counts relative to the maximum over all views.
+    A body's visibility is its pixel count divided by its greatest count in any view. The lower of both is maximised.
     """
     meshes = [object_mesh] if hand is None else [object_mesh, hand]
     corners = np.concatenate([mesh.vertices for mesh in meshes])

@@ -24,7 +24,7 @@ class LiveView:
 
     Args:
         jobs: queue of the drawing thread.
-        nodes: nodes to draw.
+        nodes: the page's scene nodes, in which the hands are drawn.
         show: shows progress as a line and the fraction of the stage that is done.
     """
 

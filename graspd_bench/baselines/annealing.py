@@ -5,7 +5,7 @@ Here the components are those of seeded random postures between open and closed,
 together. The first component is the closing of the hand, the next ones are differences between fingers.
 
 The state of a chain is the base pose and the amplitudes of a few eigengrasps. Its energy is that of GraspIt!, a mean
-over contact locations i on the inside of the hand. It grows with their distance, and if they face away:
+over contact locations i on the inside of the hand. A location far from the object, or facing away from it, costs more:
 
     E = mean_i |d_i| + α (1 − n_i · o_i)        α = 50 mm, o_i: unit direction from location i to the object
 
@@ -259,7 +259,7 @@ class Annealing:
     def neighbour(
         self, x: Float[Tensor, "batch variables"], jumps: Float[Tensor, "batch jumps"]
     ) -> Float[Tensor, "batch variables"]:
-        """Return the states after a jump. `jumps`, from -1 to 1: translation (3), rotation (3), then amplitudes."""
+        """Return the states after a jump. `jumps` lie in [-1, 1]: 3 of translation, 3 of rotation, then amplitudes."""
         config = self.config
         translation = x[:, :3] + config.translation_jump * jumps[:, :3]
         half = 0.5 * config.rotation_jump * jumps[:, 3:6]

@@ -2,8 +2,8 @@
 
 The random error of stereo depth is z² / (f B) times the error of disparity (Khoshelham and Elberink 2012). Intel's
 tuning guide for the D400 series gives 0.08 pixels for a D415. With f = 616 pixels and a baseline of B = 55 mm, this is
-0.0024 z² [m]. DEFAULT was compared with the table in real D415 frames: 0.9 mm at 0.5 m, 1.3 mm at 0.7 m. The errors
-there correlate by 0.96 between neighbouring pixels and by 0.6 over eight pixels, because a matching window spans many.
+0.0024 z² [m]. DEFAULT was compared with real D415 frames of a table: 0.9 mm at 0.5 m, 1.3 mm at 0.7 m. Their errors
+correlate by 0.96 between neighbouring pixels and by 0.6 over eight, because stereo matching averages many pixels.
 """
 
 from __future__ import annotations
@@ -190,8 +190,8 @@ def _jittered(depth: Depth, pixels: float, rng: np.random.Generator) -> Depth:
 def _shadow(depth: Depth, camera: PinholeCamera, baseline: float) -> Bool[np.ndarray, "height width"]:
     """Return the pixels that a second lens, `baseline` [m] to the right, cannot see because a nearer point hides them.
 
-    In the second image a point appears f B / z pixels further left. A pixel is hidden if a pixel to its right in the
-    row does not appear further right there.
+    In the second image a point appears f B / z pixels further left. A pixel is hidden if a pixel to its right in its
+    row does not appear to the right of it in the second image.
     """
     if not baseline:
         return np.zeros(depth.shape, dtype=bool)
@@ -204,7 +204,7 @@ def _shadow(depth: Depth, camera: PinholeCamera, baseline: float) -> Bool[np.nda
 
 
 def _grazing(depth: Depth, camera: PinholeCamera, limit: float, edge: np.ndarray, rng: np.random.Generator):
-    """Return the pixels without depth because of a small viewing angle. Edges are exempt, having no normal."""
+    """Return the pixels without depth because of a small viewing angle. Edges have no normal and are exempt."""
     if not limit:
         return np.zeros(depth.shape, dtype=bool)
     rays = np.nan_to_num(camera_rays(camera))

@@ -45,7 +45,7 @@ class Case:
         memory: limit of the process's peak memory, including libraries [MB].
         options: further arguments of `plan_grasps`.
         told: words that the message to the user must contain.
-        truth: returns the true mesh in the scene frame. None unless the scene comes from camera views.
+        truth: returns the true mesh in the scene frame. None if no camera sees the scene.
     """
 
     name: str

@@ -60,7 +60,7 @@ class ArmCase(Case):
 
 @dataclass(frozen=True)
 class ReachCase(ObjectCase):
-    """A request for `count` grasps of an object on a table, with an arm. The seed draws the poses of both."""
+    """A request for `count` grasps of an object on a table, with an arm. The seed determines the poses of both."""
 
     arm: str = ""
 

@@ -2,9 +2,9 @@
 
     graspd bench dexgraspbench FOLDER --python ENVIRONMENT/bin/python
 
-FOLDER is the user's checkout of DexGraspBench with its submodule. ENVIRONMENT has its requirements. Its code runs in a
-child process and is never imported. Our grasps and objects are written to a temporary folder in its format, and with
-`--armature` a changed copy of its Allegro. `inert_pickle` reads the results without running code from them.
+FOLDER is the user's checkout of DexGraspBench with its submodule. ENVIRONMENT is a Python environment with its
+requirements. Its code runs in a child process and is never imported. A temporary folder has our grasps and objects in
+its format, and with `--armature` a changed copy of its Allegro. `inert_pickle` reads results without running code.
 """
 
 from __future__ import annotations

@@ -61,7 +61,7 @@ def frame_cases(request: Request) -> tuple[Frame, ...]:
 
 
 def run_frame(case: Frame) -> Record:
-    """Plan on the object at the view axis, or at the reference's centre if the first has an IoU of at most 0.5."""
+    """Plan on the object at the view axis. If its IoU is at most 0.5, plan on the one at the reference's centre."""
     cloud, reference = read_frame(Path(case.folder))
     hand = load_hand(case.hand)
     target, found = None, {}

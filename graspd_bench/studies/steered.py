@@ -73,7 +73,7 @@ def drawn_constraint(case: SteeredCase, scene: Scene) -> Steering:
 
 
 def _end_of(vertices: Float[np.ndarray, "n 3"], rng: np.random.Generator, share: float, beyond: float) -> Box:
-    """Draw a box at an end of the object: `share` of its extent, for a region at least 5 cm, plus `beyond` [m]."""
+    """Draw a box around an end of the object. It has `share` of the object's length, plus `beyond` [m] on each side."""
     low, high = vertices.min(0), vertices.max(0)
     axis, side = int(rng.integers(3)), int(rng.integers(2))
     breadth = max(share * (high - low)[axis], _BREADTH if beyond < _BEYOND else 0.0)
