@@ -116,7 +116,7 @@ class _Worker:
             return self._write(folder, failure(died, "died"))
 
     def lost(self, folder: Path) -> Record:
-        """Kill the worker because it hung. Write and return a record of that."""
+        """Kill the worker because it hung. Write and return a record that says so."""
         self.end()
         return self._write(folder, failure(TimeoutError(f"no end after {self.job.patience:.0f} s"), "hung"))
 

@@ -306,7 +306,7 @@ class Picker:
         self._dropped += [taking.dropped] if taking.dropped is not None else []
 
     def back_off(self, world: SeenWorld) -> None:
-        """Open the hand and raise the arm after a failure, as far as no collision or abort prevents it."""
+        """Open the hand and raise the arm after a failure. Stop early at a collision or an abort."""
         self._stop_if_cancelled()
         try:
             self._move_hand(self._hand.open_posture)

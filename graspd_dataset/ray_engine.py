@@ -80,7 +80,7 @@ def _refuse_silent(address: str | None) -> None:
     try:
         socket.create_connection((host, int(port)), _CONNECT).close()
     except OSError as error:
-        raise ConfigError(f"address: {address}: {error.strerror or error}; start one with: ray start --head") from None
+        raise ConfigError(f"address: {address}: {error.strerror or error}; start Ray with: ray start --head") from None
 
 
 @lru_cache

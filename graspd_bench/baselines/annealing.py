@@ -148,7 +148,7 @@ def inner_contacts(hand: HandModel, per_link: int) -> Int[np.ndarray, "contacts"
 
 
 def _facing(hand: HandModel) -> Float[np.ndarray, "candidates"]:
-    """Return each candidate's cosine between its normal and its closing motion (on the palm: the palm's normal)."""
+    """Return the cosine between each candidate's normal and its closing motion. On the palm use the palm's normal."""
     links = hand.candidate_link
     early, late = (
         link_poses(hand, hand.open_posture + share * (hand.closed_posture - hand.open_posture)) for share in (0.4, 0.6)
@@ -351,8 +351,8 @@ def sampled_epsilon(
 ) -> Float[Tensor, "batch"]:
     """Return Ferrari and Canny's ε for hard contacts whose forces sum to one.
 
-    It is the minimum over directions of the greatest support of any contact. This is an upper bound, because only
-    the given directions are tested. It is zero without force closure.
+    For each direction take the greatest support of any contact. ε is the minimum over directions, and zero without
+    force closure. The result is an upper bound, because only the given directions are tested.
     """
     batch, slots = contact_set.active.shape
     support = wrench_support(

@@ -88,7 +88,7 @@ def stress_table(endings: Mapping[Case, StressEnding]) -> str:
 
 
 def summary(endings: Mapping[Case, StressEnding]) -> str:
-    """Return how many cases ended in a verified grasp, how many grasps held again, and one line per fault."""
+    """Return how many cases ended in a verified grasp, how many grasps passed the second trial, and all faults."""
     wrong = [f"* `{case.name}`: {fault}" for case, ending in endings.items() for fault in faults(case, ending)]
     lines = [f"{len(endings)} cases, {len(wrong)} faults."]
     for family in dict.fromkeys(case.family for case in endings):

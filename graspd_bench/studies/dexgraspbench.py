@@ -71,7 +71,7 @@ class BenchCase(ObjectCase):
     Attributes:
         checkout: folder of DexGraspBench.
         python: Python program that runs DexGraspBench.
-        armature: whether to also run its Allegro with our armature.
+        armature: whether to also run DexGraspBench's Allegro with our joint armature.
         grasps: file of our grasps. Empty to plan them.
         content: hash of the checkout's code and of the file of grasps.
     """
@@ -114,7 +114,7 @@ def bench_cases(request: Request) -> tuple[BenchCase, ...]:
         objects = request.objects or (str(document["object"]["source"]),)
         refuse_hand(document["hand"]["name"])
         if len(objects) > 1:
-            raise ConfigError(f"grasps: {request.grasps} is of one object; give one object, not {len(objects)}")
+            raise ConfigError(f"grasps: {request.grasps} has grasps of one object; give one object, not {len(objects)}")
     _run([python, str(checkout / _MAIN), "--help"], Path(), _START)
     files = sorted(path for glob in _HASHED for path in checkout.glob(glob) if path.is_file())
     files += [Path(request.grasps)] if request.grasps else []

@@ -4,7 +4,7 @@
 
 The user provides the MANO model (https://mano.is.tue.mpg.de, never shipped). Grasps are planned with rigid flesh and
 with flesh that yields by 1 mm. All go through the hold trial. As in the paper, the two best ranked grasps per object
-are measured. Area and volume are those of the skinned mesh (docs/metrics.md). The trials use its convex hulls.
+are measured. Area and volume are those of the skinned mesh (docs/metrics.md). The trials use convex hulls.
 """
 
 from __future__ import annotations
