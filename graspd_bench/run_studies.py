@@ -211,7 +211,7 @@ def studies_of(names: Sequence[str]) -> dict[str, Study]:
     Raises ConfigError: there is no such study. The message lists the valid names.
     """
     if unknown := [name for name in names if name not in (*STUDIES, ALL)]:
-        raise ConfigError(f"unknown suite {unknown[0]!r}; {choices(unknown[0], (*STUDIES, ALL))}")
+        raise ConfigError(f"unknown study {unknown[0]!r}; {choices(unknown[0], (*STUDIES, ALL))}")
     usual = [name for name, study in STUDIES.items() if study.usual]
     return {name: STUDIES[name] for given in names for name in (usual if given == ALL else [given])}
 

@@ -112,7 +112,7 @@ def _masses(path: Path) -> dict[str, float]:
         try:
             found[Path(str(row[name])).stem] = float(row[mass])
         except (TypeError, ValueError):
-            raise ConfigError(f"{path}: the mass of {row[name]!r} is {row[mass]!r}, no number of kilograms") from None
+            raise ConfigError(f"{path}: the mass of {row[name]!r} is {row[mass]!r}; valid: a number [kg]") from None
         if not 0 < found[Path(str(row[name])).stem] < np.inf:
             raise ConfigError(f"{path}: the mass of {row[name]!r} is {row[mass]}; valid: more than zero kilograms")
     return found

@@ -113,7 +113,7 @@ def build_cell(
     import mujoco
 
     if twice := set(arm.joint_names) & set(hand.joint_names):
-        raise ConfigError(f"arm {arm.name} and hand {hand.name} both have a joint {sorted(twice)[0]!r}")
+        raise ConfigError(f"arm {arm.name} and hand {hand.name} both have a joint {sorted(twice)[0]!r}; rename one")
     # Without this MuJoCo writes a log file into the working directory.
     mujoco.set_mju_user_warning(lambda message: None)
     protocol = PROTOCOLS["standard"]

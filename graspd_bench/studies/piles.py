@@ -199,7 +199,7 @@ def _take_one(
     truth: Int[np.ndarray, "points"],
     seen: Sequence[Float[np.ndarray, "_ 3"]],
 ) -> bool:
-    """Plan for the segments, fewest failures first. Execute one verified grasp. Return False if there is none."""
+    """Plan for segments with fewest failures first. Execute one verified grasp. Return False if there is none."""
     cloud = KDTree(np.vstack([view.points for view in views]))
     order = sorted(seen, key=lambda points: (run.failed_before(points.mean(0)), -float(points[:, 2].max())))
     for points in order:

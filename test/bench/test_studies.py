@@ -134,7 +134,7 @@ def test_a_preset_of_ones_own_is_planned_with_and_nothing_else_that_was_not_aske
 SMALL = ["--presets", "random_closure", "--objects", "shape:sphere", "--count", "2", "--trials", "standard"]
 BAD: list[tuple[list[str], str]] = [
     (["--presets", "best"], "unknown preset 'best'; valid: accurate, "),
-    (["--suite", "tall"], "unknown suite 'tall'; did you mean 'all'?"),
+    (["--suite", "tall"], "unknown study 'tall'; did you mean 'all'?"),
     (["--trials", "standard,gentle"], "unknown trial 'gentle'; valid: standard, hard, "),
     (["--processes", "0"], "processes: 0; valid: 1 or more"),
     (["--compare", "nowhere.json"], "nowhere.json: No such file"),
