@@ -254,7 +254,7 @@ def _now() -> dict[str, float]:
 def run_pace(cell: Cell) -> dict[str, Any]:
     """Time one batch of raw grasps. Return its CPU and wall time [s], and its `grasp_steps`.
 
-    The times are those of the fastest of three batches. An uncounted batch runs first.
+    The times are those of the fastest of three batches. A batch that is not timed runs first.
     """
     hand = load_hand(cell.hand, candidates=cell.settings.problem.fine_candidates)
     scene = load_scene(cell.object, mass=PROTOCOL_MASS, resolution=cell.settings.resolution)

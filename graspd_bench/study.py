@@ -116,7 +116,7 @@ class Request:
 
 
 def error_of(record: Record) -> tuple[str, ...]:
-    """Return the error of a failed case as the only item, or ()."""
+    """Return the error of a failed case in a tuple. Empty if the case did not fail."""
     return (record["error"],) if record["error"] else ()
 
 

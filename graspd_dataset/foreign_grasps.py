@@ -268,7 +268,7 @@ def read_isaac(path: Path, text: bytes, hand: HandModel, mesh: str | None) -> li
     frame = str(frame).rpartition("/")[2]
     grasps = entry(document, "grasps", f"{path}")
     if not isinstance(grasps, dict):
-        raise FormatError(f"{path}: grasps: {short_repr(grasps)}; expected grasps by name")
+        raise FormatError(f"{path}: grasps: {short_repr(grasps)}; expected a mapping of names to grasps")
     return [_grasp_of(values, hand, frame, mesh, f"{path}: {short_repr(name)}") for name, values in grasps.items()]
 
 

@@ -122,8 +122,8 @@ def posture_space(hand: HandModel, dimensions: int, seed: int) -> PostureSpace:
 def inner_contacts(hand: HandModel, per_link: int) -> Int[np.ndarray, "contacts"]:
     """Choose contact candidates on the inside of the hand. Return their indices, up to `per_link` per rigid group.
 
-    The inside of the palm faces along its normal, that of a finger along its closing motion. For each group, the first
-    candidate is the one nearest to the middle of its inside. The next are farthest from those already chosen.
+    The palm's inside faces along the palm's normal. A finger's inside faces along its closing motion. For each group,
+    the first candidate is nearest to the middle of the inside. The next are farthest from those already chosen.
     """
     chosen: list[int] = []
     facing = _facing(hand)

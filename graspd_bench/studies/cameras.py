@@ -66,7 +66,7 @@ class CameraView(Case):
     Attributes:
         thing: name of a family or a shape, or path of a scan. A stats.csv in the scan's folder gives its mass.
         crowd: whether neighbours stand around the object.
-        way: `ASSUMED`, `GIVEN` or `OPEN3D`.
+        way: mass not given (`ASSUMED`) or given (`GIVEN`), or not given with Open3D's Poisson (`OPEN3D`).
     """
 
     thing: str
