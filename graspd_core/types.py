@@ -68,10 +68,12 @@ class Plane:
     Attributes:
         normal: unit normal n, pointing away from the solid side.
         offset: n·x of every point x on the plane [m].
+        margin: least height of the hand above the plane [m]. It is the noise of the camera that saw the plane.
     """
 
     normal: Float[np.ndarray, "3"]
     offset: float
+    margin: float = 0.0
 
 
 @dataclass(frozen=True)

@@ -172,7 +172,7 @@ def moved_grasp(grasp: Grasp, T: Matrix) -> Grasp:
 def moved_plane(plane: Plane, T: Matrix) -> Plane:
     """Return a plane in another frame."""
     normal = T[:3, :3] @ plane.normal
-    return Plane(normal, plane.offset + float(normal @ T[:3, 3]))
+    return replace(plane, normal=normal, offset=plane.offset + float(normal @ T[:3, 3]))
 
 
 def _moved_posture(posture: Posture, T: Matrix) -> Posture:

@@ -102,7 +102,7 @@ def make_obstacle_tensors(
         sphere_matrix=placed(centers, sphere_links),
         sphere_radii=tensor(sphere_radii),
         normal=None if scene.support is None else tensor(scene.support.normal),
-        offset=0.0 if scene.support is None else scene.support.offset,
+        offset=0.0 if scene.support is None else scene.support.offset + scene.support.margin,
         sdfs=tuple(n.sdf.to(device, dtype) for n in reached),
         approach=tensor(hand.approach),
         points=tensor(points),

@@ -298,7 +298,7 @@ def near_scene(scene: Scene) -> tuple[Scene, Float[np.ndarray, "3"]]:
         scene,
         object=moved_object(scene.object, -far),
         sdf=moved_sdf(scene.sdf, -far),
-        support=plane and Plane(plane.normal, plane.offset - float(plane.normal @ far)),
+        support=plane and replace(plane, offset=plane.offset - float(plane.normal @ far)),
         obstacles=tuple(moved_obstacle(obstacle, -far) for obstacle in scene.obstacles),
         evidence=scene.evidence and replace(scene.evidence, origin=scene.evidence.origin - far),
     )

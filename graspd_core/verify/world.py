@@ -122,7 +122,7 @@ def add_others(spec: Any, others: Sequence[FreeBody], friction: Friction) -> tup
 def add_support(spec: Any, hand: HandModel, parts: Sequence[TriangleMesh], friction: Friction, support: Plane) -> None:
     """Add gravity, a plane for the hand, and a plane for the object at the bottom of `parts` (none without parts)."""
     spec.option.gravity = -_GRAVITY * support.normal
-    add_plane(spec, TABLE, support, friction)
+    add_plane(spec, TABLE, replace(support, offset=support.offset + support.margin), friction)
     for link in hand.link_names:
         # Real hands carry their own weight.
         spec.body(f"link:{link}").gravcomp = 1.0

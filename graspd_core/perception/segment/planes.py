@@ -6,7 +6,7 @@ disparity. A plane's tolerance grows likewise, at a rate estimated from its resi
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
@@ -69,6 +69,10 @@ class FlatPart:
     def tolerance(self, distance: Float[np.ndarray, "n"]) -> Float[np.ndarray, "n"]:
         """Return the height up to which a point belongs to the plane [m], for its distance from the camera [m]."""
         return np.clip(INLIER_DEVIATIONS * self.noise * distance**2, self.least, self.most)
+
+    def below(self, distance: Float[np.ndarray, "n"]) -> Plane:
+        """Return the plane as the support of an object at the given distances from the camera [m]."""
+        return replace(self.plane, margin=float(np.median(self.tolerance(distance))) / INLIER_DEVIATIONS)
 
     def beneath(self, points: Points, margin: float) -> Bool[np.ndarray, "n"]:
         """Return which points project into the visible part's hull, or at most `margin` [m] outside."""
