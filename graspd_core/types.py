@@ -84,11 +84,13 @@ class Contact:
         link: name of the hand link.
         position: contact point on the object's surface, object frame [m].
         normal: outward unit normal of the object at the contact, object frame.
+        force: planned force of the link on the object when the hand squeezes, object frame [N]. None if unknown.
     """
 
     link: str
     position: tuple[float, float, float]
     normal: tuple[float, float, float]
+    force: tuple[float, float, float] | None = None
 
 
 # Name of the trial that runs the robustness checks. A grasp that fails only this trial is unverified, not failed.

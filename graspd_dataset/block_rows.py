@@ -8,7 +8,7 @@ import tempfile
 import time
 from collections import Counter, OrderedDict
 from collections.abc import Sequence
-from dataclasses import asdict, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -145,7 +145,7 @@ def _row(grasp: Grasp, hand: HandModel) -> dict[str, Any]:
         "reason": grasp.reason,
         "score": float(grasp.score),
         "probability": grasp.probability,
-        "contacts": [asdict(contact) for contact in grasp.contacts],
+        "contacts": [{"link": c.link, "position": c.position, "normal": c.normal} for c in grasp.contacts],
     }
     for stage in ("pregrasp", "grasp", "squeeze"):
         posture = getattr(grasp, stage)

@@ -183,4 +183,5 @@ def _moved_posture(posture: Posture, T: Matrix) -> Posture:
 def _moved_contact(contact: Contact, T: Matrix) -> Contact:
     x, y, z = map(float, T[:3, :3] @ contact.position + T[:3, 3])
     nx, ny, nz = map(float, T[:3, :3] @ contact.normal)
-    return replace(contact, position=(x, y, z), normal=(nx, ny, nz))
+    force = contact.force and tuple(map(float, T[:3, :3] @ contact.force))
+    return replace(contact, position=(x, y, z), normal=(nx, ny, nz), force=force)

@@ -41,6 +41,7 @@ class GraspStagesConfig:
     Attributes:
         touch_reach: links this near to the object count as touching [m].
         grip_force: sum of the normal forces of the squeeze [N].
+        link_force: greatest normal force of one link when the hand squeezes [N]. Lower it for delicate objects.
         stiffness: position gain of the controllers of the hand's revolute joints [N·m/rad].
         slide_stiffness: position gain of the controllers of the hand's prismatic joints [N/m].
         effort_share: fraction of a joint's effort limit that the squeeze may use.
@@ -52,6 +53,7 @@ class GraspStagesConfig:
 
     touch_reach: float = 0.002
     grip_force: float = 40.0
+    link_force: float = 40.0
     stiffness: float = 5.0
     slide_stiffness: float = 2000.0
     effort_share: float = 1.0

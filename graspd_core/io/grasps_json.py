@@ -130,7 +130,10 @@ def _grasp(rank: int, grasp: Grasp, hand: HandModel) -> dict[str, Any]:
         "squeeze_joint_positions": joints(grasp.squeeze),
         "pregrasp_position": _list(grasp.pregrasp.position),
         "pregrasp_quaternion_wxyz": _list(grasp.pregrasp.quaternion_wxyz),
-        "contacts": [{"link": c.link, "position": list(c.position), "normal": list(c.normal)} for c in grasp.contacts],
+        "contacts": [
+            {"link": c.link, "position": list(c.position), "normal": list(c.normal), "force": c.force and list(c.force)}
+            for c in grasp.contacts
+        ],
         "arm": grasp.arm and _arm(grasp.arm),
         **grasp_figures(grasp),
     }
@@ -296,8 +299,9 @@ def _arm_of(values: dict[str, Any]) -> ArmPath:
 
 
 def _contact_of(values: dict[str, Any]) -> Contact:
-    position, normal = (_numbers_of(values, key, 3) for key in ("position", "normal"))
-    return Contact(str(values["link"]), _triple(position), _triple(normal))
+    position, normal = (_triple(_numbers_of(values, key, 3)) for key in ("position", "normal"))
+    force = None if values.get("force") is None else _triple(_numbers_of(values, "force", 3))
+    return Contact(str(values["link"]), position, normal, force)
 
 
 def _numbers_of(values: dict[str, Any], key: str, *shape: int) -> Float[np.ndarray, "..."]:

@@ -15,6 +15,7 @@ from graspd_core.hands.model import HandModel
 from graspd_core.hands.self_collision import deepest_overlap
 from graspd_core.optimize.grasp_postures import (
     approach_depth,
+    by_link,
     find_contacts,
     find_pregrasp,
     self_overlap,
@@ -176,7 +177,8 @@ def _grasps(hand: HandModel, some: Staged, scores: Tensor) -> list[Grasp]:
     poses, opened, found = some.poses, some.opened, some.contact_set
     quaternion = _numbers(poses.quaternion / poses.quaternion.norm(dim=-1, keepdim=True))
     active, distance = found.active.cpu().numpy(), found.distance.abs().cpu().numpy()
-    link, position, normal = found.link.tolist(), _numbers(found.position), _numbers(found.normal)
+    link, position, normal = found.link.tolist(), _numbers(found.position).tolist(), _numbers(found.normal).tolist()
+    pressing = _numbers(by_link(found, some.pressed.forces)).tolist()
     places = [_numbers(x) for x in (opened.translation, poses.translation)]
     # Rounding to float32 and back may exceed a joint limit by one ulp.
     joints = [np.clip(_numbers(x), hand.lower, hand.upper) for x in (opened.joints, poses.joints, some.pressed.joints)]
@@ -186,7 +188,7 @@ def _grasps(hand: HandModel, some: Staged, scores: Tensor) -> list[Grasp]:
         slots = np.flatnonzero(active[row])
         nearest = {link[slot]: slot for slot in slots[np.argsort(-distance[row, slots], kind="stable")]}
         contacts = tuple(
-            Contact(hand.link_names[of], tuple(position[row, slot].tolist()), tuple(normal[row, slot].tolist()))
+            Contact(hand.link_names[of], *map(tuple, (position[row][slot], normal[row][slot], pressing[row][of])))
             for of, slot in sorted(nearest.items())
         )
         pregrasp, grasp, squeezed = (

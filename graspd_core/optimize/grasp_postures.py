@@ -349,10 +349,18 @@ def squeeze(
     forces = torch.as_tensor(unit_forces).to(problem.hand.lower)
     torque = joint_torques(problem, poses, contact_set, forces)
     limit = (effort * config.effort_share / torque.abs().clamp_min(1e-9)).amin(-1)
+    pressed = by_link(contact_set, -(forces * contact_set.normal).sum(-1, keepdim=True)).amax((-2, -1))
+    limit = torch.minimum(limit, config.link_force / pressed.clamp_min(1e-9))
     scale = limit.clamp(max=config.grip_force)[:, None]
     stiffness = torch.where(problem.hand.joint_scale == 1.0, config.stiffness, config.slide_stiffness)
     targets = (poses.joints + scale * torque / stiffness).clamp(problem.hand.lower, problem.hand.upper)
     return Squeeze(targets, scale[..., None] * forces, torch.as_tensor(imbalance).to(problem.hand.lower))
+
+
+def by_link(contact_set: ContactSet, values: Float[Tensor, "batch slots n"]) -> Float[Tensor, "batch links n"]:
+    """Return the sum of the values over the slots of each link. Links after the last one with a slot are left out."""
+    links = int(contact_set.link.max()) + 1
+    return values.new_zeros(len(values), links, values.shape[-1]).index_add(1, contact_set.link, values)
 
 
 def joint_torques(

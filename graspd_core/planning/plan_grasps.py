@@ -26,7 +26,6 @@ from graspd_core.planning.feasibility import out_of_reach, why_trials_failed
 from graspd_core.planning.rounds import RoundsResult, rounds_of, run_rounds
 from graspd_core.runtime.worker_process import start_planning_worker
 from graspd_core.types import (
-    Contact,
     Grasp,
     GraspResult,
     Outcome,
@@ -156,8 +155,8 @@ def on_surface(scene: Scene, grasps: Sequence[Grasp]) -> tuple[Grasp, ...]:
     if not contacts:
         return tuple(grasps)
     rows = (np.array([getattr(contact, key) for contact in contacts]) for key in ("position", "normal"))
-    places, normals = (part.tolist() for part in pressed_points(make_surface(scene.object.mesh), *rows))
-    exact = iter([Contact(c.link, tuple(p), tuple(n)) for c, p, n in zip(contacts, places, normals, strict=True)])
+    places, normals = (map(tuple, part.tolist()) for part in pressed_points(make_surface(scene.object.mesh), *rows))
+    exact = iter([replace(c, position=p, normal=n) for c, p, n in zip(contacts, places, normals, strict=True)])
     return tuple(replace(grasp, contacts=tuple(next(exact) for _ in grasp.contacts)) for grasp in grasps)
 
 

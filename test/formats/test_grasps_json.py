@@ -55,7 +55,7 @@ def result() -> GraspResult:
         pregrasp=posture(0),
         grasp=grip,
         squeeze=replace(posture(2), position=grip.position, quaternion_wxyz=grip.quaternion_wxyz),
-        contacts=(Contact("link_3.0_tip", (0.1, 0.2, 0.3), (0.0, 0.6, 0.8)),),
+        contacts=(Contact("link_3.0_tip", (0.1, 0.2, 0.3), (0.0, 0.6, 0.8), (0.0, -1.0, -2.5)),),
         score=-1.5,
         metrics=GraspMetrics({"contact_area": 2e-4, "intersection_volume": 1e-6, "penetration": 0.0015}),
         trials=(TrialResult("hold", True, 0.01, 0.1),),

@@ -90,6 +90,20 @@ def test_gaps_up_to_the_widest_are_exact_and_wider_ones_are_known_to_be(hand, sc
     assert bool((gaps == WIDE).any())
 
 
+def test_the_hand_keeps_the_margin_of_the_support(hand, scenes):
+    scene = on_table(scenes["box"])
+    assert scene.support is not None
+    raised = replace(scene, support=replace(scene.support, offset=scene.support.offset + 0.003))
+    margin = replace(scene, support=replace(scene.support, margin=0.003))
+    starts = draw_starts(scene, hand, 4, 0, "cpu", DOUBLE)
+    gaps = []
+    for one in (raised, margin):
+        obstacles = make_obstacle_tensors(one, hand, "cpu", DOUBLE)
+        assert obstacles is not None
+        gaps.append(gap_on_path(obstacles, small_problem(one, hand).hand.kinematics, starts, starts))
+    assert torch.equal(*gaps)
+
+
 def test_the_least_gap_is_the_least_of_all_gaps(hand, scenes):
     scene = on_table(beside(scenes["box"], 0.06))
     obstacles = make_obstacle_tensors(scene, hand, "cpu", DOUBLE)

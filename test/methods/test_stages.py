@@ -17,6 +17,7 @@ from graspd_core.optimize.candidates import PlannerInput, find_candidates, stage
 from graspd_core.optimize.grasp_postures import (
     _cone_edges,
     balanced_forces,
+    by_link,
     find_contacts,
     find_pregrasp,
     hand_distance,
@@ -168,6 +169,10 @@ def test_the_squeeze_presses_within_effort_and_limits(problem_of, hand, scenes):
     assert (torque.abs() <= effort * config.effort_share * (1 + 1e-9)).all()
     weak = squeeze(problem, poses, contact_set, effort / 10, config)
     assert (weak.forces.norm(dim=-1) <= pressed.forces.norm(dim=-1) + 1e-12).all()
+    most = float(by_link(contact_set, -(pressed.forces * contact_set.normal).sum(-1, keepdim=True)).max())
+    gentle = squeeze(problem, poses, contact_set, effort, replace(config, link_force=most / 2))
+    pressing = by_link(contact_set, -(gentle.forces * contact_set.normal).sum(-1, keepdim=True))
+    assert float(pressing.max()) == pytest.approx(most / 2)
 
 
 def test_an_open_hand_is_clear_of_itself_and_crossed_fingers_are_not(problem_of, hand):

@@ -57,6 +57,8 @@ def test_the_object_is_cut_out_of_a_table_scene(shape):
         # No more tilt than raises the table's edge, 0.4 m away, by 4 mm, the least tolerance.
         assert found.support.normal == pytest.approx([0, 0, 1], abs=0.01)
         assert found.support.offset == pytest.approx(0, abs=1e-3)
+        # The margin is one standard deviation of the noise, at least 1 mm.
+        assert 0.001 <= found.support.margin < 0.003
         # Four standard deviations of the greatest noise at 0.6 m.
         assert share_near(found.views[0].points, scene.truth, 0.009) > 0.99
         clear = view.points[(label == 0) & (view.points[:, 2] > 0.008)]

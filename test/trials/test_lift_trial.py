@@ -75,6 +75,13 @@ def test_fingers_through_the_table_are_refused(table, hand, closing):
     assert lift.reason == "the hand reaches 5.0 mm into the support while coming"
 
 
+def test_fingers_that_do_not_keep_the_tables_margin_are_refused(hand, cube, closing):
+    world = build_world(hand, cube, (cube.mesh,), STANDARD, replace(TABLE, margin=0.007))
+    lift = lift_trial(world, hand, closing(*GOOD, height=CLEAR), STANDARD)
+    # 2 mm above the table.
+    assert lift.reason == "the hand reaches 5.0 mm into the support while coming"
+
+
 def test_a_weak_squeeze_leaves_the_object_on_the_table(table, hand, closing):
     # 0.5 N on either side hold 0.6 N by friction, of 1 N.
     lift = lift_trial(table, hand, closing(0.015, 0.025, (0.026, 0.026), height=CLEAR), STANDARD)
