@@ -1,7 +1,7 @@
-"""Distances to a mesh and overlaps of a placed hand by the compiled kernel. Other Python threads run meanwhile.
+"""Compute distances to a mesh and overlaps of a hand with the compiled kernel. Other Python threads run meanwhile.
 
-`mesh/surface_queries` and `prepared_grasp` have the same in Python. They are the reference in tests, and run without a
-compiler. The kernel gives the same figures, but for rounding.
+`mesh/surface_queries` and `prepared_grasp` do the same in Python. The tests compare the kernel with them, and they are
+used if there is no kernel. The results are equal up to rounding.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ class CompiledQuery:
 
     Attributes:
         library: the kernel.
-        surface: the tree, which points into `nodes` and `triangles`.
+        surface: addresses of `nodes` and `triangles`, as the kernel expects them.
     """
 
     library: CDLL
@@ -41,7 +41,7 @@ class CompiledQuery:
 
 
 def make_query(mesh: TriangleMesh) -> CompiledQuery | DistanceQuery:
-    """Prepare a mesh for distance queries, by libigl where there is no kernel."""
+    """Prepare a mesh for distance queries. Without the kernel, libigl answers them."""
     library = kernel().library
     if library is None:
         return make_distance_query(mesh)
@@ -50,7 +50,7 @@ def make_query(mesh: TriangleMesh) -> CompiledQuery | DistanceQuery:
     corners = np.ascontiguousarray(cut.vertices[cut.faces], dtype=float).reshape(-1, 9)
     nodes, triangles = np.zeros((2 * len(corners), _NODE)), np.empty_like(corners)
     if library.graspd_build_surface(len(corners), corners.ctypes.data, nodes.ctypes.data, triangles.ctypes.data):
-        raise MemoryError("no memory for the tree of a mesh")
+        raise MemoryError(f"not enough memory to prepare a mesh of {len(corners)} triangles for distance queries")
     return CompiledQuery(library, Surface(nodes.ctypes.data, triangles.ctypes.data), nodes, triangles)
 
 
@@ -63,24 +63,24 @@ def signed_distance(
 ) -> Float[np.ndarray, "n"]:
     """Return the distance [m] to the nearest triangle, negative inside. Beyond `reach` [m] it is a lower bound.
 
-    Points are quicker in an `order` in which neighbours follow each other. It is of int32.
+    The query is faster with an `order`: int32 indices of the points, sorted so that neighbours follow each other.
     """
     if isinstance(query, DistanceQuery):
         return python_distance(query, points, reach=reach)
     points, distance = np.ascontiguousarray(points, dtype=float), np.empty(len(points))
     arguments = len(points), points.ctypes.data, None if order is None else order.ctypes.data, reach
     if query.library.graspd_signed_distance(byref(query.surface), *arguments, distance.ctypes.data):
-        raise MemoryError("no memory for distances to a mesh")
+        raise MemoryError(f"not enough memory for the distances of {len(points)} points to a mesh")
     return distance
 
 
 @dataclass(frozen=True, eq=False)
 class CompiledHand:
-    """The collision primitives of a hand as the kernel reads them.
+    """The collision primitives of a hand in the kernel's layout.
 
     Attributes:
-        bodies: the primitives, which point into `arrays`.
-        apart: whether two links may not touch, 1 or 0.
+        bodies: addresses of `arrays`, as the kernel expects them.
+        apart: 1 for each pair of links that must not touch, else 0.
     """
 
     bodies: Bodies
@@ -90,7 +90,7 @@ class CompiledHand:
 
 @lru_cache(maxsize=8)
 def compiled_hand(hand: HandModel) -> CompiledHand:
-    """Convert the collision primitives of a hand."""
+    """Return the collision primitives of a hand in the kernel's layout."""
     solids = sorted(hand.primitives, key=lambda primitive: primitive.link)
     poses = [np.column_stack([solid.rotation, solid.translation]).ravel() for solid in solids]
     planes = [np.column_stack(hull_planes(solid)) if solid.kind == "hull" else np.zeros((0, 4)) for solid in solids]
@@ -114,7 +114,7 @@ def _doubles(values: object) -> np.ndarray:
 
 
 def _core(solid: Primitive) -> tuple[float, ...]:
-    """Return half extents, or (radius, radius, half length) of a cylinder, without the radius of round ends [m]."""
+    """Return the half extents of a solid along its own axes [m], without the radius of a sphere or capsule."""
     if solid.kind == "box":
         return solid.size
     if solid.kind == "cylinder":
@@ -123,7 +123,7 @@ def _core(solid: Primitive) -> tuple[float, ...]:
 
 
 def _ball(solid: Primitive) -> tuple[float, ...]:
-    """Return centre and radius of a ball about a solid, in its own frame [m]."""
+    """Return centre and radius of a solid's bounding sphere, in the solid's own frame [m]."""
     if solid.kind == "hull":
         center = (solid.vertices.min(0) + solid.vertices.max(0)) / 2
         return (*center, float(np.linalg.norm(solid.vertices - center, axis=1).max()))
@@ -142,9 +142,9 @@ def depth_in_hand(
     points: Float[np.ndarray, "n 3"],
     link_of: Int[np.ndarray, "n"] | None = None,
 ) -> float:
-    """Return the greatest depth of a point in a primitive [m], at least 0.
+    """Return the greatest depth of any point inside any primitive [m], 0 if no point is inside.
 
-    With `link_of`, the link of each point, only primitives count whose link may not touch that link.
+    If `link_of` gives each point's link, the primitives of this link and of its adjacent links are skipped.
     """
     compiled, depth, points = compiled_hand(hand), np.empty(1), _doubles(points)
     of = None if link_of is None else np.ascontiguousarray(link_of, dtype=np.int32)
@@ -152,14 +152,14 @@ def depth_in_hand(
     of_at = None if of is None else of.ctypes.data
     arguments = len(points), points.ctypes.data, of_at, apart, depth.ctypes.data
     if query.library.graspd_hand_depth(byref(compiled.bodies), links.ctypes.data, *arguments):
-        raise MemoryError("no memory for the depth in a hand")
+        raise MemoryError(f"not enough memory for the depth of {len(points)} points in the hand")
     return float(depth[0])
 
 
 def shared_volume(query: CompiledQuery, hand: HandModel, links: _Links, cell: float) -> float:
-    """Return the volume of a hand inside a mesh [m³], in cells this wide [m]."""
+    """Return the volume of a hand inside a mesh [m³], summed over grid cells of width `cell` [m]."""
     volume = np.empty(1)
     arguments = links.ctypes.data, byref(query.surface), cell, volume.ctypes.data
     if query.library.graspd_shared_volume(byref(compiled_hand(hand).bodies), *arguments):
-        raise MemoryError("no memory for the volume of an overlap")
+        raise MemoryError("not enough memory for the overlap volume of hand and object")
     return float(volume[0])

@@ -69,7 +69,7 @@ class ObjectState:
 
 
 def stop_rule(protocol: Protocol, fingers: int) -> StopRule | None:
-    """Return the stop rule for a protocol and a number of fingers. None if the protocol asks for full length."""
+    """Return the stop rule for a protocol and a number of fingers. Return None if the protocol forbids early stops."""
     if protocol.full_length:
         return None
     if fingers < _FEWEST_FINGERS:
@@ -81,13 +81,13 @@ def stop_rule(protocol: Protocol, fingers: int) -> StopRule | None:
 def answer_known(
     rule: StopRule, protocol: Protocol, states: Sequence[ObjectState], moved: tuple[float, float], left: int
 ) -> bool:
-    """Return True if a hold can stop, because it will stay within its limits. Return False if a value is not finite.
+    """Return True if a hold can stop, because the object will stay within its limits. False if a value is not finite.
 
     Args:
         rule: stop rule of the hold.
         protocol: protocol with the limits.
-        states: object states at the last checks, oldest first. Longer windows are skipped.
-        moved: travel [m] and rotation [rad] so far.
+        states: object states at the last checks, oldest first. Windows that are longer than this history are skipped.
+        moved: travel [m] and rotation [rad] of the object so far.
         left: number of remaining steps.
     """
     spans = ((window, states[-(window // LOOK_EVERY + 1) :]) for window in rule.windows)

@@ -4,7 +4,7 @@ The trial re-implements DexGraspBench's floating protocol from its parameters. T
 measured from its pose at the start of the trial, so they include motion while the hand closes. A pull may stop early
 (`early_stop`), unless the protocol asks for the full length.
 
-The noisy hold trial repeats the hold trial with the hand displaced, as by a wrong estimate of the object's pose.
+The noisy hold trial repeats the hold trial with a displaced hand, to simulate errors of the object's estimated pose.
 """
 
 from __future__ import annotations
@@ -186,7 +186,7 @@ def start_penetration(world: World, data: Any) -> float:
 
 
 def self_fault(world: World, data: Any, protocol: Protocol) -> str:
-    """Return a description of the deepest forbidden self-penetration in the current state, empty if there is none."""
+    """Return a text about the deepest forbidden self-penetration in the current state, empty if there is none."""
     first, second, distance = data.contact.geom1, data.contact.geom2, data.contact.dist
     deep = np.flatnonzero(distance < -protocol.max_self_penetration)
     own = deep[np.isin(first[deep], world.hand_geoms) & np.isin(second[deep], world.hand_geoms)]
@@ -227,7 +227,7 @@ def set_joints(world: World, data: Any, values: np.ndarray) -> None:
 
 
 def _move(world: World, data: Any, start: Posture, end: Posture, protocol: Protocol, worst: np.ndarray) -> str:
-    """Move the targets linearly from start to end. Return why the trial failed, empty if it did not."""
+    """Move the hand's targets linearly from start to end. Return why the trial failed, empty if it did not."""
     steps = round(protocol.stage_time / protocol.timestep)
     path = straight_path(start, end, np.arange(1, steps + 1) / steps)
     for step in range(1, steps + 1):

@@ -40,7 +40,7 @@ from graspd_core.verify.world import Protocol, World, advance, trial_data
 # pyright: reportAttributeAccessIssue=false
 
 
-_COMING, _CLOSING, _SQUEEZING, _LIFTING = "while the hand came", "while closing", "while squeezing", "while lifting"
+_COMING, _CLOSING, _SQUEEZING, _LIFTING = "while approaching", "while closing", "while squeezing", "while lifting"
 # Fractions of each path at which the hand's commanded postures are checked against the obstacles.
 _SHARES = (0.0, 0.25, 0.5, 0.75)
 
@@ -77,9 +77,9 @@ def lift_trial(
 ) -> TrialResult:
     """Run one lift trial in a world built with a support or neighbours. It ends as soon as the object exceeds a limit.
 
-    Until the hand first touches the object, the object is held fixed, because a reconstructed bottom may not stand.
-    Then it is free. Relative to the hand's lift, the object must always stay within the protocol's limits (5 cm, 15°)
-    of its start. Without a support there is no gravity, and the hand moves the object back along the approach.
+    The object is fixed until the hand first touches it, because it may fall over on a badly reconstructed bottom. Then
+    it is free. In the frame that rises with the hand, the object must always stay within the protocol's limits (5 cm,
+    15°) of its start. Without a support there is no gravity, and the hand retreats with the object along the approach.
     """
     import mujoco
 
@@ -176,12 +176,11 @@ def _sink(world: World, data: Any, up: Float[np.ndarray, "3"], a: float, setting
 
 
 def reach_through(world: World, data: Any, postures: tuple[Posture, ...], limit: float) -> str:
-    """Return the deepest penetration of an obstacle on the straight paths as text, empty if at most `limit` [m]."""
+    """Return a text about the deepest penetration of an obstacle on the straight path, empty if at most `limit` [m]."""
     import mujoco
 
     worst, reason = 0.0, ""
-    names = ("while coming", "while closing")
-    for (start, end), name in zip(pairwise(postures), names, strict=True):
+    for (start, end), name in zip(pairwise(postures), (_COMING, _CLOSING), strict=True):
         path = straight_path(start, end, np.array([*_SHARES, 1.0]))
         for index in range(len(path.positions)):
             set_targets(data, path, index)

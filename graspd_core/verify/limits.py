@@ -1,4 +1,4 @@
-"""Limits of a grasp: the greatest mass at its friction, and the least friction at its mass.
+"""Limits of a grasp: the greatest mass that it holds at the object's friction, and the least friction at its mass.
 
 Both are found by bisection over hold trials with early stop (`early_stop`).
 """
@@ -38,8 +38,8 @@ def payload(
     """Return the payload [kg]: the greatest mass at which the grasp withstands every pull of the protocol.
 
     The result is 0 if the grasp does not hold the mass `least` [kg]. The hand closes once, with the object's own mass.
-    If a hold trial has already closed it, that state is reused. Each pull starts from this state, with the force for
-    the tried mass. Set `held` if a hold trial has already passed at `least`.
+    If a hold trial has already closed the hand, its state is reused. Each pull starts from this state, with the force
+    for the tried mass. Set `held` if a hold trial has already passed at `least`.
     """
     import mujoco
 

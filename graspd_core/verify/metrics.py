@@ -1,7 +1,7 @@
 """Registry of grasp metrics. `measure`, files, messages and tables use its rows.
 
-The metrics are static and independent of the frame. docs/metrics.md defines them, and a test compares it with the rows.
-`distinct` removes near-duplicate grasps.
+The metrics are static and independent of the frame. docs/metrics.md defines them, and a test compares that page with
+the rows. `distinct` removes near-duplicate grasps.
 """
 
 from __future__ import annotations
@@ -130,7 +130,7 @@ _ROWS = (
     ),
 )  # fmt: skip
 METRICS: dict[str, Metric] = {row.name: row for row in _ROWS}
-"""The metrics by name; a row that is added is measured too."""
+"""The metrics by name. `measure` measures every row."""
 
 
 def measure(context: MetricsContext, posture: Posture, *, max_contacts: int = MAX_CONTACTS) -> GraspMetrics:

@@ -60,7 +60,7 @@ class HandSurface:
         links: link index of each sample.
         areas: surface area that each sample represents [m²].
         kinematics: the hand's kinematics in float64.
-        order: an order of the samples in which neighbours follow each other, of int32.
+        order: int32 indices of the samples, sorted so that neighbours follow each other.
     """
 
     points: Float[np.ndarray, "samples 3"]
@@ -154,7 +154,7 @@ def placed_hand(context: MetricsContext, posture: Posture) -> PlacedHand:
 
 
 def contact_area(placed: PlacedHand, within: float = CONTACT_DISTANCE) -> float:
-    """Return the area of the hand within `within` [m], at most 15 mm, of the object's surface, on either side [m²]."""
+    """Return the hand's area [m²] within `within` [m] of the object's surface, inside or outside. At most 15 mm."""
     return float(placed.areas[np.abs(placed.distance) <= within].sum())
 
 
@@ -339,7 +339,7 @@ def _root_cells(
 def _solid_distance(
     solids: _PlacedSolids, which: Int[np.ndarray, "n"], points: Float[np.ndarray, "n 3"]
 ) -> Float[np.ndarray, "n"]:
-    """Return each point's signed distance to the primitive `which` (ascending) [m]. For hulls it is a lower bound."""
+    """Return each point's signed distance [m] to the primitive of index `which` (ascending). A lower bound for hulls."""
     local = np.einsum("nji,nj->ni", solids.rotations[which], points - solids.translations[which])
     hulls = int(np.searchsorted(which, len(solids.smooth.link)))
     smooth = local_distance(solids.smooth, torch.as_tensor(local[:hulls]), torch.as_tensor(which[:hulls])).numpy()
@@ -412,7 +412,7 @@ Hull = tuple[float, Float[np.ndarray, "6"], float]
 
 
 def compiled_hull(wrenches: Float[np.ndarray, "n 6"]) -> Hull | None:
-    """Build the hull with the compiled kernel. Return None if there is no kernel or it fails."""
+    """Build the hull with the compiled kernel. Return None if there is no kernel or the kernel fails."""
     library = kernel().library
     if library is None or len(wrenches) > _MOST_WRENCHES:
         return None

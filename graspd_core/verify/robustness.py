@@ -1,9 +1,8 @@
 """Robustness checks for objects seen by cameras: other poses, less friction, other shapes of the hidden side.
 
-A grasp that holds on the likeliest scene runs these checks until it passes or fails. It must hold on two of the other
-shapes, because the hidden side may be guessed wrong. docs/clouds.md reports how often such grasps hold on the true
-object. Trials run on several threads. `results_in_order` yields the same results in the same order for any number of
-threads.
+A grasp that holds on the likeliest scene must also pass these checks. It must hold on two of the other shapes, because
+the hidden side may be guessed wrong. docs/clouds.md reports how often such grasps hold on the true object. Trials run
+on several threads. `results_in_order` yields the same results in the same order for any number of threads.
 """
 
 from __future__ import annotations
@@ -72,7 +71,7 @@ def results_in_order(
         items: the items to work on.
         threads: number of threads, at least 1.
         needed: returns the least number of further results that the caller needs. That many are started ahead.
-        known_over: also ends running work. All threads call it.
+        known_over: stop hook that also ends running work. All threads call it.
     """
     if min(threads, len(items)) <= 1:
         for item in items:
@@ -123,7 +122,7 @@ class RobustnessCheck:
 
     Attributes:
         name: name of the variant, for messages.
-        hold: runs the hold trial of a grasp in the variant. It returns None if the variant is impossible or if stopped.
+        hold: runs the hold trial of a grasp in the variant. Returns None if the variant is impossible or was stopped.
     """
 
     name: str
@@ -184,8 +183,8 @@ def begin_other_worlds(
 ) -> tuple[LaterWorld, ...]:
     """Return the worlds of other possible shapes of the object. Empty if grasps need not be tried on them.
 
-    The first two worlds, in which every grasp is tried, are built at once, one after the other. The others are built
-    when needed. A world is None if there is no such shape or if the run ended first.
+    The first two worlds, in which every grasp is tried, are built immediately, one after the other. The other worlds
+    are built when needed. A world is None if there is no such shape or if the run ended first.
     """
     making = threading.Lock()
 
@@ -240,8 +239,8 @@ def robustness_checks_of(
 def less_sure(checks: RobustnessChecks, most: float, heavy: float) -> RobustnessChecks:
     """Scale all probabilities by the probability that the object weighs at most the payload `most` [kg].
 
-    `heavy` is the heavy end of what the object's volume allows [kg]. If too many such objects weigh more than `most`,
-    the checks return this as a doubt. Checks that have doubts are returned unchanged.
+    `heavy` is the greatest mass that the object's volume allows [kg]. If too many objects of this volume weigh more
+    than `most`, the returned checks have this doubt. Checks that already have doubts are returned unchanged.
     """
     if checks.doubts:
         return checks
@@ -330,9 +329,9 @@ def _begun(evidence: Evidence) -> dict[str, Future[Scene | None]]:
 
 
 def begin_other_shapes(probability: float, likeliest: ObjectModel, evidence: Evidence) -> None:
-    """Start to build, in background threads, the other shapes on which every grasp will be tried, if there are any.
+    """Start background threads that build the other shapes on which every grasp will be tried, if there are any.
 
-    `scene_from_views` calls this, so that they are built in parallel with the distance grid of the likeliest shape.
+    `scene_from_views` calls this, so that the shapes are built in parallel with the likeliest shape's distance grid.
     """
     for rule in _rules_needed(evidence, probability, held_shares(likeliest))[:LEAST_SHAPES]:
         work = partial(run_isolated, other_scene, evidence, rule, likeliest)

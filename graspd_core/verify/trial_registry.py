@@ -55,7 +55,7 @@ _ROWS = (
     Trial("lift", lambda context: context.around is not None, _lift),
 )
 TRIALS: dict[str, Trial] = {row.name: row for row in _ROWS}
-"""The trials by name, in the order in which they run; a row that is added runs too."""
+"""The trials by name, in the order in which they run."""
 
 
 def build_worlds(scene: Scene, hand: HandModel, parts: Sequence[TriangleMesh], protocol: Protocol) -> TrialContext:

@@ -63,7 +63,7 @@ class VerificationContext:
     """Worlds, metrics and robustness checks of a run.
 
     Attributes:
-        metrics: builds the context of the metrics. None without metrics.
+        metrics: returns the context for measuring metrics. None if metrics are not measured.
         friction: whether to measure the least friction.
         heavy: the assumed mass [kg], if the trials use a lower one. None otherwise.
     """
@@ -96,8 +96,8 @@ class Prefetched:
 def prefetch(run: Run, scene: Scene, hand: HandModel, verify: str, certainty: CertaintyConfig) -> Prefetched:
     """Start to build the trial worlds in background threads, which takes about as long as the optimiser.
 
-    Only one object is cut at a time. An object is skipped if its run has ended. Otherwise work would pile up if runs
-    were cancelled quickly.
+    Only one object at a time is cut into convex parts. An object is skipped if its run has ended. Otherwise work would
+    pile up if many runs were cancelled quickly.
     """
 
     def build() -> TrialContext | None:
@@ -159,7 +159,7 @@ def payloads(context: VerificationContext, grasps: Sequence[Grasp], stop: StopHo
 # The cache keeps the last few scenes and hands. They are hashed by identity.
 @lru_cache(maxsize=4)
 def trial_context(scene: Scene, hand: HandModel, verify: str) -> TrialContext:
-    """Build the worlds of the `verify` trials at the object's friction. The scene is near the origin (`near_scene`)."""
+    """Build the worlds of the `verify` trials at the object's friction, for a scene moved by `near_scene`."""
     protocol = at_friction(PROTOCOLS[verify], scene.object.friction)
     return build_worlds(scene, hand, object_parts(scene.object), protocol)
 
@@ -262,8 +262,8 @@ def _tried(
 ) -> Generator[Grasp]:
     """Yield the candidates with their trial results, in order.
 
-    If `alone` is set, the first candidate runs several robustness checks in parallel. The others wait until it waits
-    for a world or is done.
+    If `alone` is set, the first candidate runs several robustness checks in parallel. The other candidates start when
+    the first one waits for a world or is done.
     """
     threads, checks = torch.get_num_threads(), context.checks
     work = partial(_all_trials, context, one_by_one)

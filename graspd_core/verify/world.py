@@ -1,10 +1,10 @@
-"""The MuJoCo world of a trial: a hand of primitives on a position-controlled base, and a free object of convex parts.
+"""Build the MuJoCo world of a trial: a hand of primitives on a mocap base, and a free object of convex parts.
 
 A support adds gravity and a table. Neighbours add obstacles. Table and obstacles are mocap bodies, so that a trial can
 lower them away from the hand. Their mocap indices follow the hand's.
 
 Contact and solver settings use the published parameters of DexGraspBench's floating protocol (Chen et al., BODex, ICRA
-2025). Nothing here is differentiable, and the optimiser uses nothing of it.
+2025). Nothing here is differentiable, and the optimiser does not use it.
 """
 
 from __future__ import annotations
@@ -120,7 +120,7 @@ def add_others(spec: Any, others: Sequence[FreeBody], friction: Friction) -> tup
 
 
 def add_support(spec: Any, hand: HandModel, parts: Sequence[TriangleMesh], friction: Friction, support: Plane) -> None:
-    """Add gravity, a plane for the hand, and a plane for the object at the bottom of `parts` (none without parts)."""
+    """Add gravity, a plane for the hand, and a plane for the object at the bottom of its `parts`, if there are any."""
     spec.option.gravity = -_GRAVITY * support.normal
     add_plane(spec, TABLE, replace(support, offset=support.offset + support.margin), friction)
     for link in hand.link_names:
@@ -173,7 +173,7 @@ def add_mesh(spec: Any, name: str, vertices: np.ndarray, faces: np.ndarray) -> N
 
 
 def full_inertia(inertia: Float[np.ndarray, "3 3"], floor: float) -> list[float]:
-    """Return xx yy zz xy xz yz of a valid inertia [kg·m²]: moments ≥ `floor`, each below the sum of the others."""
+    """Return xx yy zz xy xz yz [kg·m²] of an inertia corrected to be valid, with principal moments ≥ `floor`."""
     moments, axes = np.linalg.eigh(0.5 * (inertia + inertia.T))
     moments = np.maximum(moments, floor)
     moments[2] = min(moments[2], 0.999 * (moments[0] + moments[1]))
@@ -362,7 +362,7 @@ def build_world(
             its own plane through its lowest point, because a reconstructed bottom may be millimetres too high or too
             low.
         obstacles: fixed bodies, as their convex hulls. An obstacle that overlaps the object does not collide with it.
-        others: other free bodies. If given, even empty, the object rests on the support plane.
+        others: other free bodies. If given, even if empty, the object rests on `support` itself.
     """
     import mujoco
 

@@ -72,7 +72,7 @@ def test_fingers_through_the_table_are_refused(table, hand, closing):
     lift = lift_trial(table, hand, closing(*GOOD), STANDARD)
     assert not lift.passed
     # 5 mm below the table at the height of the other tests.
-    assert lift.reason == "the hand reaches 5.0 mm into the support while coming"
+    assert lift.reason == "the hand reaches 5.0 mm into the support while approaching"
 
 
 def test_fingers_that_do_not_keep_the_tables_margin_are_refused(hand, cube, closing):
