@@ -133,8 +133,8 @@ def assemble(
 ) -> tuple[Grasp, ...]:
     """Return grasps with three postures and a score, best first.
 
-    Poses whose approach path or end penetrates an obstacle are dropped. Poses whose fingers penetrate the object deeply
-    are kept, because some methods produce such poses and their grasps hold.
+    Poses that penetrate an obstacle at the grasp or on the approach path are dropped. Poses whose fingers penetrate the
+    object deeply are kept, because some methods produce such poses and their grasps hold.
     """
     grasps: list[Grasp] = []
     device, total = poses.translation.device, len(poses.translation)

@@ -1,7 +1,7 @@
 """Find the contacts of a grasp posture, and compute the pregrasp and the squeeze posture.
 
 From the pregrasp the hand closes without touching anything on its path. The squeeze has the joint targets that produce
-balanced contact forces. If the problem fits the compiled kernel, the kernel does the same steps as torch, row by row.
+balanced contact forces. If the problem fits the compiled kernel, the kernel runs the same steps in place of torch.
 """
 
 from __future__ import annotations
@@ -120,7 +120,7 @@ def _with_features(problem: Problem, poses: Poses, found: ContactSet, reach: flo
 def nearest_features(
     problem: Problem, poses: Poses
 ) -> tuple[Int[Tensor, "batch solids"], Float[Tensor, "batch solids"], Float[Tensor, "batch solids 3"]]:
-    """Return for every solid of the hand the nearest sharp point, and its signed distance [m] with gradient."""
+    """Return the sharp point nearest to every solid of the hand, as index, signed distance [m] and its gradient."""
     solids = problem.hand.solids
     if (compiled := problem.compiled) is not None:
         x = pack(poses).contiguous()
@@ -269,7 +269,7 @@ def _pregrasp_settings(config: GraspStagesConfig) -> structs.Pregrasp:
 def _rates_and_costs(
     problem: Problem, settings: structs.Pregrasp
 ) -> tuple[Float[Tensor, "variables"], Float[Tensor, "variables"]]:
-    """Return for base translation and joints the step sizes, and the costs per squared travel."""
+    """Return the step sizes and the costs per squared travel, for base translation and joints."""
     rates = problem.hand.lower.new_full((3 + len(problem.hand.lower),), settings.joint_rate)
     rates[3:] *= problem.hand.joint_scale
     rates[:3] = settings.base_rate
@@ -391,7 +391,7 @@ def balanced_forces(
         arms: contact points about the centre of mass [m].
         normals: outward unit normals.
         active: which slots are contacts.
-        length: torques are divided by this [m].
+        length: length that torques are divided by [m].
         friction: Coulomb coefficient of the cones.
 
     Returns:

@@ -55,7 +55,7 @@ class StartPool:
         middle: position of the grip [m].
         rotation: orientation of the base.
         translation: origin of the base [m].
-        joints: [rad].
+        joints: joint values [rad] or [m].
         depth: distance from the first surface in front of the palm to the wanted place [m]. 0 without a wanted place.
     """
 
@@ -219,7 +219,7 @@ def raise_clear(obstacles: ObstacleTensors, base: SE3, links: SE3) -> tuple[Posi
 
 
 def depth_of_starts(scene: Scene, hand: HandModel, count: int, restrictions: BoundRestrictions) -> float:
-    """Return the depth in the obstacles [m] of the best of `count` starts, at start or retreat. 0 without obstacles."""
+    """Return how deep the best of `count` starts, or its retreat, penetrates the obstacles [m]. 0 without obstacles."""
     obstacles = make_obstacle_tensors(scene, hand, "cpu", torch.float64)
     if obstacles is None:
         return 0.0

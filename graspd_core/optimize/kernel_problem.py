@@ -99,7 +99,7 @@ class KernelProblem:
         if failures:
             raise failures[0]
         if status != 0:
-            raise MemoryError(f"{function}: too little memory")
+            raise MemoryError(f"{function}: not enough memory for {torch.get_num_threads()} threads; use fewer threads")
 
 
 def _given(argument: Argument) -> object:

@@ -34,7 +34,7 @@ class Poses:
     Attributes:
         translation: base origin in the object frame [m].
         quaternion: base orientation, wxyz, of any non-zero length.
-        joints: [rad].
+        joints: joint values [rad] or [m].
     """
 
     translation: Float[Tensor, "batch 3"]
@@ -97,7 +97,7 @@ class Hooks:
 
     Attributes:
         report: called with (step, steps, best loss) at most every `interval` seconds.
-        stop: asked before every step. True ends the run.
+        stop: called before every step. If it returns True, the run ends.
         deadline: `time.perf_counter()` value after which the run ends within one step.
         interval: least time between reports [s].
         watch: called at every report with the best poses so far. None for no call.

@@ -1,4 +1,4 @@
-"""Compute the loss terms of the closed-form relaxation: pure functions of arrays, one value per start, of order one.
+"""Compute the loss terms of the closed-form relaxation. Each is a pure function with one value per start, of order one.
 
 For a unit disturbance w, the best resisting force in the friction cone of a contact has a closed form. So the support
 function of the grasp wrench space is a sum over contacts (docs/method.md):
@@ -69,7 +69,7 @@ def wrench_support(
 
 
 def soft_contact(distance: Distances, radius: Values, delta: float) -> Distances:
-    """Return the activation s = exp(−|φ − r| / δ): one on the padded surface. Off it the gradient is never zero."""
+    """Return the activation s = exp(−|φ − r| / δ): one on the padded surface φ = r, with a gradient everywhere else."""
     return (-(distance - radius[:, None]).abs() / delta).exp()
 
 
@@ -95,7 +95,7 @@ def touch(gap: Float[Tensor, "batch groups"], reach: Float[Tensor, "groups"]) ->
 
 
 def penetration(distance: Distances, radius: Values) -> Values:
-    """Return a penalty on points below the padded surface: the sum of squared depths [mm²], linear for deep points."""
+    """Return a tenth of the sum of squared depths below the padded surface [mm²], linear for deep points."""
     depth = (radius[:, None] - distance).clamp_min(0.0) / _MILLIMETRE
     return (depth * depth / (1.0 + 0.1 * depth)).sum(-1) / 10.0
 
@@ -103,9 +103,9 @@ def penetration(distance: Distances, radius: Values) -> Values:
 def self_collision(
     centers: Float[Tensor, "batch spheres 3"], radii: Float[Tensor, "spheres"], weight: Float[Tensor, "spheres spheres"]
 ) -> Values:
-    """Return the squared overlap of spheres of non-adjacent links [mm²], with depth (R² − d²) / 2R.
+    """Return a tenth of the squared overlap of spheres of non-adjacent links [mm²], with depth (R² − d²) / 2R.
 
-    R is the sum of the radii. The depth is exact where spheres touch. `weight` is 1 / 2R [1/m], zero for other pairs.
+    R is the sum of the radii, d the distance of the centres. `weight` is 1 / 2R [1/m], zero for unchecked pairs.
     """
     inner = (radii * radii - (centers * centers).sum(-1))[..., None]
     ones, r = torch.ones_like(inner), radii.expand(len(centers), -1)[..., None]

@@ -1,9 +1,9 @@
 """Measure the hand's distance from the support plane and from the obstacles around the object.
 
-The solids of the hand are convex. So a solid is clear of the support if its extreme points are: corners of boxes and
-hulls, ends of spheres and capsules less their radius, rim points of cylinders. Obstacles are also tested against the
-collision spheres (`hands.self_collision`), which extend a little out of flat faces. Gradients are exact, except for the
-interpolated distance to obstacles.
+The solids of the hand are convex. So a solid is clear of the support if all its extreme points are clear: corners of
+boxes and hulls, balls at the ends of spheres and capsules, rim points of cylinders. Obstacles are also tested against
+the collision spheres (`hands.self_collision`), which extend a little out of flat faces. Gradients are exact, except for
+the interpolated distance to obstacles.
 """
 
 from __future__ import annotations
@@ -52,7 +52,7 @@ class ObstacleTensors:
         corner_radii: radii of the balls about the extreme points [m].
         sphere_matrix: places the centres of the collision spheres in the same way.
         sphere_radii: radii of the collision spheres [m].
-        normal: unit normal of the support, into the free side. None without a support.
+        normal: unit normal of the support, towards the free side. None without a support.
         offset: n·x of the support's points [m].
         sdfs: signed distance fields of the obstacles within the hand's reach.
         approach: unit direction in which the hand moves to its pregrasp, base frame.

@@ -41,7 +41,7 @@ class Method:
         colour, marker: colour and marker in charts, as Matplotlib takes them.
         benchmark_count: grasps of one unfiltered batch in the benchmark.
         at_budget: returns the settings for a multiple of the usual budget. The default keeps the settings.
-        searches: returns the greatest number of searches per round. They end if enough grasps are expected to hold.
+        searches: returns the greatest number of searches per round. No search follows if enough grasps should hold.
     """
 
     module: str
@@ -116,10 +116,10 @@ class PlanConfig:
         resolution: the signed distance grid has at most `resolution`³ nodes: `resolution` along each side of a cube.
         method: name of the method, one of `method_names`.
         settings: settings of the method, an instance of `Method.config`. None takes the defaults.
-        problem: how scene and hand become tensors.
+        problem: settings for converting scene and hand to tensors.
         grasp_stages: settings of pregrasp and squeeze.
         rounds: settings of the rounds of optimisation and trial.
-        robust: how the verified grasps are ordered.
+        robust: settings for sorting the verified grasps by robustness.
         certainty: required certainty of a grasp if part of the object's surface is a guess.
 
     Raises:

@@ -74,7 +74,7 @@ class SphereTensors:
 
     Attributes:
         matrix: places the centres by their links' poses, see `hands.kinematics.placement`.
-        radii: [m].
+        radii: radii of the spheres [m].
         weight: 1 / 2R for checked pairs [1/m], where R is the sum of both radii. Zero for other pairs.
     """
 
@@ -94,7 +94,7 @@ class HandTensors:
         fine: all contact candidates. Used in the last steps.
         reach: attraction range of each group of candidates [m].
         solids: collision primitives.
-        group_of_solid: first candidate group of the solid's rigid group. One past the last group if it has none.
+        group_of_solid: index of the first candidate group on each solid's rigid group. Number of groups if none.
         solid_pairs: pairs of solids whose links are not adjacent.
         spheres: spheres for self-collision.
         lower, upper: joint limits [rad] or [m].
@@ -133,7 +133,7 @@ class ObjectTensors:
         coarse_features: number of leading `features` used in the coarse steps, 0 if the object has no thin walls.
         center: centre of mass [m].
         length: torques are divided by this characteristic length [m].
-        confidence: confidence in the surface near each node of `sdf`, at least a floor. None if all of it is known.
+        confidence: confidence in the surface near each node of `sdf`, at least a floor. None if no surface is guessed.
     """
 
     sdf: GridSDF
@@ -233,9 +233,10 @@ def make_object_tensors(scene: Scene, settings: ProblemConfig, device: str, dtyp
 
 
 def _patches(hand: HandModel, candidates: int, size: int) -> Int[np.ndarray, "points"]:
-    """Return the patch of each contact candidate: the nearest patch of its rigid group. −1 without coarse candidates.
+    """Return the patch of each contact candidate: the nearest patch of its rigid group.
 
-    A rigid group of links has one patch for every `size` coarse candidates, with centres far from each other.
+    A rigid group of links has one patch for every `size` coarse candidates, with centres far from each other. A group
+    without coarse candidates gets −1.
     """
     posture = link_poses(hand, (hand.lower + hand.upper) / 2)
     points = in_base(posture, hand.candidate_points, hand.candidate_link)
@@ -317,7 +318,7 @@ def build_problem(
     device: str = "cpu",
     dtype: torch.dtype = torch.float32,
 ) -> Problem:
-    """Convert scene and hand to tensors. `seed` fixes the disturbances other than the signed axes."""
+    """Convert scene and hand to tensors. `seed` fixes the random disturbances, which follow the signed axes."""
     return Problem(
         hand=make_hand_tensors(hand, settings.candidates, settings.patch_size, device, dtype),
         object=make_object_tensors(scene, settings, device, dtype),

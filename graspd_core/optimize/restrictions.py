@@ -96,7 +96,7 @@ class BoundRestriction:
 
     @property
     def impossible(self) -> str:
-        """The reason why no grasp can be admitted, as a sentence that ends the run. Empty if a grasp is possible."""
+        """The reason why no grasp can be admitted, as the message of the run. Empty if a grasp may be possible."""
         return ""
 
     @property
@@ -105,7 +105,7 @@ class BoundRestriction:
         return type(self).__name__
 
     def why_none(self, others: BoundRestrictions) -> str:
-        """Return why no candidate satisfies this restriction and the run's `others`. Empty if there is no reason."""
+        """Return why no candidate satisfies this restriction and the run's `others`. Empty if the reason is unknown."""
         return ""
 
     @property
@@ -132,8 +132,8 @@ class BoundRestrictions:
     """All restrictions of a run.
 
     Attributes:
-        each: applied in order. The first that refuses a candidate gives the reason.
-        origin: poses passed to or returned by this class are relative to this point, in the frame of `each` [m].
+        each: the restrictions, applied in order. The first restriction that refuses a candidate gives the reason.
+        origin: origin of the poses that this class takes and returns, in the frame of `each` [m].
     """
 
     each: tuple[BoundRestriction, ...] = ()
@@ -160,7 +160,7 @@ class BoundRestrictions:
         return replace(scene, obstacles=(*scene.obstacles, *obstacles)) if obstacles else scene
 
     def starts(self, positions: Places, quaternions: Turns, joints: JointRows) -> Allowed:
-        """Return True for each initial pose that all restrictions allow. Each checks only what the others allowed."""
+        """Return True for each initial pose that all restrictions allow."""
         allowed = np.ones(len(positions), dtype=bool)
         for one in self.each:
             rows = np.flatnonzero(allowed)
@@ -186,7 +186,8 @@ def restrictions_in_words(restrictions: BoundRestrictions, refused: Mapping[str,
     """Return a sentence about the refused candidates, most frequent reason first. Empty if none was refused.
 
     Example: "12 candidates held, 9 refused: 7 outside the approach cone, 2 with a contact outside the region".
-    If no candidate was found, it names the restrictions. `held` candidates held. `tried` candidates were admitted.
+    If no candidate was found, the sentence names the restrictions. `held` counts the candidates that held, and `tried`
+    the admitted candidates.
     """
     if refused:
         reasons = ", ".join(f"{n} {reason}" for reason, n in sorted(refused.items(), key=lambda item: -item[1]))

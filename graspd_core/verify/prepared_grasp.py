@@ -339,7 +339,7 @@ def _root_cells(
 def _solid_distance(
     solids: _PlacedSolids, which: Int[np.ndarray, "n"], points: Float[np.ndarray, "n 3"]
 ) -> Float[np.ndarray, "n"]:
-    """Return each point's signed distance [m] to the primitive of index `which` (ascending). A lower bound for hulls."""
+    """Return each point's signed distance [m] to the primitive `which` (ascending index). A lower bound for hulls."""
     local = np.einsum("nji,nj->ni", solids.rotations[which], points - solids.translations[which])
     hulls = int(np.searchsorted(which, len(solids.smooth.link)))
     smooth = local_distance(solids.smooth, torch.as_tensor(local[:hulls]), torch.as_tensor(which[:hulls])).numpy()

@@ -148,7 +148,7 @@ class ClosedForm:
     def value_and_gradient(
         self, problem: Problem, x: Rows, radius: Values, delta: float, *, fine: bool, sharp: bool
     ) -> tuple[Values, Rows]:
-        """Return the loss of every start and its gradient: infinity and zero if either is not finite."""
+        """Return the loss of every start and its gradient, or infinity and zero if one of them is not finite."""
         rows = len(x)
         short = max(0, _FEWEST_ROWS - rows)
         x = torch.cat([x, x[:1].expand(short, -1)]).detach().requires_grad_(True)

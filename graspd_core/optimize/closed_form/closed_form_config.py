@@ -34,7 +34,7 @@ class ClosedFormConfig:
 
     Attributes:
         starts_per_grasp: starts for each requested grasp. Exploring drops hopeless starts.
-        fingertip_starts: share of starts with half-closed fingertips at the object. The others have the palm there.
+        fingertip_starts: share of starts with half-closed fingertips at the object, instead of the open palm.
         explore_steps: first steps, in which hopeless starts are dropped.
         refine_steps: steps after exploring, with the kept starts.
         polish_steps: last steps, with all sharp points of the object and with weights for exact contact.
@@ -48,7 +48,7 @@ class ClosedFormConfig:
         translation_rate: step size of the base position [m].
         rotation_rate: step size of the base quaternion [half rad].
         joint_rate: step size of the joints [rad]. For prismatic joints 0.05 m count as one radian.
-        searches: greatest number of searches. It searches again only if too few grasps are expected to hold.
+        searches: greatest number of searches. The search is repeated only if too few grasps are expected to hold.
         weights: weights of the loss terms while exploring and refining.
         polish_weights: weights of the loss terms while polishing.
     """
@@ -92,9 +92,9 @@ def rows_kept(settings: ClosedFormConfig, keep: int, rows: int, index: int) -> i
 
 
 def at_budget(settings: ClosedFormConfig, budget: float) -> ClosedFormConfig:
-    """Return the settings for a budget. Below 1 it scales the steps with one search. Above 1 it scales the starts.
+    """Return the settings for a budget. A budget above 1 scales the starts, because hard objects need more.
 
-    The steps determine the time of a small batch, and easy objects need fewer. Hard objects need more starts.
+    A budget below 1 scales the steps and allows one search. The steps determine the time of a small batch.
     """
     share, times = min(budget, 1.0), max(budget, 1.0)
     steps = {

@@ -1,4 +1,4 @@
-"""Solve Grasp'D as published (Turpin et al., ECCV 2022): find forces that stop the object, and a pose for them.
+"""Solve Grasp'D as published (Turpin et al., ECCV 2022): find forces that stop the object, and a pose that yields them.
 
     min L_phys + L_range + L_inter  subject to  L_task < C_task, L_limit < C_limit
 
@@ -114,8 +114,8 @@ class FreeBody:
     """The object as a rigid body.
 
     Attributes:
-        mass: [kg].
-        inertia: about the centre of mass [kg·m²].
+        mass: mass [kg].
+        inertia: inertia about the centre of mass [kg·m²].
         inverse_inertia: inverse of `inertia`.
         center: centre of mass [m].
         length: angular velocity times this length is comparable with linear velocity [m].
@@ -200,7 +200,7 @@ def physics(desired: Forces, supplied: Forces) -> Values:
 def motion_left(
     body: FreeBody, forces: Forces, arms: Points, velocities: Float[Tensor, "simulations 3"], time_step: float
 ) -> Float[Tensor, "batch simulations"]:
-    """Return the object's squared speed after one step, relative to the mean before it. 1 if no motion is stopped.
+    """Return the object's squared speed after one step, relative to the mean before. 1 if no motion is stopped.
 
     Forces with six components contain torques, divided by the body's length.
     """

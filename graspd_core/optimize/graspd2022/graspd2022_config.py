@@ -113,7 +113,7 @@ class ConstraintsConfig:
     """Bounds on L_task and L_limit, and their multipliers.
 
     Attributes:
-        task_bound: bound on the motion that desired forces leave [1/60 of v²]. 60 is all motion. The code has 10.
+        task_bound: bound on the motion that the desired forces leave, where 60 is all motion. The code has 10.
         limit_bound: bound on the sum by which joints exceed their limits [rad].
         damping: damping coefficient of the multipliers.
         multiplier_rate: step size of the multipliers.
@@ -142,7 +142,7 @@ class ObjectiveWeights:
 
 @dataclass(frozen=True)
 class Graspd2022Config:
-    """Grasp'D as published (docs/method.md, §1). A switch selects the paper's or the code's way if they differ.
+    """Grasp'D as published (docs/method.md, §1). Where paper and released code differ, a setting selects one of them.
 
     Attributes:
         initial: starts of the optimiser.

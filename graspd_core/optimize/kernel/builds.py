@@ -76,7 +76,7 @@ def _kernel(wanted: str) -> Kernel:
 
 
 def load(name: str) -> Kernel:
-    """Load a build without a check that this machine supports its instructions."""
+    """Load a build, without checking that this machine supports the build's instructions."""
     paths = sorted(Path(__file__).parent.glob(f"{name}.*so"))
     if not paths:
         return Kernel("", None, "not built; was there a C++ compiler when graspd was installed?")
