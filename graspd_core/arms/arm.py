@@ -44,7 +44,7 @@ class Capsules:
     Attributes:
         link: index of each capsule's link.
         start, end: end points of the segments, link frame [m].
-        radius: [m].
+        radius: radius of each capsule [m].
     """
 
     link: Int[np.ndarray, "n"]
@@ -257,7 +257,7 @@ def load_arm(name_or_path: str | Path, robot_description: str = "") -> Arm:
         robot_description: text of a robot's URDF, for descriptions whose `urdf` is `robot_description`.
 
     Raises:
-        ConfigError: the arm or file does not exist, or the description is invalid. Names file, key and valid choices.
+        ConfigError: the arm or file does not exist, or the description is invalid. The message names file and key.
         HandError: the URDF cannot be used.
     """
     path, entries = read_arm_file(name_or_path)
@@ -265,8 +265,8 @@ def load_arm(name_or_path: str | Path, robot_description: str = "") -> Arm:
     if not from_robot_description(entries):
         return _make_arm(entries, urdf, read_xml(urdf), str(path))
     if not robot_description:
-        hint = "known only to the node with the parameter arm; elsewhere give the path of a URDF"
-        raise ConfigError(f"{path}.urdf: {ROBOT_DESCRIPTION}: {hint}")
+        hint = "known only to a node with the parameter arm; elsewhere, give the path of a URDF"
+        raise ConfigError(f"{path}.urdf: {ROBOT_DESCRIPTION} is {hint}")
     return _make_arm(entries, urdf, parse_xml(urdf, robot_description), str(path))
 
 
@@ -300,7 +300,7 @@ def _make_arm(entries: ArmFile, urdf: Path, root: ET.Element, where: str) -> Arm
             f"{where}: joint {chain.mimics[0].name!r} is coupled by <mimic>; valid: independent joints of the arm"
         )
     if all(chain.link_group[primitive.link] == 0 for primitive in chain.primitives):
-        raise ConfigError(f"{urdf}: no link that moves has a <collision> or <visual> shape: give the arm capsules")
+        raise ConfigError(f"{urdf}: no moving link has a <collision> or <visual> shape; valid: at least one shape")
     lower, upper = _limits(chain, entries.limits, where)
     seed = 0.5 * (lower + upper)
     for joint, value in _by_joint(chain, entries.seed, f"{where}.seed").items():

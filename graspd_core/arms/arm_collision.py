@@ -90,7 +90,7 @@ def _worst_of_each(
 
 
 def hits_of_self(arm: Arm, links: SE3) -> Hits:
-    """Return the collision depths between links. Neighbours and pairs that touch in the seed posture do not count."""
+    """Return the collision depths between arm links, without neighbours and pairs that touch in the seed posture."""
     start, end, radius = placed(arm.capsules, links)
     first, second = _pairs(arm)
     distance = segment_distance(start[:, first], end[:, first], start[:, second], end[:, second])
@@ -101,7 +101,7 @@ def hits_of_self(arm: Arm, links: SE3) -> Hits:
 
 
 def hits_of_hand(arm: Arm, hand: HandModel, links: SE3, joints: Float[Tensor, "batch hand_joints"]) -> Hits:
-    """Return the collision depths of links in the hand. Pairs that touch in the seed posture do not count."""
+    """Return the collision depths of arm and hand, without pairs that touch in the seed posture."""
     own_start, own_end, own_radius = placed(arm.capsules, links)
     start, end, radius = _hand_capsules(arm, hand, links, joints)
     # Links outside a bounding ball of the hand cannot collide with it.

@@ -39,7 +39,7 @@ def hand_paths(grasps: Sequence[Grasp], approach: Float[np.ndarray, "3"], up: Fl
     """Return `T_scene_hand` along the path of each grasp. The shape is grasps by waypoints.
 
     Args:
-        grasps: from pregrasp to grasp, positions are on a straight line and the rotation is the shortest.
+        grasps: the grasps. From pregrasp to grasp, the hand moves on a straight line, with the shortest rotation.
         approach: unit direction in which the hand moves towards an object, hand frame.
         up: unit direction of the lift, scene frame.
     """
@@ -137,7 +137,7 @@ def _some_paths(task: ArmTask, grasps: Sequence[Grasp]) -> list[ArmPath | str]:
 
 
 def _best_of_each(followed: _Followed, owner: Int[Tensor, "postures"], count: int) -> list[int]:
-    """Return for each grasp its first posture with a valid path, otherwise its first posture. -1 without posture."""
+    """Return the row of each grasp's first posture with a valid path, else of its first posture. -1 for no posture."""
     best = [-1] * count
     for row in reversed(range(len(owner))):
         grasp, good = int(owner[row]), followed.good(row)

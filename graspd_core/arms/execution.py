@@ -1,4 +1,4 @@
-"""Convert a grasp to a timed trajectory of arm and hand for an executor, which needs no geometry.
+"""Convert a grasp to a timed trajectory of arm and hand, for an executor that knows no geometry.
 
 The trajectory has gates, at which all joints are at rest. An executor sends the rows up to a gate, checks that the gate
 is reached, and sends the next rows. Between two gates the joints follow the grasp's path with a cubic time law from
@@ -41,8 +41,8 @@ class ExecutionPace:
         base_speed: greatest speed of the hand in approach and lift, and of its prismatic joints [m/s].
         closing_speed: greatest speed of the hand from the pregrasp to the grasp [m/s].
         shortest: least time of a stage [s].
-        payload_share: weight and acceleration of the object may use this share of the grasp's payload.
-        gentlest, strongest: bounds of the lift's acceleration [m/s²].
+        payload_share: share of the grasp's payload that the object's weight and acceleration may use.
+        gentlest, strongest: least and greatest acceleration of the lift [m/s²].
     """
 
     finger_speed: float = 1.0
@@ -111,7 +111,7 @@ def execution_of(
         ConfigError: the grasp has no arm path.
     """
     if grasp.arm is None:
-        raise ConfigError("execution: the grasp has no path of an arm; plan it with the restriction Reach")
+        raise ConfigError("execution: the grasp has no arm path; plan the grasp with the restriction Reach")
     pace, path, (retreat, before, closed, lifted) = pace or ExecutionPace(), grasp.arm.positions, grasp.arm.stages
     fingers = np.minimum(np.where(hand.slides, pace.base_speed, pace.finger_speed), hand.velocity)
     limits = np.concatenate([arm_speeds, fingers])
@@ -144,7 +144,7 @@ def execution_of(
 
 
 def lift_time(grasp: Grasp, mass: float | None, pace: ExecutionPace) -> float:
-    """Return the duration of the lift [s]. The more the payload exceeds the mass [kg], the faster is the lift."""
+    """Return the duration of the lift [s]. It is shorter if the grasp's payload exceeds `mass` [kg] by more."""
     payload = (grasp.metrics or {}).get("payload")
     spare = 0.0 if not payload or not mass else _GRAVITY * (pace.payload_share * payload / mass - 1.0)
     return math.sqrt(PEAK_ACCELERATION * LIFT / min(max(spare, pace.gentlest), pace.strongest))
@@ -153,7 +153,7 @@ def lift_time(grasp: Grasp, mass: float | None, pace: ExecutionPace) -> float:
 def squeeze_efforts(
     grasp: Grasp, hand: HandModel, settings: GraspStagesConfig | None = None
 ) -> Float[np.ndarray, "joints"]:
-    """Return the joint efforts if the object stops the squeeze at the grasp posture, within limits [N·m] or [N]."""
+    """Return the hand's joint efforts [N·m] or [N], within limits, if the object stops the squeeze at the grasp."""
     settings = settings or GraspStagesConfig()
     gain = np.where(hand.slides, settings.slide_stiffness, settings.stiffness)
     return np.clip(gain * (grasp.squeeze.joint_positions - grasp.grasp.joint_positions), -hand.effort, hand.effort)

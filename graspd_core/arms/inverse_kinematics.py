@@ -6,8 +6,8 @@ joint beyond its limit, the step is computed without this joint. This solver is 
 because its starts are near and it drops poses that are reached (docs/arms.md).
 
 The starts are the postures of a table with the nearest tip poses. The table also bounds the distances of the tip, and
-of points fixed to it, from the shoulder. A pose beyond these bounds counts as out of reach. For hands around
-objects at 0.3 to 0.95 m, this keeps 99.3 and 99.7 % of the hands that graspd's arms reach, and 18 and 4 % of others.
+of points fixed to it, from the shoulder. A pose beyond these bounds counts as out of reach. For hands around objects at
+0.3 to 0.95 m, the bounds of graspd's two arms keep 99.3 and 99.7 % of the reachable poses, and 18 and 4 % of others.
 
 If no posture is found, `why_unreached` names the joint whose limit prevents it, or says that the pose is out of reach.
 """
@@ -101,8 +101,8 @@ def solve(
 ) -> Solutions:
     """Iterate from each start towards its target `T_base_tip`.
 
-    Rows that have reached their target are no longer computed. The solver uses float32, which is a hundred times finer
-    than the tolerances and takes two thirds of the time.
+    Rows that have reached their target are no longer computed. The solver uses float32. It is a hundred times finer
+    than the tolerances, and takes two thirds of the time of float64.
 
     Args:
         steps: greatest number of steps.
@@ -219,7 +219,7 @@ def tip_features(tip: SE3) -> Float[Tensor, "batch 12"]:
 def nearest_postures(
     table: StartTable, tip: SE3, count: int, usable: Bool[Tensor, "entries"] | None = None
 ) -> Float[Tensor, "batch count joints"]:
-    """Return the `count` postures nearest to each `T_base_tip`, nearest first. If any are usable, only those."""
+    """Return the `count` postures nearest to each `T_base_tip`, nearest first. Usable ones only, if there are any."""
     q, features = table.q, table.features
     if usable is not None and usable.any():
         q, features = q[usable], features[usable]
@@ -246,8 +246,8 @@ _TOO_FAR, _NOWHERE = "farther than the arm reaches", "that no posture of the arm
 def why_unreached(arm: Arm, target: SE3, start: Float[Tensor, "batch joints"]) -> list[str]:
     """Return why each pose `T_base_tip` is not reached. The reason is empty if a posture within the limits reaches it.
 
-    The poses are solved without limits from `start` and from near postures. The posture that exceeds its limits least
-    is chosen. The reason names its joint that exceeds its limit most.
+    The poses are solved without limits, from `start` and from near postures. Of the solutions, the one that exceeds
+    the limits least is chosen. The reason names the joint that exceeds its limit most there.
     """
     if not len(start):
         return []

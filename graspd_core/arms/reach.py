@@ -45,7 +45,7 @@ class Reach:
     Each grasp gets the arm's joint values along its path (`Grasp.arm`).
 
     Attributes:
-        arm: from `load_arm`.
+        arm: arm from `load_arm`.
         position: origin of the arm's base in the object frame [m].
         quaternion_wxyz: orientation of the arm's base in the object frame, a unit quaternion.
     """
@@ -75,7 +75,7 @@ class BoundReach(BoundRestriction):
 
     @property
     def description(self) -> str:
-        """See `BoundRestriction`."""
+        """Name of the restriction: the reach of the arm."""
         return f"the reach of {self.task.arm.name}"
 
     @property
@@ -102,7 +102,7 @@ class BoundReach(BoundRestriction):
         )
 
     def why_none(self, others: BoundRestrictions) -> str:
-        """Return a sentence with the counts of the reasons why the arm cannot reach hands around the object."""
+        """Return a sentence that counts the reasons why the arm cannot reach hand poses around the object."""
         task = self.task
         starts = draw_starts(task.scene, task.hand, _PROBES, 0, "cpu", torch.float64, restrictions=others)
         rows = zip(*(rows.numpy() for rows in (starts.translation, starts.quaternion, starts.joints)), strict=True)

@@ -109,7 +109,7 @@ def around_ball(
 def _missed(
     fingers: Fingers, goal: FingertipGoal, away: Float[Tensor, "starts tips 3"]
 ) -> tuple[Float[Tensor, "starts"], Float[Tensor, "starts"]]:
-    """Return two costs of fingertips at `away` from the ball's centre [m]: squared error [finger lengths²], bias."""
+    """Return squared error [finger lengths²] and one-sidedness of fingertips at `away` from the ball's centre [m]."""
     if goal.directions is not None:
         missed = ((away - goal.radius * torch.as_tensor(goal.directions)) / fingers.length).square().sum(-1)
         mean = missed.mean(-1) if goal.weights is None else missed @ torch.as_tensor(goal.weights)
@@ -152,7 +152,7 @@ def default_palm(hand: HandModel) -> HandModel:
     warnings = [*hand.warnings, "palm guessed; if it is wrong, set it in a hand description"]
     if len(fingers.wrist):
         names = ", ".join(hand.joint_names[joint] for joint in fingers.wrist)
-        warnings.append(f"joints between base and palm stay at zero: {names}; a grasp is for that pose of the palm")
+        warnings.append(f"joints between base and palm stay at zero: {names}; grasps are valid for this pose only")
     return replace(
         hand, palm_center=_center(hand, fingers, normal), palm_normal=normal, approach=normal, warnings=tuple(warnings)
     )
@@ -205,7 +205,7 @@ def _along(hand: HandModel, fingers: Fingers) -> Float[np.ndarray, "3"]:
 def _first_bends(
     hand: HandModel, fingers: Fingers, q: Float[np.ndarray, "joints"], along: Float[np.ndarray, "3"]
 ) -> Float[np.ndarray, "tips 3"]:
-    """Return for each finger its first joint that does not turn the finger about `along`, base frame [m]."""
+    """Return the position of each finger's first joint that does not turn the finger about `along`, base frame [m]."""
     rotations, translations = link_poses(hand, q)
     places = fingers.roots.copy()
     for finger, tip in enumerate(fingers.links):
@@ -243,7 +243,7 @@ def _balance(directions: Float[np.ndarray, "tips 3"]) -> Float[np.ndarray, "tips
 
 
 def _own_sides(hand: HandModel, fingers: Fingers, normal: Float[np.ndarray, "3"]) -> Float[np.ndarray, "tips 3"]:
-    """Return for each finger of a gripper the unit direction of its side in the palm plane. Zero for a single finger.
+    """Return in which direction of the palm plane each finger of a gripper stands. Zero for a single finger.
 
     The side comes from the finger roots, because the tips may cross each other.
     """
@@ -259,7 +259,7 @@ def _own_sides(hand: HandModel, fingers: Fingers, normal: Float[np.ndarray, "3"]
 
 
 def _apart(hand: HandModel, fingers: Fingers) -> Float[np.ndarray, "tips 3"]:
-    """Return the opening direction of each finger of a human-like hand in the palm plane. The thumb's is opposite."""
+    """Return each finger's opening direction in the palm plane of a human-like hand. The thumb opens the other way."""
     plane = np.eye(3) - np.outer(hand.palm_normal, hand.palm_normal)
     straight = (fingers.tips - fingers.roots)[fingers.mates].mean(0) @ plane
     if fingers.mates.sum() > 1:

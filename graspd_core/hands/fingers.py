@@ -54,7 +54,7 @@ class Fingers:
 # The results for the last hands are cached. Hands are hashed by identity.
 @lru_cache(maxsize=8)
 def find_fingers(hand: HandModel) -> Fingers:
-    """Find the fingers: the chains that end in a link without children. The tip is the far end of the last solids."""
+    """Find the fingers: chains that end in a link without children. A chain's tip is the far end of its last solids."""
     groups = hand.link_group
     heads = np.unique(groups)
     above = {int(g): int(groups[hand.link_parent[g]]) if hand.link_parent[g] >= 0 else -1 for g in heads}
@@ -126,7 +126,7 @@ def _mates(
 
 
 def _stand_up(roots: Float[np.ndarray, "3 3"], pair: Float[np.ndarray, "2 3"]) -> bool:
-    """Return True if two fingers stand up from the plane of all three roots. In a human-like hand they lie in it."""
+    """Return True if two fingers stand up from the plane of all three roots. A human-like hand's fingers lie in it."""
     across = np.cross(roots[1] - roots[0], roots[2] - roots[0])
     return bool(abs(pair.mean(0) @ units(across, 1e-6)) > _UPRIGHT)
 

@@ -39,7 +39,7 @@ class Kinematics:
         joint: actuated joint of each sorted link. 0 for a fixed link, whose coefficients are zero.
         multiplier, shift: a coupled joint has the value multiplier · q + shift. None if no joint is coupled.
         level_sizes: number of links at each depth, starting with the base.
-        level_parents: for each depth from 2 on, each link's parent in the level above. None if one to one.
+        level_parents: for each depth from 2 on, each link's parent in the level above. None if they match in order.
         order: position of each link of the hand in the sorted list.
     """
 
@@ -150,7 +150,7 @@ def points_in_base(
     points: Float[Tensor, "points 3"],
     links: Int[Tensor, "points"],
 ) -> Float[Tensor, "batch points 3"]:
-    """Return link-frame points at joint values q in the base frame [m]. To repeat this, keep the `placement`."""
+    """Return link-frame points at joint values q in the base frame [m]. To repeat this, build the `placement` once."""
     poses = forward(kinematics, q)
     return place_points(placement(poses.translation.shape[1], points, links), poses)
 

@@ -42,7 +42,7 @@ def load_hand(name_or_path: str | Path, *, candidates: int = 600, prefix: str = 
         HandError: the hand or file does not exist or cannot be used. The message names the file and the culprit.
     """
     if candidates < 1:
-        raise HandError(f"candidates={candidates}: at least 1 is needed")
+        raise HandError(f"candidates: {candidates}; valid: 1 or more")
     if Path(name_or_path).suffix == ".pkl":
         from graspd_core.hands.mano.mano_hand import load_mano
 
@@ -82,7 +82,7 @@ def read_hand_file(path: Path, root_link: str | None = None) -> HandModel:
         below_link(path, root, root_link)
     hand = readers[root.tag](path, root)
     if not hand.primitives:
-        raise HandError(f"{path}: no link has a collision or a visual shape, so that nothing could touch an object")
+        raise HandError(f"{path}: no link has a collision or a visual shape; valid: one shape or more")
     return hand
 
 
@@ -115,7 +115,7 @@ _APART = 0.2
 
 
 def hand_warnings(hand: HandModel) -> tuple[str, ...]:
-    """Return warnings about implausible properties: too high efforts, an open linkage, fingers on two palms."""
+    """Return warnings about implausible properties: excessive efforts, an open linkage, fingers on two palms."""
     rotations, translations = link_poses(hand, np.clip(0.0, hand.lower, hand.upper))
     linkages = _open_linkages(hand, rotations, translations)
     return (*_strong_joints(hand), *linkages, *_palms(hand, translations))
@@ -127,14 +127,14 @@ def _strong_joints(hand: HandModel) -> tuple[str, ...]:
     if hand.effort[worst] <= bounds[worst]:
         return ()
     unit = "N" if hand.slides[worst] else "N·m"
-    fault = f"an effort of {hand.effort[worst]:.3g} {unit}, more than the {bounds[worst]:g} of any hand"
-    return (f"joint {hand.joint_names[worst]!r}: {fault}; say what it is in a hand description (effort)",)
+    fault = f"implausible effort of {hand.effort[worst]:.3g} {unit}; valid: up to {bounds[worst]:g}"
+    return (f"joint {hand.joint_names[worst]!r}: {fault}; set `effort` in a hand description",)
 
 
 def _open_linkages(
     hand: HandModel, rotations: Float[np.ndarray, "links 3 3"], translations: Float[np.ndarray, "links 3"]
 ) -> tuple[str, ...]:
-    """Warn of an open linkage: two free joints side by side on one link, one of which moves only its own link."""
+    """Warn of an open linkage: two free joints are side by side on one link, and one of them moves only one link."""
     parents = {link: int(hand.link_group[hand.link_parent[link]]) for link in np.flatnonzero(hand.link_joint >= 0)}
     coupled = {mimic.link for mimic in hand.mimics}
     free = [link for link in parents if link not in coupled and hand.joint_kind[link] == "revolute"]
@@ -166,7 +166,7 @@ def _palms(hand: HandModel, translations: Float[np.ndarray, "links 3"]) -> tuple
             related = one in above(other) or other in above(one)
             if not related and np.linalg.norm(translations[one] - translations[other]) > _APART:
                 names = " and ".join(repr(hand.link_names[link]) for link in (other, one))
-                return (f"fingers hang from {names}: two hands; name one as root in a hand description",)
+                return (f"fingers hang from {names}, as in two hands; name one link as root in a hand description",)
     return ()
 
 

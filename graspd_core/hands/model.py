@@ -105,7 +105,7 @@ class HandModel:
         joint_axis: unit axis of the joint between link and parent, link frame. Zero for a fixed joint.
         joint_kind: kind of the joint between link and parent.
         link_group: number of the rigid group of each link. Fixed joints connect the links of a group.
-        link_mass: [kg], zero if the file gives none.
+        link_mass: mass of each link [kg]. Zero if the file gives none.
         link_com: centre of mass, link frame [m].
         link_inertia: inertia about the centre of mass, in link axes [kg·m²].
         primitives: collision solids.
@@ -113,11 +113,11 @@ class HandModel:
         candidate_points: contact candidates, in the frames of their links [m].
         candidate_normals: outward unit normals at the candidates.
         candidate_link: link of each candidate.
-        warnings: guesses and doubts from loading.
+        warnings: guesses and doubtful values, found while loading.
         base_place: pose of the base link in the frame of its file: position [m] and quaternion wxyz.
         mimics: coupled joints, in the order of their links.
         mount: pose of the base link on an arm. None if it is unknown.
-        skins: links with a surface mesh [m] in the link frame. Their contact candidates lie on it, not on solids.
+        skins: index and surface mesh, link frame [m], of each link whose contact candidates lie on a mesh.
     """
 
     name: str

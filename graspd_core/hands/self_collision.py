@@ -2,7 +2,7 @@
 
 The spheres extend beyond the flat faces of long boxes, by up to a fifth of the half thickness, and beyond thin solids.
 Metrics use signed distances instead. The term tests every pair of spheres, so the number of spheres is limited. If a
-hand has too many, those that extend farthest are kept.
+hand has too many, the spheres that extend farthest are kept.
 
 The overlap of two solids is found by the separating axis test. A separating axis of two boxes is a face normal, or the
 cross product of two edges. For boxes the least overlap along these fifteen directions is the exact depth. Round solids
@@ -126,7 +126,7 @@ def link_overlaps(
     points: Float[np.ndarray, "samples 3"],
     links: Int[np.ndarray, "samples"],
 ) -> Float[np.ndarray, "postures links links"]:
-    """Return the overlap depth of each pair of links [m]: the greatest depth of surface samples of one in the other.
+    """Return the overlap depth [m] of each pair of links: how deep surface samples of one link lie in the other.
 
     `points` are surface samples in link frames [m]. Adjacent pairs are included. Mask them with `hand.adjacent`.
     """

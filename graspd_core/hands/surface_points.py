@@ -170,7 +170,7 @@ _TIP_WEIGHT, _EDGE_WEIGHT, _BACK_WEIGHT = 2.0, 1.25, 0.5
 
 @dataclass(frozen=True, eq=False)
 class _Pool:
-    """Surface points in link frames [m]. `source` is the primitive of each, `areas` the area it represents [m²]."""
+    """Surface points in link frames [m]. `source` has each point's primitive, `areas` the area it represents [m²]."""
 
     points: Float[np.ndarray, "points 3"]
     normals: Float[np.ndarray, "points 3"]
@@ -187,7 +187,7 @@ class _Pool:
 def with_candidates(hand: HandModel, count: int) -> HandModel:
     """Return the hand with `count` contact candidates, or the same hand if it has them. Raises HandError: count < 1."""
     if count < 1:
-        raise HandError(f"candidates={count}: at least 1 is needed")
+        raise HandError(f"candidates: {count}; valid: 1 or more")
     if count == len(hand.candidate_link):
         return hand
 
@@ -239,7 +239,7 @@ def dense_samples(hand: HandModel, *, count: int = 4000, seed: int = 1) -> Sampl
     while len(pool.points) < count:
         drawn = int(np.ceil(1.05 * drawn * count / max(len(pool.points), 1)))
         if drawn > _MOST_DRAWN * count:
-            raise HandError(f"{hand.urdf}: almost all of the hand's solids lie inside others")
+            raise HandError(f"{hand.urdf}: almost all of the surface lies inside other solids; move the solids apart")
         pool = _exposed(hand, _random_pool(hand, drawn, rng))
     return pool.points, pool.links, pool.areas
 
@@ -324,7 +324,7 @@ def _exposed(hand: HandModel, pool: _Pool) -> _Pool:
 
 
 def _covered_in_group(hand: HandModel, pool: _Pool) -> Bool[np.ndarray, "points"]:
-    """Return True for points inside another solid of their group, facing its surface, or on the same surface."""
+    """Return True for points inside another solid of their group, right in front of its surface, or flush with it."""
     poses = link_poses(hand, hand.open_posture)
     placed = in_base(poses, pool.points, pool.links)
     raised = in_base(poses, pool.points + _CREASE * pool.normals, pool.links)

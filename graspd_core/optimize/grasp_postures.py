@@ -106,7 +106,7 @@ def find_contacts(problem: Problem, poses: Poses, reach: float) -> ContactSet:
 
 
 def _with_features(problem: Problem, poses: Poses, found: ContactSet, reach: float) -> ContactSet:
-    """Add one slot per solid of the hand: the object's nearest sharp point, with the solid's inward normal."""
+    """Add a slot for each solid of the hand: the object's sharp point nearest to it, with the solid's inward normal."""
     pick, nearest, outward = nearest_features(problem, poses)
     return ContactSet(
         torch.cat([found.link, problem.hand.solids.link]),
@@ -249,7 +249,7 @@ def _settle(problem: Problem, poses: Poses, stop: Callable[[], bool]) -> Rows:
 
 
 def _sunk_surface(on_surface: Problem, placed: HandPlacement, poses: Poses, x: Rows) -> Values:
-    """Return the sum over the hand's solids of the squared depth of the deepest object point in each [mm²]."""
+    """Return the squared depth of the deepest object point inside each solid of the hand, summed over solids [mm²]."""
     solids, features = on_surface.hand.solids, on_surface.object.features
     if not len(features) or not len(solids.link):
         return x.new_zeros(len(x))
@@ -304,7 +304,7 @@ def _descended(
 
 @torch.no_grad()
 def approach_depth(problem: Problem, obstacles: ObstacleTensors, pregrasp: Poses) -> Values:
-    """Return the greatest penetration of the object on the straight path from the retreat to the pregrasp [m].
+    """Return how deep the hand penetrates the object on the straight path from the retreat to the pregrasp [m].
 
     The depth is 0 if the path is collision-free. The path is sampled at `RETREAT_SHARES`, without the pregrasp.
     """
@@ -366,7 +366,7 @@ def by_link(contact_set: ContactSet, values: Float[Tensor, "batch slots n"]) -> 
 def joint_torques(
     problem: Problem, poses: Poses, contact_set: ContactSet, forces: Float[Tensor, "batch slots 3"]
 ) -> Joints:
-    """Return τ = JᵀF, the gradient of Σ F·x(q) over the hand's contact points [N·m], [N] for prismatic joints."""
+    """Return τ = JᵀF [N·m] or [N], the gradient of Σ F·x(q) over the hand's contact points."""
     base = poses.base
     x = base.apply_inverse(contact_set.position)
     joints = poses.joints.detach().requires_grad_(True)
@@ -388,7 +388,7 @@ def balanced_forces(
     """Return the contact forces on the object with the least net wrench. Their normal components sum to one.
 
     Args:
-        arms: contact points about the centre of mass [m].
+        arms: contact points relative to the centre of mass [m].
         normals: outward unit normals.
         active: which slots are contacts.
         length: length that torques are divided by [m].

@@ -86,9 +86,9 @@ def draw_starts(
 
     As in Grasp'D, the palm faces a random surface point with a random roll. Points are on the hull, so that no palm
     starts inside a hollow. Narrow cross-sections are preferred. A share `fingertips` of the starts has half-closed
-    fingers, with the fingertips at the point instead of the palm. An open hand does not reach objects that are small or
-    low on a table. Poses are unlikely if the hand, or its retreat, penetrates an obstacle. With restrictions, at most
-    `_MOST_POOLS` pools are drawn. If they allow too few starts, the result has fewer than `count`, perhaps none.
+    fingers, with the fingertips at the point, because an open hand does not reach small or low objects. Poses are
+    unlikely if the hand, or its retreat, penetrates an obstacle. With restrictions, at most `_MOST_POOLS` pools are
+    drawn. If they allow too few starts, the result has fewer than `count`, perhaps none.
     """
     generator = torch.Generator().manual_seed(seed)
     obstacles = make_obstacle_tensors(scene, hand, "cpu", torch.float64)

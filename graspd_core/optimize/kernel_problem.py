@@ -109,7 +109,7 @@ def _given(argument: Argument) -> object:
 
 
 def kernel_problem(problem: Problem) -> KernelProblem:
-    """Convert a problem that the kernel can evaluate."""
+    """Convert a problem to the kernel's memory layout. The kernel must be able to evaluate it (`Problem.compiled`)."""
     hand, hand_arrays = _hand(problem.hand)
     target, object_arrays = _object(problem.object)
     own = Arrays()

@@ -56,7 +56,7 @@ def pack(poses: Poses) -> Rows:
 
 
 def unpack(x: Rows) -> Poses:
-    """Invert `pack`."""
+    """Return the poses of rows that `pack` made."""
     return Poses(x[:, :3], x[:, 3:7], x[:, 7:])
 
 
@@ -73,7 +73,7 @@ _BETA1, _BETA2, _EPSILON = 0.9, 0.98, 1e-8
 
 @runtime_checkable
 class Solver(Protocol[S]):
-    """An optimiser as a frozen value with its hyper-parameters. `minimise` runs it for `steps` steps."""
+    """An optimiser: a frozen object with its hyper-parameters. `minimise` runs `steps` steps of it."""
 
     @property
     def steps(self) -> int: ...

@@ -217,7 +217,7 @@ def _gaps_to(
 def gap_on_path(
     obstacles: ObstacleTensors, kinematics: Kinematics, pregrasp: Poses, grasp: Poses, wide: float = WIDE
 ) -> Values:
-    """Return the least signed distance [m] of the hand to any obstacle on the path retreat, pregrasp, grasp.
+    """Return the hand's least signed distance [m] to any obstacle, from the retreat over the pregrasp to the grasp.
 
     Distances are negative inside. A distance of at least `wide` may be returned as `wide`. The base must have the same
     orientation in both poses.

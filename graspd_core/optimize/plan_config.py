@@ -41,7 +41,7 @@ class Method:
         colour, marker: colour and marker in charts, as Matplotlib takes them.
         benchmark_count: grasps of one unfiltered batch in the benchmark.
         at_budget: returns the settings for a multiple of the usual budget. The default keeps the settings.
-        searches: returns the greatest number of searches per round. No search follows if enough grasps should hold.
+        searches: returns the greatest number of searches per round. Fewer run if enough grasps are expected to hold.
     """
 
     module: str
@@ -170,7 +170,7 @@ def plan_config(values: Any, where: str = "config") -> PlanConfig:
     # `method_names` searches other packages, which is slow. So it is called only for an unknown key.
     if others := sorted(name for name in unknown if name in method_names()):
         raise ConfigError(
-            f"{where}.{others[0]}: not a setting of method: {named}; remove it, or set method: {others[0]}"
+            f"{where}.{others[0]}: settings of another method than {named}; remove them, or set method: {others[0]}"
         )
     found = coerced(hints, values, where)
     return PlanConfig(**{("settings" if key == named else key): value for key, value in found.items()})

@@ -94,7 +94,7 @@ class HandTensors:
         fine: all contact candidates. Used in the last steps.
         reach: attraction range of each group of candidates [m].
         solids: collision primitives.
-        group_of_solid: index of the first candidate group on each solid's rigid group. Number of groups if none.
+        group_of_solid: first candidate group on the rigid group of each solid. The number of groups stands for none.
         solid_pairs: pairs of solids whose links are not adjacent.
         spheres: spheres for self-collision.
         lower, upper: joint limits [rad] or [m].
@@ -132,7 +132,7 @@ class ObjectTensors:
         surface: many points on the surface and its edges [m], to measure how deep a grasp penetrates.
         coarse_features: number of leading `features` used in the coarse steps, 0 if the object has no thin walls.
         center: centre of mass [m].
-        length: torques are divided by this characteristic length [m].
+        length: characteristic length that torques are divided by [m].
         confidence: confidence in the surface near each node of `sdf`, at least a floor. None if no surface is guessed.
     """
 

@@ -2,7 +2,7 @@
 
 Objects with fewer earlier failures come first. Among equals, higher objects come first, because nothing lies on them.
 An object without failures gets one round of the planner. The first verified grasp ends the search. After `enough`
-objects, a likely grasp also ends the search, to limit its time. `result_of_things` is the answer to one request.
+objects, a likely grasp also ends the search, to limit its time. `result_of_things` returns the result of one request.
 """
 
 from __future__ import annotations
@@ -48,7 +48,7 @@ class Failure:
     """An earlier failed try: a grasp that failed, or an object for which no grasp was found.
 
     Attributes:
-        place: mean of the object's points [m]. None if the object is unknown. Then only its grasp is left out.
+        place: mean of the object's points [m]. None if the object is unknown. Then only the grasp is avoided.
         grasp: hand posture at the failed grasp. None if no grasp was tried.
     """
 
@@ -118,11 +118,11 @@ def plan_any_thing(
         settings: settings for segmentation, reconstruction and obstacles.
         surface: support plane of all objects, if it is known.
         solids: known solids by name, in the frame of the views [m]. They are obstacles and never grasped.
-        mass: mass of each object [kg]. None assumes `heavy_mass` of its volume.
+        mass: mass of each object [kg]. None assumes the `heavy_mass` of each object's volume.
         friction: Coulomb friction coefficient between hand and objects.
         source: name of the views, for messages.
         failures: failures of earlier requests. Grasps like the failed ones are left out.
-        tries: an object with this many failures is skipped.
+        tries: number of failures after which an object is skipped.
         deadline: time after which the whole search ends [s]. None for no limit.
         enough: number of objects after which a likely grasp ends the search.
         most: greatest number of objects that are planned for. None for all.
@@ -130,7 +130,7 @@ def plan_any_thing(
 
     Raises:
         CloudError: a cloud is empty, all NaN, or has too few points.
-        ConfigError: see `plan_grasps`. A region that misses an object is not an error, but the object's `reason`.
+        ConfigError: see `plan_grasps`. If a region misses an object, the object's `reason` says so instead.
     """
     began, things, over = time.perf_counter(), list[ThingPlan](), False
     asked = {"seed": 0, "count": 1, "verify": "standard", "device": "cpu", "preset": "balanced"} | plan

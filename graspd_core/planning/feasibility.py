@@ -41,7 +41,7 @@ _FROM_ABOVE, _LOW = 0.5, 0.03
 
 
 def out_of_reach(scene: Scene, hand: HandModel) -> str:
-    """Return a sentence that says why the hand cannot hold the object anywhere. Empty if it may be able to."""
+    """Return a sentence that says why the hand cannot hold the object anywhere. Empty if no reason is known."""
     span, opening = reach_of(hand)
     vertices = scene.object.mesh.vertices
     # Most objects fit into the hand along an axis and need no further check.
@@ -57,7 +57,7 @@ def out_of_reach(scene: Scene, hand: HandModel) -> str:
         return ""
     return (
         f"the object is {_centimetres(narrowest)} across where it is narrowest, without edge or handle to hold it by, "
-        f"and the fingertips of {hand.name} open to {_centimetres(opening)}: smaller things or a larger hand"
+        f"and the fingertips of {hand.name} open to {_centimetres(opening)}; use a smaller object or a larger hand"
     )
 
 
@@ -76,8 +76,8 @@ def why_trials_failed(scene: Scene, grasps: Sequence[Grasp]) -> str:
     if heights.max() > _LOW or above < _FROM_ABOVE:
         return text
     return (
-        f"{text}; it is {heights.max() * 1e3:.0f} mm high on its support, so that fingers press on it from above: "
-        "bring a part of it over an edge, or take a hand with thinner fingers"
+        f"{text}; the object is {heights.max() * 1e3:.0f} mm high on its support, so the fingers press it from above; "
+        "move a part of it over an edge, or use a hand with thinner fingers"
     )
 
 

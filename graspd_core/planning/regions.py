@@ -1,4 +1,4 @@
-"""Regions of space: boxes, spheres and neighbourhoods of points. Also checks whether a link enters a box."""
+"""Define regions of space: boxes, spheres and neighbourhoods of points. Check whether a link enters a box."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ Numbers = Sequence[float | int] | np.ndarray
 
 
 def numbers(name: str, given: Any, count: int) -> tuple[float, ...]:
-    """Return `given` as `count` finite numbers. Raises ConfigError, which names the value `name`: it is not that."""
+    """Return `given` as `count` finite numbers. Raises ConfigError about `name`: `given` is something else."""
     try:
         values = np.asarray(given, dtype=float)
     except (TypeError, ValueError):
@@ -154,7 +154,7 @@ def entered(hand: HandModel, postures: Sequence[Posture], boxes: Sequence[Box]) 
 def _placed_solids(
     hand: HandModel, postures: Sequence[Posture]
 ) -> tuple[Float[np.ndarray, "postures solids corners 3"], Float[np.ndarray, "solids"]]:
-    """Return each primitive's extreme points [m], padded with the first to equal numbers, and its radius [m]."""
+    """Return each primitive's extreme points [m] and radius [m]. Repeated points pad the array."""
     solids = extreme_points_of_solids(hand)
     most = max(len(points) for points, _, _ in solids)
     local = np.stack([np.vstack([points, np.repeat(points[:1], most - len(points), 0)]) for points, _, _ in solids])

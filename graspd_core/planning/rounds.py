@@ -183,7 +183,7 @@ def _searched_since(state: RoundsResult, began: float) -> RoundsResult:
 def _tried_lighter(
     run: Run, scene: Scene, prefetched: Prefetched, state: RoundsResult, certainty: CertaintyConfig, count: int
 ) -> RoundsResult:
-    """Try the best grasps again with a lower mass that the strongest of them can lift. Try the strongest first."""
+    """Try the best grasps again, strongest first, with a lower mass that the strongest grasp can lift."""
     if state.context is None:
         return state
     best, others = state.grasps[:_WEIGHED], state.grasps[_WEIGHED:]

@@ -2,7 +2,7 @@
 
 The part of the object outside the wanted region is an obstacle of the search. The obstacle loss then moves all contacts
 into the region. The obstacle's signed distance is the maximum of the distances to the object and to the outside of the
-region. It is a lower bound of the true distance. Its gradient jumps where the two are equal.
+region. It is a lower bound of the true distance. Its gradient jumps where these two distances are equal.
 """
 
 from __future__ import annotations
@@ -178,7 +178,7 @@ class BoundSteering(BoundRestriction):
 
     @property
     def impossible(self) -> str:
-        """The reason, if the hand would pass through the support on its approach. Otherwise empty."""
+        """The reason: the hand would pass through the support on its approach. Empty otherwise."""
         if self.scene.support is None or self.wanted.direction is None:
             return ""
         depth = depth_of_starts(self.scene, self.hand, _PROBES, BoundRestrictions((self,)))

@@ -1,4 +1,4 @@
-"""Compute distances to a mesh and overlaps of a hand with the compiled kernel. Other Python threads run meanwhile.
+"""Compute distances to a mesh and overlaps of a hand with the compiled kernel, while other Python threads run.
 
 `mesh/surface_queries` and `prepared_grasp` do the same in Python. The tests compare the kernel with them, and they are
 used if there is no kernel. The results are equal up to rounding.

@@ -154,7 +154,7 @@ def placed_hand(context: MetricsContext, posture: Posture) -> PlacedHand:
 
 
 def contact_area(placed: PlacedHand, within: float = CONTACT_DISTANCE) -> float:
-    """Return the hand's area [m²] within `within` [m] of the object's surface, inside or outside. At most 15 mm."""
+    """Return the area [m²] of the hand samples at most `within` [m] inside or outside the object (up to 15 mm)."""
     return float(placed.areas[np.abs(placed.distance) <= within].sum())
 
 

@@ -63,7 +63,7 @@ def results_in_order(
 ) -> Generator[Result]:
     """Yield the result of each item in order, until `over` returns true.
 
-    When the iterator is closed, the stop hook ends work that was started ahead.
+    Closing the iterator ends the work that was started ahead, by the stop hook.
 
     Args:
         over: ends the iteration. Only the calling thread calls it.
@@ -213,7 +213,7 @@ def robustness_checks_of(
     if scene.evidence is None or probability <= shares.likeliest:
         return None
     places = [
-        RobustnessCheck(f"place {number}", partial(_hold_displaced, trials, error))
+        RobustnessCheck(f"displaced pose {number}", partial(_hold_displaced, trials, error))
         for number, error in enumerate(pose_errors(_PLACES_SEED, _PLACES), 1)
     ]
     least = _LEAST_PLACES

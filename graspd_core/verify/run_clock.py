@@ -92,7 +92,7 @@ def result_of(
 ) -> GraspResult:
     """Return the result of a run. Its outcome is success if at least `count` grasps are usable.
 
-    `ended_early` is the outcome if there are too few usable grasps because the run was ended.
+    `ended_early` is the outcome if there are too few usable grasps because the run ended early.
     """
     few = Outcome.TOO_FEW if grasps else Outcome.NO_CANDIDATES
     enough = sum(grasp.usable for grasp in grasps) >= count

@@ -212,8 +212,8 @@ def run_trials(
 ) -> TriedGrasps:
     """Try candidates in rank order until `count` are verified, and measure each verified grasp.
 
-    `before` is the number of grasps that were verified earlier. The trials use torch's number of threads. Verdicts and
-    order do not depend on it. Grasps are measured in parallel with the next trials.
+    `before` is the number of grasps that were verified earlier. The trials use torch's number of threads, which changes
+    neither verdicts nor order. Grasps are measured in parallel with the next trials.
     """
     verified: list[Grasp] = []
     others: list[Grasp] = []
@@ -340,7 +340,7 @@ def rank_by_robustness(
 
 
 def most_robust_first(verified: Sequence[Grasp]) -> list[Grasp]:
-    """Return the grasps by descending robustness. Equal ones keep their order. An unmeasured one counts as 0.5."""
+    """Return the grasps by descending robustness, 0.5 if unmeasured. Grasps of equal robustness keep their order."""
 
     def share(grasp: Grasp) -> float:
         known = grasp.metrics.get("robustness") if grasp.metrics else None

@@ -256,7 +256,7 @@ def test_an_arm_that_could_hit_nothing_or_has_a_joint_that_follows_is_refused(tm
     path = write(tmp_path)
     camera = '<collision><geometry><box size="0.1 0.02 0.02"/></geometry></collision>'
     (tmp_path / "cell.urdf").write_text(ROBOT.replace(camera, ""))
-    with pytest.raises(ConfigError, match=r"cell.urdf: no link that moves has a <collision> or <visual> shape"):
+    with pytest.raises(ConfigError, match=r"cell.urdf: no moving link has a <collision> or <visual> shape"):
         load_arm(path)
     (tmp_path / "cell.urdf").write_text(ROBOT.replace('<origin xyz="0.4 0 0"/>', '<mimic joint="j1"/>'))
     with pytest.raises(ConfigError, match=r"cell.yaml: joint 'j2' is coupled by <mimic>; valid: independent joints"):
@@ -317,7 +317,7 @@ def test_an_arm_is_taken_out_of_a_robot_that_the_caller_brings(tmp_path):
     arm, plain = load_arm(path, ROBOT), load_arm(write(tmp_path))
     assert (arm.joint_names, arm.chain.link_names) == (plain.joint_names, plain.chain.link_names)
     path = write(tmp_path, urdf="robot_description")
-    with pytest.raises(ConfigError, match=r"cell.yaml.urdf: robot_description: known only to the node"):
+    with pytest.raises(ConfigError, match=r"cell.yaml.urdf: robot_description is known only to a node"):
         load_arm(path)
     with pytest.raises(GraspdError, match=r"robot_description: not well-formed XML"):
         load_arm(path, "<robot>")

@@ -78,7 +78,7 @@ def test_what_a_grasp_would_hold_beyond_the_mass_makes_the_lift_faster():
 
 
 def test_a_grasp_that_no_arm_reaches_has_no_execution():
-    with pytest.raises(ConfigError, match="no path of an arm"):
+    with pytest.raises(ConfigError, match="has no arm path"):
         execution_of(replace(reached_grasp(), arm=None), HAND, arm_speeds=SPEEDS)
     with pytest.raises(ConfigError, match=r"finger_speed: 0\.0; valid: a positive"):
         ExecutionPace(finger_speed=0.0)

@@ -158,7 +158,7 @@ def test_a_mount_is_read_and_its_quaternion_made_exact(allegro_copy: Path, entry
 
 @pytest.mark.parametrize("count", [0, -5])
 def test_no_candidates_is_refused(count: int) -> None:
-    with pytest.raises(HandError, match="candidates="):
+    with pytest.raises(HandError, match="candidates: "):
         load_hand("allegro_right", candidates=count)
 
 

@@ -108,7 +108,7 @@ def test_what_is_too_low_for_the_fingers_is_told_with_what_became_of_the_trials(
     assert result.outcome is Outcome.TOO_FEW
     assert not any(grasp.verdict is Verdict.VERIFIED for grasp in result.tried)
     assert result.message.startswith(f"{len(result.tried)} grasps failed their trials: the object ")
-    assert "; it is 2 mm high on its support" in result.message
+    assert "; the object is 2 mm high on its support" in result.message
 
 
 def test_reasons_are_told_without_numbers_the_most_frequent_first(hand, card_on_table):

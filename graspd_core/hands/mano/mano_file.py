@@ -86,7 +86,7 @@ def _dense(value: Inert, depth: int) -> np.ndarray:
         or (np.diff(starts) < 0).any()
         or (len(indices) and not 0 <= indices.min() <= indices.max() < minor)
     ):
-        raise ValueError("holds a sparse matrix with inconsistent indices")
+        raise ValueError("holds a sparse matrix whose indices do not fit its shape and data")
     dense = np.zeros((major, minor))
     np.add.at(dense, (np.repeat(np.arange(major), np.diff(starts)), indices), data)
     return dense if value.kind == "sparse rows" else dense.T
@@ -144,11 +144,11 @@ class ManoData:
 def read_mano(path: Path) -> ManoData:
     """Read and check a MANO file (.pkl) as downloaded.
 
-    Raises HandError: the file cannot be read, would run code, or has a missing or wrong entry. Names file and entry.
+    Raises HandError, which names file and entry: the file cannot be read, would run code, or has a wrong entry.
     """
     content = read_pickle(path)
     if not isinstance(content, Mapping):
-        raise HandError(f"{path}: holds {type(content).__name__}, a MANO file holds a dictionary")
+        raise HandError(f"{path}: holds {type(content).__name__}; valid: a dictionary, as in a MANO file")
     template = _read(path, content, "v_template", (None, 3))
     count = len(template)
     data = ManoData(
@@ -167,9 +167,9 @@ def read_mano(path: Path) -> ManoData:
         raise HandError(f"{path}: kintree_table is not MANO's tree of a wrist and five fingers of three joints")
     for key, rows in (("weights", data.weights), ("J_regressor", data.joint_regressor)):
         if np.abs(rows.sum(1) - 1.0).max() > 0.01:
-            raise HandError(f"{path}: {key}: rows do not sum to one")
+            raise HandError(f"{path}: {key}: rows do not sum to one; valid: 1 within 0.01")
     if len(data.faces) == 0 or data.faces.min() < 0 or data.faces.max() >= count:
-        raise HandError(f"{path}: f: names vertices outside 0 to {count - 1}")
+        raise HandError(f"{path}: f: no faces, or vertex indices outside 0 to {count - 1}")
     bare = set(range(len(BODIES))) - set(data.weights.argmax(1).tolist())
     if bare:
         raise HandError(f"{path}: weights: no vertex belongs to {', '.join(BODIES[i] for i in sorted(bare))}")
@@ -192,7 +192,7 @@ def _read(path: Path, content: Mapping[str, Any], key: str, shape: tuple[int | N
     )
     if not fits:
         wanted = " x ".join("any" if n is None else str(n) for n in shape)
-        raise HandError(f"{path}: {key} is {' x '.join(map(str, array.shape))}, expected {wanted}")
+        raise HandError(f"{path}: {key} has shape {' x '.join(map(str, array.shape))}; valid: {wanted}")
     if not np.isfinite(array).all():
         raise HandError(f"{path}: {key} has entries that are not finite")
     return array

@@ -8,7 +8,7 @@ The base frame has the model's axes and its origin in the wrist joint. The palm 
 
 Each of MANO's fifteen ball joints becomes three hinges. A body turns relative to its parent by `R = B Rx(flexion)
 Ry(abduction) Rz(twist) Bᵀ`. B is the anatomical frame at rest: z along the bone, x the flexion axis, y = z × x. The
-order follows the ISB (Wu et al. 2005, after Grood and Suntay 1983). It is exact both ways while abduction is below 90°.
+order follows the ISB (Wu et al. 2005, after Grood and Suntay 1983). Both conversions are exact for abduction below 90°.
 
 The anatomical frames come from the joints of the shape. A finger flexes towards the palm normal, which is the normal of
 the plane through wrist, index knuckle and little knuckle. The thumb flexes towards a point in front of the palm. In the
@@ -208,7 +208,7 @@ def load_mano(path: str | Path, betas: Sequence[float] = (), *, candidates: int 
     data = read_mano(Path(path))
     shape = np.zeros(data.shape_directions.shape[-1])
     if len(betas) > len(shape) or not np.isfinite(list(betas)).all():
-        raise HandError(f"{path}: {len(betas)} betas, expected at most {len(shape)} finite numbers")
+        raise HandError(f"{path}: betas has {len(betas)} numbers; valid: at most {len(shape)} finite numbers")
     shape[: len(betas)] = betas
     vertices, joints = (t[0].numpy() for t in rest(make_skin(data), torch.as_tensor(shape)[None]))
     closed_faces(data)  # This refuses a mesh that cannot be closed before any planning.

@@ -21,7 +21,7 @@ from graspd_core.se3 import rotation_from_quaternion, safe_norm
 
 @dataclass(frozen=True, eq=False)
 class Skin:
-    """A MANO model as tensors. Fields as in `ManoData`."""
+    """A MANO model as tensors. `ManoData` describes the fields."""
 
     template: Float[Tensor, "vertices 3"]
     shape_directions: Float[Tensor, "vertices 3 shapes"]
@@ -87,7 +87,7 @@ def wrist_loop(data: ManoData) -> Int[np.ndarray, "loop"]:
     edges = face_edges(data.faces).tolist()
     present = set(map(tuple, edges))
     if len(present) != len(edges):
-        raise HandError(f"{data.path}: f: faces of opposite winding, or an edge of three faces")
+        raise HandError(f"{data.path}: f: faces of opposite winding, or an edge that three faces share")
     after = {a: b for a, b in present if (b, a) not in present}
     if not after:
         return np.zeros(0, dtype=np.int64)
@@ -109,7 +109,7 @@ def closed_faces(data: ManoData) -> Int[np.ndarray, "faces 3"]:
 
 
 def close_wrist(data: ManoData, vertices: Float[Tensor, "batch vertices 3"]) -> Float[Tensor, "batch closed 3"]:
-    """Return the vertices for `closed_faces`: the hub of the fan, the mean of the loop, is appended."""
+    """Return the vertices for `closed_faces`, with the hub of the fan appended. The hub is the mean of the loop."""
     loop = wrist_loop(data)
     if len(loop) == 0:
         return vertices

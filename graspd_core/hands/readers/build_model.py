@@ -83,7 +83,7 @@ class JointSpec:
 
 
 def refuse_crowds(path: Path, links: int, joints: int, solids: int) -> None:
-    """Raise HandError if a file has too many links, joints or solids for a hand. It runs before they are read."""
+    """Raise HandError if a file has too many links, joints or solids for a hand. Call this before reading them."""
     for what, count, most in (
         ("links", links, _MOST_LINKS),
         ("joints", joints, _MOST_LINKS),
@@ -118,7 +118,7 @@ def assemble(
     chain, couplings, mended = _settled(path, [into[link] for link in order[1:]], couplings)
     joint_fields = _actuated([joint for joint in chain if joint.kind != "fixed" and joint.name not in couplings])
     if not joint_fields["joint_names"]:
-        told = f"{path}: {name!r} has no joint that moves ({len(order)} links), so that it could not grasp"
+        told = f"{path}: {name!r} has no joint that moves ({len(order)} links); valid: one movable joint or more"
         raise HandError("; ".join([told, *mended]))
     return HandModel(
         name=name,
@@ -213,7 +213,7 @@ def _depth_first(path: Path, links: Sequence[LinkSpec], joints: Sequence[JointSp
 def _refuse_repeated(path: Path, what: str, names: Sequence[str]) -> None:
     repeated = sorted(name for name, count in Counter(names).items() if count > 1)
     if repeated:
-        raise HandError(f"{path}: {what} {repeated[0]!r} is defined twice; names are unique")
+        raise HandError(f"{path}: {what} {repeated[0]!r} is defined twice; valid: unique names")
 
 
 def _reaches(root: str, link: str, above: Mapping[str, str]) -> bool:

@@ -114,7 +114,7 @@ class HandDescription:
         palm_center: centre of the palm's surface [m]. None to guess the palm.
         palm_normal: unit direction out of the palm. None to guess the palm.
         approach: unit direction of approach in the base frame. None for the palm normal.
-        effort: greatest effort [N·m] or [N] of all joints, or of some by joint name. None for those of the URDF.
+        effort: greatest effort [N·m] or [N] of all joints, or of some by joint name. None to keep the URDF's efforts.
         open, closed: joint values by joint name [rad] or [m]. None to guess the posture.
         mount: pose of the base link on an arm. None if the file has no `mount`.
         root: first link of the hand in a URDF of a whole robot. None if the whole URDF is the hand.
@@ -135,14 +135,14 @@ class HandDescription:
 
 
 def is_number(value: object) -> bool:
-    """Return True for a number of a sensible size. True and False are no numbers."""
+    """Return True for a number between -1e9 and 1e9. Booleans do not count as numbers."""
     return isinstance(value, int | float) and not isinstance(value, bool) and -_LARGEST <= value <= _LARGEST
 
 
 def read_description(path: Path) -> HandDescription:
     """Read and check a hand description.
 
-    Raises HandError: the file is not YAML, or has an unknown or missing key or a wrong value. Names line and key.
+    Raises HandError, which names line and key: the file is not YAML, or has an unknown or missing key or a wrong value.
     """
     try:
         node, data = parse_yaml(path.read_text(encoding="utf-8"))
@@ -245,7 +245,7 @@ def _check_joints(hand: HandModel, description: HandDescription, key: str, value
 
 
 def _key_lines(node: yaml.Node | None, prefix: str = "") -> dict[str, int]:
-    """Return the line of every key and of every key one level below. Nested keys are joined by a dot."""
+    """Return the line of every key on the first two levels. A nested key is written with a dot, as in `palm.center`."""
     lines: dict[str, int] = {}
     if isinstance(node, yaml.MappingNode):
         for key, value in node.value:

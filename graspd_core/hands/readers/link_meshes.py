@@ -59,7 +59,7 @@ def _address(filename: str) -> tuple[str, str]:
 
 
 def missing_packages(urdf: Path, meshes: Iterable[ET.Element]) -> tuple[str, ...]:
-    """Return warnings of packages that were not found. Their meshes are searched beside the URDF and above it."""
+    """Return warnings about packages that were not found. Their meshes are searched beside the URDF and above it."""
     addresses = (_address(mesh.get("filename") or "") for mesh in meshes)
     named = {rest.partition("/")[0] for scheme, rest in addresses if scheme in ("package", "model")}
     parents = urdf.resolve().parents

@@ -1,7 +1,7 @@
 """Read a `HandModel` from an MJCF file. MuJoCo parses and compiles the file.
 
 MuJoCo gets the XML of `read_xml`, reduced to the sections that describe how the hand moves. MuJoCo opens no file.
-graspd reads the meshes, in more formats, as convex hulls. Unsupported elements that affect motion are an error.
+graspd itself reads the meshes as convex hulls, in more formats. Unsupported elements that affect motion are an error.
 """
 
 from __future__ import annotations
@@ -167,7 +167,7 @@ class _Parts:
 
 
 def read_mjcf(path: Path, root: ET.Element | None = None) -> HandModel:
-    """Read the hand of an MJCF file. The result is as from `read_urdf`.
+    """Read the hand of an MJCF file. The result is like that of `read_urdf`.
 
     The base is the only body of the world. Raises HandError: MuJoCo refuses the file, the world has several bodies, or
     the file uses unsupported elements.

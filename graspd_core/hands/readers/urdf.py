@@ -1,6 +1,6 @@
 """Read a `HandModel` from a URDF. Common mistakes are repaired with a warning, or are errors that name the element.
 
-Boxes, spheres, cylinders and capsules do not change. Meshes become convex hulls. Visual shapes are for the viewer.
+Boxes, spheres, cylinders and capsules do not change. Meshes become convex hulls. The viewer draws the visual shapes.
 """
 
 from __future__ import annotations
@@ -70,7 +70,7 @@ def _read_shape(path: Path, element: ET.Element, read_mesh: Callable[..., Triang
     geometry = element.find("geometry")
     shapes = [] if geometry is None else list(geometry)
     if not shapes:
-        raise wrong(path, element, f"a <{element.tag}> element has no geometry")
+        raise wrong(path, element, f"a <{element.tag}> has no <geometry> with a shape; valid: {', '.join(_SHAPES)}")
     shape = shapes[0]
     if shape.tag == "box":
         half = 0.5 * _positive(path, shape, "size", 3)
@@ -135,13 +135,13 @@ def read_urdf(path: Path, root: ET.Element | None = None) -> HandModel:
     """
     root = read_xml(path) if root is None else root
     if root.tag != "robot":
-        raise wrong(path, root, f"the root element is <{root.tag}>, a URDF has <robot>")
+        raise wrong(path, root, f"the root element is <{root.tag}>; a URDF has <robot>")
     links, joints = root.findall("link"), root.findall("joint")
     shapes = sum(len(link.findall(tag)) for link in links for tag in ("collision", "visual"))
     refuse_crowds(path, len(links), len(joints), shapes)
     for element in (*links, *joints):
         if not element.get("name"):
-            raise wrong(path, element, f"a <{element.tag}> has no name")
+            raise wrong(path, element, f"a <{element.tag}> has no name; give it a unique one")
     _refuse_xacro(path, root)
     links, joints, dropped = _below_world(path, links, joints)
     specs = [_read_joint(path, joint) for joint in joints]
@@ -298,7 +298,7 @@ def _limits(path: Path, joint: ET.Element) -> tuple[float, float, float, float]:
     continuous = joint.get("type") == "continuous"
     if limit is None:
         if not continuous:
-            raise wrong(path, joint, "has no <limit>")
+            raise wrong(path, joint, "has no <limit>; give its lower and upper, or make the joint continuous")
         limit = ET.Element("limit")
     lower, upper = (float(read_numbers(path, limit, key, 1, "0")[0]) for key in ("lower", "upper"))
     if continuous:

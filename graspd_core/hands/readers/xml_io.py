@@ -47,7 +47,7 @@ def read_xml(path: Path) -> Element:
         with path.open("rb") as file:
             data = file.read(_LARGEST_FILE + 1)
         if len(data) > _LARGEST_FILE:
-            raise HandError(f"{path}: larger than {_LARGEST_FILE >> 20} MiB, the limit of a hand file")
+            raise HandError(f"{path}: the hand file is too large; valid: at most {_LARGEST_FILE >> 20} MiB")
         text = _decoded(data)
     except (OSError, ValueError) as error:
         raise HandError(f"{path}: cannot be read: {getattr(error, 'strerror', None) or error}") from error
@@ -146,7 +146,7 @@ def _parsed(path: Path, text: str) -> Element:
         stack.pop()
 
     def refuse(*_: object) -> None:
-        raise HandError(f"{path}:{parser.CurrentLineNumber}: a <!DOCTYPE> is refused: it could define entities")
+        raise HandError(f"{path}:{parser.CurrentLineNumber}: a <!DOCTYPE> is refused, because it may define entities")
 
     parser.StartElementHandler, parser.EndElementHandler, parser.StartDoctypeDeclHandler = start, end, refuse
     try:
@@ -175,7 +175,7 @@ def read_origin(path: Path, element: ET.Element) -> tuple[Float[np.ndarray, "3 3
 
 
 def read_numbers(path: Path, element: ET.Element, key: str, count: int, default: str) -> Float[np.ndarray, "n"]:
-    """Read an attribute of `count` finite numbers. Raises HandError: it has other content."""
+    """Read an attribute of `count` finite numbers. Raises HandError: the attribute has other content."""
     text = element.get(key) or default
     try:
         values = np.array([float(word) for word in text.split()])

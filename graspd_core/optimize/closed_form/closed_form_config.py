@@ -33,13 +33,13 @@ class ClosedFormConfig:
     """The closed-form relaxation (docs/method.md).
 
     Attributes:
-        starts_per_grasp: starts for each requested grasp. Exploring drops hopeless starts.
+        starts_per_grasp: number of starts for each requested grasp. Exploring drops hopeless starts.
         fingertip_starts: share of starts with half-closed fingertips at the object, instead of the open palm.
-        explore_steps: first steps, in which hopeless starts are dropped.
-        refine_steps: steps after exploring, with the kept starts.
-        polish_steps: last steps, with all sharp points of the object and with weights for exact contact.
-        fine_steps: last steps of polishing, with all contact candidates too.
-        keep_per_grasp: starts kept after exploring, for each requested grasp.
+        explore_steps: number of first steps, in which hopeless starts are dropped.
+        refine_steps: number of steps after exploring, with the kept starts.
+        polish_steps: number of last steps, with all sharp points of the object and with weights for exact contact.
+        fine_steps: number of the last polishing steps, which use all contact candidates.
+        keep_per_grasp: number of starts kept after exploring, for each requested grasp.
         drops: how often exploring drops starts. Drops are evenly spread, and each drops the same share.
         activation: `soft` contact decays over its width. `hard` contact, for the ablation, ends at `delta_end`.
         delta_start: width of the soft contact at the start [m].

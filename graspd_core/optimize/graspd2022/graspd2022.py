@@ -118,7 +118,7 @@ class FreeBody:
         inertia: inertia about the centre of mass [kg·m²].
         inverse_inertia: inverse of `inertia`.
         center: centre of mass [m].
-        length: angular velocity times this length is comparable with linear velocity [m].
+        length: characteristic length that makes angular and linear velocity comparable [m].
     """
 
     mass: float
@@ -200,7 +200,7 @@ def physics(desired: Forces, supplied: Forces) -> Values:
 def motion_left(
     body: FreeBody, forces: Forces, arms: Points, velocities: Float[Tensor, "simulations 3"], time_step: float
 ) -> Float[Tensor, "batch simulations"]:
-    """Return the object's squared speed after one step, relative to the mean before. 1 if no motion is stopped.
+    """Return the object's squared speed after a step, divided by the mean before the step. 1 if no motion is stopped.
 
     Forces with six components contain torques, divided by the body's length.
     """
@@ -365,7 +365,7 @@ class Graspd2022:
         return self.body.mass * config.simulation.speed * math.sqrt(3) / config.simulation.stopping_force
 
     def points(self, problem: Problem) -> PointSet:
-        """Return the contact candidates that are used."""
+        """Return the contact candidates that the configuration selects."""
         return problem.hand.fine if self.config.contact.all_candidates else problem.hand.coarse
 
     def init(self, problem: Problem, starts: Poses) -> RelaxedState:

@@ -11,7 +11,7 @@ class InitialPosesConfig:
     """The starts of the optimiser.
 
     Attributes:
-        starts_per_grasp: starts for each requested grasp.
+        starts_per_grasp: number of starts for each requested grasp.
         kind: `published` has the palm at `standoff` from a random surface point. `hull` uses `draw_starts`.
         standoff: distance of the palm from the surface point [m].
     """
@@ -63,8 +63,8 @@ class SimulationConfig:
 
     Attributes:
         scaling: `published` uses `time_step`. `object` uses the time in which `stopping_force` stops the object.
-        stopping_force: for the scaling `object` [N].
-        time_step: for the scaling `published` [s].
+        stopping_force: force that stops the object, for the scaling `object` [N].
+        time_step: duration of the step, for the scaling `published` [s].
         speed: initial speed along each axis [m/s]: 0, positive and negative in the three simulations.
     """
 
