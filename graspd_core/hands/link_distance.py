@@ -202,7 +202,7 @@ def _to_solids(
 def pair_distance(
     solids: CollisionTensors, links: SE3, points: Float[Tensor, "batch pairs 3"], which: Int[Tensor, "batch pairs"]
 ) -> Float[Tensor, "batch pairs"]:
-    """Return the signed distance [m] of each base-frame point to the solid with its index in `which`."""
+    """Return the signed distance [m] of each base-frame point to its solid. `which` has the solids' indices."""
     rows = torch.arange(len(points), device=points.device)[:, None]
     in_link = links[rows, solids.link[which]].apply_inverse(points[..., None, :])
     local = SE3(solids.rotation, solids.translation)[which].apply_inverse(in_link).squeeze(-2)

@@ -2,7 +2,7 @@
 
 A method of graspd_core is a row of `METHODS`. Another package registers a method by an entry point of the group
 `graspd.methods` that names its row. The row is loaded when the method is first used. A plugin is a Python file that
-adds rows to `METHODS`, `METRICS` or `TRIALS`. An environment variable lists the plugins, so child processes load them.
+adds rows to `METHODS`, `METRICS` or `TRIALS`. Child processes load the plugins that an environment variable lists.
 """
 
 from __future__ import annotations

@@ -71,7 +71,7 @@ class Aim:
 
 @dataclass(frozen=True)
 class Refusal:
-    """The reason for refusing a candidate, as a phrase to follow a number: "outside the approach cone"."""
+    """The reason for refusing a candidate: a phrase that follows a number, such as "outside the approach cone"."""
 
     reason: str
 

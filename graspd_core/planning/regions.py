@@ -154,7 +154,7 @@ def entered(hand: HandModel, postures: Sequence[Posture], boxes: Sequence[Box]) 
 def _placed_solids(
     hand: HandModel, postures: Sequence[Posture]
 ) -> tuple[Float[np.ndarray, "postures solids corners 3"], Float[np.ndarray, "solids"]]:
-    """Return each primitive's extreme points [m] and radius [m]. Repeated points pad the array."""
+    """Return each primitive's extreme points [m] and radius [m]. Repeated points pad the rows to equal length."""
     solids = extreme_points_of_solids(hand)
     most = max(len(points) for points, _, _ in solids)
     local = np.stack([np.vstack([points, np.repeat(points[:1], most - len(points), 0)]) for points, _, _ in solids])

@@ -190,7 +190,7 @@ class BoundSteering(BoundRestriction):
         )
 
     def starts(self, positions: Places, quaternions: Turns, joints: JointRows) -> Allowed:
-        """Return which initial poses have their palm outside all avoided boxes, at the pose and at the retreat."""
+        """Return which initial poses have the palm outside all avoided boxes, both at the pose and at its retreat."""
         if not self.steering.avoid:
             return np.ones(len(positions), dtype=bool)
         turns = rotation_from_quaternion(torch.as_tensor(quaternions)).numpy()
