@@ -169,9 +169,7 @@ def plan_config(values: Any, where: str = "config") -> PlanConfig:
     unknown = set(values) - set(hints) if isinstance(values, Mapping) else ()
     # `method_names` searches other packages, which is slow. So it is called only for an unknown key.
     if others := sorted(name for name in unknown if name in method_names()):
-        raise ConfigError(
-            f"{where}.{others[0]}: settings of another method than {named}; remove them, or set method: {others[0]}"
-        )
+        raise ConfigError(f"{where}.{others[0]}: not used with method: {named}; remove it, or set method: {others[0]}")
     found = coerced(hints, values, where)
     return PlanConfig(**{("settings" if key == named else key): value for key, value in found.items()})
 
