@@ -63,7 +63,7 @@ MAY_IMPORT = {
 # Most lines of Python per package. They are lowered when the code shrinks, and raised only with a reason.
 # The layout aims at 22,000 of graspd_core, 4,500 of graspd_ros, 26,000 of test. Input checks added 1,700, 500, 3,300.
 MAX_PACKAGE_LINES = {
-    "graspd_core": 27_527,
+    "graspd_core": 27_525,
     "graspd_ros": 5_268,
     "graspd_bench": 8_824,
     "graspd_dataset": 2_961,

@@ -79,7 +79,7 @@ def test_fingers_that_do_not_keep_the_tables_margin_are_refused(hand, cube, clos
     world = build_world(hand, cube, (cube.mesh,), STANDARD, replace(TABLE, margin=0.007))
     lift = lift_trial(world, hand, closing(*GOOD, height=CLEAR), STANDARD)
     # 2 mm above the table.
-    assert lift.reason == "the hand reaches 5.0 mm into the support while coming"
+    assert lift.reason == "the hand reaches 5.0 mm into the support while approaching"
 
 
 def test_a_weak_squeeze_leaves_the_object_on_the_table(table, hand, closing):
