@@ -7,13 +7,15 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
+from functools import partial
+from typing import Any
 
 import numpy as np
 
 from graspd_core.types import Grasp, StopHook
 from graspd_core.verify.early_stop import LOOK_EVERY
-from graspd_core.verify.hold_trial import CHECK_EVERY, DIRECTIONS, close_hand, hold_trial, step_until_known
-from graspd_core.verify.world import Protocol, World, altered, at_friction, trial_data
+from graspd_core.verify.hold_trial import CHECK_EVERY, DIRECTIONS, breach, close_hand, hold_trial, step_until_known
+from graspd_core.verify.world import Protocol, World, advance, altered, at_friction, trial_data
 
 # mujoco is a compiled module without stubs.
 # pyright: reportAttributeAccessIssue=false
@@ -24,6 +26,11 @@ LEAST_PAYLOAD, MOST_PAYLOAD = 0.01, 16.0
 _LEAST_SHARE = 0.02
 # The bisections end when the bounds differ by less than this factor.
 FINENESS = 1.1
+# Estimate of a payload: steps in which the pull doubles, steps over which the hand's force is averaged, and share of
+# this force that resists a sudden pull. Most estimates are within a factor of 2.
+_DOUBLING, _WINDOW, _SHARE = 2, 8, 0.5
+# Factor between the masses that are tried from the estimate on.
+_STRIDE = 1.2
 
 
 def payload(
@@ -45,7 +52,7 @@ def payload(
 
     kind = mujoco.mjtState.mjSTATE_INTEGRATION
     steps = CHECK_EVERY * round(protocol.hold_time / protocol.timestep / CHECK_EVERY)
-    most = math.inf
+    most = max(least, MOST_PAYLOAD)
     try:
         with trial_data(world) as data:
             closed = next((s for at, by, s in tuple(world.closed) if at is grasp.squeeze and by == protocol), None)
@@ -54,28 +61,25 @@ def payload(
                     return 0.0
                 closed = np.empty(mujoco.mj_stateSize(world.model, kind))
                 mujoco.mj_getState(world.model, data, closed, kind)
-            # Hands are weakest against pulls along the approach, out of the hand. These directions come first.
-            way = grasp.grasp.position - grasp.pregrasp.position
-            directions = DIRECTIONS[list(protocol.pulls)]
-            for direction in directions[np.argsort(-directions @ way, kind="stable")]:
 
-                def holds(mass: float, direction: np.ndarray = direction) -> bool:
-                    mujoco.mj_setState(world.model, data, closed, kind)
-                    data.xfrc_applied[world.object_body, :3] = protocol.pull * mass * direction
-                    # Half of the pulls end at a limit, which a look finds before the trial's own check.
-                    worst, often = np.zeros(2), LOOK_EVERY
-                    return not step_until_known(world, data, protocol, worst, steps, stop=stop, check_every=often)
+            def holds(direction: np.ndarray, mass: float) -> bool:
+                mujoco.mj_setState(world.model, data, closed, kind)
+                data.xfrc_applied[world.object_body, :3] = protocol.pull * mass * direction
+                # Half of the pulls end at a limit, which a look finds before the trial's own check.
+                worst, often = np.zeros(2), LOOK_EVERY
+                return not step_until_known(world, data, protocol, worst, steps, stop=stop, check_every=often)
 
-                if not held and not holds(least):
+            pulls = []
+            for direction in DIRECTIONS[list(protocol.pulls)]:
+                mujoco.mj_setState(world.model, data, closed, kind)
+                pulls.append((_estimated(world, data, protocol, direction, least), direction))
+            # The weakest direction comes first. Search again only in a direction that is weaker than all earlier ones.
+            for estimate, direction in sorted(pulls, key=lambda pull: pull[0]):
+                resists = partial(holds, direction)
+                if not held and not resists(least):
                     return 0.0
-                if math.isinf(most):
-                    low = high = least
-                    while high < MOST_PAYLOAD and holds(high := min(2 * low, MOST_PAYLOAD)):
-                        low = high
-                    most = _greatest(holds, low, high) if low < high else high
-                # Bisect again only in a direction that is weaker than all earlier ones.
-                elif not holds(most):
-                    most = _greatest(holds, least, most)
+                if not resists(most):
+                    most = _greatest(resists, least, most, max(min(estimate, most / _STRIDE), least))
     except mujoco.FatalError:
         return 0.0
     return most
@@ -91,9 +95,26 @@ def least_friction(world: World, grasp: Grasp, protocol: Protocol, *, stop: Stop
     return protocol.friction[0] / _greatest(holds, 1.0, 1 / _LEAST_SHARE)
 
 
-def _greatest(holds: Callable[[float], bool], low: float, high: float) -> float:
-    """Return by bisection the greatest value that holds. `low` must hold and `high` must not."""
+def _estimated(world: World, data: Any, protocol: Protocol, direction: np.ndarray, least: float) -> float:
+    """Pull the object in a direction ever harder until it is lost, and return an estimate of the payload there [kg]."""
+    force, resisted = slice(world.object_velocity, world.object_velocity + 3), list[float]()
+    for step in range(max(math.ceil(_DOUBLING * math.log2(MOST_PAYLOAD / least)), _WINDOW)):
+        data.xfrc_applied[world.object_body, :3] = 2 * protocol.pull * least * 2 ** (step / _DOUBLING) * direction
+        advance(world, data)
+        resisted.append(-float(data.qfrc_constraint[force] @ direction))
+        if breach(world, data, protocol, np.zeros(2)):
+            break
+    count = min(_WINDOW, len(resisted))
+    return _SHARE * float(np.convolve(resisted, np.full(count, 1 / count), "valid").max()) / protocol.pull
+
+
+def _greatest(holds: Callable[[float], bool], low: float, high: float, start: float | None = None) -> float:
+    """Return by bisection the greatest value that holds. `low` must hold and `high` must not.
+
+    If `start` is given, the search moves away from it by at most a factor of `_STRIDE` at a time.
+    """
+    middle, stride = (math.sqrt(low * high), math.inf) if start is None else (start, _STRIDE)
     while high > FINENESS * low:
-        middle = math.sqrt(low * high)
         low, high = (middle, high) if holds(middle) else (low, middle)
+        middle = min(max(math.sqrt(low * high), middle / stride), middle * stride)
     return low

@@ -33,6 +33,7 @@ def test_the_payload_is_where_the_trial_s_verdict_changes(world, closing):
     assert hold_trial(altered(world, mass=0.9 * found), grasp, STANDARD).passed
     assert not hold_trial(altered(world, mass=1.1 * FINENESS * found), grasp, STANDARD).passed
     assert payload(world, grasp, STANDARD, least=2 * found) == 0.0
+    assert payload(world, grasp, STANDARD, least=2 * MOST_PAYLOAD, held=True) == 2 * MOST_PAYLOAD
 
 
 def test_a_hand_that_a_trial_closed_is_not_closed_again(world, closing):
