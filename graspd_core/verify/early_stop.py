@@ -12,7 +12,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 from graspd_core.verify.world import Protocol
 
@@ -42,6 +42,8 @@ class StopRule:
 
 
 FIRM = StopRule(first=10, windows=(5, 10, 20, 40), safety=8.0)
+# For the pulls of a payload: a third fewer steps. Of 719 pulls at 1.03 payloads and more, 4 seemed to hold.
+ROUGH = replace(FIRM, safety=2.0)
 SLIPPERY = StopRule(first=10, windows=(5, 10, 20, 40), safety=16.0)
 # Objects may begin to slip after 1.9 s. An object that creeps at 1 mm/s until then may slip suddenly.
 CREEPING = StopRule(first=100, windows=(50,), safety=16.0, speed=0.0005, spin=math.radians(0.5))
@@ -68,14 +70,18 @@ class ObjectState:
     spin: float
 
 
-def stop_rule(protocol: Protocol, fingers: int) -> StopRule | None:
-    """Return the stop rule for a protocol and a number of fingers. Return None if the protocol forbids early stops."""
+def stop_rule(protocol: Protocol, fingers: int, *, rough: bool = False) -> StopRule | None:
+    """Return the stop rule for a protocol and a number of fingers. Return None if the protocol forbids early stops.
+
+    If `rough` is set, `ROUGH` replaces `FIRM`.
+    """
     if protocol.full_length:
         return None
     if fingers < _FEWEST_FINGERS:
         return CREEPING
     fits = (r for r, ratio, friction in _RULES if protocol.impratio >= ratio and protocol.friction[0] >= friction)
-    return next(fits, CREEPING)
+    rule = next(fits, CREEPING)
+    return ROUGH if rough and rule is FIRM else rule
 
 
 def answer_known(

@@ -88,14 +88,14 @@ def step_until_known(
     steps: int,
     *,
     stop: Callable[[], bool],
-    check_every: int = CHECK_EVERY,
+    rough: bool = False,
 ) -> str:
     """Simulate `steps` steps, or fewer if the stop rule knows that the object stays within the limits.
 
-    Return why the trial failed, empty if it did not. Update `worst`, the greatest travel [m] and rotation [rad]. The
-    limits are checked after every `check_every` steps, a multiple of `LOOK_EVERY`.
+    Return why the trial failed, empty if it did not. Update `worst`, the greatest travel [m] and rotation [rad]. If
+    `rough` is set, a rougher rule applies (`stop_rule`), and a broken limit ends the pull sooner.
     """
-    rule, done = stop_rule(protocol, world.fingers), 0
+    rule, done = stop_rule(protocol, world.fingers, rough=rough), 0
     recent = deque[ObjectState](maxlen=1 + max(rule.windows) // LOOK_EVERY if rule else 0)
     while done < steps:
         if done % CHECK_EVERY == 0 and stop():
@@ -103,14 +103,16 @@ def step_until_known(
         count = min(LOOK_EVERY, steps - done)
         advance(world, data, count)
         done += count
-        checked = done % check_every == 0 or done == steps
-        reason = breach(world, data, protocol, worst) if checked else ""
-        if reason:
-            return reason
+        state = object_state(world, data)
+        so_far = moved(world, state)
+        if done % CHECK_EVERY == 0 or done == steps or (rough and broken_limit(protocol, *so_far)):
+            reason = breach(world, data, protocol, worst)
+            if reason:
+                return reason
         if rule is None:
             continue
-        recent.append(object_state(world, data))
-        if done >= rule.first and answer_known(rule, protocol, [*recent], moved(world, recent[-1]), steps - done):
+        recent.append(state)
+        if done >= rule.first and answer_known(rule, protocol, [*recent], so_far, steps - done):
             return breach(world, data, protocol, worst)
     return ""
 
