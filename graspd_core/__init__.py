@@ -139,8 +139,8 @@ def __getattr__(name: str) -> Any:
     module = _MODULE_OF.get(name)
     if module is None and name in _MOVED_TO:
         module = _MOVED_TO[name]
-        there = f"{__name__}.{module}"
-        warnings.warn(f"{__name__}.{name} goes with version 0.3; it is in {there}", DeprecationWarning, stacklevel=2)
+        there = f"import it from {__name__}.{module}"
+        warnings.warn(f"{__name__}.{name} is removed in version 0.3; {there}", DeprecationWarning, stacklevel=2)
     if module is None:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
     return getattr(importlib.import_module(f"{__name__}.{module}"), name)
@@ -151,7 +151,7 @@ def __dir__() -> list[str]:
 
 
 class _MovedModules:
-    """Import finder that names the new path of a module of version 0.1. As the last, it sees only failed imports."""
+    """Import finder that names the new path of a moved module. As the last finder, it sees only failed imports."""
 
     def find_spec(self, fullname: str, path: Any = None, target: Any = None) -> ModuleSpec | None:
         if not fullname.startswith(f"{__name__}."):

@@ -84,7 +84,7 @@ class Check:
         ok: whether the check passed.
         detail: a version or a number if the check passed, else the error in one line.
         hint: what to do if the check failed.
-        needed: whether graspd cannot work without it.
+        needed: whether graspd needs this library or part.
     """
 
     name: str
@@ -99,7 +99,7 @@ def run_checks() -> list[Check]:
     probes = [
         ("torch", _TORCH, _SETUP, True),
         ("mujoco", _MUJOCO, _SETUP, True),
-        ("compiled kernel", _KERNEL, f"torch does its work, 30 times slower: {_SETUP}", False),
+        ("compiled kernel", _KERNEL, f"torch replaces it and is 30 times slower: {_SETUP}", False),
         *((name, _LIBRARY.format(module=module, name=name), _SETUP, True) for name, module in _LIBRARIES.items()),
         ("open3d", _LIBRARY.format(module="open3d", name="open3d"), _CLOUDS, _has_open3d()),
         ("hands", _HANDS, "check the files under config/hands, or unset GRASPD_CONFIG", True),
@@ -181,6 +181,6 @@ def _check_cache() -> Check:
         with tempfile.TemporaryFile(dir=path.parent):
             pass
     except OSError as error:
-        hint = "make it writable, set XDG_CACHE_HOME, or GRASPD_CACHE=off; without it every start builds anew"
+        hint = "make it writable, set XDG_CACHE_HOME, or GRASPD_CACHE=off; without a cache every start is slow"
         return Check("cache", False, str(error), hint, needed=False)
     return Check("cache", True, f"{path.parent} is writable")

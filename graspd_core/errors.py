@@ -21,7 +21,7 @@ def short_repr(value: object) -> str:
 
 
 def first_line(error: BaseException) -> str:
-    """Return the first line of an error of a library, at most 200 characters, or its type if it says nothing."""
+    """Return the first line of a library's error, at most 200 characters, or the error's type if it has no text."""
     return next(iter(str(error).splitlines()), "")[:200] or type(error).__name__
 
 

@@ -38,7 +38,7 @@ class TransformBuffer:
     """A thread-safe buffer that returns the transform between any two connected frames.
 
     Args:
-        history: age relative to a frame's newest sample up to which samples are kept [ns]. None keeps all samples.
+        history: samples older than the frame's newest sample by more than this are dropped [ns]. None keeps all.
     """
 
     def __init__(self, history: int | None = HISTORY) -> None:
@@ -81,8 +81,8 @@ class TransformBuffer:
             common = next((name for name in up_source if name in up_target), None)
             if common is None:
                 raise TransformError(
-                    f"transform {source} -> {target}: not connected; {source} hangs under {up_source[-1]}, "
-                    f"{target} under {up_target[-1]}"
+                    f"transform {source} -> {target}: not connected; the root of {source} is {up_source[-1]}, "
+                    f"that of {target} is {up_target[-1]}"
                 )
             below_source = up_source[: up_source.index(common)]
             below_target = up_target[: up_target.index(common)]
@@ -172,9 +172,9 @@ def _name(frame: str) -> str:
     # ROS 1 wrote a slash before names, and old drivers still do.
     name = frame.removeprefix("/")
     if not name:
-        raise TransformError("transform: a frame without a name")
+        raise TransformError("transform: a frame has no name")
     if not name.isprintable():
-        raise TransformError(f"transform: the frame name {name[:80]!r} has a letter that cannot be printed")
+        raise TransformError(f"transform: the frame name {name[:80]!r} has a character that cannot be printed")
     return name
 
 

@@ -205,7 +205,7 @@ class Grasp:
 
     @property
     def verdict(self) -> Verdict:
-        """Verified if all trials passed. Failed if a trial on the likeliest scene failed. Otherwise unverified."""
+        """VERIFIED if all trials passed, FAILED if a trial on the likeliest scene failed, otherwise UNVERIFIED."""
         failed = {trial.name for trial in self.trials if not trial.passed}
         if self.trials and not failed:
             return Verdict.VERIFIED
@@ -213,7 +213,7 @@ class Grasp:
 
     @property
     def usable(self) -> bool:
-        """Whether the grasp is verified. If no trial was requested, whether it has a contact."""
+        """Whether the grasp is verified, or has a contact if no trial was requested."""
         return self.verdict is Verdict.VERIFIED or bool(not self.trials and self.contacts)
 
     @property

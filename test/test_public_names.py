@@ -61,7 +61,7 @@ def test_importing_the_package_imports_nothing_heavy():
 
 @pytest.mark.parametrize("name", graspd_core._MOVED_TO)
 def test_a_name_that_moved_is_found_with_a_warning(name: str):
-    with pytest.warns(DeprecationWarning, match=f"graspd_core.{name} goes with version"):
+    with pytest.warns(DeprecationWarning, match=f"graspd_core.{name} is removed in version"):
         assert callable(getattr(graspd_core, name))
 
 

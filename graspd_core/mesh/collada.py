@@ -1,8 +1,8 @@
 """Reader of the surfaces in COLLADA (.dae) files. It needs no COLLADA library.
 
-It reads the triangles, strips, fans, polylists and polygons of every geometry that the visual scene instances. It
-applies the node transforms, and converts lengths to metres by the file's `<unit>`. Polygons are split into fans, which
-is exact for convex ones. The up axis is ignored, as ROS viewers do. Format: COLLADA 1.4.1, Khronos Group, 2008.
+It reads the triangles, strips, fans, polylists and polygons of every geometry that the visual scene uses. It applies
+the node transforms, and converts lengths to metres by the file's `<unit>`. Polygons are split into fans, which is exact
+for convex ones. The up axis is ignored, as in ROS viewers. Format: COLLADA 1.4.1, Khronos Group, 2008.
 """
 
 from __future__ import annotations
@@ -67,14 +67,14 @@ def _joined(root: ET.Element) -> TriangleMesh:
             surfaces[geometry] = _surface(geometry, named)
         count += max(map(len, surfaces[geometry]))
         if count > _MOST_FACES:
-            raise ValueError(f"holds more than {_MOST_FACES} faces or vertices")
+            raise ValueError(f"the file has more than {_MOST_FACES} faces or vertices")
         parts.append(_placed(*surfaces[geometry], pose))
     vertices = np.concatenate([np.zeros((0, 3)), *(corners for corners, _ in parts)]) * scale
     starts = np.cumsum([0, *(len(corners) for corners, _ in parts)])
     faces = [part + start for (_, part), start in zip(parts, starts, strict=False)]
     joined = np.concatenate([np.zeros((0, 3), dtype=np.int64), *faces])
     if len(joined) == 0:
-        raise ValueError("holds no triangles")
+        raise ValueError("the file holds no triangles")
     return TriangleMesh(vertices, joined)
 
 
@@ -87,7 +87,7 @@ def _instances(roots: list[ET.Element], named: dict[str, ET.Element]) -> list[tu
         above, node = stack.pop()
         visits += 1
         if visits > _MOST_NODES:
-            raise ValueError(f"more than {_MOST_NODES} nodes, or a node that contains itself")
+            raise ValueError(f"the scene has more than {_MOST_NODES} nodes, or a node contains itself")
         pose = above @ _pose(node)
         for instance in (*node.findall("instance_geometry"), *node.findall("instance_controller")):
             geometry = _target(named, instance.get("url"))
@@ -195,5 +195,5 @@ def _fans(indices: Int[np.ndarray, "corners"], sides: Int[np.ndarray, "polygons"
 
 def _target(named: dict[str, ET.Element], reference: str | None) -> ET.Element:
     if reference not in named:
-        raise ValueError(f"refers to {reference!r}, which is not in the file")
+        raise ValueError(f"an element refers to {reference!r}, which is not in the file")
     return named[reference]

@@ -23,8 +23,8 @@ TINY, STAYS = 0.05, 0.98
 def drop_small_components(mesh: TriangleMesh) -> tuple[TriangleMesh, int]:
     """Return the mesh without its small floating pieces, and the number of dropped pieces.
 
-    Such a piece is tiny, shares no vertex with the rest, and its distance from the rest exceeds its own extent. A bump,
-    a screw's head or a loose triangle that touches the body stays.
+    A dropped piece has under 5 % of the body's extent, shares no vertex with the rest, and is farther from the rest
+    than its own extent. A bump, a screw's head or a loose triangle that touches the body stays.
     """
     piece = face_components(mesh)
     count = int(piece.max()) + 1
@@ -114,7 +114,7 @@ def _grown(
     among: Bool[np.ndarray, "points"],
     reach: float,
 ) -> Bool[np.ndarray, "points"]:
-    """Return which points in `among` are of the longest piece or of pieces linked to it by gaps below `reach` [m]."""
+    """Return the points in `among` of the longest piece, and of pieces linked to it by gaps below `reach` [m]."""
     low, high = np.full((2, int(owner.max()) + 1, 3), np.inf)
     np.minimum.at(low, owner[among], points[among])
     np.minimum.at(high, owner[among], -points[among])

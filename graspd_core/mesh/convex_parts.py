@@ -1,8 +1,8 @@
 """Approximate convex decomposition of an object by greedy planar cuts, in the object frame [m]. Hollows stay hollow.
 
 Each part is the convex hull of a cluster of surface points. The bulge of a cluster is how far its hull extends outside
-the object, by the signed distance grid. Each cut divides the cluster with the largest bulge, by the plane that leaves
-least bulge. It ends once all bulges are within tolerance or there are enough parts. Touching clusters are then joined.
+the object, by the signed distance grid. Each cut divides the cluster with the largest bulge. Cutting ends when all
+bulges are within tolerance or there are enough parts. Then touching clusters are joined.
 """
 
 from __future__ import annotations
@@ -68,7 +68,7 @@ def convex_parts(
 
     Args:
         sdf: the object's signed distance grid.
-        tolerance: largest bulge of a part [m]: how far the 98th percentile of its surface may lie outside the object.
+        tolerance: largest bulge of a part [m]. 98 % of a part's surface lies at most this far outside the object.
         max_parts: maximum number of parts. If the object needs more, the bulges of some parts exceed the tolerance.
         surface_points: number of surface samples to form clusters of. Up to half as many mesh vertices are added.
     """
@@ -160,7 +160,7 @@ def _bulge_left(sdf: GridSDF, points: Points, cut: _Cut) -> float:
 
 
 def _join(sdf: GridSDF, clusters: list[Points], tolerance: float, most: int) -> list[Points]:
-    """Join touching clusters, least bulge first, while it is within `tolerance` [m] or over `most` clusters remain."""
+    """Join the touching pair of least bulge while that is within `tolerance` [m] or over `most` clusters remain."""
     alive = dict(enumerate(clusters))
     boxes = {name: (cluster.min(0), cluster.max(0) + OVERLAP) for name, cluster in alive.items()}
     heap: list[tuple[float, bool, int, int]] = []
@@ -258,7 +258,7 @@ def even_directions(count: int) -> Float[np.ndarray, "3 count"]:
 
 
 def limited_hull(points: Points, most: int) -> TriangleMesh:
-    """Return a hull of at most `most` points: the extremes along even directions, then the farthest outside these."""
+    """Return a hull of at most `most` points: first the extremes along even directions, then the farthest outside."""
     hull = _hull(points)
     if hull is None:
         return _slab(points)

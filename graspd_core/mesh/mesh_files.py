@@ -1,7 +1,7 @@
 """Mesh files: reading, checking, cleaning, writing and mass properties. Lengths are in metres.
 
-If a file holds no mesh, or only a part of one, the error says what it holds. A guess at the unit of a file only goes
-into a message and is never applied.
+If a file holds no mesh or only a part of one, the error says what the file holds. Messages guess the unit of a file.
+The guess is never applied.
 """
 
 from __future__ import annotations
@@ -93,7 +93,7 @@ def refuse_broken(path: Path) -> None:
         file.seek(max(0, size - _LOOK))
         tail = file.read()
     if size == 0:
-        raise MeshError(f"{path}: an empty file")
+        raise MeshError(f"{path}: the file is empty")
     for begins, what in _OTHERS:
         if head.lstrip()[: len(begins)].lower() == begins.lower():
             raise MeshError(f"{path}: {what}")
@@ -139,11 +139,11 @@ SPREAD_POINTS = 2**15
 
 
 def load_mesh(path: str | Path, *, scale: float = 1.0) -> TriangleMesh:
-    """Read a mesh file. Join the parts of its scene where they stand, and multiply coordinates by `scale`.
+    """Read a mesh file. Join the parts of its scene at their poses, and multiply coordinates by `scale`.
 
     Raises:
-        MeshError: the path is missing, a directory or of an unknown ending. Or the file is no mesh, cut off, or
-            unreadable, or it has no finite surface. Or the scale is not positive.
+        MeshError: there is no such file, its ending is unknown, it holds no complete mesh with a finite surface, or
+            the scale is not positive.
     """
     return read_mesh(path, scale=scale)[0]
 
@@ -200,7 +200,7 @@ def check_mesh(
         dusty: whether to drop tiny pieces that touch nothing else.
 
     Raises:
-        MeshError: no usable faces, vertices of faces that are not finite, or a longest side outside 2 mm to 2 m.
+        MeshError: no face is usable, a face's vertex is not finite, or the longest side is outside 2 mm to 2 m.
     """
     mesh, strays = _without_strays(mesh, source)
     _doubted_size(mesh, source, scale)
@@ -223,7 +223,7 @@ def check_mesh(
     faces = mesh.faces
     if not topology.is_oriented(faces):
         faces = topology.orient(mesh.vertices, faces)
-        warnings.append(f"{source}: neighbouring faces had opposite winding; it was made consistent")
+        warnings.append(f"{source}: neighbouring faces had opposite winding; all faces now agree")
     used, compact = np.unique(faces, return_inverse=True)
     clean = TriangleMesh(mesh.vertices[used], compact.reshape(-1, 3))
     # Simplifying can tear a surface. That is no defect of the input, and the winding number tolerates it.
@@ -253,10 +253,10 @@ def content_hash(mesh: TriangleMesh) -> str:
 
 
 def mass_properties(mesh: TriangleMesh) -> tuple[float, Float[np.ndarray, "3"], Float[np.ndarray, "3 3"]]:
-    """Return volume [m³], centre of mass [m], and inertia [m⁵] about it at unit density, of the enclosed solid.
+    """Return the enclosed solid's volume [m³], centre of mass [m], and inertia [m⁵] about that centre at unit density.
 
-    The result is exact for one closed, consistently wound body. Otherwise it is a sum over points inside by the winding
-    number, to about 1 % of volume. A surface that encloses nothing counts as its solid bounding box.
+    One closed, consistently wound body is computed exactly, other surfaces by sample points to about 1 % of volume. A
+    surface that encloses nothing counts as its solid bounding box.
     """
     far = topology.far_centre(mesh.vertices)
     if far.any():

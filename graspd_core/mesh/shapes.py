@@ -113,7 +113,7 @@ def _box(half: tuple[float, float, float], centre: tuple[float, float, float] = 
 
 
 def _revolve(profile, closed: bool = False) -> TriangleMesh:
-    """Revolve an (r, z) profile about z. It rises outside from axis to axis, or is a closed counter-clockwise loop."""
+    """Revolve an (r, z) profile about z: a curve that rises from axis to axis, or a counter-clockwise loop."""
     profile = np.asarray(profile, dtype=float)
     if not closed:
         profile[[0, -1], 0] = 0.0
@@ -187,7 +187,7 @@ def object_sources(sources: Sequence[str]) -> tuple[str, ...]:
 
 @lru_cache
 def object_hash(source: str) -> str:
-    """Return the SHA-256 of the content of a shape or a mesh file. Raises MeshError if it does not exist."""
+    """Return the SHA-256 of the content of a shape or a mesh file. Raises MeshError if shape or file does not exist."""
     if source.startswith("shape:"):
         return content_hash(make_shape(source.removeprefix("shape:")))
     path = Path(source)

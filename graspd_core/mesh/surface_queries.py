@@ -197,7 +197,7 @@ def pressed_points(
 def first_hits(
     mesh: TriangleMesh, directions: Float[np.ndarray, "*batch 3"]
 ) -> tuple[Float[np.ndarray, "*batch"], Integer[np.ndarray, "*batch"], Float[np.ndarray, "*batch 3"]]:
-    """Cast rays from the origin. Return distances in lengths of `directions` (inf: no hit), faces and unit normals."""
+    """Cast rays from the origin. Return distances as factors on `directions` (inf: no hit), faces and unit normals."""
     with Extra("clouds"):
         import open3d as o3d
 

@@ -27,7 +27,7 @@ def packed_rows(rows: Int[np.ndarray, "n k"]) -> Int[np.ndarray, "n"]:
 
 
 def voxel_keys(points: Float[np.ndarray, "n k"], size: float) -> Int[np.ndarray, "n"]:
-    """Return one integer for the voxel of side `size` of each point. They sort in the order of the voxels' indices."""
+    """Return one integer for the voxel of side `size` of each point. The integers sort like the voxels' indices."""
     return packed_rows(np.floor(points / size).astype(np.int64))
 
 

@@ -304,7 +304,7 @@ def test_pointers_pictures_and_empty_files_are_called_that(tmp_path: Path, endin
     assert "a git-LFS pointer to the mesh, not the mesh; `git lfs pull`" in refusal(path, POINTER)
     for what, data in PICTURES.items():
         assert f"{what}, not a mesh" in refusal(path, data)
-    assert "an empty file" in refusal(path, b"")
+    assert "the file is empty" in refusal(path, b"")
 
 
 @pytest.mark.parametrize(
@@ -424,7 +424,7 @@ def test_what_is_no_surface_may_be_broken(tmp_path: Path, before: str, beside: s
         ("<vcount>4 3", "<vcount>4 30", "names vertices that the file does not hold"),
         ("<vcount>4 3", "<vcount>1 2", "holds no triangles"),
         ('semantic="VERTEX"', 'semantic="COLOR"', "has no VERTEX input"),
-        ("<node><translate>", '<node id="n"><instance_node url="#n"/><translate>', "a node that contains itself"),
+        ("<node><translate>", '<node id="n"><instance_node url="#n"/><translate>', "a node contains itself"),
     ],
 )
 def test_a_broken_file_is_refused(tmp_path: Path, old: str, new: str, message: str) -> None:
