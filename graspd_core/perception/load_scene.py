@@ -49,7 +49,7 @@ def load_scene(
 
     Args:
         source: a mesh file, a point cloud file (the object is cut out and reconstructed), `shape:NAME`, or a mesh.
-        mass: mass of the object [kg]. None assumes the heavy end of what the volume allows, with a warning.
+        mass: mass of the object [kg]. None assumes the most that its volume allows (`heavy_mass`), with a warning.
         friction: Coulomb friction coefficient between hand and object.
         scale: factor that converts the file's coordinates to metres.
         resolution: the distance grid has at most `resolution`³ nodes. `plan_grasps` uses the value of its preset.
@@ -86,7 +86,7 @@ def load_scene(
     if view_point is not None:
         raise MeshError(f"view_point: {given} is a mesh; only a cloud has a camera")
     if target is not None:
-        raise MeshError(f"target: given with {given}, a mesh; valid with clouds, where it says which object is meant")
+        raise MeshError(f"target: given with {given}, a mesh; valid with clouds of several objects")
     return build_scene(mesh, source=given, scale=scale, device=device, started=started, warnings=warnings, **numbers)
 
 

@@ -109,7 +109,7 @@ def padded_hull(points: Points, support: Plane | None, padding: float) -> Triang
 def held_hull(mesh: TriangleMesh, base: Posture) -> TriangleMesh:
     """Return the convex hull of an object in the frame of the hand's base link at the posture `base` [m].
 
-    Of a round object it has 128 corners, so that motion planners stay fast.
+    The hull has at most 128 corners, so that motion planners stay fast.
     """
     rotation = rotation_from_quaternion(torch.as_tensor(base.quaternion_wxyz, dtype=torch.float64)).numpy()
     return limited_hull((mesh.vertices - base.position) @ rotation, _HELD_CORNERS)
@@ -137,7 +137,7 @@ def with_neighbours(
     for name, shapes in things.items():
         near = [s for s in shapes if (s.vertices.min(0) <= high).all() and (s.vertices.max(0) >= low).all()]
         if near and _overlap(np.concatenate([s.vertices for s in shapes]), mesh.vertices) >= _SAME:
-            same.append(f"collision object {name!r} fills the object's own place: taken for it, not for an obstacle")
+            same.append(f"collision object {name!r} fills the object's own place and counts as the object")
             continue
         points = [_points_within(shape, low, high) for shape in near]
         found += [p for p in points if len(p) and (support is None or (p @ support.normal).max() > level)]

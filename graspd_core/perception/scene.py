@@ -222,7 +222,7 @@ def build_scene(
     sdf = moved_sdf(sdf, far) if far.any() else sdf
     if not is_solid(sdf):
         cell = float(sdf.spacing) * 1000
-        note = f"{source}: no point of the grid of {cell:.1f} mm lies inside; it counts as a sheet"
+        note = f"{source}: no node of the {cell:.1f} mm grid lies inside; the object counts as a sheet"
         model = ObjectModel(**{**vars(model), "warnings": (*model.warnings, note)})
     sdf = sdf.to(device, sdf.field.dtype)
     known = None if confidence is None else confidence_grid(mesh.vertices, confidence, sdf)
@@ -323,7 +323,7 @@ def _object_model(mesh, source, mass, friction, scale, warnings, reconstructed) 
     assumed = mass is None
     if mass is None:
         mass = heavy_mass(volume)
-        told = f"no mass was given: {mass:.2g} kg is assumed, the heavy end for its volume of {volume * 1e6:.0f} cm³"
+        told = f"no mass was given: {mass:.2g} kg is assumed, the most for its volume of {volume * 1e6:.0f} cm³"
         warnings += (f"{source}: {told}",)
     return ObjectModel(
         source=source,

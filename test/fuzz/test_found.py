@@ -63,8 +63,8 @@ PCD = "# .PCD\nFIELDS x y z\nSIZE 4 4 4\nTYPE F F F\nCOUNT 1 1 1\nWIDTH {n}\nHEI
     [
         (npy("{[]: 1}"), "not readable as numbers"),
         (npy("(" * 900), "not readable as numbers"),
-        (array("[('a', '<f4')]", "(1,)", bytes(4)), "'points' not readable as numbers: it holds"),
-        (array("'<c16'", "(1, 3)", bytes(48)), "'points' not readable as numbers: it holds complex128"),
+        (array("[('a', '<f4')]", "(1,)", bytes(4)), "'points' is not readable as numbers: it holds"),
+        (array("'<c16'", "(1, 3)", bytes(48)), "'points' is not readable as numbers: it holds complex128"),
         (array("'<f4'", "(1000000000000, 3)"), "not readable as numbers"),
         (archive(flags=1), "is encrypted"),
         (archive(method=99), "compression method is not supported"),

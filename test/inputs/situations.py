@@ -423,7 +423,7 @@ DRIVERS = (
     Situation(
         "the matrix of another resolution",
         array_file("a.npz", lambda: {"depth": millimetres(), "K": MATRIX * [[2], [2], [1]]}),
-        "K is of another resolution",
+        "K is for another resolution",
         "stepjam/RLBench/issues/208",
     ),
 )

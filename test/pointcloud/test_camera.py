@@ -175,7 +175,7 @@ GOOD = {"width": 4, "height": 3, "step": 8, "encoding": "16UC1", "is_bigendian":
 @pytest.mark.parametrize(
     ("changes", "culprit"),
     [
-        ({"encoding": "rgb8"}, "encoding 'rgb8' is no depth; valid: 16UC1, mono16, 32FC1"),
+        ({"encoding": "rgb8"}, "encoding 'rgb8'; valid for depth: 16UC1, mono16, 32FC1"),
         ({"width": 0}, "empty: width=0, height=3"),
         ({"height": 0}, "empty: width=4, height=0"),
         ({"step": 7}, "step=7 is smaller than width=4 pixels of 2 bytes"),

@@ -58,13 +58,13 @@ def test_a_ply_with_faces_is_a_mesh(tmp_path):
             lambda p: np.save(p, np.array({"points": 1}, dtype=object)),
             r"a pickled Python object, .*np.savez\(path",
         ),
-        ("a.xyz", lambda p: p.write_text("0,0,1\n0,1,1\n"), "its numbers are separated by commas"),
+        ("a.xyz", lambda p: p.write_text("0,0,1\n0,1,1\n"), "commas separate its numbers"),
         (
             "a.bag",
             lambda p: p.write_bytes(b"#ROSBAG V2.0"),
             "is a bag of ROS 1; .*: rosbags-convert --src a.bag --dst a",
         ),
-        ("a.mcap", lambda p: p.write_bytes(b"x"), "is a recording of ROS 2: graspd replay a.mcap"),
+        ("a.mcap", lambda p: p.write_bytes(b"x"), "is a recording of ROS 2; read it with graspd replay a.mcap"),
         ("a.las", lambda p: p.write_bytes(b"rubbish"), "unknown cloud ending '.las'; valid endings: npy"),
         ("a.npy", lambda p: p.mkdir(), "is a directory"),
         ("a.npy", lambda p: None, "no such cloud file"),
@@ -161,7 +161,7 @@ FLIPPED = POSES[:2] * np.array([1, 1, -1, 1])
         ({"points": np.ones((5, 3)), "forward": np.array([0, 0, np.inf])}, "'forward' is no direction"),
         ({"points": np.ones((5, 3)), "viewpoint": np.array([0, 0, np.nan])}, "'viewpoint' is NaN or infinite"),
         ({"points": np.ones((5, 3)), "viewpoint": np.array([np.inf, 0, 0])}, "'viewpoint' is NaN or infinite"),
-        ({"points": np.array(["a", "b"])}, "'points' not readable as numbers"),
+        ({"points": np.array(["a", "b"])}, "'points' is not readable as numbers"),
     ],
 )
 def test_arrays_that_do_not_fit_are_named(tmp_path, arrays, culprit):

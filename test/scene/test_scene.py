@@ -74,7 +74,7 @@ def test_a_sheet_is_warned_about():
     corners = np.array([[0.0, 0, 0], [0.1, 0, 0], [0.1, 0.1, 0], [0, 0.1, 0]])
     scene = build_scene(TriangleMesh(corners, np.array([[0, 1, 2], [0, 2, 3]])), source="sheet", resolution=16)
     assert any("not closed" in w for w in scene.object.warnings)
-    assert any("it counts as a sheet" in w for w in scene.object.warnings)
+    assert any("the object counts as a sheet" in w for w in scene.object.warnings)
     assert (np.linalg.eigvalsh(scene.object.inertia) > 0).all()
 
 

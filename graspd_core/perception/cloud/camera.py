@@ -51,8 +51,8 @@ _REMEDIES = {
 }
 # Depth in mm that was cut to 8 bits has this greatest value [m] at more than this fraction of the pixels.
 _MOST_OF_8_BITS, _CUT_SHARE = 0.255, 0.2
-# A principal point this far off the middle (relative), by the same factor across and down within this tolerance, is of
-# an image of another size. Cropping seldom moves it by the same factor both ways.
+# If the principal point is this far off the middle (relative), and by the same factor across and down within this
+# tolerance, the camera matrix is for another image size. Cropping seldom gives equal factors.
 _OFF_MIDDLE, _SAME_MIDDLE, _MOST_SCALED = 0.3, 0.08, 4.5
 
 
@@ -114,7 +114,7 @@ def camera_from_calibration(
 
 @lru_cache(maxsize=8)
 def camera_rays(camera: PinholeCamera) -> Float[np.ndarray, "height width 3"]:
-    """Return the ray of unit depth through each pixel, in the camera frame, NaN beyond the lens model. Read-only."""
+    """Return the ray of unit depth through each pixel, camera frame, read-only. It is NaN beyond the lens model."""
     column, row = np.meshgrid(np.arange(camera.width), np.arange(camera.height))
     image = np.stack([(column - camera.cx) / camera.fx, (row - camera.cy) / camera.fy], -1)
     rays = np.concatenate([undistort(image, camera.distortion), np.ones((*image.shape[:2], 1))], -1)
@@ -180,7 +180,7 @@ def reaches_image_border(
 ) -> bool:
     """Return True if an object touches an image border: a side of the view's outline that other points touch too.
 
-    The outline is the convex hull of all viewing directions. Points within `width` [rad] of it touch it.
+    The outline is the convex hull of all viewing directions. Points within `width` [rad] of the outline touch it.
     """
     if not mine.any():
         return False
@@ -219,7 +219,7 @@ def depth_in_metres(image: UInt16[np.ndarray, "height width"] | DepthImage, enco
     """Return the depth along the optical axis [m], 0 for missing depth: zero, negative, NaN or infinite values.
 
     Raises:
-        CloudError: the encoding is not one of depth, or the pixels are not of the encoding's type.
+        CloudError: the encoding is not a depth encoding, or the pixels have another type than the encoding.
     """
     kind, unit = depth_encoding(encoding)
     if image.dtype.kind != kind[0] or (kind[0] == "u" and image.dtype.itemsize != 2):
@@ -240,7 +240,7 @@ def cloud_from_depth(
         T_frame_camera: pose of the camera (z forward, x right, y down).
 
     Raises:
-        CloudError: image and camera differ in size, depth was cut to 8 bits, or K is of another resolution.
+        CloudError: image and camera differ in size, depth was cut to 8 bits, or K is for another resolution.
     """
     if depth.shape != (camera.height, camera.width):
         raise CloudError(
@@ -260,13 +260,13 @@ def cloud_from_depth(
 
 
 def _check_image(depth: Float[np.ndarray, "pixels"], camera: PinholeCamera) -> None:
-    """Raise CloudError if depth was cut to 255 mm, or if the camera's matrix is of another resolution."""
+    """Raise CloudError if depth was cut to 255 mm, or if the camera's matrix is for another resolution."""
     known = depth[np.isfinite(depth) & (depth > 0)]
     if known.size and abs(float(known.max()) - _MOST_OF_8_BITS) < 1e-6:
         share = float((known > _MOST_OF_8_BITS - 1e-6).mean())
         if share > _CUT_SHARE:
             raise CloudError(
-                f"depth image: {100 * share:.0f} % of it is 255 mm: cut to 8 bits; valid: 16 bits (mm), floats (m)"
+                f"depth image: {100 * share:.0f} % of it is 255 mm: cut to 8 bits; send 16 bits (mm) or floats (m)"
             )
     across, down = (2 * camera.cx + 1) / camera.width, (2 * camera.cy + 1) / camera.height
     off = min(abs(across - 1), abs(down - 1))
@@ -274,13 +274,13 @@ def _check_image(depth: Float[np.ndarray, "pixels"], camera: PinholeCamera) -> N
     if scaled and abs(across - down) < _SAME_MIDDLE * max(across, down):
         raise CloudError(
             f"camera: its cx={camera.cx:g}, cy={camera.cy:g} are the middle of an image {across:.2g} times "
-            f"{camera.width} x {camera.height}: K is of another resolution; scale it as the image was"
+            f"{camera.width} x {camera.height}: K is for another resolution; scale K like the image"
         )
 
 
 def depth_encoding(name: str) -> tuple[str, float]:
-    """Return the NumPy type of a pixel and the metres per unit. Raises CloudError: the encoding is not one of depth."""
+    """Return the NumPy type of a pixel and the metres per unit. Raises CloudError for any other encoding."""
     if name not in ENCODINGS:
         remedy = next((f"; {said}" for begins, said in _REMEDIES.items() if name.startswith(begins)), "")
-        raise CloudError(f"depth image: encoding {name[:64]!r} is no depth; valid: {', '.join(ENCODINGS)}{remedy}")
+        raise CloudError(f"depth image: encoding {name[:64]!r}; valid for depth: {', '.join(ENCODINGS)}{remedy}")
     return ENCODINGS[name]

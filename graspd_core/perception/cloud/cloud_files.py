@@ -219,7 +219,7 @@ def load_views(path: str | Path, viewpoint: Vector | None = None) -> tuple[Point
     try:
         if "depth" in arrays or "depths" in arrays:
             if viewpoint is not None:
-                raise CloudError("holds depth, which has its own camera pose; view_point is valid for points only")
+                raise CloudError("view_point: given with depth, which has its own camera pose; valid with points")
             return _depth_views(arrays)
         return (_points_view(arrays, viewpoint),)
     except CloudError as error:
@@ -227,9 +227,9 @@ def load_views(path: str | Path, viewpoint: Vector | None = None) -> tuple[Point
 
 
 def recording_told(path: Path) -> str:
-    """Return a message on the kind of a recording, with the command that reads or converts it."""
+    """Return the end of an error about a recording: its kind, and the command that reads or converts it."""
     if path.suffix.lower() != ".bag":
-        return f"is a recording of ROS 2: graspd replay {path.name}"
+        return f"is a recording of ROS 2; read it with graspd replay {path.name}"
     return f"is a bag of ROS 1; convert it first: rosbags-convert --src {path.name} --dst {path.stem}"
 
 
@@ -243,7 +243,7 @@ def _points_view(arrays: Mapping[str, np.ndarray], said: Vector | None) -> Point
     pixels = points if points.ndim == 3 else points[None]
     if points.ndim == 2 and points.shape[1] in (4, 6, 7):
         told = "colours or normals" if points.shape[1] > 4 else "an intensity"
-        raise CloudError(f"shape {points.shape}: {told} beside x, y, z? save the coordinates alone: points[:, :3]")
+        raise CloudError(f"shape {points.shape}: {told} beside x, y, z? save only the coordinates, points[:, :3]")
     if pixels.ndim != 3 or pixels.shape[2] != 3 or viewpoint.shape != (3,):
         raise CloudError(f"points of shape {points.shape}, viewpoint {viewpoint.shape}; (n, 3) and (3,) are needed")
     if not np.isfinite(viewpoint).all():
@@ -307,7 +307,7 @@ def rigid(pose: np.ndarray, name: str) -> Float[np.ndarray, "4 4"]:
 
 def _numbers(arrays: Mapping[str, np.ndarray], name: str) -> np.ndarray:
     if arrays[name].dtype.kind not in "biuf":
-        raise CloudError(f"{name!r} not readable as numbers: it holds {str(arrays[name].dtype)[:80]}")
+        raise CloudError(f"{name!r} is not readable as numbers: it holds {str(arrays[name].dtype)[:80]}")
     # Signalling NaNs stay NaN. NumPy would warn of them.
     with np.errstate(invalid="ignore", over="ignore"):
         return arrays[name].astype(float)
@@ -323,7 +323,7 @@ def read_numpy(path: Path) -> dict[str, np.ndarray]:
                 return {"points": stored}
             unpacked = sum(entry.file_size for entry in stored.zip.infolist())
             if unpacked > _MAX_UNPACKED_BYTES:
-                raise ValueError(f"{unpacked} bytes when unpacked; at most {_MAX_UNPACKED_BYTES} are taken")
+                raise ValueError(f"{unpacked} bytes when unpacked; at most {_MAX_UNPACKED_BYTES} are allowed")
             return {name: stored[name] for name in stored.files}
     # For a broken file, NumPy and the readers that it uses may raise any exception. A header that promises too much
     # raises MemoryError.
@@ -342,7 +342,7 @@ def _ply_has_faces(path: Path) -> bool:
 
 
 def _read_points(path: Path, ending: str, viewpoint: Vector | None) -> PointCloud:
-    """Read a ply, pcd or xyz file, seen from `viewpoint`, else from where a pcd file says, else from the origin."""
+    """Read a ply, pcd or xyz file. The camera is at `viewpoint`, else at a pcd file's VIEWPOINT, else at the origin."""
     data, points, header = path.read_bytes(), None, {}
     try:
         if ending == "ply":
@@ -355,7 +355,7 @@ def _read_points(path: Path, ending: str, viewpoint: Vector | None) -> PointClou
         raise CloudError(f"{path}: not a readable {ending} cloud ({first_line(error)})") from error
     points = _read_open3d(path) if points is None else points
     if len(points) == 0 and ending == "xyz" and b"," in data[:4096]:
-        raise CloudError(f"{path}: its numbers are separated by commas; an xyz file has blanks: tr , ' '")
+        raise CloudError(f"{path}: commas separate its numbers; an xyz file needs blanks; convert it: tr , ' '")
     if len(points) == 0:
         raise CloudError(f"{path}: empty, or not a readable {ending} cloud")
     rows = header.get("HEIGHT", [""])[0]

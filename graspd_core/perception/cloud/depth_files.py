@@ -45,7 +45,7 @@ def is_depth_image(path: str | Path) -> bool:
 
 
 def load_depth_view(image: str | Path, camera: str | Path, unit: float | None = None) -> PointCloud:
-    """Read the points of a depth image and its camera file, in the world frame if the file has a pose.
+    """Read the points of a depth image and its camera file, in the world frame if the camera file has a pose.
 
     Args:
         image: a png or tiff of 16 bits or floats, an npy, or an npz with `depth`.
@@ -65,7 +65,7 @@ def load_depth_view(image: str | Path, camera: str | Path, unit: float | None = 
 
 
 def load_depth_camera(path: str | Path) -> DepthCamera:
-    """Read a camera file. Raises CloudError if it is missing, not JSON, or lacks a key, which the error names."""
+    """Read a camera file. Raises CloudError if the file is missing, not JSON, or lacks a key. The error names it."""
     try:
         told = json.loads(Path(path).read_text(encoding="utf-8"))
     except OSError as error:
@@ -73,7 +73,7 @@ def load_depth_camera(path: str | Path) -> DepthCamera:
     except (ValueError, RecursionError) as error:
         raise CloudError(f"{path}: not JSON: {str(error)[:200]}") from None
     if not isinstance(told, dict):
-        raise CloudError(f"{path}: {short_repr(told)}; a camera's file holds an object with width, height and K")
+        raise CloudError(f"{path}: {short_repr(told)}; valid: a JSON object with width, height and K")
     try:
         return _camera_of(told)
     except CloudError as error:
@@ -83,7 +83,7 @@ def load_depth_camera(path: str | Path) -> DepthCamera:
 def _camera_of(told: Mapping[str, Any]) -> DepthCamera:
     for key in ("width", "height"):
         if key not in told:
-            raise CloudError(f"{key} is missing: the size of the image that the matrix is for; it has {_keys(told)}")
+            raise CloudError(f"{key} is missing; give the image's width and height; the file has {_keys(told)}")
     if "depth_scale" in told and "depth_unit" not in told:
         raise CloudError(
             f"depth_scale: {short_repr(told['depth_scale'])} is ambiguous, because programs disagree on its unit; "
@@ -107,7 +107,7 @@ def _matrix(told: Mapping[str, Any]) -> list[float]:
         return _numbers(told["intrinsic_matrix"], (9,), "intrinsic_matrix").reshape(3, 3).T.reshape(-1).tolist()
     lost = [key for key in _SIMPLE if key not in told]
     if lost:
-        raise CloudError(f"{lost[0]} is missing; valid: K, or fx, fy, cx and cy; it has {_keys(told)}")
+        raise CloudError(f"{lost[0]} is missing; give K, or fx, fy, cx and cy; the file has {_keys(told)}")
     fx, fy, cx, cy = (float(_numbers(told[key], (), key)) for key in _SIMPLE)
     return [fx, 0.0, cx, 0.0, fy, cy, 0.0, 0.0, 1.0]
 
@@ -173,5 +173,5 @@ def _metres(pixels: np.ndarray, unit: float | None, name: str) -> DepthImage:
     seen = depth[depth > 0]
     if len(seen) and float(np.median(seen)) > _FARTHEST:
         told = f"half of its depths are beyond {float(np.median(seen)):.0f} m at {unit:g} m a unit"
-        raise CloudError(f"{name}: {told}; say the unit: --units mm, or depth_unit in the camera's file")
+        raise CloudError(f"{name}: {told}; give the unit: --units mm, or depth_unit in the camera's file")
     return depth

@@ -163,7 +163,7 @@ def empty_depth(free_space: FreeSpace, points: Places) -> Depths:
 
 
 def weigh(free_space: FreeSpace, points: Places, normals: Places) -> tuple[Bool[np.ndarray, "*batch"], Depths]:
-    """Return whether guessed points lie on seen surface and face its camera, and contradict cameras (0 to 1)."""
+    """Return which guesses lie on seen surface and face its camera, and how much they contradict cameras (0 to 1)."""
     confirmed, deep = _classify(free_space, points, normals)
     return confirmed, np.clip((deep - free_space.slack) / CONTRADICTION_DEPTH_M, 0.0, 1.0)
 
@@ -204,7 +204,7 @@ def _classify(
 
 
 def _look(view_depth: ViewDepth, points: Places) -> tuple[Depths, Depths]:
-    """Return how deep points lie in empty space, and how far behind seen surface, infinite beside the outline [m]."""
+    """Return how deep points lie in empty space, and how far behind seen surface (infinite beside the outline) [m]."""
     local = (points - view_depth.eye) @ view_depth.frame
     forward = np.maximum(local[..., 2], 1e-6)
     place = (local[..., :2] / forward[..., None] - view_depth.low) / view_depth.cell

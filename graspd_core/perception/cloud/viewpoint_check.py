@@ -86,7 +86,7 @@ def check_scene(views: Sequence[PointCloud]) -> None:
     """Check that views of a whole scene, in one frame, can have been seen from their viewpoints.
 
     Raises:
-        CloudError: a view cannot. The error says why.
+        CloudError: a view cannot have been seen from its viewpoint. The error says why.
     """
     from scipy.spatial import KDTree
 
@@ -158,7 +158,7 @@ def check_viewpoint(thing: PointCloud, view: PointCloud, up: Vector | None = Non
 
 
 def fits_nowhere(thing: PointCloud) -> bool:
-    """Return True if no camera on any side can see all points of an object, e.g. if they show it from all round."""
+    """Return True if no camera on any side can see all points of an object, e.g. if they show all its sides."""
     own = _thinned(thing)
     if len(own) < FEWEST_POINTS:
         return False
@@ -231,7 +231,7 @@ def bulge(points: Points, surfaces: Surfaces, viewpoint: Vector) -> float:
 
 
 def _surfaces(points: Points) -> Surfaces:
-    """Return normals with a consistent sign within each surface, each point's surface, and where both are certain.
+    """Return normals with a consistent sign within each surface, each point's surface, and whether both are certain.
 
     The graph has two nodes for each point, one for each sign of its normal. Edges join neighbours whose signs agree.
     """

@@ -52,7 +52,7 @@ class VoxelScene:
 
     @property
     def weight(self) -> Float[np.ndarray, "voxels"]:
-        """Return the point count of each voxel times its squared distance [m²]. It hardly depends on the distance."""
+        """Return the point count of each voxel times its squared distance [m²], nearly the same at every distance."""
         return self.count * self.mean_distance**2
 
     def of_view(self, view: int) -> slice:

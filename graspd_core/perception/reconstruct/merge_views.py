@@ -69,7 +69,7 @@ def take(surfels: Surfels, kept: np.ndarray) -> Surfels:
 
 
 def nothing() -> Surfels:
-    """Return no surfels."""
+    """Return an empty set of surfels."""
     return Surfels(np.zeros((0, 3)), np.zeros((0, 3)))
 
 
@@ -158,7 +158,7 @@ def _thin_by_sight(view: PointCloud, step: float) -> Points:
 def is_unposed(view: PointCloud, axis_known: bool = False) -> bool:
     """Return True if a cloud shows surface behind surface on many lines of sight, as no single camera can see.
 
-    A cloud that encloses a body with the camera's position inside its bounding box counts too.
+    Also return True if the cloud encloses a body and the camera's position is inside its bounding box.
 
     Args:
         view: the object's points.

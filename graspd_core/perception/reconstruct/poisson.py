@@ -4,7 +4,7 @@ Where points are missing, a Poisson surface bulges outwards or stays open. So it
 cut by the space seen to be empty and by the support, and meshed again, which closes the surface.
 
 The field is computed on a regular grid by Fourier transforms (Kazhdan 2005), or by Open3D on an adaptive grid. On small
-grids the first takes a sixth of the time. As in screened Poisson, the field is then drawn to zero at the points. This
+grids the former takes a sixth of the time. As in screened Poisson, the field is then drawn to zero at the points. This
 would fit noise too, so the points are first checked to lie on one surface.
 """
 
@@ -61,7 +61,7 @@ def grid_cell(surfels: Surfels, least: float, cells: int = GRID_CELLS) -> float:
 
 
 def part_walls(surfels: Surfels, cell: float) -> Surfels:
-    """Move apart the two sides of walls too thin for the grid, by a millimetre or two. Otherwise they would cancel."""
+    """Move the two sides of walls too thin for the grid a millimetre or two apart. Otherwise they would cancel."""
     from scipy.spatial import KDTree
 
     points, normals = surfels.points, surfels.normals
@@ -127,7 +127,7 @@ def close_surface(surfels: Surfels, field: Field, free_space: FreeSpace, cell: f
 
 
 def _beneath_floors(surfels: Surfels, lowest: float) -> Points:
-    """Return the points of a low floor, as of a cup, moved down to the support. They make the hull thick enough."""
+    """Return the points of a low floor, as of a cup, moved down to the support. They thicken the hull."""
     floor = (surfels.normals[:, 2] > MIN_FLOOR_COSINE) & (surfels.points[:, 2] < lowest + MAX_FLOOR_RISE_M)
     return surfels.points[floor] * np.array([1.0, 1.0, 0.0])
 

@@ -1,8 +1,8 @@
 """Reconstruction of a closed mesh from one or more views of an object, with the confidence of each part.
 
 The hidden part is guessed first, by the symmetry, revolution or extrusion that fits the views best. Then screened
-Poisson fits a surface to the points, with normals towards each camera. It is computed on a grid, and again by Open3D if
-the first surface does not fit. Space that the cameras saw to be empty is cut away.
+Poisson fits a surface to the points, with normals towards each camera. The surface is computed on a grid, and again by
+Open3D if the first surface does not fit. Space that the cameras saw to be empty is cut away.
 """
 
 from __future__ import annotations
@@ -232,7 +232,7 @@ def _frame(views: Sequence[PointCloud], support: Plane | None) -> tuple[Float[np
 
 
 def _finished(mesh: TriangleMesh, seen: Surfels, settings: ReconstructionConfig) -> TriangleMesh:
-    """Simplify and check the mesh. Raises CloudError if it is not closed or too far from the seen points."""
+    """Simplify and check the mesh. Raises CloudError if the mesh is not closed or too far from the seen points."""
     try:
         mesh = _fewer(check_mesh(mesh, "reconstruction")[0], settings.max_faces)
     except MeshError as error:

@@ -192,7 +192,7 @@ def find_revolution(surfels: Surfels, free_space: FreeSpace, step: float) -> Rev
 
 
 def revolve(surfels: Surfels, free_space: FreeSpace, axis: Axis, step: float) -> Revolution | None:
-    """Revolve the seen profile about the axis. Leave out rings that the cameras contradict. None if few are left."""
+    """Revolve the seen profile about the axis, without rings that the cameras contradict. Return None if few remain."""
     from scipy.spatial import KDTree
 
     _, rows = half_plane(surfels, axis)
@@ -219,7 +219,7 @@ def revolve(surfels: Surfels, free_space: FreeSpace, axis: Axis, step: float) ->
 def _ends(profile: Rows, axis: Axis, right, up, free_space: FreeSpace, step: float) -> list[Rows]:
     """Return the rows that close the profile if it ends away from the axis: a flat cap, or a curve down to the support.
 
-    A cap is added only if the cameras saw empty space beyond the rim. Neither may contradict the cameras.
+    A cap is added only if the cameras saw empty space beyond the rim. Neither cap nor curve may contradict the cameras.
     """
     found = []
     outer = profile[profile[:, 3] > 0.1]

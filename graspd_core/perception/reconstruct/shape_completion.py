@@ -115,7 +115,7 @@ def _mirrored(mirrors: list[Symmetry], seen: Surfels) -> Surfels:
 
 
 def guess_by(rule: str, seen: Surfels, free_space: FreeSpace, step: float) -> Surfels | None:
-    """Return the guess of one of `RULES` for the unseen side, however likely. None if the rule makes no guess.
+    """Return the guess of one of `RULES` for the unseen side, even an unlikely one. None if the rule makes no guess.
 
     The rule "" guesses no points, so the surface just closes over the seen part.
     """

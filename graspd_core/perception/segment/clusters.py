@@ -68,7 +68,7 @@ OUTLINE_SHARE = 0.6
 
 
 def link_length(points: Points, settings: SegmentationConfig) -> float:
-    """Return the distance up to which points are linked [m]. It is less than the gap unless the points are sparse."""
+    """Return the distance up to which points are linked [m]. It is below `gap` unless the points are sparse."""
     if len(points) < 5:
         return settings.gap
     some = points[:: max(1, len(points) // SPACING_SAMPLES)]
@@ -267,7 +267,7 @@ def _near(
     settings: SegmentationConfig,
     support: FlatPart | None,
 ) -> bool:
-    """Return True if two clusters, the larger first, are near enough to be one object: farther apart if one hangs."""
+    """Return True if two clusters, the larger first, are near enough to be one object. Hanging ones may be farther."""
     if support is None:  # two objects behind each other look like two sides of one object
         return apart <= settings.unsupported_reach
     if apart <= max(link, settings.gap) or _share_within(b, a, support) >= OUTLINE_SHARE:

@@ -51,7 +51,7 @@ class Segmentation:
         obstacles: downsampled points of each other object or surface nearby [m].
         warnings: warnings for the user.
         cut: whether the object reaches the border of an image or of the workspace.
-        beside: why the segment may be larger than the target or another object. Empty if there is no doubt.
+        beside: why the segment may be too large or the wrong object. Empty if there is no doubt.
     """
 
     views: tuple[PointCloud, ...]
@@ -217,7 +217,7 @@ def _doubts(parted: _Parted, chosen: Mask, crowded: bool) -> tuple[str, ...]:
     if blind:
         doubts.append(f"cloud: of {len(scene.rows)} views these show nothing within range: {', '.join(blind)}")
     if ground.support is None and crowded:
-        doubts.append("cloud: no support is seen under the object; what is behind it in the image may be taken for it")
+        doubts.append("cloud: no support is seen; the object may include what is behind it in the image")
     # Without surroundings, the object itself is the outline of the view.
     surrounded = ground.support is not None or len(ground.background) > 0
     for k in range(len(scene.rows) if surrounded else 0):
@@ -248,7 +248,7 @@ def _touching(scene: VoxelScene, chosen: Mask, part: Labels) -> tuple[str, ...]:
         return ()
     places = " and ".join("({:.3f}, {:.3f}, {:.3f})".format(*scene.mean[mine].mean(0)) for mine in apart or parts)
     if apart:
-        return (f"cloud: the target touches another object, about {places} m; it ends at the seam between them",)
+        return (f"cloud: the target touches another object, about {places} m; the target ends at the seam",)
     return (
         f"cloud: the object may be {len(parts)} objects that touch, about {places} m; "
         "give a point, a box or a mask as target",
@@ -256,7 +256,7 @@ def _touching(scene: VoxelScene, chosen: Mask, part: Labels) -> tuple[str, ...]:
 
 
 def _beside(parted: _Parted, chosen: Mask, point: Vector) -> str:
-    """Return why the segment may be wrong for a target point inside it: the point is too far from its middle.
+    """Return why the segment may be wrong for a target point inside it: the point is too far from the segment's middle.
 
     A target point on the surface may be anywhere on the object. A point inside is taken for the object's middle, as
     pose estimators give it.
@@ -298,7 +298,7 @@ def _nothing(parted: _Parted) -> str:
         sizes = [extent(scene.mean[label == k]) for k in range(int(label.max()) + 1)]
         each = f"{sizes[0]:.2f} m long:" if len(sizes) == 1 else f"the shortest {min(sizes):.2f} m long: each is"
         limit = f"larger than largest_object={settings.largest_object:g} m"
-        return f"{told} {seen(scene, label)}, {each} {limit}; a box or a mask as target says what part is meant"
+        return f"{told} {seen(scene, label)}, {each} {limit}; give the wanted part as a box or a mask"
     flat = ([] if ground.support is None else [ground.support]) + list(ground.background)
     if not flat:
         near = float(np.median(scene.mean_distance))
