@@ -1,4 +1,4 @@
-"""`graspd_play BAG`: publishes a recording's topics over DDS at the recorded times, if `ros2 bag play` is missing.
+"""`graspd_play BAG`: publish a recording's topics at the recorded times. It replaces a missing `ros2 bag play`.
 
 graspd_play BAG [--rate R] [--loop] [--topics NAME ...] [--now] [--wait SEC] [--ros-args -r /recorded:=/wanted]
 """
@@ -75,15 +75,15 @@ def play(
 
 def _parse(arguments: list[str]) -> argparse.Namespace:
     parser = Parser(prog="graspd_play", description="Publish the topics of a rosbag2 recording.")
-    parser.add_argument("bag", metavar="BAG", type=Path, help="a directory, or a file .mcap or .db3")
-    parser.add_argument("--rate", type=float, default=1.0, metavar="R", help="times as fast as recorded (default 1)")
-    parser.add_argument("--loop", action="store_true", help="begin again at the end")
-    parser.add_argument("--topics", nargs="+", default=[], metavar="NAME", help="only these")
-    parser.add_argument("--now", action="store_true", help="shift stamps as if the recording happened now")
-    parser.add_argument("--wait", type=float, default=0.0, metavar="SEC", help="for a subscriber, before the start")
+    parser.add_argument("bag", metavar="BAG", type=Path, help="a directory, or a .mcap or .db3 file")
+    parser.add_argument("--rate", type=float, default=1.0, metavar="R", help="factor on the recorded speed (default 1)")
+    parser.add_argument("--loop", action="store_true", help="start again at the end")
+    parser.add_argument("--topics", nargs="+", default=[], metavar="NAME", help="play only these topics")
+    parser.add_argument("--now", action="store_true", help="shift all stamps to the present time")
+    parser.add_argument("--wait", type=float, default=0.0, metavar="SEC", help="wait this long for a subscriber")
     options = parser.parse_args(arguments)
     if not options.rate > 0:
-        raise ConfigError(f"rate: {options.rate}; it must be positive")
+        raise ConfigError(f"--rate: {options.rate}; valid: above 0")
     return options
 
 
@@ -94,21 +94,21 @@ def _publishers(node: Any, bag: Path, wanted: Sequence[str]) -> dict[str, tuple[
     recorded = bag_topics(bag)
     for name in wanted:
         if name not in {topic.name for topic in recorded}:
-            raise BagError(f"{bag}: no topic {name!r}; it has: {', '.join(t.name for t in recorded) or 'none'}")
+            raise BagError(f"{bag}: no topic {name!r}; the bag has: {', '.join(t.name for t in recorded) or 'none'}")
     publishers = {}
     for topic in recorded:
         if wanted and topic.name not in wanted:
             continue
         kind = _message_type(topic)
         if kind is None:
-            node.get_logger().warning(f"{topic.name} is left out: no Python package for {topic.type} is installed")
+            node.get_logger().warning(f"{topic.name} is not played: no Python package for {topic.type} is installed")
             continue
         latched = topic.name.endswith("tf_static")
         durability = DurabilityPolicy.TRANSIENT_LOCAL if latched else DurabilityPolicy.VOLATILE
         qos = QoSProfile(depth=100 if latched else DEPTH, durability=durability)
         publishers[topic.name] = node.create_publisher(kind, topic.name, qos), kind
     if not publishers:
-        raise BagError(f"{bag}: no topic of a type that is installed here; it has: {_types(recorded)}")
+        raise BagError(f"{bag}: no topic of a type that is installed here; the bag has: {_types(recorded)}")
     return publishers
 
 
@@ -144,8 +144,8 @@ def _wait_for_delivery(publishers: dict[str, tuple[Any, type]]) -> None:
 def _shifted(data: bytes, kind: type, start: int, began: int, rate: float) -> Any:
     """Return the message with the stamps of its headers moved to the time of publication.
 
-    The stamp `start` [ns] becomes `began` [ns]. Later stamps are scaled by `rate`. Messages without headers do not
-    change.
+    The stamp `start` [ns] becomes `began` [ns]. Times after `start` are divided by `rate`. Messages without headers do
+    not change.
     """
     from rclpy.serialization import deserialize_message
 

@@ -78,7 +78,7 @@ class BagFrame:
 
 
 def is_bag(path: str | Path) -> bool:
-    """Return True if a path is a storage file by its ending, or a directory with a storage file or metadata.yaml."""
+    """Return True if a file has a recording's ending, or a directory holds such a file or metadata.yaml."""
     path = Path(path)
     if path.is_dir():
         return (path / "metadata.yaml").exists() or bool(_storage_files(path))
@@ -86,7 +86,7 @@ def is_bag(path: str | Path) -> bool:
 
 
 def bag_topics(path: str | Path) -> tuple[BagTopic, ...]:
-    """Return the topics of a recording, sorted by name. Raises BagError: it is not a bag, or it is broken."""
+    """Return the topics of a recording, sorted by name. Raises BagError: the path is no bag, or the bag is broken."""
     with _opened(path) as reader:
         return _topics(reader)
 
@@ -94,13 +94,13 @@ def bag_topics(path: str | Path) -> tuple[BagTopic, ...]:
 def read_transforms(path: str | Path) -> TransformBuffer:
     """Read all transforms of a recording (/tf and /tf_static).
 
-    Raises BagError: it is not a bag, it is broken, or it has no transforms.
+    Raises BagError: the path is no bag, or the bag is broken or has no transforms.
     """
     buffer = TransformBuffer(history=None)
     with _opened(path) as reader:
         connections = [c for c in reader.connections if c.msgtype == TRANSFORMS]
         if not any(c.msgcount for c in connections):
-            raise BagError(f"{path}: holds no transforms (/tf, /tf_static), so no other frame can be used")
+            raise BagError(f"{path}: has no transforms (/tf, /tf_static); use the frame of the clouds")
         for connection, _, raw in _messages(path, reader, connections):
             message = _decode(path, reader, connection, raw)
             add_transforms(buffer, message, static=connection.topic.endswith("tf_static"))
@@ -120,12 +120,12 @@ def read_frames(
     Args:
         path: a rosbag2 directory, or one of its storage files (.mcap, .db3).
         topic: topic of clouds or depth images. None takes the only cloud topic, else the only depth topic.
-        info_topic: CameraInfo topic of the depth images. None takes `camera_info` next to them, or the only one.
-        every: yield only every n-th message.
-        limit: greatest number of messages to yield. None for no limit.
+        info_topic: CameraInfo topic of the depth images. None takes `camera_info` beside the images, else the only one.
+        every: yield every n-th message only.
+        limit: greatest number of messages to yield. None means no limit.
 
     Raises:
-        BagError: it is not a bag, it is broken, or the topic is missing, ambiguous, empty or of another type.
+        BagError: the path is no bag, the bag is broken, or the topic is missing, ambiguous, empty or unsuitable.
     """
     with _opened(path) as reader:
         chosen = _choose(path, reader, topic)
@@ -154,13 +154,13 @@ def read_frames(
 def read_raw(path: str | Path, topics: tuple[str, ...] = ()) -> Iterator[tuple[BagTopic, int, bytes]]:
     """Yield raw messages (CDR) of the given topics, or of all, each with its topic and receive time [ns].
 
-    Raises BagError: it is not a bag, it is broken, or a topic is not in it.
+    Raises BagError: the path is no bag, or the bag is broken or lacks a topic.
     """
     with _opened(path) as reader:
         known = {topic.name: topic for topic in _topics(reader)}
         for name in topics:
             if name not in known:
-                raise BagError(f"{path}: no topic {name!r}; it has: {', '.join(known) or 'none'}")
+                raise BagError(f"{path}: no topic {name!r}; the bag has: {', '.join(known) or 'none'}")
         connections = [c for c in reader.connections if not topics or c.topic in topics]
         for connection, time, raw in _messages(path, reader, connections):
             yield known[connection.topic], time, bytes(raw)
@@ -190,7 +190,7 @@ def _opened(path: str | Path) -> Iterator[Any]:
         # The recorder was killed before it wrote the metadata. Its storage file may still be complete.
         files = _storage_files(path)
         if len(files) > 1:
-            raise BagError(f"{path}: no metadata.yaml and {len(files)} storage files; give one of them")
+            raise BagError(f"{path}: no metadata.yaml, but {len(files)} storage files; give one of the files")
         path = files[0]
     reader: Any = None
     try:
@@ -248,13 +248,13 @@ def _choose(path: str | Path, reader: Any, name: str | None) -> BagTopic:
     if name is not None:
         found = next((t for t in (*clouds, *images, *packed) if t.name == name), None)
         if found is None:
-            raise BagError(f"{path}: no clouds or depth images on {name!r}; topics with some: {offered}")
+            raise BagError(f"{path}: no clouds or depth images on {name!r}; valid topics: {offered}")
         return found
     # A compressed image next to a raw one shows the same. The raw one is preferred.
     candidates = clouds or images or packed
     if not candidates:
         have = ", ".join(f"{t.name} ({t.type.rsplit('/', 1)[-1]})" for t in topics) or "none"
-        raise BagError(f"{path}: no topic with clouds or depth images; it has: {have}")
+        raise BagError(f"{path}: no topic with clouds or depth images; the bag has: {have}")
     if len(candidates) > 1:
         raise BagError(f"{path}: several topics fit; name one of: {offered}")
     return candidates[0]
@@ -285,7 +285,7 @@ def _info_topic(path: str | Path, reader: Any, image: str, name: str | None) -> 
         return wanted
     if name is None and len(known) == 1:
         return known[0]
-    raise BagError(f"{path}: no camera info on {wanted!r} for {image}; topics with some: {', '.join(known) or 'none'}")
+    raise BagError(f"{path}: no camera info on {wanted!r} for {image}; valid topics: {', '.join(known) or 'none'}")
 
 
 def _storage_files(path: Path) -> list[Path]:

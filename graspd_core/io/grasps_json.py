@@ -188,7 +188,7 @@ def load_grasps(path: str | Path) -> tuple[Grasp, ...]:
 
 
 def load_document(path: str | Path) -> dict[str, Any]:
-    """Read a grasps file. Raises FormatError: it is missing, not JSON, of another format or of an unknown version."""
+    """Read a grasps file. Raises FormatError: the file is missing, not JSON, or of an unknown format or version."""
     path = Path(path)
     try:
         document = json.loads(path.read_text(encoding="utf-8"), parse_constant=_refuse_constant)
@@ -207,8 +207,8 @@ def load_document(path: str | Path) -> dict[str, Any]:
 def grasps_of(document: dict[str, Any]) -> tuple[Grasp, ...]:
     """Return the grasps of a document that `load_document` read, in rank order.
 
-    The squeeze gets the grasp's base pose. Postures hold actuated joints only. Metrics that this version does not know
-    are ignored. Raises FormatError: a grasp lacks a key, or a value has the wrong type or is not finite.
+    The squeeze gets the base pose of the grasp. Postures hold actuated joints only. Unknown metrics are ignored.
+    Raises FormatError: a grasp lacks a key, or a value has the wrong type or is not finite.
     """
     try:
         hand = document["hand"]
@@ -248,12 +248,12 @@ def _grasp_of(values: dict[str, Any], actuated: Bool[np.ndarray, "movable"]) -> 
         arm=_arm_of(values["arm"]) if values.get("arm") is not None else None,
     )
     if values["verdict"] != grasp.verdict:
-        raise ValueError(f"verdict: {short_repr(values['verdict'])}; by its trials the grasp is {grasp.verdict}")
+        raise ValueError(f"verdict: {short_repr(values['verdict'])}; expected {grasp.verdict}, by the trials")
     return grasp
 
 
 def _from_version_1(values: dict[str, Any]) -> dict[str, Any]:
-    """Convert a grasp from version 1 to version 2. Its `reason` belongs to the last trial."""
+    """Convert a grasp from version 1 to version 2. The grasp's `reason` goes to its last trial."""
     # Older files, from before the lift trial, do not have this key.
     tried = {name: values["metrics"].get(name) for name in ("hold", "lift")}
     tried = {name: trial for name, trial in tried.items() if trial is not None}

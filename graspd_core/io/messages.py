@@ -73,7 +73,7 @@ def finite_points(pixels: Float[np.ndarray, "height width 3"]) -> Float[np.ndarr
 
 
 def pixels_from_message(message: Any) -> Float[np.ndarray, "height width 3"]:
-    """Return the points of a PointCloud2 as an image, NaN and infinity too. Raises CloudError: empty or malformed."""
+    """Return all points of a PointCloud2 as an image, even NaN. Raises CloudError: the cloud is empty or malformed."""
     width, height, data = message.width, message.height, memoryview(message.data)
     if width == 0 or height == 0:
         raise CloudError(f"the cloud is empty: width={width}, height={height}")
@@ -139,7 +139,7 @@ def _check_order(is_bigendian: bool, dtype: np.dtype, points: Float[np.ndarray, 
 
 
 def _odd_share(numbers: Float[np.ndarray, "n"]) -> float:
-    """Return the fraction of the finite, non-zero numbers that are not plausible as lengths in any unit."""
+    """Return the fraction of the finite, non-zero numbers that are no plausible lengths in any unit."""
     size = np.abs(numbers[np.isfinite(numbers) & (numbers != 0)])
     return float(((size < 1e-6) | (size > 1e9)).mean()) if len(size) else 0.0
 
@@ -227,7 +227,7 @@ def camera_from_message(info: Any, *, rectified: bool = False) -> PinholeCamera:
 def image_size(message: Any) -> tuple[int, int]:
     """Return width and height [pixels] of a raw or compressed depth image, or of the images of a CameraInfo.
 
-    Raises CloudError: a compressed image does not contain its size.
+    Raises CloudError: a compressed image does not state its size.
     """
     if hasattr(message, "roi"):
         bins = max(message.binning_x, 1), max(message.binning_y, 1)
@@ -240,7 +240,7 @@ def image_size(message: Any) -> tuple[int, int]:
 def depth_from_message(image: Any) -> DepthImage:
     """Return the depth [m] of an Image or CompressedImage, 0 for no depth. Rows may be padded.
 
-    Raises CloudError if the encoding is not one of depth, the image is empty or broken, or its sizes disagree.
+    Raises CloudError if the encoding holds no depth, the image is empty or broken, or its sizes disagree.
     """
     if hasattr(image, "format"):
         return _depth_from_compressed(memoryview(image.data), image.format)
@@ -267,7 +267,7 @@ def _size_of_compressed(data: memoryview, told: str) -> tuple[int, int]:
         raise CloudError(f"depth image: its PNG is cut off, the message has {len(data)} bytes")
     width, height = _PNG_SIZES.unpack_from(data, at)
     if width * height > _MOST_PIXELS:
-        raise CloudError(f"depth image: a PNG of {width} x {height} pixels; at most {_MOST_PIXELS} are read")
+        raise CloudError(f"depth image: its PNG has {width} x {height} pixels; valid: at most {_MOST_PIXELS}")
     return width, height
 
 
@@ -287,13 +287,13 @@ def _depth_from_compressed(data: memoryview, told: str) -> DepthImage:
         with Image.open(io.BytesIO(data[begins:])) as picture:
             mode, pixels = picture.mode, np.asarray(picture)
     except Exception as error:  # for a broken file, the library may raise any exception
-        raise CloudError(f"depth image: a broken PNG ({error})") from None
+        raise CloudError(f"depth image: its PNG is broken ({error})") from None
     if not mode.startswith("I"):
         raise CloudError(f"depth image: format {told[:64]!r} holds a PNG of mode {mode}; valid: 16 bits a pixel")
     if kind[0] == "u":
         return depth_in_metres(pixels.astype(np.uint16), encoding)
     if not begins:
-        raise CloudError(f"depth image: format {told[:64]!r} without the {_QUANTISED.size} bytes of its quantisation")
+        raise CloudError(f"depth image: format {told[:64]!r} lacks the {_QUANTISED.size} bytes of its quantisation")
     _, a, b = _QUANTISED.unpack_from(data)
     with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
         depth = unit * np.float32(a) / (pixels.astype(np.float32) - np.float32(b))

@@ -77,17 +77,17 @@ class SensorFrame:
     pixels: Callable[[], Pixels] | None = None
 
     def check(self, now: int, limit: float) -> None:
-        """Check frame and age. Raises RequestError: no frame, or the stamp is more than `limit` [s] from `now` [ns].
+        """Check frame and age. Raises RequestError: no frame id, or a stamp over `limit` [s] from `now` [ns].
 
         A `limit` of 0 means no limit.
         """
         if not self.frame.strip("/"):
-            text = f"the {self.kind} names no frame: its header.frame_id is empty, so that its grasps could be anywhere"
-            raise RequestError(ErrorCode.BAD_CLOUD, f"{text}; have its publisher set one")
+            text = f"the {self.kind} has an empty header.frame_id, so the place of its grasps is unknown"
+            raise RequestError(ErrorCode.BAD_CLOUD, f"{text}; let its publisher set the frame")
         age = (now - (nanoseconds(self.stamp) or self.arrived)) * 1e-9
         if not limit or -limit <= age <= limit:
             return
-        text, hint = f"is {age:.1f} s old", "for a bag set use_sim_time, or cloud_max_age 0"
+        text, hint = f"is {age:.1f} s old", "for a bag, set use_sim_time, or cloud_max_age to 0"
         if age < 0:
             text = f"has a stamp {-age:.1f} s in the future"
             hint = "its clock is not the node's, or use_sim_time is set for one of them only"
@@ -106,7 +106,7 @@ class SensorFrame:
 def cloud_frame(message: PointCloud2, arrived: int) -> SensorFrame:
     """Return a cloud message as a frame. Its points are read on use. Raises RequestError if the cloud is too large."""
     if len(message.data) > MOST_CLOUD_BYTES:
-        fault = f"a cloud of {len(message.data)} bytes; at most {MOST_CLOUD_BYTES} are taken"
+        fault = f"the cloud has {len(message.data)} bytes; valid: at most {MOST_CLOUD_BYTES}"
         raise RequestError(ErrorCode.BAD_CLOUD, fault)
     header = message.header
     read = lambda place=ORIGIN, lookup=no_lookup: place.cloud(message, lookup)  # noqa: E731
@@ -130,8 +130,8 @@ def depth_sensor_frame(image: DepthMessage, info: CameraInfo, arrived: int) -> S
 class ImagePairs:
     """Matcher of depth images with the last CameraInfo of the same frame and size. It is not thread-safe.
 
-    The newest image without a match waits for one. A CameraInfo without a frame matches every frame. `clock` returns
-    monotonic time [s].
+    The newest image waits until a CameraInfo matches it. A CameraInfo without a frame matches every frame. `clock`
+    returns monotonic time [s].
     """
 
     def __init__(self, clock: Callable[[], float] = time.monotonic) -> None:
@@ -142,7 +142,7 @@ class ImagePairs:
         self._alone_since = 0.0
 
     def add(self, message: DepthMessage | CameraInfo) -> tuple[DepthMessage, CameraInfo] | None:
-        """Add an image or a CameraInfo and return the pair it completes, or None. Raises CloudError: no image."""
+        """Add an image or a CameraInfo. Return the completed pair, or None. Raises CloudError for a broken image."""
         if isinstance(message, CameraInfo):
             self._calibrations += 1
             kind = _kind(message)
@@ -168,7 +168,7 @@ class ImagePairs:
         return image, info
 
     def unpaired(self) -> str:
-        """Return one line about images without a matching CameraInfo. Empty if they match or wait under `UNPAIRED`."""
+        """Return one line about images without a matching CameraInfo, empty before they have waited `UNPAIRED`."""
         if self._waiting is None or self._clock() - self._alone_since < UNPAIRED:
             return ""
         last = next(reversed(self._infos.values()), None)
@@ -216,15 +216,15 @@ def masked_points(
     """Return one point per pixel, NaN without a measurement, and True for the pixels inside the mask.
 
     Raises:
-        RequestError: the mask is no mono8 image of the cloud's size. The message names the field `name`.
+        RequestError: the mask is no mono8 image of the cloud's size. The error names the field `name`.
         CloudError: the cloud cannot be read.
     """
     pixels = np.empty((0, 0, 3)) if frame.pixels is None else frame.pixels()
     height, width = pixels.shape[:2]
     if mask.encoding not in ("mono8", "8UC1") or (mask.height, mask.width) != (height, width):
         raise bad_request(
-            f"{name}: {mask.width} x {mask.height} {mask.encoding[:16]!r}; valid: mono8 of {width} x {height} "
-            f"pixels, as the {frame.kind} has"
+            f"{name}: {mask.width} x {mask.height} {mask.encoding[:16]!r}; valid: mono8, {width} x {height} "
+            f"pixels like the {frame.kind}"
         )
     if mask.step < width or len(mask.data) < (height - 1) * mask.step + width:
         fault = f"{name}: {len(mask.data)} bytes, step {mask.step}, are too few for {width} x {height} pixels"
@@ -247,7 +247,7 @@ class Views:
         Raises GraspdError if there are `MOST_VIEWS` views already, or the cloud cannot be cropped or transformed.
         """
         if len(self.clouds) >= MOST_VIEWS:
-            raise bad_request(f"{MOST_VIEWS} views are kept already; call ~/reset_views first")
+            raise bad_request(f"{MOST_VIEWS} views are stored, the most possible; call ~/reset_views first")
         frame = self.frame or settings.fixed_frame or sensor_frame.frame
         cloud = trimmed(cloud, settings)
         if len(cloud.points) > MOST_VIEW_POINTS:
@@ -263,7 +263,7 @@ def scene_of_views(
 ) -> Scene:
     """Return the scene of clouds in a common frame. `target` selects the object in the same frame.
 
-    `warnings` become warnings of the object. Raises GraspdError if no usable object is found in the clouds, or the
+    `warnings` become warnings of the object. Raises GraspdError if the clouds show no usable object, or the
     `scene_config` file is no longer valid.
     """
     # Start the robustness variants of the shape in parallel with its distance grid, if grasps are verified.
@@ -294,7 +294,7 @@ def within(cloud: PointCloud, settings: Settings) -> Bool[np.ndarray, "n"]:
     if inside.any():
         return inside
     seen = points[np.isfinite(points).all(1)]
-    span = f", they lie from {seen.min(0).round(3).tolist()} to {seen.max(0).round(3).tolist()}" if len(seen) else ""
+    span = f"; they lie from {seen.min(0).round(3).tolist()} to {seen.max(0).round(3).tolist()}" if len(seen) else ""
     fault = (
         f"none of {len(points)} points lies in the workspace, roi_min={settings.roi_min} to roi_max={settings.roi_max}"
     )

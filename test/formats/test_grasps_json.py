@@ -172,7 +172,7 @@ def test_a_file_of_version_1_from_before_there_was_a_lift_trial_is_read():
 
 def test_a_verdict_that_its_trials_do_not_support_is_refused(document):
     document["grasps"][1]["verdict"] = "verified"
-    with pytest.raises(FormatError, match="verdict: 'verified'; by its trials the grasp is failed"):
+    with pytest.raises(FormatError, match="verdict: 'verified'; expected failed, by the trials"):
         grasps_of(document)
     document["grasps"][1]["trials"][0]["passed"] = "yes"
     with pytest.raises(FormatError, match="passed: 'yes'; expected true or false"):

@@ -129,8 +129,8 @@ def test_the_command_loops_under_other_names_until_a_signal(client, play_process
     ("arguments", "culprit"),
     [
         (["missing"], "missing: no such bag"),
-        (["BAG", "--rate", "0"], "rate: 0.0; it must be positive"),
-        (["BAG", "--topics", "/nothing"], "no topic '/nothing'; it has: /play/camera_info"),
+        (["BAG", "--rate", "0"], "--rate: 0.0; valid: above 0"),
+        (["BAG", "--topics", "/nothing"], "no topic '/nothing'; the bag has: /play/camera_info"),
         (["BAG", "--backwards"], "unrecognized arguments: --backwards"),
     ],
 )
@@ -152,5 +152,5 @@ def test_a_bag_without_any_known_type_is_refused(client, tmp_path, monkeypatch):
     monkeypatch.setitem(sys.modules, "tf2_msgs.msg", None)  # as where the package is not installed
     message = transforms_message([("world", "camera", np.eye(4))], START)
     write_bag(tmp_path / "only_tf", [Record("/tf", START, message)])
-    with pytest.raises(BagError, match=r"no topic of a type that is installed here; it has: /tf \(tf2_msgs"):
+    with pytest.raises(BagError, match=r"no topic of a type that is installed here; the bag has: /tf \(tf2_msgs"):
         play(client.node, tmp_path / "only_tf")

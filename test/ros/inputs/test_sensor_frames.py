@@ -135,7 +135,7 @@ def test_depth_comes_packed_too(message, off: float):
     ("message", "culprit"),
     [
         (CompressedImage(format="16UC1; compressedDepth rvl", data=bytes(40)), "the data is no PNG; valid: "),
-        (CompressedImage(format="16UC1; compressedDepth png", data=packed(DEPTH).data[:60]), "a broken PNG"),
+        (CompressedImage(format="16UC1; compressedDepth png", data=packed(DEPTH).data[:60]), "its PNG is broken"),
         (CompressedImage(format="16UC1; compressedDepth png", data=packed(DEPTH).data[:30]), "its PNG is cut off"),
         (
             CompressedImage(format="rgb8; png compressed bgr8", data=packed(DEPTH).data),
@@ -209,7 +209,7 @@ def test_memory_is_bounded_and_no_image_is_given_out_twice(arrivals: list[tuple[
 def test_a_cloud_without_a_frame_or_with_a_stamp_of_another_clock_is_refused(scene):
     grid, _, T = scene
     taker, cloud = builder(T), message(grid, "", True)
-    with pytest.raises(RequestError, match=r"the cloud names no frame: its header.frame_id is empty") as refused:
+    with pytest.raises(RequestError, match=r"the cloud has an empty header.frame_id") as refused:
         taker.from_message("r", Settings(), GraspRequest(cloud=cloud))
     assert refused.value.code is ErrorCode.BAD_CLOUD
     cloud.header = Header(frame_id=OPTICAL, stamp=Time(sec=NOW.sec + 60))
@@ -248,7 +248,7 @@ def test_a_workspace_without_a_point_says_where_they_are_and_names_the_unit(scen
     assert "they lie from [" in str(no.value)
     asked = GraspRequest(cloud=message(grid, OPTICAL, True), target_mask=mask_of(np.isfinite(grid[..., 0])))
     behind = Settings(cloud_max_age=0.0, roi_max=[10.0, 10.0, 0.0])
-    with pytest.raises(RequestError, match=r"roi_max=\[10.0, 10.0, 0.0\], they lie from"):
+    with pytest.raises(RequestError, match=r"roi_max=\[10.0, 10.0, 0.0\]; they lie from"):
         taker.from_message("r", behind, asked).load()
 
 
@@ -390,7 +390,7 @@ def test_a_mask_says_which_object_is_meant(scene):
         middle = taker.from_message("r", settings, asked).load().object.mesh.vertices.mean(0)
         assert np.linalg.norm(middle - truth) < 0.06
     for bad, culprit in (
-        (mask_of(label == 0, encoding="rgb8"), "320 x 240 'rgb8'; valid: mono8 of 320 x 240"),
+        (mask_of(label == 0, encoding="rgb8"), "320 x 240 'rgb8'; valid: mono8, 320 x 240"),
         (mask_of((label == 0)[:100]), "320 x 100 'mono8'"),
         (mask_of(label == 0, data=array.array("B", [1])), "1 bytes, step 320, are too few"),
     ):
@@ -425,7 +425,7 @@ def test_a_mask_shows_where_contacts_may_be(scene):
             {"target_mask": Image(height=1), "use_target_point": True},
             "target_mask: cannot be combined with target_point",
         ),
-        ({"target_mask": Image(height=1), "source": GraspRequest.MESH}, "target_mask: with source 1"),
+        ({"target_mask": Image(height=1), "source": GraspRequest.MESH}, "target_mask: given with source 1"),
     ],
 )
 def test_wishes_that_cannot_be_meant_are_refused_by_name(fields, culprit):
