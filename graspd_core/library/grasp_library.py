@@ -1,6 +1,6 @@
 """Store verified grasps in an SQLite file, with one transaction per record.
 
-The key of an entry has the content of the mesh, that of the hand, and the physics of the trials. A write-ahead log lets
+The key of an entry is a hash of the mesh, the hand and the physics of the trials. A write-ahead log lets
 readers work while another process writes. A killed writer loses only its own record. Each call opens and closes the
 file.
 """
@@ -30,7 +30,7 @@ from graspd_core.perception.scene import ObjectModel
 from graspd_core.runtime.disk_cache import digest
 from graspd_core.types import Grasp, GraspResult, Outcome, Timing, Verdict
 
-# Strictness of each kind of verification. Grasps that passed a stricter one are valid for a less strict one.
+# Strictness of each kind of verification. Grasps that passed stricter trials are valid for less strict ones.
 STRICTNESS = {"none": 0, "standard": 1, "full": 1, "hard": 2, "hard_full": 2}
 # Fields that are not part of a hand's content: names, mount, and contact candidates, which each plan draws anew.
 _NO_CONTENT = {"name", "urdf", "link_names", "joint_names", "warnings", "mount", "mimics", "base_place"}
@@ -73,7 +73,7 @@ class LibraryEntry:
 
 
 def entry_of(target: ObjectModel, hand: HandModel, verify: str, name: str = "") -> LibraryEntry:
-    """Return the library entry of a loaded object. The default of `name` is the name of its file."""
+    """Return the library entry of a loaded object. An empty `name` becomes the name of the object's file."""
     shape = target.source.startswith(SHAPE_PREFIX)
     source = absolute(target.source) if shape or Path(target.source).is_file() else ""
     called = target.source.removeprefix(SHAPE_PREFIX) if shape else Path(target.source).stem
@@ -143,13 +143,13 @@ class GraspLibrary:
     """A library of grasps in a file. Call `checked` to verify the file.
 
     Attributes:
-        path: path of the file. While it is open, SQLite keeps two files beside it, with the suffixes -wal and -shm.
+        path: path of the file. While the file is open, SQLite keeps two files beside it, ending in -wal and -shm.
     """
 
     path: Path
 
     def create(self) -> None:
-        """Create an empty library if the file does not exist or is empty. Raises FormatError: it cannot be written."""
+        """Create an empty library if the file is missing or empty. Raises FormatError: the file cannot be written."""
         if self.path.exists() and self.path.stat().st_size:
             return
         self.path.parent.mkdir(parents=True, exist_ok=True)
@@ -186,7 +186,7 @@ class GraspLibrary:
         return strict_enough([entry for entry, _ in self.entries(**same)], wanted.verify)
 
     def grasps(self, entry: LibraryEntry, hand: HandModel) -> tuple[Grasp, ...]:
-        """Return the verified grasps of an entry in the object frame. Empty for an unknown entry.
+        """Return the verified grasps of an entry in the object frame, none for an unknown entry.
 
         Raises:
             FormatError: the library or the record is damaged.
@@ -241,7 +241,7 @@ class GraspLibrary:
     def _reading(self, write: bool = False) -> Iterator[sqlite3.Connection]:
         """Open the file and check its version. With `write` the body runs in a transaction."""
         if not self.path.is_file():
-            raise FormatError(f"{self.path}: no such file; `graspd library build --out {self.path}` makes a library")
+            raise FormatError(f"{self.path}: no such file; `graspd library build --out {self.path}` creates a library")
         with self._own_errors(), _opened(self.path, "rw" if os.access(self.path, os.W_OK) else "ro") as base:
             if write:
                 base.execute("BEGIN IMMEDIATE")
@@ -249,11 +249,11 @@ class GraspLibrary:
                 base.execute(f"PRAGMA {name}").fetchone() for name in ("application_id", "user_version")
             )
             if application != _APPLICATION:
-                raise FormatError(f"{self.path}: no library of grasps; `graspd library build --out FILE` makes one")
+                raise FormatError(f"{self.path}: not a library of grasps; `graspd library build --out FILE` makes one")
             if version != VERSION:
                 raise FormatError(
-                    f"{self.path}: a library of version {version}, this graspd reads version {VERSION}; build another "
-                    "with `graspd library build --out FILE`"
+                    f"{self.path}: library version {version} is unknown; valid: {VERSION}; build another with "
+                    "`graspd library build --out FILE`"
                 )
             yield base
             if write:

@@ -1,8 +1,8 @@
 """Find stored grasps of a known object for the present scene. Missing grasps are planned and added to the library.
 
-A name or a mesh file identifies the object. If the library lacks it, the error lists the known objects. A stored
-grasp is checked against support and obstacles. If the hand would collide, the grasp is refused. If the hand comes near,
-the trials are repeated. Otherwise the stored trials remain valid.
+A name or a mesh file identifies the object. If the library lacks the object, the error lists others. A stored
+grasp is refused if the hand would collide with support or obstacles. If the hand comes near them, the trials are
+repeated. Otherwise the stored trials remain valid.
 """
 
 from __future__ import annotations
@@ -48,7 +48,7 @@ _MOST_NAMED = 8
 
 @dataclass(frozen=True)
 class Physics:
-    """Conditions of the trials: mass [kg] and friction of the object, and name of the trials. Mass None is any mass."""
+    """Conditions of the trials: mass [kg] and friction of the object, and name of the trials. None means any mass."""
 
     mass: float | None
     friction: float
@@ -67,7 +67,7 @@ class Physics:
 def entry_by_name(library: GraspLibrary, hand: HandModel | None, name: str, physics: Physics) -> LibraryEntry:
     """Return the entry of the object with this name, for this hand (None for any hand).
 
-    The entry must have the wanted mass and friction, unless all entries of the object have the same.
+    If all entries of the object share one mass and friction, these need not be the wanted ones.
 
     Raises:
         ConfigError: the name is unknown, has no entry for this hand or physics, or is not unique.
@@ -102,7 +102,7 @@ def entry_by_file(
     *,
     required: bool = True,
 ) -> LibraryEntry | None:
-    """Return the entry of a mesh file, or of shape:NAME, at a scale. None if it is missing and not required.
+    """Return the entry of a mesh file, or of shape:NAME, at a scale. None if the entry is missing and not required.
 
     Raises:
         ConfigError: the library has no entry of this content, scale, hand and physics.
@@ -122,7 +122,7 @@ def entry_by_file(
     sized = [entry for entry in content if entry.scale == scale]
     if not sized:
         scales = ", ".join(sorted({f"{entry.scale:g}" for entry in content}))
-        raise ConfigError(f"{path}: not at scale {scale:g} in the library {library.path}; valid scales: {scales}")
+        raise ConfigError(f"{path}: scale {scale:g} is not in the library {library.path}; valid: {scales}")
     same = _with_hand(library, hand, sized, path)
     return _held_entry(library, physics.of(same), same, path, physics)
 
@@ -137,7 +137,7 @@ def _with_hand(
         return same
     hands = sorted({entry.hand for entry in entries})
     made = f"for {', '.join(hands)}, not for {hand.name}" if hand.name not in hands else "for another form of this hand"
-    raise ConfigError(f"{what}: in the library {library.path} {made}; `graspd library build --hand` adds it")
+    raise ConfigError(f"{what}: the library {library.path} has it {made}; `graspd library build --hand` adds it")
 
 
 def _held_entry(
@@ -147,7 +147,7 @@ def _held_entry(
     if enough:
         return enough[0]
     had = ", ".join(sorted({str(Physics(e.mass, e.friction, e.verify)) for e in others}))
-    raise ConfigError(f"{what}: not with {physics} in the library {library.path}; it has {had}")
+    raise ConfigError(f"{what}: the library {library.path} does not have it with {physics}; valid: {had}")
 
 
 def _changed(library: GraspLibrary, entry: LibraryEntry) -> MeshError:
@@ -176,17 +176,17 @@ def known_grasps(
     wanted: Wanted = list,
     stop: StopHook | None = None,
 ) -> GraspResult:
-    """Return at most `count` verified grasps of the scene's object from the library. None for an unknown object.
+    """Return at most `count` verified grasps of the scene's object from the library, none for an unknown object.
 
     Args:
         library: from `GraspLibrary(path).checked()`.
-        scene: scene with the object, which is identified by mesh, friction, and mass if it was given.
-        hand: hand, which is identified by its content.
+        scene: scene with the object. Its mesh, friction and given mass identify the entry.
+        hand: hand. Its content identifies the entry, not its name.
         count: greatest number of grasps.
         restrictions: as for `plan_grasps`.
         verify: trials that the grasps must have passed. Stricter trials count too.
         wanted: function that filters the stored grasps.
-        stop: asked during the trials. True ends them.
+        stop: stop hook. The trials end when it returns True.
 
     Raises:
         FormatError: the library is damaged, missing, or of another version.
@@ -213,7 +213,7 @@ def known_grasps(
 
 
 def library_result(library: GraspLibrary, grasps: Sequence[Grasp], count: int, seconds: float) -> GraspResult:
-    """Return grasps of a library as the result of a request for `count` grasps that took `seconds`."""
+    """Return grasps of a library as the result of a request for `count` grasps that took `seconds` [s]."""
     timing = Timing(first_verified=seconds if grasps else None, total=seconds)
     message = f"{len(grasps)} grasps of the library {library.path.name}"
     return result_of(grasps, count, method="library", timing=timing, message=message)
@@ -235,7 +235,7 @@ def known_or_planned(
 ) -> GraspResult:
     """Return grasps from the library, and plan more if there are fewer than `count`.
 
-    Planned grasps that are verified are added to the library. `wanted` selects the grasps that count, stored and
+    Planned grasps that are verified are added to the library. `wanted` filters the grasps, stored and
     planned. `name` is the object's name in the library. The other arguments are as for `plan_grasps`. If the library
     cannot be written, the result has a warning.
     """
@@ -284,7 +284,7 @@ def add_planned(
     verify: str,
     name: str = "",
 ) -> int:
-    """Add the verified grasps of a run to the library, with only their hold trials.
+    """Add the verified grasps of a run to the library, with their hold trials only.
 
     Returns the new number of grasps of the entry. Raises FormatError: the library cannot be written.
     """
@@ -325,7 +325,7 @@ def _held(
 
 
 def clearance(scene: Scene, hand: HandModel, grasps: Sequence[Grasp]) -> Float[np.ndarray, "grasps"]:
-    """Return each hand's least distance [m] to support and obstacles from retreat to squeeze. Infinite without both."""
+    """Return each hand's least distance [m] to support and obstacles from pregrasp to squeeze, inf without both."""
     obstacles = make_obstacle_tensors(scene, hand, "cpu", torch.float64)
     if obstacles is None or not grasps:
         return np.full(len(grasps), np.inf)

@@ -206,12 +206,12 @@ def test_a_library_that_nobody_may_write_is_read(library: GraspLibrary, hand, tm
     ("spoil", "told"),
     [
         (lambda path: path.unlink(), "no such file; `graspd library build --out"),
-        (lambda path: path.write_bytes(b""), "no library of grasps"),
+        (lambda path: path.write_bytes(b""), "not a library of grasps"),
         (lambda path: path.write_text("grasps: none\n" * 500), "damaged or not a library"),
         (lambda path: os.truncate(path, path.stat().st_size // 2), "damaged or not a library"),
         (lambda path: _scribble(path), "damaged or not a library"),
-        (lambda path: _sql(path, "PRAGMA user_version = 7"), "a library of version 7, this graspd reads version 1"),
-        (lambda path: _sql(path, "PRAGMA application_id = 7"), "no library of grasps"),
+        (lambda path: _sql(path, "PRAGMA user_version = 7"), "library version 7 is unknown; valid: 1;"),
+        (lambda path: _sql(path, "PRAGMA application_id = 7"), "not a library of grasps"),
     ],
 )
 def test_what_is_no_whole_library_of_this_version_is_told_in_one_line(library: GraspLibrary, spoil, told: str):
@@ -365,12 +365,12 @@ def test_an_object_is_found_by_name_and_by_file(library: GraspLibrary, hand: Han
         (
             lambda library, hand, ball: entry_by_name(library, hand, "ball", Physics(0.1, 0.6, "hard")),
             ConfigError,
-            "it has 0.1 kg, friction 0.6, standard trials",
+            "valid: 0.1 kg, friction 0.6, standard trials",
         ),
         (
             lambda library, hand, ball: entry_by_file(library, hand, ball, 0.5, PHYSICS),
             ConfigError,
-            "ball.obj: not at scale 0.5 in the library",
+            "ball.obj: scale 0.5 is not in the library",
         ),
         (
             lambda library, hand, ball: entry_by_file(library, hand, "shape:mug", 1.0, PHYSICS),

@@ -152,13 +152,13 @@ def test_a_direction_and_a_surface_are_kept(folder: Path, hand: HandModel):
     [
         (known(known_object="bell"), {}, ConfigError, "'bell' is not in the library known.grasps; it has ball"),
         (known(), {"grasp_library": ""}, GraspdError, "KNOWN=4 needs a library; set the parameter grasp_library"),
-        (known(), {"verify": "hard"}, ConfigError, "ball: not with any mass, friction 0.6, hard trials"),
+        (known(), {"verify": "hard"}, ConfigError, "does not have it with any mass, friction 0.6, hard trials"),
         (known(mesh_uri="ball.obj"), {}, GraspdError, "known_object: 'ball' with mesh_uri too; valid with KNOWN=4"),
         (
             {"source": GraspRequest.KNOWN, "mesh_uri": "ball.obj", "mesh_scale": 0.5},
             {},
             ConfigError,
-            "ball.obj: not at scale 0.5 in the library known.grasps; valid scales: 1",
+            "ball.obj: scale 0.5 is not in the library known.grasps; valid: 1",
         ),
         (
             {"source": GraspRequest.LATEST_CLOUD, "surface": Plane(coef=[0.0, 0.0, 1.0, 0.0])},
