@@ -1,4 +1,4 @@
-"""Settings that several folders share, as frozen dataclasses. The folder of each method holds the method's own."""
+"""Settings that several folders share, as frozen dataclasses. Each method's own settings are in its folder."""
 
 from __future__ import annotations
 

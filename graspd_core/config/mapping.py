@@ -50,7 +50,7 @@ def coerced(
 def yaml_values(path: Path) -> Iterator[Any]:
     """Yield the values of a YAML file, an empty mapping for an empty file.
 
-    A ConfigError that begins with a dotted key and is raised inside the block gets the file's path and the key's line.
+    If a ConfigError inside the block begins with a dotted key, the file's path and the key's line are added to it.
     Raises ConfigError if the file is missing or malformed.
     """
     try:
@@ -69,7 +69,7 @@ def yaml_values(path: Path) -> Iterator[Any]:
 
 
 def _line_of(node: yaml.Node | None, keys: list[str]) -> int:
-    """Return the line of the innermost of nested keys, or of the innermost key that the file holds."""
+    """Return the line of the innermost of nested keys that the file holds."""
     line = 1
     for key in keys:
         found = [pair for pair in node.value if pair[0].value == key] if isinstance(node, yaml.MappingNode) else []
@@ -128,13 +128,13 @@ class _Loader(yaml.SafeLoader):
 def parse_yaml(text: str) -> tuple[yaml.Node | None, Any]:
     """Return the node tree of a YAML text, whose nodes hold line numbers, and the value of the text.
 
-    Both are None for an empty text. Raises YamlError, a ValueError, if the text is malformed or a value is invalid for
-    its tag or its format.
+    Both are None for an empty text. Raises YamlError (a ValueError) if the text is malformed, or a value does not fit
+    its tag or format.
     """
     try:
         return yaml.compose(text, Loader=yaml.SafeLoader), yaml.load(text, Loader=_Loader)
-    # Beside its own errors, the library passes on whatever a value raises that does not fit its tag or its form: a date
-    # in month 13, an endless number, `!!timestamp x`.
+    # Beside its own errors, the library passes on any error of a value that does not fit its tag or format: a date in
+    # month 13, an endless number, `!!timestamp x`.
     except Exception as error:
         mark = getattr(error, "problem_mark", None)
         problem = getattr(error, "problem", None) or getattr(error, "reason", None) or type(error).__name__

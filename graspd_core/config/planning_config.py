@@ -1,4 +1,4 @@
-"""Planning settings of all methods, and the certainty required of grasps of objects that cameras saw."""
+"""Planning settings of all methods, and the certainty required of grasps on objects seen by cameras."""
 
 from __future__ import annotations
 
@@ -16,9 +16,9 @@ class ProblemConfig:
         fine_candidates: number of contact candidates that polishing uses.
         patch_size: number of contact candidates in a patch. Each patch is drawn to the surface separately, so that all
             of the hand touches. Zero draws only the nearest candidate of each rigid group of links.
-        softness: depth by which the hand yields, as flesh does [m]. Planning makes the object thinner by this depth and
-            ignores its sharp points. Trials do not model it.
-        features: number of sharp points of the object that polishing uses, more on large thin walls.
+        softness: depth to which the hand's surface yields, as flesh does [m]. Planning makes the object thinner by this
+            depth and ignores the object's sharp points. Trials do not model softness.
+        features: number of sharp object points that polishing uses. Large thin walls get more.
         directions: number of disturbance wrenches.
         friction: friction coefficient for planning, below the object's own, so that contacts keep a margin.
         confidence_floor: weight of a contact on guessed surface, relative to a contact on seen surface.
@@ -67,12 +67,12 @@ class GraspStagesConfig:
 class RoundsConfig:
     """Settings for rounds of optimisation and trials. If too few grasps held, the next round starts from other poses.
 
-    An effort of 1 means the method's settings unchanged. Below 1, it multiplies the number of steps. Above 1, it
-    multiplies the number of starts.
+    An effort of 1 leaves the method's settings unchanged. An effort below 1 multiplies the number of steps. An effort
+    above 1 multiplies the number of starts.
 
     Attributes:
         most: maximum number of rounds.
-        first_budget: effort of the first round for an object of known shape that stands alone. For others it is 1.
+        first_budget: effort of the first round for an object of known shape that stands alone. Others get 1.
         growth: factor on the effort from one round to the next.
     """
 
@@ -86,7 +86,7 @@ class RobustConfig:
     """Settings for further trials of verified grasps, with the hand misplaced by up to 5 mm and 5°.
 
     Attributes:
-        rank: whether to run these trials, and rank grasps that still hold first.
+        rank: whether to run these trials. Grasps that hold in more trials rank higher.
         trials: number of these hold trials for each verified grasp.
         hold_time: duration of each of a trial's six pulls [s].
         friction: whether to measure the least friction at which each verified grasp holds.
@@ -126,7 +126,7 @@ MASS_KNOWN = HeldShares(0.76, 0.88, 0.91, 0.57, 0.57)
 _LIGHT_GROWTH = 1.3
 # With a payload below the heavy end, a grasp is verified only if at least this fraction of objects is lighter than it.
 LEAST_LIGHT = 0.8
-# Fraction of grasps that hold on a doubtful scene, such as one whose camera may have stood elsewhere.
+# Fraction of grasps that hold on a doubtful scene, e.g. with a doubtful camera position.
 DOUBTED_SHARE = 0.6
 
 
@@ -140,7 +140,7 @@ class CertaintyConfig:
     """How certain a grasp of an object seen by cameras must be to count as verified.
 
     Attributes:
-        probability: least probability of holding on the true object, if it weighs no more than in the trials. With 0,
+        probability: least probability of holding on the true object, if that weighs no more than in the trials. With 0,
             only the likeliest shape is tried. Higher values require further trials (docs/clouds.md).
 
     Raises:

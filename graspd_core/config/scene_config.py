@@ -24,8 +24,8 @@ class SegmentationConfig:
         max_range: points farther than this from their camera are ignored [m].
         voxel: side of the voxels that the scene is downsampled to, below half of `gap` [m].
         max_voxels: maximum number of voxels of a scene. Larger scenes get larger voxels, which bounds the time.
-        plane_tolerance: points up to this height above a plane still belong to it, higher for noisy cameras [m].
-        max_plane_tolerance: greatest value of this height for noisy cameras [m].
+        plane_tolerance: points up to this height above a plane belong to the plane, higher for noisy cameras [m].
+        max_plane_tolerance: greatest value of that height, for the noisiest cameras [m].
         plane_search_width: largest distance of inliers when a plane is searched, larger for noisy cameras [m].
         ransac_trials: number of planes that RANSAC tries. Use more if the support is a small part of the scene.
         support_size: least width of the visible part of a support plane [m].
@@ -44,8 +44,8 @@ class SegmentationConfig:
         target_reach: a target point selects an object within this distance [m].
         target_share: a box or mask that covers this fraction of an object selects all of it.
         obstacle_range: other objects up to this distance from the object become obstacles [m].
-        piled: whether objects lie on each other. If so, parts divided by a seam are objects even if they do not reach
-            the support, and a heap of any size may stand on it.
+        piled: whether objects lie on each other. If so, parts divided by a seam are objects even above the support, and
+            a heap of any size may stand on the support.
     """
 
     roi_low: tuple[float, float, float] | None = None
@@ -92,7 +92,7 @@ class ReconstructionConfig:
         poisson: solver for the surface: "open3d", or "grid" with Open3D as fallback if its surface does not fit.
         poisson_cell: approximate width of the finest cells of Open3D's solver, twice the camera's noise [m].
         min_cell: least cell width of the grid that the surface is closed on, also twice the noise [m].
-        fit_distance: a mesh is refused unless 85 % of the seen points are this near to it [m].
+        fit_distance: a mesh is refused unless 85 % of the seen points are this near to its surface [m].
         max_faces: maximum number of faces of the mesh.
         seen_distance: surface this near to a seen point has confidence 1 [m].
         guessed_distance: surface farther than this from all seen points has confidence 0 [m].

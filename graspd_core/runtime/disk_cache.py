@@ -1,8 +1,8 @@
 """Cache arrays by key, in the memory of this process and on disk for other processes.
 
 Files are in `$XDG_CACHE_HOME/graspd`, by default `~/.cache/graspd`. `GRASPD_CACHE=off` disables the files. A damaged
-file is built again. A disk that cannot be written is not used. The least recently used files are removed, because
-clouds are never the same twice. Files are written atomically.
+file is built again. A read-only disk is not used. The least recently used files are removed, because clouds are never
+the same twice. Files are written atomically.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ Arrays = dict[str, np.ndarray]
 # Part of every file name. Increase it if the arrays computed from the same mesh or hand change.
 VERSION = 8
 CAPACITY = 24
-# Greatest size of all files together [bytes], and number of written files between two checks of it.
+# Greatest size of all files together [bytes], and number of written files between two checks of the size.
 MOST_BYTES, LOOK_EVERY = 512 * 2**20, 16
 
 _memory: OrderedDict[str, Arrays] = OrderedDict()
@@ -37,7 +37,7 @@ _written = itertools.count(1)
 def remember(key: str, build: Callable[[], Arrays], valid: Callable[[Arrays], bool]) -> Arrays:
     """Return the arrays of `key`, from memory, from the file, or from `build`.
 
-    If there is no file, or `valid` rejects its arrays, they are built and stored. Do not modify the returned arrays.
+    If there is no file, or `valid` rejects its arrays, `build` makes the arrays. Do not modify the returned arrays.
     """
     with _lock:
         if key in _memory:
@@ -97,7 +97,7 @@ def digest(values: Iterable[Any]) -> str:
 
 
 def cache_path(key: str) -> Path | None:
-    """Return the file path of `key`, None if `GRASPD_CACHE` disables the disk."""
+    """Return the file path of `key`, or None if `GRASPD_CACHE` disables files."""
     if os.environ.get("GRASPD_CACHE", "").lower() in ("off", "0", "no"):
         return None
     home = os.environ.get("XDG_CACHE_HOME") or str(Path.home() / ".cache")

@@ -1,9 +1,9 @@
 """Read pickles without running any code that a file names.
 
 A pickle is a program that names classes and functions and calls them. This reader replaces every admitted name by an
-inert object of this module. `array_of` reads the numbers of such an object. Any other name is refused, and no library
-is called. Time and memory are limited by the file size, by the number of arguments of a call, and by the keys, which
-must be text or small numbers. The memo is a dictionary. Opcodes that reserve memory in advance are refused.
+inert object of this module. `array_of` reads the numbers of an inert object. Any other name is refused, and no library
+is called. Limits on the file size, the arguments of a call and the keys (text or small numbers) bound time and memory.
+The memo is a dictionary. Opcodes that reserve memory in advance are refused.
 
 Formats: protocol 0 to 4, written by Python 3 or by Python 2, whose text is bytes and is decoded as latin-1.
 """
@@ -36,9 +36,9 @@ class Inert:
     """An object of the file that is stored but never run.
 
     Attributes:
-        kind: kind of object that it represents, such as "array".
+        kind: kind of the object in the file, such as "array".
         arguments: arguments of its construction.
-        state: argument of its `__setstate__`, None without a call.
+        state: argument of its `__setstate__`. None if that was not called.
     """
 
     kind: str
@@ -59,12 +59,12 @@ class Maker:
         # In protocol 0, `copy_reg._reconstructor` constructs an object of the class in its first argument.
         if self.kind == "rebuilt":
             if not arguments or not isinstance(arguments[0], Maker):
-                raise pickle.UnpicklingError("an object of no known class")
+                raise pickle.UnpicklingError("an object has no known class")
             return arguments[0]()
         return Inert(self.kind, arguments)
 
     def __setstate__(self, state: Any) -> None:
-        raise pickle.UnpicklingError(f"{self.kind} has no state")
+        raise pickle.UnpicklingError(f"{self.kind}: a state is given, but it has none")
 
 
 def makers(*rows: tuple[str, tuple[str, ...], tuple[str, ...]]) -> dict[tuple[str, str], Maker]:
@@ -92,7 +92,7 @@ def _with_plain_keys(name: str, keys: slice) -> Callable[[Any], None]:
 
     def act(reader: Any) -> None:
         if not all(map(_is_plain, reader.stack[keys])):
-            raise pickle.UnpicklingError("a dictionary with an invalid key; valid: text, integers from 0 to 2**32 - 1")
+            raise pickle.UnpicklingError("a dictionary has an invalid key; valid: text, integers from 0 to 2**32 - 1")
         getattr(pickle._Unpickler, name)(reader)
 
     return act
@@ -109,7 +109,7 @@ class _Reader(pickle._Unpickler):
     def _call(self) -> None:
         arguments = self.stack.pop()
         if not isinstance(arguments, tuple) or len(arguments) > _MOST_ARGUMENTS:
-            raise pickle.UnpicklingError(f"a call with invalid arguments; valid: a tuple of at most {_MOST_ARGUMENTS}")
+            raise pickle.UnpicklingError(f"a call has invalid arguments; valid: a tuple of at most {_MOST_ARGUMENTS}")
         self.stack[-1] = self.stack[-1](*arguments)
 
     def _put(self) -> None:
@@ -148,11 +148,11 @@ class _Reader(pickle._Unpickler):
 
 
 class _RefusedError(Exception):
-    """The refusal of a name that is not admitted."""
+    """A pickle contains a name that is not admitted."""
 
 
 def read_bounded(path: Path, what: str) -> bytes:
-    """Read a file. Raises ValueError: it cannot be read or is too large. `what` names the format: "MANO file"."""
+    """Read a file. Raises ValueError: the file is unreadable or too large. `what` names the format: "MANO file"."""
     try:
         with path.open("rb") as file:
             content = file.read(MAX_BYTES + 1)
@@ -166,7 +166,7 @@ def read_bounded(path: Path, what: str) -> bytes:
 def load_inert(content: bytes, admitted: Mapping[tuple[str, str], Maker], what: str) -> Any:
     """Return the content of a pickle: Python's numbers, text, lists and dictionaries, and `Inert` objects.
 
-    Raises ValueError: `content` is no pickle, or contains a name outside `admitted`. The message has the name.
+    Raises ValueError: `content` is no pickle, or contains a name outside `admitted`. The error names it.
     """
     try:
         return _Reader(content, admitted).load()
@@ -186,31 +186,31 @@ _MOST_AXES = 8
 
 
 def array_of(value: Inert) -> np.ndarray:
-    """Return the numeric array of an inert object, in native byte order. Raises ValueError: it is not numeric."""
+    """Return the numeric array of an inert object, in native byte order. Raises ValueError: it is no numeric array."""
     state = value.state
     if not isinstance(state, tuple) or len(state) != 5:
-        raise ValueError("holds an array without content")
+        raise ValueError("its array has no content")
     _, shape, dtype, fortran, raw = state
     kind = _dtype(dtype)
     if isinstance(raw, Inert) and raw.kind == "encoded" and raw.arguments[1:] in ((), ("latin1",), ("latin-1",)):
         raw = raw.arguments[0] if raw.arguments else None
     raw = raw.encode("latin1") if isinstance(raw, str) else raw
     if not isinstance(raw, bytes) or not is_shape(shape):
-        raise ValueError("holds an array whose shape or content is not numeric")
+        raise ValueError("its array has a shape or content that is not numeric")
     flat = np.frombuffer(raw, dtype=kind)
     # `math.prod` uses Python's integers, which cannot overflow.
     if math.prod(shape) != len(flat):
-        raise ValueError(f"holds {len(flat)} numbers for an array of shape {shape}")
+        raise ValueError(f"its array has {len(flat)} numbers, but shape {shape}")
     return flat.astype(kind.newbyteorder("=")).reshape(shape, order="F" if fortran else "C")
 
 
 def _dtype(value: Any) -> np.dtype:
     code = value.arguments[0] if isinstance(value, Inert) and value.kind == "dtype" and value.arguments else None
     if not isinstance(code, str) or code not in _NUMERIC:
-        raise ValueError(f"holds an array of type {_short_text(code)}; valid: booleans, integers, floats")
+        raise ValueError(f"its array has type {_short_text(code)}; valid: booleans, integers, floats")
     order = value.state[1] if isinstance(value.state, tuple) and len(value.state) > 1 else "="
     if order not in ("<", ">", "|", "="):
-        raise ValueError(f"holds an array in byte order {_short_text(order)}; valid: <, >, |, =")
+        raise ValueError(f"its array has byte order {_short_text(order)}; valid: <, >, |, =")
     return np.dtype(("<" if order in ("|", "=") else order) + code)
 
 

@@ -1,9 +1,9 @@
 """Run functions in a child process, because many libraries hold Python's lock during long calls and some crash.
 
 A server process calls `start_worker_process` once. After that `run_isolated` runs functions in the child. In other
-processes it runs them in place. The child is a bare interpreter. A child of multiprocessing would import the user's
-main module again. This module imports fast, so that the child can start before anything else. It also returns freed
-memory to the system, for processes that run for days.
+processes `run_isolated` runs them in place. The child is a bare interpreter. multiprocessing's child would import the
+user's main module again. This module imports fast, so that the child can start first. `trim_heap` returns freed memory
+to the system, for processes that run for days.
 """
 
 from __future__ import annotations
@@ -39,7 +39,7 @@ def trim_heap() -> None:
 
 
 def limit_malloc_arenas() -> None:
-    """Let all threads allocate from two arenas (glibc only), because an arena per thread would keep freed memory."""
+    """Let all threads allocate from two arenas (glibc only). One arena per thread would keep much freed memory."""
     try:
         mallopt = ctypes.CDLL(None).mallopt
     except (OSError, AttributeError, TypeError):
@@ -61,7 +61,7 @@ _PR_SET_PDEATHSIG = 1
 class WorkerProcess:
     """A child process that calls functions. It starts immediately and ends with this process.
 
-    The child first imports `modules`. Calls run one at a time. A child that has died is replaced. Functions must be
+    The child first imports `modules`. Calls run one at a time. A dead child is replaced. Functions must be
     importable by name. Arguments, results and errors are pickled. If this process ends, the child finishes its call and
     ends. With `killed_with_thread` (Linux) the end of the starting thread kills the child even during a call.
     """
@@ -116,7 +116,7 @@ class WorkerProcess:
                 self._pipe.send_bytes(call)
                 while not self._pipe.poll(_POLL):
                     if time.monotonic() > end:
-                        raise TimeoutError(f"no end after {seconds:g} s")
+                        raise TimeoutError(f"the call did not end within {seconds:g} s")
                     if (held := resident_mb(self._process.pid)) > most_mb:
                         raise MemoryError(f"its process used {held:.0f} MB, more than {most_mb:g} MB")
                 reply = self._pipe.recv_bytes()
@@ -161,7 +161,7 @@ _child: WorkerProcess | None = None
 def start_worker_process(*modules: str) -> None:
     """Start the child of `run_isolated`, so that its calls do not block other threads.
 
-    The child first imports `modules`. Do nothing if there already is a child.
+    The child first imports `modules`. If there already is a child, do nothing.
     """
     global _child
     if _child is None:
@@ -186,7 +186,7 @@ def resident_mb(process: int) -> float:
 def serve(number: int, modules: Iterable[str] = (), parent: int = 0) -> None:
     """Import `modules`, then answer calls from the pipe with file descriptor `number` until the pipe is closed.
 
-    If `parent` is a process id, this process is killed when the parent ends.
+    If `parent` is a process id, the end of that process kills this one.
     """
     if parent:
         _end_with(parent)
@@ -221,7 +221,7 @@ def _end_with(parent: int) -> None:
 
 
 def _answer(call: bytes) -> bytes:
-    """Run a pickled call. Return the pickle of (True, error) if it failed, otherwise of (False, result)."""
+    """Run a pickled call. Return the pickle of (True, error) if the call failed, otherwise of (False, result)."""
     try:
         work, arguments, named = pickle.loads(call)
         return pickle.dumps((False, work(*arguments, **named)), pickle.HIGHEST_PROTOCOL)

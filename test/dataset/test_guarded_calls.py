@@ -39,7 +39,7 @@ def test_a_bounded_call_gives_what_the_work_gives_or_raises(child: WorkerProcess
 @pytest.mark.parametrize(
     ("work", "argument", "limits", "error", "told"),
     [
-        (time.sleep, 600, (0.3, 4096.0), TimeoutError, "no end after 0.3 s"),
+        (time.sleep, 600, (0.3, 4096.0), TimeoutError, "the call did not end within 0.3 s"),
         (os._exit, 7, (60.0, 4096.0), ChildProcessError, "died with exit code 7"),
         (os.abort, None, (60.0, 4096.0), ChildProcessError, "died with exit code -6"),
         (exec, FILL, (60.0, 300.0), MemoryError, "more than 300"),

@@ -237,7 +237,7 @@ CHANGES: dict[str, tuple[Callable[[dict[str, Any]], Any], str]] = {
     "huge": (lambda v: v["grasp_qpos"].__setitem__(0, 1e200), "expected 23 numbers of at most 1e"),
     "length": (lambda v: v["grasp_qpos"].__setitem__(slice(3, 7), 0.1), "the quaternion has length 0.2"),
     "text": (lambda v: v.update(obj_scale="big"), "obj_scale: 'big'; expected a number of at most"),
-    "objects": (lambda v: v.update(obj_pose=np.array([None] * 7)), "obj_pose: holds an array of type 'O8'"),
+    "objects": (lambda v: v.update(obj_pose=np.array([None] * 7)), "obj_pose: its array has type 'O8'"),
     "mesh": (lambda v: v.update(obj_path="/nowhere"), "--object MESH"),
 }
 

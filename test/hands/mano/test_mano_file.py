@@ -179,7 +179,7 @@ def test_a_missing_or_huge_file_is_refused(tmp_path: Path) -> None:
         ("posedirs", np.zeros((5, 3, 135)), r"posedirs has shape 5 x 3 x 135; valid: \d+ x 3 x 135"),
         ("weights", "half", "weights: holds str"),
         ("hands_mean", np.full(45, np.nan), "hands_mean has entries that are not finite"),
-        ("hands_mean", np.array([None] * 45), "hands_mean: holds an array of type 'O8'"),
+        ("hands_mean", np.array([None] * 45), "hands_mean: its array has type 'O8'"),
         ("f", np.array([[0, 1, 10**6]]), "f: no faces, or vertex indices outside"),
         ("kintree_table", np.zeros((2, 16)), "kintree_table is not MANO's tree"),
     ],
