@@ -26,7 +26,7 @@ _YOUNG = 20_000
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Run the command line. Return the exit status: 0 enough grasps, 3 fewer, 2 bad input, 130 interrupted."""
+    """Run the command line. Return 0 for enough grasps, 3 for fewer, 2 for bad input, 130 if interrupted."""
     # A call with arguments comes from a process that may have started long ago.
     own_process = arguments is None
     began = process_began() if own_process else time.perf_counter()
@@ -82,9 +82,9 @@ _COMMANDS = {
 }
 # Summaries for `graspd --help`, which imports no command.
 _SUMMARIES = {
-    "synthesize": "plan grasps on a mesh, a cloud or a boxed shape",
+    "synthesize": "plan grasps on a mesh, a cloud or a built-in shape",
     "replay": "plan grasps on the clouds or depth images of a rosbag2 recording",
-    "reconstruct": "turn a point cloud into a closed mesh",
+    "reconstruct": "reconstruct a closed mesh from a point cloud",
     "library": "keep verified grasps of known objects in a file",
     "hands": "list the built-in hands, or inspect one",
     "methods": "list the methods that find grasps",
@@ -94,14 +94,14 @@ _SUMMARIES = {
     "completion": "print a script that lets bash, zsh or tcsh complete commands and options",
     "view": "show hands, grasps and results in a browser",
     "bench": "measure presets and methods on objects, with tables and charts",
-    "dataset": "make a data set of grasps, or look at one",
-    "import": "turn grasps of other tools into grasps.json",
+    "dataset": "make or inspect a data set of grasps",
+    "import": "convert grasps of other tools to grasps.json",
     "cell": "let a simulated arm, hand and camera empty a bin",
 }
 
 
 def _overview() -> argparse.ArgumentParser:
-    """Build a parser for `--help` and `--version`, which knows only the names and summaries of commands."""
+    """Build the parser for `--help` and `--version`. It has only the names and summaries of the commands."""
     parser = _parser()
     parser.add_argument("--version", action="version", version=f"graspd {version('graspd')}")
     commands = parser.add_subparsers(metavar="COMMAND", dest="command")

@@ -29,10 +29,10 @@ def add_command(commands: Any) -> None:
         "hand", metavar="FILE|NAME", help="URDF, MJCF, hand description, or the name of a built-in hand"
     )
     inspect.add_argument(
-        "--picture", type=Path, metavar="out.png", help="draw it: open and closed, palm and candidates"
+        "--picture", type=Path, metavar="out.png", help="draw the hand open and closed, with palm and candidates"
     )
-    inspect.add_argument("--yaml", type=Path, metavar="out.yaml", help="write a hand description with what was found")
-    inspect.add_argument("--candidates", type=int, default=600, help="contact candidates (default 600)")
+    inspect.add_argument("--yaml", type=Path, metavar="out.yaml", help="write a hand description to edit")
+    inspect.add_argument("--candidates", type=int, default=600, help="number of contact candidates (default 600)")
 
 
 def run(options: argparse.Namespace) -> int:
@@ -137,7 +137,7 @@ def as_text(hand: HandModel) -> str:
 
 
 def as_yaml(hand: HandModel, urdf: str) -> str:
-    """Return an editable hand description in YAML. `urdf` is the path of the hand's file in it."""
+    """Return an editable hand description in YAML. `urdf` becomes its path of the hand's file."""
     lines = [f"urdf: {_quoted(urdf)}", "", "palm:", f"  link: {_quoted(hand.base_link)}"]
     lines += [f"  center: {_list(hand.palm_center)}", f"  normal: {_list(hand.palm_normal)}"]
     lines += ["", f"approach: {_list(hand.approach)}"]

@@ -19,26 +19,26 @@ def add_command(commands: Any) -> None:
     """Add this command to the parser."""
     parser = commands.add_parser("library")
     actions = parser.add_subparsers(required=True, metavar="ACTION", dest="action")
-    build = actions.add_parser("build", help="plan for meshes and add what holds; what is there already is kept")
+    build = actions.add_parser("build", help="plan for meshes and add the verified grasps; stored grasps stay")
     build.set_defaults(run=_build)
     build.add_argument("meshes", nargs="*", metavar="MESH", help="mesh files, folders of them, or shape:NAME")
-    build.add_argument("--out", type=Path, required=True, metavar="FILE", help="the library; made where there is none")
+    build.add_argument("--out", type=Path, required=True, metavar="FILE", help="the library, created if missing")
     build.add_argument("--scales", type=float, nargs="+", default=(1.0,), metavar="S", help="metres per unit of a file")
     add_planning_options(build)
-    listing = actions.add_parser("list", help="the objects of a library")
+    listing = actions.add_parser("list", help="list the objects of a library")
     listing.set_defaults(run=_list)
     listing.add_argument("library", type=Path, metavar="FILE")
 
 
 def _build(options: argparse.Namespace) -> int:
-    """Add grasps of all objects. Return the exit status: 0, 3 if an object has too few grasps, 130 if interrupted."""
+    """Add grasps of all objects. Return 0, 3 if an object has too few grasps, 130 if interrupted."""
     from graspd_core.hands.library import load_hand
     from graspd_core.library.grasp_library import GraspLibrary
     from graspd_core.mesh.shapes import object_sources
 
     config, request = planning_options(options)
     if options.verify == "none":
-        raise ConfigError("verify: 'none'; valid for a library: standard, full, hard, hard_full")
+        raise ConfigError("--verify: 'none'; valid for a library: standard, full, hard, hard_full")
     sources, hand = object_sources(options.meshes), load_hand(options.hand)
     library = GraspLibrary(options.out)
     library.create()
@@ -75,7 +75,7 @@ def _add_object(options: argparse.Namespace, library: GraspLibrary, source: str,
     _refuse_name(library, entry)
     has = len(library.grasps(entry, hand))
     if has >= options.count:
-        print(f"{entry.name}: {has} grasps are there")
+        print(f"{entry.name}: the library has {has} grasps already")
         return has
     missing = {**request, "count": options.count - has, "seed": options.seed + has}
     with Reporter() as reporter:
@@ -89,7 +89,7 @@ def _add_object(options: argparse.Namespace, library: GraspLibrary, source: str,
 def _refuse_name(library: GraspLibrary, entry: LibraryEntry) -> None:
     for other, _ in library.entries(name=entry.name):
         if other.source != entry.source and other.mesh_sha256 != entry.mesh_sha256:
-            fault = f"{entry.source}: the library {library.path} has another {entry.name!r}, of {other.source}"
+            fault = f"{entry.source}: the library {library.path} has another {entry.name!r}, from {other.source}"
             raise ConfigError(f"{fault}; give one of the files another name")
 
 

@@ -1,4 +1,4 @@
-"""`graspd methods`, `graspd presets` and `graspd metrics`: list names, each with a description of one line."""
+"""`graspd methods`, `graspd presets` and `graspd metrics`: list names with a one-line description of each."""
 
 from __future__ import annotations
 

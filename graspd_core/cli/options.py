@@ -1,4 +1,4 @@
-"""Options that several commands share: planning, clouds from files or bags, restrictions. Also prints summaries."""
+"""Options that several commands share: planning, clouds from files or bags, restrictions. Also summaries of results."""
 
 from __future__ import annotations
 
@@ -46,25 +46,25 @@ def add_plugin_option(parser: argparse._ActionsContainer) -> None:
 
 def add_planning_options(parser: argparse.ArgumentParser) -> None:
     """Add the options for hand, grasps, method, trials, and the object's mass and friction."""
-    parser.add_argument("--hand", default="allegro_right", metavar="NAME|PATH", help="graspd hands lists the names")
-    parser.add_argument("-n", "--count", type=int, default=16, help="verified grasps wanted (default 16)")
-    parser.add_argument("--method", default=None, metavar="NAME", help="instead of the preset's, at its defaults")
+    parser.add_argument("--hand", default="allegro_right", metavar="NAME|PATH", help="a hand (see graspd hands)")
+    parser.add_argument("-n", "--count", type=int, default=16, help="number of verified grasps (default 16)")
+    parser.add_argument("--method", default=None, metavar="NAME", help="replace the preset's method, with defaults")
     add_plugin_option(parser)
     parser.add_argument("--preset", default="balanced", help=f"{', '.join(preset_names())}, or a .yaml file")
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument(
         "--mass", type=float, default=None, metavar="KG",
-        help="of the object; by default the most that a thing of its volume may weigh",
+        help="mass of the object; by default the most that an object of its volume may weigh",
     )  # fmt: skip
-    parser.add_argument("--friction", type=float, default=0.6, metavar="MU", help="default 0.6")
+    parser.add_argument("--friction", type=float, default=0.6, metavar="MU", help="friction coefficient (default 0.6)")
     parser.add_argument(
-        "--deadline", type=float, default=None, metavar="SEC", help="end with what there is then; loading counts"
+        "--deadline", type=float, default=None, metavar="SEC", help="time limit, with loading; keeps the grasps so far"
     )
     parser.add_argument("--verify", choices=VERIFICATIONS, default="standard")
-    parser.add_argument("--robust", action="store_true", help="grasps that hold out of place too come first")
-    parser.add_argument("--least-friction", action="store_true", help="measure at how little friction each still holds")
+    parser.add_argument("--robust", action="store_true", help="rank grasps first that hold with a misplaced hand")
+    parser.add_argument("--least-friction", action="store_true", help="measure the least friction for each grasp")
     parser.add_argument("--device", default="cpu", help="torch device of the optimiser")
-    parser.add_argument("--threads", type=int, default=1, help="of the optimiser and the trials (default 1)")
+    parser.add_argument("--threads", type=int, default=1, help="threads of optimiser and trials (default 1)")
 
 
 def planning_options(options: argparse.Namespace) -> tuple[PlanConfig, dict[str, Any]]:
@@ -79,7 +79,7 @@ def planning_options(options: argparse.Namespace) -> tuple[PlanConfig, dict[str,
     request = {key: getattr(options, key) for key in ("count", "seed", "verify", "device")}
     check_request(**request, deadline=options.deadline)
     if options.threads < 1:
-        raise ConfigError(f"threads: {options.threads}; valid: 1 or more")
+        raise ConfigError(f"--threads: {options.threads}; valid: 1 or more")
     torch.set_num_threads(options.threads)
     config = load_preset(options.preset)
     if options.method:
@@ -91,7 +91,7 @@ def planning_options(options: argparse.Namespace) -> tuple[PlanConfig, dict[str,
 
 
 def not_loaded(options: argparse.Namespace, config: PlanConfig, began: float) -> GraspResult:
-    """Return the result if the deadline passed while loading, which began at `began` (`time.perf_counter()`)."""
+    """Return the result of a run whose deadline passed while loading. `began` is its start by `time.perf_counter()`."""
     taken = time.perf_counter() - began
     return GraspResult(Outcome.DEADLINE, (), Timing(load=taken, total=taken), options.seed, config.method)
 
@@ -145,12 +145,12 @@ MOST_VIEWS = 100
 
 def add_bag_options(parser: argparse.ArgumentParser) -> None:
     """Add the options that choose the messages of a bag and the frame of their clouds."""
-    parser.add_argument("--topic", default=None, help="of clouds or depth images, where a bag has several")
-    parser.add_argument("--camera-info", default=None, metavar="TOPIC", help="of the depth images' camera")
-    parser.add_argument("--frame", default=None, help="put clouds into this frame by the bag's /tf and /tf_static")
-    parser.add_argument("--sensor-frame", default="", metavar="FRAME", help="of the clouds' camera, in the bag's /tf")
-    parser.add_argument("--every", type=int, default=1, metavar="N", help="take one cloud of N")
-    parser.add_argument("--limit", type=int, default=None, metavar="N", help="end after N clouds")
+    parser.add_argument("--topic", default=None, help="topic of the clouds or depth images, if a bag has several")
+    parser.add_argument("--camera-info", default=None, metavar="TOPIC", help="CameraInfo of the depth images")
+    parser.add_argument("--frame", default=None, help="transform clouds to this frame by the bag's /tf and /tf_static")
+    parser.add_argument("--sensor-frame", default="", metavar="FRAME", help="frame of the clouds' camera in /tf")
+    parser.add_argument("--every", type=int, default=1, metavar="N", help="use every N-th cloud")
+    parser.add_argument("--limit", type=int, default=None, metavar="N", help="use at most N clouds")
 
 
 def add_object_options(parser: argparse.ArgumentParser, *, any_object: bool = False) -> None:
@@ -160,19 +160,19 @@ def add_object_options(parser: argparse.ArgumentParser, *, any_object: bool = Fa
     """
     which = parser.add_mutually_exclusive_group()
     if any_object:
-        which.add_argument("--any", action="store_true", help="the object of all seen that has the surest grasp")
+        which.add_argument("--any", action="store_true", help="choose the object with the surest grasp")
     which.add_argument(
         "--target", type=float, nargs=3, default=None, metavar=("X", "Y", "Z"),
-        help="a point on the object, in metres; else what is nearest the axis of view",
+        help="a point on the object [m]; by default the object nearest the camera's axis",
     )  # fmt: skip
-    which.add_argument("--alone", action="store_true", help="the clouds show the object and nothing else")
+    which.add_argument("--alone", action="store_true", help="the clouds show only the object")
     parser.add_argument(
         "--view-point", type=float, nargs=3, default=None, metavar=("X", "Y", "Z"),
-        help="where the camera of a cloud stood, in metres in the cloud's frame; else at the origin",
+        help="position of a cloud's camera in the cloud's frame [m] (default: the origin)",
     )  # fmt: skip
     parser.add_argument(
         "--scene", type=Path, default=None, metavar="FILE.yaml",
-        help="settings of segmentation, reconstruction and obstacles (docs/clouds.md)",
+        help="settings for segmentation, reconstruction and obstacles (docs/clouds.md)",
     )  # fmt: skip
 
 
@@ -180,7 +180,7 @@ def add_camera_option(parser: argparse.ArgumentParser) -> None:
     """Add `--camera`, the camera of a depth image."""
     parser.add_argument(
         "--camera", type=Path, default=None, metavar="camera.json",
-        help="that took the depth image (png, tiff, npy, npz): width, height, K (docs/clouds.md)",
+        help="camera of the depth image (png, tiff, npy, npz): width, height, K (docs/clouds.md)",
     )  # fmt: skip
 
 
@@ -205,10 +205,10 @@ def plan_any_object(
     source: str,
     **request: Any,
 ) -> tuple[GraspResult, Scene, dict[str, Any]]:
-    """Plan for any object that the views show (`--any`). Return result, scene, and JSON entries about all objects.
+    """Plan for any object in the views (`--any`). Return result, scene, and JSON entries about all objects.
 
     Args:
-        source: name of the views, for messages.
+        source: name of the views in messages.
         request: keyword arguments of `plan_grasps`.
 
     Raises GraspdError: the views are unusable, or show no object.
@@ -230,7 +230,7 @@ def check_bag_options(options: argparse.Namespace) -> None:
     for name in ("every", "limit"):
         value = getattr(options, name)
         if value is not None and value < 1:
-            raise ConfigError(f"{name}: {value} clouds; valid: 1 or more")
+            raise ConfigError(f"--{name}: {value} clouds; valid: 1 or more")
 
 
 def bag_views(path: Path, options: argparse.Namespace) -> Iterator[tuple[BagFrame, PointCloud | str]]:
@@ -266,7 +266,7 @@ def merged_views(path: Path, options: argparse.Namespace) -> tuple[PointCloud, .
     """Return the chosen clouds as views of one scene. Print the number of unusable clouds on stderr.
 
     Raises BagError: nothing can be read, no cloud is usable, the clouds are in several frames, or there are too many
-    clouds without --limit.
+    clouds and no --limit.
     """
     views, names, refusals = [], set(), []
     for frame, seen in bag_views(path, options):
@@ -281,7 +281,7 @@ def merged_views(path: Path, options: argparse.Namespace) -> tuple[PointCloud, .
         raise BagError(f"{path}: {refusals[0]}")
     if refusals:
         count = len(views) + len(refusals)
-        print_note(f"{len(refusals)} of {count} clouds left out, the first {refusals[0]}")
+        print_note(f"{len(refusals)} of {count} clouds are left out, the first: {refusals[0]}")
     if len(names) > 1:
         raise BagError(f"{path}: clouds in several frames ({', '.join(sorted(names))}); name one with --frame")
     return tuple(views)
@@ -304,21 +304,21 @@ def add_restriction_options(parser: argparse.ArgumentParser) -> None:
     group = parser.add_argument_group("steering (docs/usage.md)")
     group.add_argument(
         "--approach", type=float, nargs=3, default=None, metavar=("X", "Y", "Z"),
-        help="direction that the hand moves in towards the object",
+        help="direction in which the hand moves towards the object",
     )  # fmt: skip
-    group.add_argument("--approach-angle", type=float, default=None, metavar="DEG", help="either way (default 30)")
-    group.add_argument("--roll", type=float, default=None, metavar="DEG", help="of the hand about its approach")
-    group.add_argument("--roll-tolerance", type=float, default=None, metavar="DEG", help="either way (default 15)")
+    group.add_argument("--approach-angle", type=float, default=None, metavar="DEG", help="tolerance (default 30)")
+    group.add_argument("--roll", type=float, default=None, metavar="DEG", help="angle of the hand about its approach")
+    group.add_argument("--roll-tolerance", type=float, default=None, metavar="DEG", help="tolerance (default 15)")
     group.add_argument(
         "--region", nargs="+", default=None, metavar="REGION",
-        help=f"where contacts may be: {_FORMS}: a cloud of points and how near to them [m]",
+        help=f"where contacts may be: {_FORMS} (a cloud, and the distance from it) [m]",
     )  # fmt: skip
     group.add_argument(
         "--avoid", type=float, nargs=6, action="append", default=[], metavar=("X", "Y", "Z", "SX", "SY", "SZ"),
-        help="a box that no link enters: middle and edges [m]; may be given again",
+        help="a box that no link enters: centre and edge lengths [m] (repeatable)",
     )  # fmt: skip
     parser.add_argument(
-        "--arm", default=None, metavar="NAME|FILE", help="only grasps that this arm reaches (docs/arms.md)"
+        "--arm", default=None, metavar="NAME|FILE", help="find only grasps that this arm reaches (docs/arms.md)"
     )
     parser.add_argument(
         "--arm-base",
@@ -326,7 +326,7 @@ def add_restriction_options(parser: argparse.ArgumentParser) -> None:
         nargs="+",
         default=None,
         metavar="N",
-        help="where the arm's base stands, in the object's or the cloud's frame: X Y Z [QW QX QY QZ]",
+        help="pose of the arm's base in the object's or the cloud's frame: X Y Z [QW QX QY QZ]",
     )
 
 
@@ -386,14 +386,14 @@ def _reach(options: argparse.Namespace) -> tuple[Reach, ...]:
     if options.arm is None and options.arm_base is None:
         return ()
     if options.arm is None:
-        raise ConfigError("--arm-base: arm missing; give --arm NAME or --arm FILE")
+        raise ConfigError("--arm-base: no arm is given; give --arm NAME or --arm FILE")
     from graspd_core.arms.arm import load_arm
     from graspd_core.arms.reach import Reach
 
     arm, base = load_arm(options.arm), options.arm_base
     if base is None:
         raise ConfigError(
-            "--arm: base pose missing; give --arm-base X Y Z or X Y Z QW QX QY QZ, in metres, "
+            "--arm: no base pose is given; give --arm-base X Y Z or X Y Z QW QX QY QZ, in metres, "
             "in the object's or cloud's frame"
         )
     if len(base) not in (3, 7):
@@ -405,5 +405,5 @@ def _reach(options: argparse.Namespace) -> tuple[Reach, ...]:
 
 def add_address(parser: argparse.ArgumentParser) -> None:
     """Add `--host` and `--port`, the address of a served page."""
-    parser.add_argument("--host", default="127.0.0.1", help="who may come: by default this machine alone")
-    parser.add_argument("--port", type=int, default=8080, help="or the next that is free (default 8080)")
+    parser.add_argument("--host", default="127.0.0.1", help="address to serve at (default: for this machine only)")
+    parser.add_argument("--port", type=int, default=8080, help="port, or the next free one (default 8080)")

@@ -1,4 +1,4 @@
-"""Output of commands: results on stdout, errors, notes and progress on stderr. Also the options `--quiet` and `--json`.
+"""Output of commands: results on stdout, messages and progress on stderr. Also the options `--quiet` and `--json`.
 
 Output has no colours. Progress bars appear only on a terminal.
 """
@@ -28,7 +28,7 @@ _PATIENCE = 1.0
 
 @dataclass(frozen=True)
 class _OutputSettings:
-    """Output settings of the running command: whether notes are hidden, and the stream for JSON, None for text."""
+    """Output settings of the running command: whether notes are hidden, and the stream for JSON (None for text)."""
 
     quiet: bool = False
     document_to: Any = None
@@ -40,9 +40,9 @@ _settings = _OutputSettings()
 def add_output_options(parser: argparse.ArgumentParser) -> None:
     """Add `--quiet`, and `--json` unless the parser's default for `json` is False."""
     # There is no default, because a subcommand's default would overwrite the option given before it.
-    parser.add_argument("--quiet", action="store_true", default=argparse.SUPPRESS, help="errors and the result only")
+    parser.add_argument("--quiet", action="store_true", default=argparse.SUPPRESS, help="only errors and the result")
     if parser.get_default("json") is None:
-        text = "the result as one JSON document on stdout"
+        text = "print the result as one JSON document on stdout"
         parser.add_argument("--json", action="store_true", default=argparse.SUPPRESS, help=text)
 
 
@@ -103,7 +103,7 @@ def _draws() -> bool:
 
 @contextmanager
 def busy(what: str) -> Iterator[None]:
-    """Show on a terminal how long the work inside the context has taken, if it takes longer than 1 s."""
+    """Show on a terminal how long the work inside the context takes, once it takes over 1 s."""
     began, ended = time.time(), threading.Event()
     if not _draws():
         yield

@@ -23,7 +23,7 @@ def add_command(commands: Any) -> None:
     """Add this command to the parser."""
     parser = commands.add_parser("reconstruct")
     parser.set_defaults(run=run)
-    parser.add_argument("cloud", metavar="CLOUD_OR_BAG", type=Path, help="cloud, depth image; of a bag its first cloud")
+    parser.add_argument("cloud", metavar="CLOUD_OR_BAG", type=Path, help="cloud, depth image, or bag (its first cloud)")
     add_camera_option(parser)
     add_object_options(parser)
     add_bag_options(parser)

@@ -58,16 +58,16 @@ def add_command(commands: Any) -> None:
     """Add this command to the parser."""
     parser = commands.add_parser("replay")
     parser.set_defaults(run=run)
-    parser.add_argument("bag", metavar="BAG", type=Path, help="a directory, or a file .mcap or .db3")
+    parser.add_argument("bag", metavar="BAG", type=Path, help="a directory, or a .mcap or .db3 file")
     add_bag_options(parser)
-    parser.add_argument("--fuse", action="store_true", help="take all clouds as views of one scene")
+    parser.add_argument("--fuse", action="store_true", help="use all clouds as views of one scene")
     add_object_options(parser, any_object=True)
     add_planning_options(parser)
-    parser.add_argument("--out", type=Path, default=None, metavar="DIR", help="or a .json file for a single result")
+    parser.add_argument("--out", type=Path, default=None, metavar="DIR", help="folder, or .json file for one result")
 
 
 def run(options: argparse.Namespace) -> int:
-    """Plan on every cloud. Return the exit status: 0 all have enough grasps, 3 fewer, 2 none usable, 130 stopped."""
+    """Plan on every cloud. Return 0 if all have enough grasps, 3 for fewer, 2 for no usable cloud, 130 if stopped."""
     from graspd_core.hands.library import load_hand
     from graspd_core.io.grasps_json import check_writable
 
@@ -76,7 +76,7 @@ def run(options: argparse.Namespace) -> int:
     settings = scene_config_of(options)
     single = options.out is not None and options.out.suffix == ".json"
     if single and not (options.fuse or options.limit == 1):
-        raise ConfigError(f"--out {options.out}: one file for many clouds; give a directory, or --limit 1, or --fuse")
+        raise ConfigError(f"--out {options.out}: one file for several clouds; give a directory, --limit 1, or --fuse")
     if options.out:
         check_writable(options.out if single else options.out / "probe")
     hand = load_hand(options.hand)

@@ -26,7 +26,7 @@ _ENDS = (signal.SIGINT, signal.SIGTERM)
 
 
 class Interrupt:
-    """Context for Ctrl-C and SIGTERM. The first signal ends the run with its result so far, the second the process."""
+    """Context for Ctrl-C and SIGTERM. The first signal ends the run and keeps its result. A second ends the process."""
 
     def __init__(self) -> None:
         self._event = threading.Event()
@@ -61,13 +61,13 @@ class DeadlinePassed(BaseException):
 
 
 class Deadline:
-    """Deadline `seconds` after `began`, a `time.perf_counter()` value. It never passes if `seconds` is None."""
+    """Deadline `seconds` after `began`, a `time.perf_counter()` value. Without `seconds` it never passes."""
 
     def __init__(self, seconds: float | None, began: float) -> None:
         self._end = None if seconds is None else began + seconds
 
     def left(self) -> float | None:
-        """Return the remaining time [s], always above 0. None without a deadline."""
+        """Return the remaining time [s], always above 0, or None without a deadline."""
         return None if self._end is None else max(self._end - time.perf_counter(), 1e-9)
 
     @contextmanager
@@ -93,7 +93,7 @@ class Deadline:
 
 @contextmanager
 def _alarm(end: float) -> Iterator[None]:
-    """Raise DeadlinePassed in the main thread at `end`. Raise it again if a library catches it."""
+    """Raise DeadlinePassed in the main thread at `end`, and again if a library catches it."""
     armed = True
 
     def passed(number: int, frame: FrameType | None) -> None:
@@ -116,7 +116,7 @@ def _alarm(end: float) -> Iterator[None]:
 
 
 def process_began() -> float:
-    """Return the start time of this process, a `time.perf_counter()` value. If it is unknown, return the time now."""
+    """Return the start time of this process, a `time.perf_counter()` value. If unknown, return the time now."""
     now = time.perf_counter()
     try:
         # The start time is field 22. Field 2, the program's name in brackets, may contain blanks.

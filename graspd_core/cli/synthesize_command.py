@@ -42,18 +42,18 @@ def add_command(commands: Any) -> None:
     """Add this command to the parser."""
     parser = commands.add_parser("synthesize")
     parser.set_defaults(run=run)
-    parser.add_argument("object", metavar="OBJECT", help="mesh, cloud or depth image, or shape:NAME")
+    parser.add_argument("object", metavar="OBJECT", help="mesh, cloud, depth image, or shape:NAME")
     add_planning_options(parser)
     add_camera_option(parser)
     add_object_options(parser, any_object=True)
     add_restriction_options(parser)
     sizes = parser.add_mutually_exclusive_group()
-    sizes.add_argument("--scale", type=float, default=1.0, metavar="S", help="metres per unit of the file or the depth")
+    sizes.add_argument("--scale", type=float, default=1.0, metavar="S", help="metres per unit of file or depth")
     sizes.add_argument("--units", choices=tuple(_UNITS), default=None, help="unit of the file's coordinates")
-    parser.add_argument("--out", type=Path, default=None, metavar="grasps.json", help="the grasps (docs/format.md)")
-    parser.add_argument("--html", type=Path, default=None, metavar="view.html", help="a page that shows them")
-    parser.add_argument("--picture", type=Path, default=None, metavar="grasp.png", help="the best grasp, drawn")
-    parser.add_argument("--view", action="store_true", help="watch it in a browser (docs/viewer.md)")
+    parser.add_argument("--out", type=Path, default=None, metavar="grasps.json", help="grasps file (docs/format.md)")
+    parser.add_argument("--html", type=Path, default=None, metavar="view.html", help="write a page with the grasps")
+    parser.add_argument("--picture", type=Path, default=None, metavar="grasp.png", help="draw the best grasp")
+    parser.add_argument("--view", action="store_true", help="show the run in a browser (docs/viewer.md)")
     add_address(parser)
 
 
@@ -113,14 +113,14 @@ def run(options: argparse.Namespace) -> int:
 
 
 def _any_object(options: argparse.Namespace, config: PlanConfig, request: dict[str, Any], deadline: Deadline) -> int:
-    """Plan for any object of a cloud, and report like `run`. Raises ConfigError: it is a mesh, or `--view` is given."""
+    """Plan for any object of a cloud, and report like `run`. Raises ConfigError: no cloud is given, or `--view` is."""
     from graspd_core.hands.library import load_hand
     from graspd_core.perception.cloud.cloud_files import is_cloud_file
     from graspd_core.perception.cloud.depth_files import is_depth_image
     from graspd_core.perception.load_scene import scaled_views
 
     if options.view:
-        raise ConfigError("--any: --view is given too; give one of them")
+        raise ConfigError("--any: --view is given too; remove one of them")
     if not (options.camera or is_depth_image(options.object) or is_cloud_file(options.object)):
         raise ConfigError(f"--any: given with {options.object}; valid with clouds and depth images of several objects")
     scale = _UNITS[options.units] if options.units else options.scale
@@ -163,7 +163,7 @@ def _report(
     different = len(distinct(result.grasps[: good_grasps(result)], hand))
     print(summary(result, options.count, different))
     if options.out:
-        print(f"written: {options.out}; to look at it: graspd view {shlex.quote(str(options.out))}")
+        print(f"written: {options.out}; show it: graspd view {shlex.quote(str(options.out))}")
     if options.html:
         print(f"written: {options.html}: the grasps, for any browser")
     if options.picture:

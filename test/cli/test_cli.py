@@ -50,18 +50,18 @@ BAD_OPTIONS: list[tuple[list[str], str]] = [
     (["--scale", "2", "--units", "mm"], "not allowed with argument"),
     (["--any", "--alone"], "not allowed with argument"),
     (["--any"], "--any: given with shape:box; valid with clouds and depth images of several objects"),
-    (["--any", "--view"], "--any: --view is given too; give one of them"),
+    (["--any", "--view"], "--any: --view is given too; remove one of them"),
     (["--verify", "gently"], "invalid choice: 'gently' (choose from"),
     (["--picture", "grasp.jpg"], "--picture grasp.jpg; valid: a file name that ends in .png"),
-    (["--threads", "0"], "threads: 0; valid: 1 or more"),
+    (["--threads", "0"], "--threads: 0; valid: 1 or more"),
     (["--approach-angle", "20"], "--approach-angle needs --approach"),
     (["--roll-tolerance", "20"], "--roll-tolerance needs --roll"),
     (["--region", "cube", "0"], "--region: cube 0; valid: box X Y Z SX SY SZ"),
     (["--region", "box", "0", "0", "0"], "--region: box 0 0 0; valid: box X Y Z SX SY SZ, sphere X Y Z R, or FILE [R]"),
     (["--region", "sphere", "0", "0", "0", "wide"], "--region: sphere 0 0 0 wide; valid: box"),
-    (["--arm", "ur5e_like"], "--arm: base pose missing; give --arm-base X Y Z or X Y Z QW QX QY QZ, in metres"),
+    (["--arm", "ur5e_like"], "--arm: no base pose is given; give --arm-base X Y Z or X Y Z QW QX QY QZ, in metres"),
     (["--arm", "ur5e_like", "--arm-base", "1", "0", "0", "1"], "--arm-base: 4 numbers; valid"),
-    (["--arm-base", "1", "0", "0"], "--arm-base: arm missing; give --arm NAME"),
+    (["--arm-base", "1", "0", "0"], "--arm-base: no arm is given; give --arm NAME"),
     (["--frobnicate"], "unrecognized arguments: --frobnicate"),
     (["--preste", "fast"], "unrecognized arguments: --preste fast; did you mean --preset?"),
     (["--hand", "alegro_right"], "unknown hand 'alegro_right'; did you mean 'allegro_right'?"),
@@ -375,7 +375,7 @@ def test_clouds_can_be_views_of_one_scene(bags, tmp_path, capsys, quick):
     assert printed.startswith("2 clouds fused: ")
     assert np.abs(load_document(out)["object"]["center_of_mass"]).max() < 0.01
     # The empty image between the two is no view of anything.
-    assert "graspd: 1 of 3 clouds left out, the first cloud 1: depth image: none of its" in said
+    assert "graspd: 1 of 3 clouds are left out, the first: cloud 1: depth image: none of its" in said
     assert main(["replay", str(bags["hopeless"]), "--fuse", *quick]) == EXIT_BAD_INPUT
     assert "cloud 0: the cloud has no finite point" in the_line(capsys)
 
@@ -449,9 +449,9 @@ def test_a_target_that_is_not_there_is_an_answer_and_no_bad_input(bags, capsys, 
 @pytest.mark.parametrize(
     ("options", "culprit"),
     [
-        (["--every", "0"], "every: 0 clouds; valid: 1 or more"),
-        (["--limit", "0"], "limit: 0 clouds; valid: 1 or more"),
-        (["--out", "one.json"], "one.json: one file for many clouds; give a directory, or --limit 1, or --fuse"),
+        (["--every", "0"], "--every: 0 clouds; valid: 1 or more"),
+        (["--limit", "0"], "--limit: 0 clouds; valid: 1 or more"),
+        (["--out", "one.json"], "one.json: one file for several clouds; give a directory, --limit 1, or --fuse"),
         (["--target", "0", "0", "0", "--alone"], "not allowed with argument"),
     ],
 )
@@ -488,7 +488,7 @@ def test_a_library_is_built_gone_on_with_and_listed(tmp_path: Path, capsys: pyte
     assert "sphere: 2 of 2 grasps" in capsys.readouterr().out
     assert build(out, "shape:sphere", "--scales", "1", "0.9") == 0
     told = capsys.readouterr().out
-    assert "sphere: 2 grasps are there" in told
+    assert "sphere: the library has 2 grasps already" in told
     assert "sphere@0.9: 2 of 2 grasps" in told
     assert main(["library", "list", str(out)]) == 0
     rows = capsys.readouterr().out.splitlines()
@@ -515,7 +515,7 @@ def test_an_object_that_would_go_by_the_name_of_another_is_refused(tmp_path: Pat
     assert build(out, str(tmp_path / "a" / "ball.obj")) == 0
     assert build(out, str(tmp_path / "b" / "ball.obj")) == 2
     told = capsys.readouterr().err
-    assert "has another 'ball', of" in told
+    assert "has another 'ball', from" in told
     assert "give one of the files another name" in told
 
 
@@ -524,7 +524,7 @@ def test_an_object_that_would_go_by_the_name_of_another_is_refused(tmp_path: Pat
     [
         (["build", "shape:sphere"], "--out"),
         (["build", "shape:nothing", "--out", "new.grasps"], "shape"),
-        (["build", "shape:sphere", "--out", "new.grasps", "--verify", "none"], "verify: 'none'; valid for a library"),
+        (["build", "shape:sphere", "--out", "new.grasps", "--verify", "none"], "--verify: 'none'; valid for a library"),
         (["build", "shape:sphere", "--out", "other.grasps"], "other.grasps: damaged or not a library"),
         (["list", "none.grasps"], "none.grasps: no such file"),
         (["list", "other.grasps"], "other.grasps: damaged or not a library"),

@@ -159,7 +159,7 @@ def test_a_run_is_watched_and_its_grasps_looked_at(start, visit, tmp_path: Path)
     rest, _ = process.communicate(timeout=60)
     assert process.returncode == 0, rest
     assert "2 of 2 grasps" in rest
-    assert f"written: {out}; to look at it: graspd view {out}" in rest
+    assert f"written: {out}; show it: graspd view {out}" in rest
     assert "Traceback" not in rest
     assert out.is_file()
     page.errors.clear()  # of the connection that is gone
