@@ -87,50 +87,50 @@ def wxyz_of_matrix(T: Matrix) -> Float[np.ndarray, "4"]:
 
 
 def matrix_of_pose(pose: Pose) -> Matrix:
-    """Return a pose as a matrix. Raises TransformError if it is not finite or has no rotation."""
+    """Return a pose as a matrix. Raises TransformError if it is not finite or its quaternion has not unit length."""
     return matrix_of(array_of(pose.position), wxyz_of(pose.orientation))
 
 
 def near(point: Point, name: str, what: str = "") -> Float[np.ndarray, "3"]:
-    """Return the point [m] of the field `name`. Raises RequestError if it is not finite or not within 1 km."""
+    """Return the point [m] of the field `name`. Raises RequestError if it is not finite or over 1 km away."""
     place = array_of(point)
     if not (np.abs(place) <= _FARTHEST).all():
-        raise bad_request(f"{name}: {what}{place.tolist()}; it must be finite, within {_FARTHEST:g} m")
+        raise bad_request(f"{name}: {what}{place.tolist()}; valid: finite, within {_FARTHEST:g} m")
     return place
 
 
 def pose_matrix(pose: Pose, name: str = "object_pose") -> Matrix:
-    """Return a pose as a matrix. An all-zero quaternion means identity. Raises RequestError if it is not valid."""
+    """Return a pose as a matrix. An all-zero quaternion means no rotation. Raises RequestError if it is not valid."""
     near(pose.position, name, "position ")
     length = float(np.linalg.norm(wxyz_of(pose.orientation)))
     if length == 0:
         pose = Pose(position=pose.position)
     elif not abs(length - 1) < 0.01:
-        raise bad_request(f"{name}: a quaternion of length {length:.3g}; it must be 1 (or 0, for no turn)")
+        raise bad_request(f"{name}: its quaternion has length {length:.3g}; valid: 1, or 0 for no rotation")
     return matrix_of_pose(pose)
 
 
 def matrix_of_transform(transform: Transform) -> Matrix:
-    """Return a transform as a matrix. Raises TransformError if it is not finite or has no rotation."""
+    """Return a transform as a matrix. Raises TransformError as `matrix_of`."""
     place, turn = transform.translation, transform.rotation
     return matrix_of((place.x, place.y, place.z), (turn.w, turn.x, turn.y, turn.z))
 
 
 def matrix_of_posture(posture: Posture) -> Matrix:
-    """Return the pose of the hand's base link as a matrix. Raises TransformError if not finite or without rotation."""
+    """Return the pose of the hand's base link as a matrix. Raises TransformError as `matrix_of`."""
     return matrix_of(posture.position, posture.quaternion_wxyz)
 
 
 def matrix_of(position: Sequence[float] | np.ndarray, quaternion_wxyz: Sequence[float] | np.ndarray) -> Matrix:
-    """Return a position and a quaternion as a matrix. Raises TransformError if they are not finite or no rotation."""
+    """Return position [m] and quaternion as a matrix. Raises TransformError: not finite, or no unit quaternion."""
     px, py, pz = map(float, position)
     w, x, y, z = map(float, quaternion_wxyz)
     # Plain numbers are faster than small arrays. Robots send thousands of transforms a second.
     length = math.sqrt(x * x + y * y + z * z + w * w)
     if not (math.isfinite(px) and math.isfinite(py) and math.isfinite(pz)):
-        raise TransformError(f"position {[px, py, pz]}: not finite")
+        raise TransformError(f"position {[px, py, pz]}; valid: finite numbers")
     if not abs(length - 1) <= _ROUNDED:
-        raise TransformError(f"quaternion x y z w {[x, y, z, w]}: its length is {length:.3g}; it must be 1")
+        raise TransformError(f"quaternion x y z w {[x, y, z, w]}: its length is {length:.3g}; valid: 1")
     x, y, z, w = x / length, y / length, z / length, w / length
     return np.array(
         [
@@ -143,7 +143,7 @@ def matrix_of(position: Sequence[float] | np.ndarray, quaternion_wxyz: Sequence[
 
 
 def moved_points(points: Float[np.ndarray, "n 3"], T: Matrix) -> Float[np.ndarray, "n 3"]:
-    """Return points in another frame."""
+    """Return points [m] transformed by `T` to another frame."""
     return points @ T[:3, :3].T + T[:3, 3]
 
 
@@ -158,7 +158,7 @@ def moved_result(result: GraspResult, T_new_old: Matrix) -> GraspResult:
 
 
 def moved_grasp(grasp: Grasp, T: Matrix) -> Grasp:
-    """Return a grasp in another frame."""
+    """Return a grasp transformed by `T` to another frame."""
     return replace(
         grasp,
         pregrasp=_moved_posture(grasp.pregrasp, T),
@@ -170,7 +170,7 @@ def moved_grasp(grasp: Grasp, T: Matrix) -> Grasp:
 
 
 def moved_plane(plane: Plane, T: Matrix) -> Plane:
-    """Return a plane in another frame."""
+    """Return a plane transformed by `T` to another frame."""
     normal = T[:3, :3] @ plane.normal
     return replace(plane, normal=normal, offset=plane.offset + float(normal @ T[:3, 3]))
 

@@ -15,20 +15,20 @@ class ErrorCode(StrEnum):
     BAD_REQUEST = "BAD_REQUEST"  # a field is out of range or unknown
     BAD_MESH = "BAD_MESH"  # the mesh cannot be read, used or reached
     BAD_CLOUD = "BAD_CLOUD"  # the cloud or depth image cannot be read or shows no usable object
-    BAD_LIBRARY = "BAD_LIBRARY"  # grasp_library is torn, of another version, locked or gone
-    NO_OBJECT = "NO_OBJECT"  # the scene does not contain the object asked for
+    BAD_LIBRARY = "BAD_LIBRARY"  # grasp_library is damaged, of another version, locked or missing
+    NO_OBJECT = "NO_OBJECT"  # the scene does not contain the requested object
     NO_CLOUD = "NO_CLOUD"  # LATEST_CLOUD without a received cloud, or VIEWS without a stored view
     STALE_CLOUD = "STALE_CLOUD"  # the cloud is older than cloud_max_age
     NO_TRANSFORM = "NO_TRANSFORM"  # /tf does not connect the frames
-    WRONG_HAND = "WRONG_HAND"  # another hand than the node's
+    WRONG_HAND = "WRONG_HAND"  # the request names another hand than the node's
     NOT_FOUND = "NOT_FOUND"  # a cancel names no waiting or running request
-    DUPLICATE_ID = "DUPLICATE_ID"  # a request of this id is waiting or running
+    DUPLICATE_ID = "DUPLICATE_ID"  # a request with this id is waiting or running
     BUSY = "BUSY"  # refused under busy_policy, or the queue is full
     SHUTTING_DOWN = "SHUTTING_DOWN"  # the node is ending
     CANCELLED = "CANCELLED"  # by ~/cancel, ~/reset, the action's client or the node's end
     SUPERSEDED = "SUPERSEDED"  # a newer request took its place
-    DEADLINE = "DEADLINE"  # time_budget passed before as many grasps as asked for were found
-    NO_GRASP = "NO_GRASP"  # fewer grasps than asked for, or none, held in the trial
+    DEADLINE = "DEADLINE"  # time_budget passed before enough grasps were found
+    NO_GRASP = "NO_GRASP"  # fewer grasps than requested passed the trials, or none
     OUT_OF_MEMORY = "OUT_OF_MEMORY"
     INTERNAL = "INTERNAL"  # a fault of graspd: the node's log has the traceback
 
@@ -64,7 +64,7 @@ def code_of(error: BaseException) -> ErrorCode:
     """Return the code of the error that ended a request."""
     if isinstance(error, RequestError):
         return error.code
-    if isinstance(error, RuntimeError) and "allocate memory" in str(error):  # torch's way of saying it
+    if isinstance(error, RuntimeError) and "allocate memory" in str(error):  # torch's error for too little memory
         return ErrorCode.OUT_OF_MEMORY
     return next((code for kind, code in _CODES if isinstance(error, kind)), ErrorCode.INTERNAL)
 

@@ -55,11 +55,11 @@ from graspd_ros.request import Listener, Request
 from graspd_ros.request_planner import PATIENCE, Planned, Planner, overdue
 from graspd_ros.worker import BusyPolicy, StopHook, Worker
 
-GOAL_PATIENCE = 0.3  # seconds that the executor has at shutdown to end all goals
+GOAL_PATIENCE = 0.3  # seconds for the executor to end all goals at shutdown
 RESULT_PATIENCE = 0.05  # seconds from then until the last result is sent
-IMAGES = "depth images"  # key in `missing` of images without a matching CameraInfo. The other keys are topic names
+IMAGES = "depth images"  # key in `missing` for images without a matching CameraInfo. Other keys are topic names
 OVERDUE_PERIOD = 0.25  # seconds between two checks for waiting requests whose deadline passed
-# Even a reliable reader keeps only its newest messages. A burst must fit in, or requests are lost unanswered.
+# Even a reliable reader keeps only its newest messages. A burst of requests must fit, or some get no answer.
 REQUEST_DEPTH = 500
 THINGS_DEPTH = 500  # a planning scene arrives in one burst
 RESULT_TIMEOUT = 60  # seconds for which results are kept for clients. rclpy's 900 s need much memory
@@ -68,7 +68,7 @@ RESULT_TIMEOUT = 60  # seconds for which results are kept for clients. rclpy's 9
 class GraspNode(Node):
     """ROS node that receives objects and answers with grasps.
 
-    It calls `on_failure` if its warm-up fails. Raises GraspdError if the hand or a parameter is unusable.
+    The node calls `on_failure` if its warm-up fails. Raises GraspdError if the hand or a parameter is unusable.
     """
 
     def __init__(self, on_failure: Callable[[], None]) -> None:
@@ -344,7 +344,7 @@ def _collision_object() -> type:
 
 
 class SynthesizeMessages:
-    """Feedback and result messages of a goal of `~/synthesize`."""
+    """Makes the feedback and result messages of a goal of `~/synthesize`."""
 
     def progressed(self, message: GraspProgress) -> SynthesizeGrasps.Feedback:
         return SynthesizeGrasps.Feedback(progress=message)
@@ -364,12 +364,12 @@ class GoalServer:
     """Action server whose goals are handled like other requests.
 
     An invalid goal is accepted and aborted at once, so that the client gets the reason. No method blocks. The worker
-    decides when a goal starts and ends, and the executor carries it out.
+    decides when a goal starts and ends. The executor sends this to the client.
 
     Args:
         make_messages: makes the message converter of a new goal, for example `SynthesizeMessages`.
         submit: submits a goal's request with its listener and returns the request's id.
-        cancel: cancels a request by id and returns True if there was one.
+        cancel: cancels the request with an id and returns True if there was one.
     """
 
     def __init__(

@@ -27,7 +27,7 @@ from graspd_ros.request import Listener, Request
 
 
 class PlanningMessages:
-    """Feedback and result of a goal of GraspPlanning: the grasps found so far, then all of them."""
+    """Makes feedback and result of a goal of GraspPlanning: the grasps found so far, then all grasps."""
 
     def __init__(self, hand: HandModel) -> None:
         self._hand = hand
@@ -36,7 +36,7 @@ class PlanningMessages:
         self._up: tuple[str, tuple[float, float, float]] | None = None
 
     def watching(self, request: Request, goal: Any) -> Request:
-        """Return the goal's request and store the object the hand may touch. Loading also stores the up direction."""
+        """Return the goal's request. Store the object that the hand may touch and, on loading, the up direction."""
         self._touch = (goal.object.name,) if goal.object.name else ()
 
         def loaded() -> Scene:
@@ -58,7 +58,7 @@ class PlanningMessages:
         return GraspPlanning.Feedback(grasps=list(self._found))
 
     def result(self, message: GraspArray) -> GraspPlanning.Result:
-        """Return the grasps that failed no trial and have an arrival posture, best first. Uncertainty is not stated."""
+        """Return the grasps that failed no trial and have an arrival posture, best first."""
         good = [grasp for grasp in message.grasps if all(trial.passed for trial in grasp.trials)]
         return GraspPlanning.Result(grasps=[self._grasp(grasp) for grasp in good if grasp.arrival_joints.name])
 
@@ -78,9 +78,9 @@ class PlanningMessages:
 def request_from_goal(
     builder: RequestBuilder, hand: str, request_id: str, settings: Settings, goal: Any, listener: Listener | None = None
 ) -> Request:
-    """Return a goal's request. Raises GraspdError if it is for another hand or its object has no usable shape."""
+    """Return a goal's request. Raises GraspdError if the goal names another hand or its object has no usable shape."""
     if goal.group_name not in ("", hand):
-        fault = f"group_name: {goal.group_name[:128]!r} is no hand here; this node plans for {hand!r}"
+        fault = f"group_name: unknown hand {goal.group_name[:128]!r}; this node plans for {hand!r}"
         raise RequestError(ErrorCode.WRONG_HAND, fault)
     target = goal.object
     plane = plane_of(target.surface)
@@ -90,10 +90,10 @@ def request_from_goal(
         return builder.from_loader(request_id, header, settings, load, listener)
     cluster = target.point_cluster
     if not cluster.data:
-        raise bad_message("object", "no meshes, no primitives and no point_cluster; give one of them")
+        raise bad_message("object", "it has no meshes, primitives or point_cluster; give one of these")
     header = cluster.header if cluster.header.frame_id else target.header
     if plane is not None and target.header.frame_id not in ("", header.frame_id):
-        fault = f"surface: in {target.header.frame_id!r}, the point_cluster in {header.frame_id!r}; give one frame"
+        fault = f"surface: frame {target.header.frame_id!r}, but point_cluster has {header.frame_id!r}; give one frame"
         raise bad_message("object", fault)
     request = builder.from_cluster(request_id, replace(settings, segment=False), cluster, header, listener)
     return replace(request, load=with_support(request.load, plane))

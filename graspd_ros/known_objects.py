@@ -1,4 +1,4 @@
-"""Answers from a library of grasps. Missing grasps are planned, as are grasps under restrictions or near obstacles."""
+"""Answers from a library of grasps. If the library has too few valid grasps, more are planned."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from graspd_ros.request_planner import unlike
 
 
 def find_entry(known: KnownObject, settings: Settings, hand: HandModel | None) -> LibraryEntry | None:
-    """Return the library's entry for a request. `hand` None matches any hand. None if an optional entry is missing.
+    """Return the library's entry for a request, for any hand if `hand` is None. None if an optional entry is missing.
 
     Raises GraspdError if a required entry is missing or the library cannot be read.
     """
@@ -58,7 +58,7 @@ def answer_known(
     restrictions: Sequence[Steering | Reach],
     **plan: Any,
 ) -> tuple[GraspResult, Scene | None]:
-    """Return grasps that differ from the excluded poses, and the scene, or None if it was not loaded.
+    """Return grasps that differ from the excluded poses, and the scene (None if not loaded).
 
     If the library has too few grasps, more are planned. Raises GraspdError as `find_entry`, loading and planning do.
     """

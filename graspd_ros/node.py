@@ -1,4 +1,4 @@
-"""Process of the node: start, wait for a signal, clean shutdown. It also holds code that the other commands share.
+"""Process of the node: start, wait for a signal, clean shutdown. Other ROS commands share its code.
 
 This module handles Ctrl-C and SIGTERM itself, before the slow imports, so that they never cause a traceback. While the
 node runs, the main thread only waits, because Python runs signal handlers only in the main thread.
@@ -53,9 +53,9 @@ def run_command(
     parse: Callable[[list[str]], argparse.Namespace],
     work: Callable[[argparse.Namespace, threading.Event], None],
 ) -> int:
-    """Run `work` with rclpy initialised. A signal sets its event. Return 0 when it ends, 2 for bad input.
+    """Run `work` with rclpy initialised. A signal sets the event of `work`. Return 0 when `work` ends, 2 for bad input.
 
-    `args` exclude the program name (None for this process's own). `parse` receives the arguments that are not for ROS.
+    `args` exclude the program name. None means the arguments of this process. `parse` gets those that are not for ROS.
     """
     if conflict := foreign_ros():
         sys.stderr.write(f"{name}: {conflict}\n")
@@ -82,7 +82,7 @@ def run_command(
 
 
 def foreign_ros() -> str:
-    """Return one line about a ROS that shadows the environment's own, or "" if there is none."""
+    """Return one line about a ROS that shadows this environment's ROS, or "" if none does."""
     for package in ROS_PACKAGES:
         own = next((Path(sys.prefix) / "lib").glob(f"python3*/site-packages/{package}/__init__.py"), None)
         # Find the package without importing it, because one built for another Python would raise.
@@ -90,14 +90,14 @@ def foreign_ros() -> str:
         if own is None or spec is None or not spec.origin or Path(spec.origin).resolve() == own.resolve():
             continue
         where = Path(spec.origin).parents[1]
-        return f"{package} is that of {where}, not this environment's: unset PYTHONPATH, or do not source another ROS"
+        return f"{package} comes from {where}, not from this environment; unset PYTHONPATH, or source no other ROS"
     return ""
 
 
 def probe() -> str:
-    """Create and destroy a node and return the middleware's name. `graspd doctor` calls it in a separate process.
+    """Create and destroy a node. Return the middleware's name. `graspd doctor` calls this in a separate process.
 
-    Raises ImportError if two ROS are mixed, and rclpy's own exceptions if ROS does not work.
+    Raises ImportError if two ROS installations are mixed, and rclpy's exceptions if ROS does not work.
     """
     if conflict := foreign_ros():
         raise ImportError(conflict)
@@ -126,7 +126,7 @@ def main(args: list[str] | None = None) -> int:
     except ConfigError as error:
         sys.stderr.write(f"graspd_node: {error}\n")
         return EXIT_BAD_INPUT
-    # No request is pending yet, and an import or the reading of a hand cannot be interrupted otherwise.
+    # No request is pending yet, and a signal could not interrupt an import or the reading of a hand otherwise.
     _on_signal(lambda: os._exit(EXIT_STOPPED))
     os.environ.setdefault("AMENT_PREFIX_PATH", sys.prefix)  # the wheels leave it unset
 
@@ -169,13 +169,13 @@ def main(args: list[str] | None = None) -> int:
 
 
 def _refuse_arguments(args: list[str]) -> None:
-    description = "Grasps of objects that are asked for over ROS 2; its parameters are in config/graspd.yaml."
+    description = "Plan grasps for objects that are requested over ROS 2. config/graspd.yaml lists the parameters."
     parser = Parser(prog="graspd_node", usage="graspd_node [--ros-args -p NAME:=VALUE ...]", description=description)
     parser.parse_args(args[: args.index("--ros-args")] if "--ros-args" in args else args)
 
 
 def _spinning(executor: Executor, wake: threading.Event, fail: Callable[[], None]) -> threading.Thread:
-    """Start a thread that spins the executor until `wake` is set, and return it. An earlier end calls `fail`."""
+    """Start and return a thread that spins the executor until `wake` is set. An earlier end calls `fail`."""
 
     def spin() -> None:
         try:
@@ -219,7 +219,7 @@ def _make_node(args: list[str] | None, on_failure: Callable[[], None]) -> GraspN
 
 
 def log_directory() -> str:
-    """Set ROS_LOG_DIR to a temporary directory if the default one is not writable. Return a line about it, or ""."""
+    """If the default log directory is read-only, set ROS_LOG_DIR to a temporary one. Return a line about it, or ""."""
     if os.environ.get("ROS_LOG_DIR"):
         return ""
     usual = Path(os.environ.get("ROS_HOME") or Path.home() / ".ros") / "log"
@@ -229,7 +229,7 @@ def log_directory() -> str:
             return ""
     except OSError as error:
         os.environ["ROS_LOG_DIR"] = tempfile.mkdtemp(prefix="graspd-log-")
-        return f"{usual} cannot be written ({error.strerror}): ROS_LOG_DIR={os.environ['ROS_LOG_DIR']}"
+        return f"{usual} cannot be written ({error.strerror}); logs go to ROS_LOG_DIR={os.environ['ROS_LOG_DIR']}"
 
 
 def _on_signal(action: Callable[[], None]) -> None:

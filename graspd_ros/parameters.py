@@ -53,7 +53,7 @@ def _check_device(name: str) -> None:
 
     try:
         torch.empty(0, device=name)
-    except (RuntimeError, AssertionError):  # torch raises either, as the build goes
+    except (RuntimeError, AssertionError):  # which of them depends on torch's build
         valid = ["cpu", *(f"cuda:{index}" for index in range(torch.cuda.device_count()))]
         raise ConfigError(f"{name!r} is not a device of this machine; valid: {', '.join(valid)}") from None
 
@@ -84,7 +84,7 @@ def _check_library(path: str) -> None:
 
 def _check_corner(corner: Any) -> None:
     if not _numbers(corner) or len(corner) != 3 or not np.isfinite(corner).all():
-        raise ConfigError(f"{corner} is no position; valid: three finite numbers, x, y and z in metres")
+        raise ConfigError(f"{corner} is no position; valid: three finite numbers x, y, z [m]")
 
 
 def _check_parts(parts: Any) -> None:
@@ -97,41 +97,37 @@ def _check_parts(parts: Any) -> None:
 class Settings:
     """Values of the parameters at the time of a request. `ros2 param describe` shows the descriptions."""
 
-    hand: str = _setting("allegro_right", "name of a shipped hand, or path of a hand's yaml file", read_only=True)
+    hand: str = _setting("allegro_right", "name of a built-in hand, or path of a hand description", read_only=True)
     hand_prefix: str = _setting(
-        "", "put before the names of the hand's joints and links, where a robot has several hands", read_only=True
+        "", "prefix of the names of the hand's joints and links, for a robot with several hands", read_only=True
     )
     arm: str = _setting(
         "",
-        "name of a shipped arm, or path of an arm's yaml file: only grasps that it reaches are tried; empty: no arm",
+        "name of a built-in arm, or path of an arm description; only grasps within its reach are tried; empty: no arm",
         check=_check_arm,
     )
-    arm_base_frame: str = _setting(
-        "", "frame of the arm's base, by /tf; empty: named as the link that the arm begins at"
-    )
+    arm_base_frame: str = _setting("", "frame of the arm's base in /tf; empty: the name of the arm's base link")
     device: str = _setting("cpu", "torch device of the optimiser", check=_check_device, read_only=True)
     torch_threads: int = _setting(
         1,
-        "threads of the optimiser and the trials; more than 1 costs time on a shared machine",
+        "number of threads for optimiser and trials; several are slower on a busy machine",
         low=1,
         high=64,
         read_only=True,
     )
-    queue_size: int = _setting(4, "requests that may wait", low=0, high=64, read_only=True)
-    busy_policy: str = _setting("queue", "what a request does while the node is busy", choices=BusyPolicy)
+    queue_size: int = _setting(4, "number of requests that may wait", low=0, high=64, read_only=True)
+    busy_policy: str = _setting("queue", "treatment of a request while the node is busy", choices=BusyPolicy)
     cloud_policy: str = _setting(
         "newest",
-        "newest: a cloud waits until the node is idle, and a newer one takes its place; each: every cloud is a request "
-        "under busy_policy; off: clouds are not taken",
+        "newest: a cloud waits until the node is idle, and a newer cloud replaces it; each: every cloud is a request "
+        "under busy_policy; off: a cloud starts no request",
         choices=CLOUD_POLICIES,
     )
     cloud_max_age: float = _setting(
-        5.0, "clouds and depth images older than this are refused [s]; 0: none is", low=0.0, high=1e6
+        5.0, "greatest age of clouds and depth images, older ones are refused [s]; 0: any age", low=0.0, high=1e6
     )
-    segment: bool = _setting(
-        True, "whether the object is cut out of the cloud; false: clouds show the object and nothing else"
-    )
-    voxel_size: float = _setting(0.0, "clouds are thinned to one point a cube of this side [m]; 0: not", low=0, high=1)
+    segment: bool = _setting(True, "whether the object is cut out of the cloud; false: clouds show only the object")
+    voxel_size: float = _setting(0.0, "clouds keep one point per cube of this side [m]; 0: all", low=0, high=1)
     roi_min: list[float] = _setting(
         [-WORKSPACE] * 3, "lower corner of the workspace, in the frame of the cloud [m]", check=_check_corner
     )
@@ -140,69 +136,71 @@ class Settings:
     )
     sensor_frame: str = _setting(
         "",
-        "frame at whose origin the camera of clouds stood, by /tf; empty: at the origin of the cloud's own",
+        "frame in /tf at whose origin the camera of the clouds is; empty: the frame of the cloud",
     )
     view_point: list[float] = _setting(
         [0.0] * 3,
-        "where the camera of clouds stood, in the frame of the cloud [m]; all 0: as sensor_frame says",
+        "position of the camera of the clouds, in the frame of the cloud [m]; all 0: use sensor_frame",
         check=_check_corner,
     )
     scene_config: str = _setting(
         "",
-        "path of a yaml file with settings of segmentation, reconstruction and obstacles, as of `graspd --scene`; "
+        "path of a yaml file with settings for segmentation, reconstruction and obstacles, as for `--scene`; "
         "empty: the defaults",
         check=_check_scene_config,
     )
     collision_objects: str = _setting(
         "",
-        "topic of moveit_msgs/CollisionObject, as /collision_object: what it tells of are obstacles of later requests; "
-        "empty: none is heard",
+        "topic of moveit_msgs/CollisionObject, such as /collision_object; its objects are obstacles of later requests; "
+        "empty: no topic",
         read_only=True,
     )
     grasp_library: str = _setting(
         "",
-        "path of a library of grasps, from `graspd library build`: what it knows is answered from it, and what is "
-        "planned for meshes is added; empty: none",
+        "path of a grasp library from `graspd library build`; it answers requests for its objects, and grasps planned "
+        "for meshes are added; empty: no library",
         check=_check_library,
     )
-    fixed_frame: str = _setting("", "frame that ~/add_view keeps views in, by /tf; empty: that of the first view")
-    output_frame: str = _setting("", "frame of the results, by /tf; empty: the frame of the input")
-    num_grasps: int = _setting(8, "grasps to optimise and, with a trial, to verify", low=1, high=MOST_GRASPS)
-    preset: str = _setting("balanced", "name of a shipped preset, or path of a preset's yaml file", check=load_preset)
-    verify: str = _setting("standard", "the hold trial that a grasp must pass", choices=VERIFICATIONS)
-    deadline: float = _setting(60.0, "time that one request may take [s]", low=BUDGETS[0], high=BUDGETS[1])
-    seed: int = _setting(0, "seed of the random starts", low=0, high=2**63 - 1)
+    fixed_frame: str = _setting("", "frame of the views of ~/add_view, in /tf; empty: that of the first view")
+    output_frame: str = _setting("", "frame of the results in /tf; empty: the frame of the input")
+    num_grasps: int = _setting(8, "number of grasps to find and verify", low=1, high=MOST_GRASPS)
+    preset: str = _setting("balanced", "name of a built-in preset, or path of a preset file", check=load_preset)
+    verify: str = _setting("standard", "trials that a grasp must pass", choices=VERIFICATIONS)
+    deadline: float = _setting(60.0, "time limit of a request [s]", low=BUDGETS[0], high=BUDGETS[1])
+    seed: int = _setting(0, "seed of all random draws", low=0, high=2**63 - 1)
     mass: float = _setting(
-        0.0, "mass of the object [kg]; 0: not known, the heavy end of what its volume allows", low=0.0, high=MASSES[1]
+        0.0, "mass of the object [kg]; 0: unknown, the most that its volume makes likely", low=0.0, high=MASSES[1]
     )
     friction: float = _setting(0.6, "friction coefficient between hand and object", low=0.01, high=5.0)
-    mesh_scale: float = _setting(1.0, "factor from the mesh file's unit to metres", low=SCALES[0], high=SCALES[1])
-    mesh_frame: str = _setting("object", "frame id of grasps on a mesh: the mesh's own frame")
+    mesh_scale: float = _setting(1.0, "metres per unit of a mesh", low=SCALES[0], high=SCALES[1])
+    mesh_frame: str = _setting("object", "frame id of grasps on a mesh, for the mesh's own frame")
     mesh_roots: list[str] = _setting(
-        [".", "package://graspd_ros"], "directories that meshes may be read from: paths or package://name"
+        [".", "package://graspd_ros"], "directories from which meshes may be read: paths or package://name"
     )
-    progress_rate: float = _setting(10.0, "most progress reports a second [Hz]", low=0.1, high=10.0)
-    joint_speed: float = _setting(1.0, "top speed of the fingers in a trajectory [rad/s]", low=0.01, high=100.0)
-    base_speed: float = _setting(0.05, "top speed of the hand's base in a trajectory [m/s]", low=0.001, high=10.0)
+    progress_rate: float = _setting(10.0, "greatest rate of progress reports [Hz]", low=0.1, high=10.0)
+    joint_speed: float = _setting(
+        1.0, "greatest speed of the finger joints in a trajectory [rad/s]", low=0.01, high=100.0
+    )
+    base_speed: float = _setting(0.05, "greatest speed of the hand's base in a trajectory [m/s]", low=0.001, high=10.0)
     base_turn: float = _setting(
-        0.5, "top turning speed of the hand's base in a trajectory [rad/s]", low=0.01, high=100.0
+        0.5, "greatest angular speed of the hand's base in a trajectory [rad/s]", low=0.01, high=100.0
     )
-    shortest_stage: float = _setting(1.0, "least time of each stage of a trajectory [s]", low=0.01, high=100.0)
+    shortest_stage: float = _setting(1.0, "least duration of each stage of a trajectory [s]", low=0.01, high=100.0)
     publish_markers: bool = _setting(True, "whether ~/markers shows the result")
-    marker_grasps: int = _setting(1, "how many of the best grasps ~/markers shows", low=0, high=MOST_GRASPS)
+    marker_grasps: int = _setting(1, "number of best grasps that ~/markers shows", low=0, high=MOST_GRASPS)
     marker_parts: list[str] = _setting(
         list(USUAL_PARTS), f"what ~/markers shows: any of {', '.join(PARTS)}", check=_check_parts
     )
     marker_geometry: str = _setting(
         "visual",
-        "what ~/markers draws the hand with: visual, the visual shapes of its URDF; collision, what is planned with",
+        "shapes that ~/markers draws for the hand: visual (of its URDF) or collision (used by planning)",
         choices=GEOMETRIES,
     )
-    output_dir: str = _setting("", "directory for <request id>.json, format graspd/grasps; empty: none is written")
+    output_dir: str = _setting("", "directory for result files <request id>.json (graspd/grasps); empty: no files")
 
 
 class LiveSettings:
-    """Settings of a node, updated when a parameter changes. `now` has the current values. Doubtful values are logged.
+    """Settings of a node, updated when a parameter changes. `now` has the current values. It logs doubtful values.
 
     `frames` returns the frames in /tf. Raises ConfigError if a start value is not a valid choice, and rclpy's
     ParameterException if its type is wrong or it is out of range.
@@ -276,7 +274,7 @@ def _unknown_frames(settings: Settings, changed: Collection[str], known: Sequenc
 
 
 def _of_their_types(parameters: list[Parameter]) -> list[Parameter]:
-    """Return parameters in their fields' types: floats in place of integers, and `off` in place of YAML's false."""
+    """Return parameters in their fields' types: floats instead of integers, and `off` instead of YAML's false."""
     kept = []
     for parameter in parameters:
         setting = Settings.__dataclass_fields__.get(parameter.name)
@@ -298,7 +296,7 @@ def check_parameters(parameters: list[Parameter]) -> SetParametersResult:
 def _check_value(name: str, value: Any) -> None:
     setting = Settings.__dataclass_fields__.get(name)
     if setting is None:
-        return  # every node also has parameters of ROS itself
+        return  # a parameter that ROS adds to every node
     choices, check, value = setting.metadata["choices"], setting.metadata["check"], _word(setting, value)
     if _is_number(setting) and not _is_number_like(value):
         raise ConfigError(f"parameter {name}: {value!r} is no number; valid: a number such as 1.0")

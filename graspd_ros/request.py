@@ -60,17 +60,17 @@ class Request:
         T_frame_object: pose of the object's own frame in `frame` [m]. None if both are the same.
         only_newest: if True, a newer request of this kind replaces this one while it waits.
         listener: receives the request's messages in addition to the topics. May be None.
-        timeless: True if the request has no stamp. Then the newest transforms are used.
-        object_key: equal for requests of the same object in the same measurement. An empty key equals no other.
+        timeless: True if the request has no stamp, so that the newest transforms are used.
+        object_key: key of the object and its measurement, equal for the same object. An empty key equals no other.
         exclude: ids of grasps. The answer must contain no similar grasp.
         exclude_poses: frames and base-link poses of grasps to exclude in the same way.
         known: key of the object in a grasp library. None if no library is used.
         surface: support plane in the object's frame. None if the request gives none.
         steering: makes the steering constraints. It is slow and may raise a GraspdError. None without constraints.
-        region_points: returns the points inside the `region_mask`, in `frame` [m]. None for sources without an image.
-        closes_late: True if the hand closes only after it has arrived. Then grasps need their `arrival`.
+        region_points: returns the points inside `region_mask`, in `frame` [m]. None for sources without an image.
+        closes_late: True if the hand closes only after it has arrived, so that grasps need an `arrival` posture.
         collision_objects: collision objects of the planning scene by id. Empty if the node has no such topic.
-        views: reads the clouds that show the objects of a request for any object. None for a request of one object.
+        views: reads the clouds of a request for any object. None for a request for one object.
         solids: meshes of `collision_objects` in the object's frame [m]. The worker sets them.
         accepted: time of arrival on the monotonic clock [s].
     """

@@ -1,7 +1,7 @@
 """Processing of one request: load the object, plan, and transform the result to the output frame.
 
-Grasps similar to the excluded ones are left out. The answer has the next best grasps of an earlier run on the same
-object, or those of a new run.
+Grasps similar to excluded ones are left out. The answer has the next best grasps of an earlier run on the same
+object, or grasps of a new run.
 """
 
 from __future__ import annotations
@@ -79,8 +79,8 @@ class Planned:
         worked_on: False if the request ended before any run.
         mass: object's mass in the trials [kg]. 0 without trials.
         mass_assumed: True if the request gave no mass.
-        objects: for a request for any object, the place [m] of each object seen, and why it has no verified grasp. The
-            grasps belong to the first.
+        objects: for a request for any object, the position [m] of each object seen, and why it has no verified grasp.
+            The grasps belong to the first object.
         surface: the object's mesh in its own frame [m]. None if it was not loaded.
         held: the object's hull in the base link's frame at the first grasp [m]. None without a usable grasp or mesh.
     """
@@ -135,9 +135,9 @@ class RecentRuns:
         return poses + [request.to_object(frame, pose, lookup) for frame, pose in request.exclude_poses]
 
     def failures(self, request: Request, excluded: Sequence[Matrix], lookup: FrameLookup) -> list[Failure]:
-        """Return the excluded grasps as failures at the places of their objects, as far as these are known.
+        """Return the excluded grasps as failures, with the positions of their objects where known.
 
-        `excluded` is from the function `excluded`. Raises TransformError as `lookup`.
+        `excluded` are the poses from the method `excluded`. Raises TransformError as `lookup`.
         """
         places: list[Any] = [None] * len(excluded)
         for row, name in enumerate(request.exclude):
@@ -196,8 +196,8 @@ class Planner:
     """Planner for one hand. One thread may use it at a time.
 
     A background thread does the work, because reading a mesh or computing a large batch cannot be stopped. When a
-    request ends early, the answer is sent after `PATIENCE` seconds without the thread. The thread ends by itself soon
-    after. The next request waits for this end, so that cancelled work does not pile up.
+    request ends early, `plan` waits for the thread only `PATIENCE` seconds. The thread ends by itself soon after. The
+    next request waits for that end, so that cancelled work does not pile up.
     """
 
     def __init__(self, hand: HandModel, lookup: Lookup, robot_description: str = "") -> None:

@@ -1,4 +1,4 @@
-"""`graspd_view`: shows the grasps of a running node in a browser. It runs on any machine in the node's ROS domain.
+"""`graspd_view`: show the grasps of a running node in a browser, on any machine in the node's ROS domain.
 
 graspd_view [--node /graspd] [--object OBJECT] [--hand FILE] [--host H] [--port P] [--ros-args -r points:=/seen]
 """
@@ -24,12 +24,12 @@ def main(args: list[str] | None = None) -> int:
 
 
 def _parse(arguments: list[str]) -> argparse.Namespace:
-    parser = Parser(prog="graspd_view", description="Look at what a graspd node finds, in a browser.")
+    parser = Parser(prog="graspd_view", description="Show the grasps of a graspd node in a browser.")
     parser.add_argument("--node", default="/graspd", help="name of the node (default /graspd)")
-    parser.add_argument("--object", default=None, metavar="OBJECT", help="a file, in the answers' frame")
-    parser.add_argument("--hand", default=None, metavar="NAME|PATH", help="instead of the one that answers name")
-    parser.add_argument("--host", default="127.0.0.1", help="who may come: by default this machine alone")
-    parser.add_argument("--port", type=int, default=8080, help="or the next that is free (default 8080)")
+    parser.add_argument("--object", default=None, metavar="OBJECT", help="object file, in the answers' frame")
+    parser.add_argument("--hand", default=None, metavar="NAME|PATH", help="show this hand, not the answers' hand")
+    parser.add_argument("--host", default="127.0.0.1", help="address to serve at (default: for this machine only)")
+    parser.add_argument("--port", type=int, default=8080, help="port, or the next free one (default 8080)")
     return parser.parse_args(arguments)
 
 
@@ -46,7 +46,7 @@ def _serve(options: argparse.Namespace, stop: threading.Event) -> None:
     try:
         node = rclpy.create_node("graspd_view")
         Follower(node, viewer, options.node, scene=scene, hand=options.hand)
-        print(f"{viewer.url} - follows {options.node}, Ctrl-C ends it", flush=True)
+        print(f"{viewer.url} shows the grasps of {options.node}; Ctrl-C ends it", flush=True)
         while not stop.is_set():
             rclpy.spin_once(node, timeout_sec=0.1)
         node.destroy_node()
@@ -133,10 +133,10 @@ def grasp_of(message: Any, joint_names: tuple[str, ...]) -> Grasp:
         values = dict(zip(joints.name, joints.position, strict=True))
         missing = [name for name in joint_names if name not in values]
         if missing:
-            raise ValueError(f"no value for joint {missing[0]}")
+            raise ValueError(f"joint {missing[0]} has no value")
         made = array_of(pose.position), wxyz_of(pose.orientation), np.array([values[name] for name in joint_names])
         if not all(np.isfinite(numbers).all() for numbers in made) or not 0.9 < np.linalg.norm(made[1]) < 1.1:
-            raise ValueError("a posture has a number that is not finite, or a quaternion that is not of unit length")
+            raise ValueError("a posture has a number that is not finite, or no unit quaternion")
         return Posture(*made)
 
     def moved(value: float) -> float:

@@ -14,7 +14,7 @@ from typing import Generic, Protocol, TypeVar
 
 
 class BusyPolicy(StrEnum):
-    """Treatment of a request that arrives while another one is running."""
+    """What happens to a request that arrives while another one is running."""
 
     REJECT = "reject"
     QUEUE = "queue"
@@ -41,7 +41,7 @@ class Refusal(StrEnum):
 class WorkerRequest(Protocol):
     """Interface of a request.
 
-    `only_newest` requests wait outside the queue, in one slot. A newer one replaces the waiting one.
+    `only_newest` requests wait outside the queue, in one slot. A newer request replaces the waiting one.
     """
 
     @property
@@ -57,7 +57,7 @@ StopHook = Callable[[], bool]
 
 @dataclass(frozen=True)
 class Admission:
-    """Answer of `submit`: accepted if `refusal` is None. Then `ahead` is the number of requests before this one."""
+    """Answer of `submit`. Without `refusal` the request is accepted, and `ahead` requests are before it."""
 
     refusal: Refusal | None = None
     reason: str = ""
@@ -66,7 +66,7 @@ class Admission:
 
 @dataclass(frozen=True)
 class Report(Generic[V]):
-    """End of a request: `error` if it failed, `value` if it is done. A stopped request may have a partial `value`."""
+    """End of a request, with `error` if it failed, else `value`. The `value` of a stopped request may be partial."""
 
     ending: WorkerEnding
     value: V | None = None
@@ -77,12 +77,12 @@ class Worker(Generic[R, V]):
     """Worker thread with a bounded queue.
 
     Args:
-        work: processes one request. It must call its stop hook often and return early if that returns True. It may
-            raise anything.
+        work: processes one request. It must call its stop hook often, and return early if the hook returns True. It
+            may raise anything.
         finish: called once at the end of each accepted request. It runs in the worker thread, or in the thread that
             ends a waiting request. It must not raise.
         prepare: runs in the worker thread before the first request.
-        queue_size: most requests that wait behind the running one under the policy `queue`.
+        queue_size: greatest number of requests that wait behind the running one under the policy `queue`.
     """
 
     def __init__(
@@ -140,7 +140,7 @@ class Worker(Generic[R, V]):
         if request.only_newest or policy is BusyPolicy.REPLACE:
             return None
         if policy is BusyPolicy.REJECT and ahead:
-            return Admission(Refusal.BUSY, "busy with another request, and busy_policy is reject")
+            return Admission(Refusal.BUSY, "the node is busy, and busy_policy is reject")
         if policy is BusyPolicy.QUEUE and ahead > self.queue_size:
             full = f"the queue is full: one runs, {ahead - 1} of queue_size={self.queue_size} wait"
             return Admission(Refusal.BUSY, full)
@@ -171,7 +171,7 @@ class Worker(Generic[R, V]):
         return dropped
 
     def state(self) -> tuple[str | None, int]:
-        """Return the id of the running request and the length of the queue, without a waiting `only_newest` request."""
+        """Return the running request's id and the queue's length, in which `only_newest` requests do not count."""
         with self._condition:
             running = self._running.id if self._running else None
             return running, len(self._waiting)
@@ -180,7 +180,7 @@ class Worker(Generic[R, V]):
         return self._thread.is_alive()
 
     def stopping(self) -> bool:
-        """Return True after `stop` was called. Long work outside requests polls this."""
+        """Return True after `stop` was called. Long work outside requests must poll this."""
         return self._stopping
 
     def stop(self, timeout: float) -> bool:

@@ -1,6 +1,6 @@
 """Conversion of messages to requests: mesh paths, clouds, depth images, and GraspRequest with its checks.
 
-Each row of `SOURCES` is a source of a GraspRequest's object. To add one, write its function and its row here, and its
+Each row of `SOURCES` is a source of a GraspRequest's object. A new source needs a function and a row here, and a
 constant in `GraspRequest.msg`. No other file changes.
 """
 
@@ -56,8 +56,8 @@ class RequestBuilder:
     Frames and views are immutable, so requests may keep them.
 
     Args:
-        lookup: returns `T_target_source` at a time without waiting. May raise a TransformError.
-        lookup_in_time: the same for the worker's thread, with a wait for late transforms. If None, `lookup` is used.
+        lookup: function that returns `T_target_source` at a time without waiting. May raise a TransformError.
+        lookup_in_time: like `lookup`, but waits for late transforms, in the worker's thread. None uses `lookup`.
     """
 
     def __init__(
@@ -74,7 +74,7 @@ class RequestBuilder:
         self._started = time.strftime("%Y%m%dT%H%M%S")
 
     def new_id(self, kind: str) -> str:
-        """Return an id that is unique even after a restart, because output files have the id as their name."""
+        """Return an id that stays unique after a restart, because output files are named by it."""
         return f"{kind}-{self._started}-{next(self._numbers)}"
 
     def forget(self) -> None:
@@ -82,15 +82,15 @@ class RequestBuilder:
         self.newest, self.views = None, Views()
 
     def latest(self, settings: Settings) -> SensorFrame:
-        """Return the newest frame. Raises RequestError: none has arrived (with known reasons), or it is too old."""
+        """Return the newest frame. Raises RequestError: no frame has arrived, or the newest is too old."""
         if self.newest is None:
             why = "".join(f"; {reason}" for reason in self.missing.values())
-            raise RequestError(ErrorCode.NO_CLOUD, f"no cloud or depth image has come yet{why}")
+            raise RequestError(ErrorCode.NO_CLOUD, f"no cloud or depth image has arrived yet{why}")
         self.newest.check(nanoseconds(self._now()), settings.cloud_max_age)
         return self.newest
 
     def add_view(self, settings: Settings) -> None:
-        """Store the newest frame as a view. Raises GraspdError: none has arrived, or it cannot be used."""
+        """Store the newest frame as a view. Raises GraspdError: no frame has arrived, or the newest is unusable."""
         frame = self.latest(settings)
         cloud = seen.seen_by_camera(frame, place_of(settings), self.lookup)
         if settings.segment:
@@ -98,13 +98,13 @@ class RequestBuilder:
         self.views = self.views.add(frame, cloud, settings, self.lookup)
 
     def from_mesh(self, request_id: str, settings: Settings, uri: str) -> Request:
-        """Return the request for a mesh that is given by its path only. Raises MeshError: the path is not usable."""
+        """Return the request for a mesh given only by its path. Raises MeshError: the path is not usable."""
         path = resolve_mesh(uri, settings.mesh_roots)
         load, known = mesh_loader(path, settings), known_mesh(path, settings)
         return Request(request_id, "mesh", settings.mesh_frame, self._now(), settings, load, timeless=True, known=known)
 
     def from_sensor_frame(self, request_id: str, settings: Settings, sensor_frame: SensorFrame) -> Request:
-        """Return the request for a frame that came without a GraspRequest. Raises RequestError: it is too old."""
+        """Return the request for a frame without a GraspRequest. Raises RequestError: the frame is too old."""
         load = self._frame_loader(settings, sensor_frame)
         newest = settings.cloud_policy == "newest"
         return Request(request_id, "cloud", sensor_frame.frame, sensor_frame.stamp, settings, load, only_newest=newest)
@@ -118,7 +118,7 @@ class RequestBuilder:
         """
         check_request(message, self._hand)
         if message.any_object and not settings.segment:
-            raise bad_request("any_object: the parameter segment is false, so that clouds show one object; set it true")
+            raise bad_request("any_object: the parameter segment is false; set segment to true to see several objects")
         settings = settings_of(message, settings)
         source = source_of(message)
         given = SourceInput(request_id, source.name, message, settings, listener, self._now(), self)
@@ -129,7 +129,7 @@ class RequestBuilder:
         return replace(request, closes_late=message.closes_late, **fields)
 
     def _steering(self, message: GraspRequest, request: Request) -> Callable[[], Steering] | None:
-        """Check the steering fields and return a function that also reads `region_mask`. None without constraints."""
+        """Check the steering fields. Return a function that makes the constraints and reads `region_mask`, or None."""
         if not _has_constraints(message):
             return None
         stamp, region_points = message.header.stamp, request.region_points
@@ -152,7 +152,7 @@ class RequestBuilder:
     def from_cluster(
         self, request_id: str, settings: Settings, cloud: PointCloud2, header: Header, listener: Listener | None
     ) -> Request:
-        """Return the request for a cloud that shows one object. Raises RequestError: it is too large or too old."""
+        """Return the request for a cloud of one object. Raises RequestError: the cloud is too large or too old."""
         frame = replace(cloud_frame(cloud, nanoseconds(self._now())), frame=header.frame_id, stamp=header.stamp)
         load = self._frame_loader(settings, frame)
         return self.from_loader(request_id, header, settings, load, listener)
@@ -182,7 +182,7 @@ def check_request(message: GraspRequest, hand: str) -> None:
     _check_range("mass", message.mass, MASSES, "kg, 0 for the parameter")
     _check_range("mesh_scale", message.mesh_scale, SCALES, "m, 0 for 1")
     if len(message.cloud.data) > seen.MOST_CLOUD_BYTES:
-        raise bad_request(f"cloud: {len(message.cloud.data)} bytes; at most {seen.MOST_CLOUD_BYTES} are taken")
+        raise bad_request(f"cloud: {len(message.cloud.data)} bytes; valid: at most {seen.MOST_CLOUD_BYTES}")
     if message.use_target_point:
         near(message.target_point, "target_point")
         if message.source in (GraspRequest.MESH, GraspRequest.KNOWN):
@@ -217,14 +217,14 @@ def _check_any_object(message: GraspRequest) -> None:
     given = {"use_target_point": message.use_target_point, "alone": message.alone}
     given["target_mask"] = message.target_mask.height > 0
     for other in (name for name, value in given.items() if value):
-        raise bad_request(f"any_object: {other} is given too, which says what the object is; give one of them")
+        raise bad_request(f"any_object: {other} is given too and selects an object; remove one of them")
     if message.source in (GraspRequest.MESH, GraspRequest.KNOWN):
-        raise bad_request(f"any_object: with source {message.source}; valid with CLOUD=0, LATEST_CLOUD=2 and VIEWS=3")
+        raise bad_request(f"any_object: given with source {message.source}; valid: CLOUD=0, LATEST_CLOUD=2, VIEWS=3")
 
 
 def _check_mask_source(message: GraspRequest, name: str, height: int) -> None:
     if height and message.source not in _OF_ONE_CLOUD:
-        raise bad_request(f"{name}: with source {message.source}; valid with CLOUD=0 and LATEST_CLOUD=2")
+        raise bad_request(f"{name}: given with source {message.source}; valid with CLOUD=0 and LATEST_CLOUD=2")
 
 
 def settings_of(message: GraspRequest, settings: Settings) -> Settings:
@@ -280,15 +280,15 @@ def steering_of(message: GraspRequest, T_object_header: Matrix) -> Steering:
 def _check(message: GraspRequest) -> None:
     """Refuse constraints that need another field, and constraints given twice."""
     if message.approach_angle and not _direction(message):
-        raise bad_request("approach_angle: needs approach_direction")
+        raise bad_request("approach_angle: needs approach_direction; give both or neither")
     if (message.roll or message.roll_tolerance) and not message.use_roll:
-        raise bad_request("roll: use_roll is false; set it true to ask for a roll")
+        raise bad_request("roll: use_roll is false; set use_roll to true")
     if message.region_mask.height and message.region.dimensions:
-        raise bad_request("region_mask: region is given too; give one of them")
+        raise bad_request("region_mask: region is given too; remove one of them")
     _check_mask_source(message, "region_mask", message.region_mask.height)
     if len(message.avoid) != len(message.avoid_poses) or len(message.avoid) > MOST_BOXES:
         counts = f"{len(message.avoid)} boxes, {len(message.avoid_poses)} poses"
-        raise bad_request(f"avoid: {counts}; valid: one avoid_poses for each, at most {MOST_BOXES}")
+        raise bad_request(f"avoid: {counts}; valid: one pose for each box, at most {MOST_BOXES} boxes")
 
 
 def _direction(message: GraspRequest) -> tuple[float, ...]:
@@ -303,7 +303,7 @@ def _region(message: GraspRequest, T_object_header: Matrix) -> Box | Sphere | No
         return None
     if solid.type == SolidPrimitive.SPHERE:
         if len(solid.dimensions) != 1:
-            raise bad_request(f"region: {len(solid.dimensions)} dimensions; valid for a SPHERE: one, its radius")
+            raise bad_request(f"region: {len(solid.dimensions)} dimensions; valid for a SPHERE: 1, the radius [m]")
         pose = T_object_header @ pose_matrix(message.region_pose, "region_pose")
         return Sphere(pose[:3, 3], float(solid.dimensions[0]))
     return _box("region", solid, message.region_pose, T_object_header)
@@ -313,16 +313,16 @@ def _box(name: str, solid: SolidPrimitive, pose: Pose, T_object_header: Matrix) 
     valid = "BOX=1 or SPHERE=2" if name == "region" else "BOX=1"
     if solid.type != SolidPrimitive.BOX or len(solid.dimensions) != 3:
         given = f"type {solid.type} of {len(solid.dimensions)} dimensions"
-        raise bad_request(f"{name}: {given}; valid: {valid}, 3 lengths of a box")
+        raise bad_request(f"{name}: {given}; valid: {valid}; a BOX has 3 dimensions")
     placed = T_object_header @ pose_matrix(pose, f"{name}_pose{'s' * (name == 'avoid')}")
     return Box(placed[:3, 3], list(solid.dimensions), wxyz_of_matrix(placed))
 
 
 @dataclass(frozen=True, eq=False)
 class SourceInput:
-    """Input of a source: the checked message, and the builder with its frames and views.
+    """Input of a source's function: the checked message, and the builder with its frames and views.
 
-    `settings` contain the values of the message.
+    `settings` include the values of the message.
     """
 
     request_id: str
@@ -343,7 +343,7 @@ class SourceInput:
 
 @dataclass(frozen=True)
 class Source:
-    """Source of objects. GraspRequest has a constant with its name in capitals.
+    """Source of objects. A constant of GraspRequest is named like the source, in capitals.
 
     `find` returns the request without reading the object. Raises GraspdError: the object is missing, old or forbidden.
     """
@@ -359,7 +359,7 @@ def mesh_loader(path: Path, settings: Settings) -> Callable[[], Scene]:
 
 
 def known_mesh(path: Path, settings: Settings) -> KnownObject | None:
-    """Return the library key of a mesh. None if the node has no library."""
+    """Return the library key of a mesh, or None if the node has no library."""
     return KnownObject("", str(path), False) if settings.grasp_library else None
 
 
@@ -373,7 +373,7 @@ def frame_loader(
 ) -> Callable[[], Scene]:
     """Return a function that makes a scene from one sensor frame. The worker's thread calls `lookup`.
 
-    The target is selected by a `point` on or near it, in the frame's coordinates [m], or by a `mask` of its pixels.
+    `point`, on or near the target in the frame's coordinates [m], or `mask`, over its pixels, selects the target.
     """
 
     def load() -> Scene:
@@ -451,7 +451,7 @@ def _from_latest_cloud(given: SourceInput) -> Request:
 def _from_views(given: SourceInput) -> Request:
     views, settings = given.builder.views, given.settings
     if not views.clouds:
-        raise RequestError(ErrorCode.NO_CLOUD, "no view is kept; call ~/add_view while clouds arrive")
+        raise RequestError(ErrorCode.NO_CLOUD, "no view is stored; call ~/add_view while clouds arrive")
     point = _target(given, views.frame)
     target = None if point is None else Target(point=point)
     more = {"views": lambda: (views.clouds, ())} if given.message.any_object else {}
@@ -510,7 +510,7 @@ def resolve_mesh(uri: str, roots: Sequence[str]) -> Path:
 
     Symbolic links are resolved before the comparison with the roots, so that no link leads outside. A root may be a
     `package://` name. Roots whose package is not installed are ignored.
-    Raises MeshError: unknown form or package, path outside every root, no such file, or file too large.
+    Raises MeshError: the form or package is unknown, or the file is outside every root, missing or too large.
     """
     uri = uri.strip()
     if len(uri) > MOST_PATH:
@@ -519,16 +519,16 @@ def resolve_mesh(uri: str, roots: Sequence[str]) -> Path:
         raise MeshError(f"the mesh path is empty; give {_FORMS}")
     allowed = _allowed_roots(roots)
     if not allowed:
-        raise MeshError(f"{uri}: mesh_roots {list(roots)} allows no directory; set that parameter")
+        raise MeshError(f"{uri}: the parameter mesh_roots {list(roots)} names no directory; give one that exists")
     try:
         path = (allowed[0] / _local_path(uri)).resolve()
         if not any(path.is_relative_to(root) for root in allowed):
-            raise MeshError(f"{uri}: outside the allowed mesh_roots: {', '.join(map(str, allowed))}")
+            raise MeshError(f"{uri}: the file is outside mesh_roots; valid: files below {', '.join(map(str, allowed))}")
         if not path.is_file():
             kind = "a directory, not a mesh file" if path.is_dir() else "no such file"
             raise MeshError(f"{uri}: {kind} (looked at {path})")
         if (size := path.stat().st_size) > MOST_MESH_BYTES:
-            raise MeshError(f"{uri}: {size / 1e6:.0f} MB; at most {MOST_MESH_BYTES / 1e6:.0f} MB are read")
+            raise MeshError(f"{uri}: {size / 1e6:.0f} MB; valid: at most {MOST_MESH_BYTES / 1e6:.0f} MB")
     except (OSError, ValueError) as error:
         raise MeshError(f"{uri!r}: not a usable path: {error}") from None
     return path
@@ -555,7 +555,7 @@ def _local_path(uri: str) -> Path:
         return Path(unquote(parts.path))
     if parts.scheme == "package":
         return _package_share(parts.netloc, uri) / unquote(parts.path).lstrip("/")
-    raise MeshError(f"{uri}: unknown form; give {_FORMS}")
+    raise MeshError(f"{uri}: unknown form; valid: {_FORMS}")
 
 
 def _package_share(package: str, uri: str) -> Path:

@@ -1,7 +1,7 @@
 """Subscriptions to sensor topics with the QoS that their publishers offer, and detection of lost messages.
 
-rmw's BEST_AVAILABLE chooses the QoS once, when the subscription is created. It may be incompatible with a camera that
-starts later, and no message would arrive. This module chooses again when publishers appear or disappear.
+rmw's BEST_AVAILABLE chooses the QoS once, when the subscription is created. That QoS may not fit a camera that starts
+later, and no message would arrive. This module chooses again when publishers appear or disappear.
 """
 
 from __future__ import annotations
@@ -23,8 +23,8 @@ MOST_TWICE = 100  # stamps remembered to drop duplicates while two subscriptions
 SILENCE = 5.0  # seconds that a publisher may be silent without a warning
 REPEAT = 10.0  # seconds between two warnings about lost messages
 REMEDY = (
-    "large messages get lost in Fast DDS' shared memory of 512 KB; start both processes with "
-    "FASTRTPS_DEFAULT_PROFILES_FILE=config/fastdds.xml, or have the sensor publish reliably (docs/ros.md, Large clouds)"
+    "Fast DDS loses large messages in its shared memory of 512 KB; start both processes with "
+    "FASTRTPS_DEFAULT_PROFILES_FILE=config/fastdds.xml, or let the sensor publish reliably (docs/ros.md, Large clouds)"
 )
 
 
@@ -36,7 +36,7 @@ class SensorTopic:
         kind: message type.
         name: name of the topic before remapping.
         callback: called with each message.
-        instead_of: preferred topic. While it has publishers, this one is not subscribed.
+        instead_of: preferred topic. While that topic has publishers, there is no subscription to this one.
         ending: suffix. If `name` is not remapped, this topic is called `instead_of.name + ending`.
     """
 
@@ -71,7 +71,7 @@ class SensorTopic:
         return [info for info in self._node.get_publishers_info_by_topic(self.name) if info.topic_type == kind]
 
     def check(self) -> str:
-        """Adapt the QoS to the publishers and return a line about missing messages, or "". Call it once a second."""
+        """Adapt the QoS to the publishers. Return a line about missing messages, or "". Call this once a second."""
         publishers = self.publishers()
         if self._instead_of is not None and (not publishers or self._instead_of.publishers()):
             self._stop()
@@ -91,7 +91,7 @@ class SensorTopic:
     def _other_types(self) -> str:
         types = {info.topic_type for info in self._node.get_publishers_info_by_topic(self.name)}
         heard = f"this node needs {self._kind.__name__}"
-        return f"{self.name}: publishers have type {', '.join(sorted(types))}, {heard}" if types else ""
+        return f"{self.name}: its publishers have type {', '.join(sorted(types))}; {heard}" if types else ""
 
     def _follow(self, publishers: list[Any]) -> None:
         offers = [info.qos_profile for info in publishers]

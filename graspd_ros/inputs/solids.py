@@ -28,12 +28,12 @@ _SIZES = {SolidPrimitive.BOX: 3, SolidPrimitive.SPHERE: 1, SolidPrimitive.CYLIND
 
 
 def mesh_shapes(shapes: Collection[Mesh], poses: Collection[Pose], owner: str) -> list[TriangleMesh]:
-    """Return meshes at their poses, or at the origin without poses. Raises RequestError, naming `owner`: invalid."""
+    """Return meshes at their poses, or at the origin without poses. Raises RequestError on `owner` for invalid ones."""
     return _placed("mesh", _mesh, shapes, poses, owner)
 
 
 def primitive_shapes(shapes: Collection[SolidPrimitive], poses: Collection[Pose], owner: str) -> list[TriangleMesh]:
-    """Return the meshes of primitives at their poses. Raises RequestError, naming `owner`: invalid shape."""
+    """Return the meshes of primitives at their poses. Raises RequestError on `owner` for an invalid primitive."""
     return _placed("primitive", _primitive, shapes, poses, owner)
 
 
@@ -41,14 +41,14 @@ def _placed(
     kind: str, make: Callable[[Any, str], TriangleMesh], shapes: Collection[Any], poses: Collection[Pose], owner: str
 ) -> list[TriangleMesh]:
     if len(poses) not in (0, len(shapes)):
-        raise bad_message(owner, f"{kind}_poses: {len(poses)} poses of {len(shapes)} shapes; give one for each")
+        raise bad_message(owner, f"{kind}_poses: {len(poses)} poses for {len(shapes)} shapes; give one for each shape")
     parts = [make(shape, owner) for shape in shapes]
     matrices = [pose_matrix(pose, f"{owner}: {kind}_poses") for pose in poses] or [np.eye(4)] * len(parts)
     return [moved_mesh(part, T) for part, T in zip(parts, matrices, strict=True)]
 
 
 def moved_mesh(mesh: TriangleMesh, T: Matrix) -> TriangleMesh:
-    """Return a mesh in another frame."""
+    """Return a mesh transformed by `T` to another frame."""
     return TriangleMesh(moved_points(mesh.vertices, T), mesh.faces)
 
 
@@ -57,7 +57,7 @@ def _mesh(shape: Mesh, owner: str) -> TriangleMesh:
     faces = np.array([list(t.vertex_indices) for t in shape.triangles], dtype=np.int64).reshape(-1, 3)
     if not len(faces) or not np.isfinite(vertices).all() or faces.max() >= len(vertices):
         counts = f"meshes: {len(vertices)} vertices and {len(faces)} triangles"
-        raise bad_message(owner, f"{counts}; valid: finite vertices, and triangles whose indices name them")
+        raise bad_message(owner, f"{counts}; valid: finite vertices, and triangles of vertex indices")
     return TriangleMesh(vertices, faces)
 
 
@@ -94,13 +94,13 @@ def bad_message(owner: str, message: str) -> RequestError:
 
 
 def plane_of(surface: PlaneMessage, T_object_frame: Matrix | None = None) -> Plane | None:
-    """Return the support plane in the object's frame, None if all numbers are 0. Raises RequestError: no plane."""
+    """Return the support plane in the object's frame, None if all numbers are 0. Raises RequestError if not a plane."""
     a, b, c, d = map(float, surface.coef)
     if not any((a, b, c, d)):
         return None
     length = float(np.linalg.norm([a, b, c]))
     if not (np.isfinite([a, b, c, d]).all() and length > 0):
-        raise bad_request(f"surface: {[a, b, c, d]} is no plane; valid: finite a, b, c, d with a normal a, b, c")
+        raise bad_request(f"surface: {[a, b, c, d]} is no plane; valid: finite numbers, a, b, c not all 0")
     plane = Plane(np.array([a, b, c]) / length, -d / length)
     return plane if T_object_frame is None else moved_plane(plane, T_object_frame)
 
@@ -143,7 +143,7 @@ def updated_objects(objects: Mapping[str, SceneObject], message: Any) -> Mapping
     if operation == message.REMOVE and not name:
         return {}
     if not name:
-        raise bad_message(owner, "id: empty; valid: a name; REMOVE alone may have none, and then removes all objects")
+        raise bad_message(owner, "id: empty; give a name; only REMOVE may leave it empty, to remove all objects")
     if operation not in operations:
         raise bad_message(owner, f"operation: {operation[0]}; valid: ADD=0, REMOVE=1, APPEND=2, MOVE=3")
     there = objects.get(name)
@@ -152,13 +152,13 @@ def updated_objects(objects: Mapping[str, SceneObject], message: Any) -> Mapping
     if operation == message.REMOVE:
         return {other: kept for other, kept in objects.items() if other != name}
     if there is None and len(objects) >= MOST_OBJECTS:
-        raise bad_message(owner, f"{MOST_OBJECTS} collision objects are kept already; REMOVE some")
+        raise bad_message(owner, f"{MOST_OBJECTS} collision objects are stored, the most possible; REMOVE some")
     return {**objects, name: _changed(there, message, owner)}
 
 
 def _changed(there: SceneObject | None, message: Any, owner: str) -> SceneObject:
     if message.planes:
-        raise bad_message(owner, "planes: not supported, since they are infinite; give a box, or the request's surface")
+        raise bad_message(owner, "planes: infinite planes are not supported; give a box, or the request's surface")
     solids = primitive_shapes(message.primitives, message.primitive_poses, owner)
     shapes = (*solids, *mesh_shapes(message.meshes, message.mesh_poses, owner))
     # As in MoveIt, appended shapes are relative to the object's existing pose.
@@ -169,10 +169,10 @@ def _changed(there: SceneObject | None, message: Any, owner: str) -> SceneObject
     frame, T = message.header.frame_id, pose_matrix(message.pose, f"{owner}: pose")
     if message.operation == message.MOVE and there is not None:
         if shapes:
-            raise bad_message(owner, "MOVE with shapes; give ADD, or no shapes")
+            raise bad_message(owner, "operation: MOVE takes no shapes; use ADD, or remove the shapes")
         return SceneObject(frame, T, there.shapes)
     if not shapes:
-        raise bad_message(owner, "no primitives and no meshes; give one of them")
+        raise bad_message(owner, "it has no primitives or meshes; give at least one")
     return SceneObject(frame, T, shapes)
 
 

@@ -1,6 +1,6 @@
-"""Transforms from /tf and /tf_static, with a wait for late ones, and the reach of the arm that carries the hand.
+"""Transforms from /tf and /tf_static, with a wait for late transforms, and the reach of the arm with the hand.
 
-ROS and `make setup` install tf2_msgs. Without it the node works, but has no transforms.
+ROS and `make setup` install tf2_msgs. Without tf2_msgs the node works, but has no transforms.
 """
 
 from __future__ import annotations
@@ -46,7 +46,7 @@ class TransformListener:
             from tf2_msgs.msg import TFMessage  # pyright: ignore[reportMissingImports]
         except ImportError:
             self.available = False
-            node.get_logger().info("tf2_msgs is not installed: /tf is not read, results stay in the frame of the input")
+            node.get_logger().info("tf2_msgs is not installed: without /tf, results stay in the input's frame")
             return
         self.available = True
         latched = QoSProfile(depth=100, durability=DurabilityPolicy.TRANSIENT_LOCAL)
@@ -56,14 +56,14 @@ class TransformListener:
         self._jumps = node.get_clock().create_jump_callback(back, post_callback=self._on_jump)
 
     def lookup(self, target: str, source: str, stamp: Time) -> Matrix:
-        """Return `T_target_source` at a time, 0 for the newest. Raises TransformError if it is unknown."""
+        """Return `T_target_source` at a time, 0 for the newest. Raises TransformError if the transform is unknown."""
         return self._buffer.lookup(target, source, nanoseconds(stamp) or None)
 
     def lookup_in_time(self, target: str, source: str, stamp: Time, stop: StopHook) -> Matrix:
-        """Return `T_target_source` and wait for it if necessary, because transforms arrive later than clouds.
+        """Return `T_target_source`. Wait for late transforms, because they arrive after their clouds.
 
-        Do not call it in the executor's thread, which must receive the transforms meanwhile. After `TRANSFORM_PATIENCE`
-        seconds, or when `stop` returns True, it raises the last TransformError.
+        Do not call this in the executor's thread, which must receive the transforms meanwhile. Raises the last
+        TransformError after `TRANSFORM_PATIENCE` seconds, or when `stop` returns True.
         """
         end = time.monotonic() + TRANSFORM_PATIENCE
         while True:
@@ -84,7 +84,7 @@ class TransformListener:
                 self._node.get_logger().warning(str(error), throttle_duration_sec=_COMPLAIN_AGAIN)
 
     def _on_jump(self, jump: TimeJump) -> None:
-        self._node.get_logger().info(f"time jumped by {jump.delta.nanoseconds * 1e-9:.3f} s: transforms are forgotten")
+        self._node.get_logger().info(f"time jumped by {jump.delta.nanoseconds * 1e-9:.3f} s: transforms are deleted")
         self._buffer.clear()
 
 
@@ -112,9 +112,9 @@ def _arm(name: str, robot_description: str) -> Arm:
 
 
 def heard_robot(node: Node, arm: str) -> str:
-    """Return the URDF from the topic robot_description, or "" at once if there is no arm or its file names a URDF.
+    """Return the URDF from the topic robot_description. Without an arm, or if its file names a URDF, return "".
 
-    Call it before the node is spun. Raises GraspdError if no URDF arrives in time, or the URDF lacks the arm.
+    Call this before the node is spun. Raises GraspdError if no URDF arrives in time, or the URDF lacks the arm.
     """
     if not arm:
         return ""
@@ -136,8 +136,8 @@ def heard_robot(node: Node, arm: str) -> str:
     node.destroy_subscription(topic)
     if not heard:
         raise ConfigError(
-            f"parameter arm: {arm} is part of the robot on {name}, where nothing came within {ROBOT_PATIENCE:g} s; "
-            "start robot_state_publisher first, or name a file in urdf"
+            f"parameter arm: {arm} needs the robot from {name}, but none arrived within {ROBOT_PATIENCE:g} s; "
+            "start robot_state_publisher first, or give a URDF file as urdf"
         )
     robot = str(heard[-1].data)
     _arm(arm, robot)

@@ -2,7 +2,7 @@
 
 `ros2 launch graspd_ros graspd.launch.py points:=/camera/depth/color/points hand:=allegro_right output_frame:=base_link`
 
-A given argument overrides the parameter of the same name in the parameter file.
+An argument overrides the parameter of the same name in the parameter file.
 """
 
 from launch import LaunchDescription
@@ -19,21 +19,21 @@ ARGUMENTS = {
     "depth_image": ("depth/image_rect", "depth image topic to listen to"),
     "camera_info": ("depth/camera_info", "CameraInfo topic of the depth image"),
     "hand": ("", "name or path of the hand"),
-    "hand_prefix": ("", "put before the names of the hand's joints and links"),
-    "output_frame": ("", "frame of the results, by /tf"),
-    "sensor_frame": ("", "frame at whose origin the camera of clouds stood, by /tf"),
+    "hand_prefix": ("", "prefix of the names of the hand's joints and links"),
+    "output_frame": ("", "frame of the results in /tf"),
+    "sensor_frame": ("", "frame in /tf at whose origin the camera of the clouds is"),
     "params": (str(config_dir() / "graspd.yaml"), "parameter file"),
     "name": ("graspd", "name of the node"),
     "namespace": ("", "namespace of the node"),
-    "use_sim_time": ("", "whether /clock tells the time"),
-    "large_clouds": ("false", "share 64 MB instead of 512 KB with this machine's cameras; they must do so too"),
-    "respawn": ("false", "start the node again when it dies"),
+    "use_sim_time": ("", "whether the time comes from /clock"),
+    "large_clouds": ("false", "whether Fast DDS shares 64 MB instead of 512 KB; the cameras must do so too"),
+    "respawn": ("false", "whether to restart the node when it dies"),
 }
 PARAMETERS = ("hand", "hand_prefix", "output_frame", "sensor_frame", "use_sim_time")
 
 
 def given(values: dict[str, str]) -> dict[str, str | bool]:
-    """Return the non-empty values, converted to the parameters' types. The parameter file gives the others."""
+    """Return the non-empty values, converted to the parameters' types. The parameter file supplies the rest."""
     typed: dict[str, str | bool] = {name: value for name, value in values.items() if value}
     if "use_sim_time" in typed:
         typed["use_sim_time"] = values["use_sim_time"].lower() in ("true", "1")
@@ -42,7 +42,7 @@ def given(values: dict[str, str]) -> dict[str, str | bool]:
 
 def _argument(name: str) -> DeclareLaunchArgument:
     default, text = ARGUMENTS[name]
-    text += "; empty: as the parameter file says" if name in PARAMETERS else ""
+    text += "; empty: the value of the parameter file" if name in PARAMETERS else ""
     return DeclareLaunchArgument(name, default_value=default, description=text)
 
 

@@ -2,7 +2,7 @@
 
 Metrics that were not measured are omitted. Other non-finite numbers become -1.
 
-A trajectory has three points for the fingers. The base has one pose for each point. Velocities are zero at every point.
+A trajectory has three points for the fingers, and a base pose for each point. Velocities are zero at every point.
 A controller with cubic interpolation, such as ros2_control's, then moves all joints in step on straight lines, as the
 trial did. Its greatest speed is 1.5 times the mean speed of a stage. The stage times allow for this factor.
 
@@ -104,15 +104,15 @@ class Pace:
     def __post_init__(self) -> None:
         for name, value in vars(self).items():
             if not (math.isfinite(value) and value > 0):
-                raise ConfigError(f"{name}: {value}; it must be positive and finite")
+                raise ConfigError(f"{name}: {value}; valid: a positive, finite number")
 
 
 @dataclass(frozen=True)
 class AnswerEnding:
-    """End of a request for a GraspArray. The grasps of `result` are in the answer's frame.
+    """Outcome of a request, for a GraspArray. The grasps of `result` are in the answer's frame.
 
     `mass` is the object's mass in the trials [kg], 0 without trials. `mass_assumed` is True if no mass was given.
-    For a request for any object, `objects` has the place [m] of each object seen, and why it has no verified grasp.
+    For a request for any object, `objects` has the position [m] of each object seen, and why it has no verified grasp.
     """
 
     status: int
@@ -138,7 +138,7 @@ def ending_of(result: GraspResult) -> AnswerEnding:
 def array_message(
     ending: AnswerEnding, request_id: str, header: Header, elapsed: float, hand: HandModel, pace: Pace
 ) -> GraspArray:
-    """Return the answer to a request that came `elapsed` seconds ago. Raises FloatingPointError: a grasp has a NaN."""
+    """Return the answer, `elapsed` seconds after the request. Raises FloatingPointError if a grasp has a NaN."""
     message = GraspArray(
         header=header,
         request_id=request_id,
@@ -174,9 +174,9 @@ def grasp_message(
     *,
     mass: float | None = None,
 ) -> GraspMessage:
-    """Return one grasp in the header's frame. Raises FloatingPointError if it contains a NaN.
+    """Return one grasp in the header's frame. Raises FloatingPointError if the grasp contains a NaN.
 
-    `mass` is the object's mass [kg], None if unknown. It determines the lift acceleration.
+    `mass` is the object's mass [kg], None if unknown. The lift acceleration depends on it.
     """
     _check_finite(grasp, rank)
     pregrasp, closed, squeeze = (joint_message(posture, hand, header.stamp) for posture in _postures(grasp))
@@ -223,7 +223,7 @@ def grasp_message(
 
 
 def progress_message(progress: Progress, request_id: str, frame: str, stamp: Time, elapsed: float) -> GraspProgress:
-    """Return the progress of a request that came `elapsed` seconds ago."""
+    """Return the progress of a request that arrived `elapsed` seconds ago."""
     return GraspProgress(
         header=Header(frame_id=frame, stamp=stamp),
         request_id=request_id,
@@ -250,7 +250,7 @@ def sentence(progress: Progress) -> str:
 
 
 def fraction_of(progress: Progress) -> float:
-    """Return the fraction of the current stage that is done, 0 to 1. It is 0 if unknown."""
+    """Return the fraction of the current stage that is done, 0 to 1, or 0 if unknown."""
     return min(progress.step / progress.of, 1.0) if progress.of > 0 else 0.0
 
 
@@ -264,7 +264,7 @@ def joint_message(posture: Posture, hand: HandModel, stamp: Time) -> JointState:
 
 
 def mount_pose(base: Posture, mount: Mount) -> Pose:
-    """Return the pose of the arm's link when the hand's base link is at `base`, in the same frame."""
+    """Return the pose of the arm's mount link when the hand's base link is at `base`, in the same frame."""
     return pose_of_matrix(matrix_of_posture(base) @ np.linalg.inv(matrix_of(mount.position, mount.quaternion_wxyz)))
 
 
@@ -297,8 +297,8 @@ def _number(value: float, otherwise: float = UNMEASURED) -> float:
 def trajectory_of(grasp: Grasp, hand: HandModel, pace: Pace) -> JointTrajectory:
     """Return the trajectory through pregrasp, grasp and squeeze. Its stamp is zero, so it starts on receipt.
 
-    It contains only the driven joints, because controllers refuse others. Coupled joints follow. Any start is valid.
-    Positions are within the joint limits. The last point is a target inside the object, which joints do not reach.
+    Only the driven joints are in it, because controllers refuse others. Any start posture is valid. Positions are
+    within the joint limits. The last point is a target inside the object, which the joints do not reach.
     """
     times = posture_times(grasp, hand, pace)
     return JointTrajectory(
@@ -309,7 +309,7 @@ def trajectory_of(grasp: Grasp, hand: HandModel, pace: Pace) -> JointTrajectory:
 
 
 def base_poses(grasp: Grasp, frame: str, stamp: Time) -> list[PoseStamped]:
-    """Return the base link's pose at each trajectory point. It moves and rotates uniformly between the points."""
+    """Return the base link's pose at each trajectory point. The base moves and rotates uniformly between the points."""
     return [PoseStamped(header=Header(frame_id=frame, stamp=stamp), pose=pose_of_posture(p)) for p in _postures(grasp)]
 
 
@@ -334,7 +334,7 @@ def _move_time(start: Posture, end: Posture, speed: np.ndarray, pace: Pace) -> f
 
 
 def _greatest_speeds(hand: HandModel, pace: Pace) -> np.ndarray:
-    """Return the speed limit of each actuated joint [rad/s] or [m/s], reduced so that coupled joints keep theirs."""
+    """Return the speed limit of each actuated joint [rad/s] or [m/s] at which coupled joints keep their limits too."""
     speed = np.minimum(np.where(hand.slides, pace.base_speed, pace.joint_speed), hand.velocity)
     for mimic in hand.mimics:
         own = pace.base_speed if hand.joint_kind[mimic.link] == "prismatic" else pace.joint_speed
@@ -409,7 +409,7 @@ def result_markers(
     parts: Sequence[str] = USUAL_PARTS,
     solids: Sequence[Primitive] | None = None,
 ) -> MarkerArray:
-    """Return the markers of the best `most` grasps. `solids` draw the hand. If None, its collision solids are used.
+    """Return the markers of the best `most` grasps. `solids` draw the hand. None uses its collision solids.
 
     The first marker deletes all earlier ones, so that a result without grasps clears the display.
     """

@@ -55,7 +55,7 @@ def moveit_grasp(
 
     Args:
         grasp: a grasp from ~/grasps.
-        retreat: lift direction of any length in `retreat_frame`, usually up.
+        retreat: lift direction in `retreat_frame`, of any length, usually up.
         retreat_frame: frame of `retreat`.
         retreat_distance: lift height [m].
         T_parent_base: pose of the hand's base link in the end effector's parent link. If None, the mount in the hand's
@@ -69,7 +69,7 @@ def moveit_grasp(
         ConfigError: the grasp failed its trial, or `retreat` is zero or not finite.
     """
     if grasp.verdict == Grasp.FAILED:
-        raise ConfigError(f"grasp {grasp.id!r}: it failed its trial ({grasp.reason}) and must not be executed")
+        raise ConfigError(f"grasp {grasp.id!r}: the grasp failed its trial ({grasp.reason}); execute a verified one")
     up = np.array(retreat, dtype=float)
     if not (np.isfinite(up).all() and up.any()):
         raise ConfigError(f"retreat: {retreat}; valid: a finite direction that is not zero")
@@ -105,8 +105,8 @@ def attached_object(
 ) -> Any:
     """Return the object in the hand as a moveit_msgs/AttachedCollisionObject, from the squeeze of a grasp on.
 
-    The object is attached to the hand's base link, and all links of the hand may touch it. Its id is that of the
-    request. Detaching opens the hand to the pregrasp.
+    The object is attached to the hand's base link, and all links of the hand may touch it. Its id is the id of the
+    request. The detach posture opens the hand to the pregrasp.
 
     Args:
         grasp: a grasp from ~/grasps.

@@ -1,7 +1,7 @@
 """Outcomes of requests as messages: one GraspArray per request, and events for clients without graspd_msgs.
 
-A cloud that comes without a request gets no answer if a newer cloud replaces it. Such clouds are counted. The node
-publishes its health and its counts since the start on /diagnostics.
+A cloud without a request gets no answer if a newer cloud replaces it, and is only counted. The node publishes its
+health and its counts since the start on /diagnostics.
 """
 
 from __future__ import annotations
@@ -90,7 +90,7 @@ class Health:
         waiting: number of waiting requests, at most `queue_size`.
         counts: counts since the start, by their keys in the message.
         last_latency: time from the last planned request to its answer [s]. None before the first.
-        last_first_verified: planning time until the first verified grasp of that request [s]. None without one.
+        last_first_verified: planning time until that request's first verified grasp [s]. None without such a grasp.
     """
 
     name: str
@@ -133,7 +133,7 @@ class Counters:
                 self._last["failed_in_a_row"] = 0
 
     def planned(self, result: GraspResult, latency: float) -> None:
-        """Store the times of a run that ended `latency` seconds after its request came."""
+        """Store the times of a run that ended `latency` seconds after its request arrived."""
         with self._lock:
             self._last |= {"last_latency": latency, "last_first_verified": result.timing.first_verified}
 
@@ -188,7 +188,7 @@ def _words(file: Path) -> list[str]:
 def _verdict(health: Health) -> tuple[bytes, str]:
     """Return the level and message of the worst problem."""
     if not health.worker_alive:
-        return DiagnosticStatus.ERROR, "the worker has ended: restart the node"
+        return DiagnosticStatus.ERROR, "the worker has ended; restart the node"
     if not health.ready:
         return DiagnosticStatus.WARN, "warming up"
     if health.failed_in_a_row:
@@ -340,7 +340,7 @@ class Responses:
             self._report(request, GraspProgress(header=header, request_id=request.id, stage="queued", message=message))
 
     def started(self, request: Request) -> None:
-        """Report that the worker starts an `only_newest` request. Other requests were reported on submission."""
+        """Report that the worker starts an `only_newest` request. Other requests are reported on submission."""
         if request.only_newest:
             self._report_superseded(request.id)
             self._accepted(request, 0)
@@ -377,7 +377,7 @@ class Responses:
             request.listener.progressed(message)
 
     def finished(self, request: Request, report: Report[Planned]) -> None:
-        """Answer an accepted request that has ended. Never raises."""
+        """Answer an accepted request that has ended. Never raise."""
         try:
             self._finished(request, report)
         except Exception as error:  # the client must get an answer even if the result is invalid
@@ -434,7 +434,7 @@ class Responses:
         self._publish(answer, request.listener)
 
     def drawn(self, settings: Settings) -> Sequence[Primitive]:
-        """Return the solids with which markers draw the hand. The first call may read large ones for seconds."""
+        """Return the solids with which markers draw the hand. The first call may take seconds to read large meshes."""
         if settings.marker_geometry != "visual":
             return self._hand.primitives
         if self._visuals is None:
@@ -475,7 +475,7 @@ class Responses:
         self._log().error(f"{request_id or source}: {message}{detail}")
 
     def _report_superseded(self, request_id: str) -> None:
-        """Publish the number of superseded clouds since the last report, and reset it."""
+        """Publish and reset the number of clouds that were superseded since the last report."""
         count, self._superseded = self._superseded, 0
         if count:
             self._superseded_reported = time.monotonic()
@@ -498,7 +498,7 @@ def _pace(request: Request) -> Pace:
 
 
 def presentable(result: GraspResult) -> Grasp | None:
-    """Return the best grasp if it is usable. Otherwise return None, so that no uncertain grasp is published."""
+    """Return the best grasp if it is usable, otherwise None, so that no uncertain grasp is published."""
     best = result.tried[0] if result.tried else None
     return best if best is not None and best.usable else None
 

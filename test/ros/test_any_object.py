@@ -87,7 +87,7 @@ def test_any_object_is_taken_and_after_a_loss_another(client, start_node, make_c
 
     refused = ask("both", use_target_point=True)
     assert refused.status == GraspArray.REFUSED
-    told = "any_object: use_target_point is given too, which says what the object is; give one of them"
+    told = "any_object: use_target_point is given too and selects an object; remove one of them"
     assert (refused.error_code, refused.message) == ("BAD_REQUEST", told)
     ball = SolidPrimitive(type=SolidPrimitive.SPHERE, dimensions=[0.1])
     nowhere = ask("nowhere", region=ball, region_pose=Pose(position=Point(x=9.0)))

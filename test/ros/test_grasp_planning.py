@@ -159,9 +159,9 @@ def test_a_group_that_is_no_hand_and_an_object_without_shape_are_aborted_and_tol
     status, grasps, _ = ask(client, planning, box(0.05, 0.05, 0.12), "left_arm")
     assert (status, grasps) == (GoalStatus.STATUS_ABORTED, [])
     refused = client.event(event="refused", code="WRONG_HAND")
-    assert "group_name: 'left_arm' is no hand here; this node plans for 'allegro_right'" in refused["message"]
+    assert "group_name: unknown hand 'left_arm'; this node plans for 'allegro_right'" in refused["message"]
     assert ask(client, planning, Object())[0] == GoalStatus.STATUS_ABORTED
-    assert "object: no meshes" in client.event(event="refused", code="BAD_REQUEST")["message"]
+    assert "object: it has no meshes" in client.event(event="refused", code="BAD_REQUEST")["message"]
 
 
 def test_the_client_of_the_docs_gets_grasps_in_a_process_of_its_own(client, planning):
@@ -206,7 +206,7 @@ BAD = {
     "primitives: dimensions [0.1], valid: 3": box(0.1),
     "primitives: dimensions [-1.0, 1.0, 1.0]": box(-1.0, 1.0, 1.0),
     "primitives: type 9": Object(primitives=[SolidPrimitive(type=9)]),
-    "primitive_poses: 2 poses of 1 shapes": Object(primitives=[SolidPrimitive()], primitive_poses=[Pose(), Pose()]),
+    "primitive_poses: 2 poses for 1 shapes": Object(primitives=[SolidPrimitive()], primitive_poses=[Pose(), Pose()]),
     "meshes: 0 vertices and 0 triangles": Object(meshes=[Mesh()]),
     "surface: [0.0, 0.0, 0.0, 1.0] is no plane": box(0.1, 0.1, 0.1, surface=Plane(coef=[0.0, 0.0, 0.0, 1.0])),
 }

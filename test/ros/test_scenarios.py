@@ -287,7 +287,7 @@ def depth_images_are_grasped(client) -> None:
 
     missing = latest(Image, "alone")
     assert (missing.status, missing.error_code) == (GraspArray.REFUSED, "NO_CLOUD")
-    assert missing.message.startswith("no cloud or depth image has come yet; ")
+    assert missing.message.startswith("no cloud or depth image has arrived yet; ")
     assert "; depth images: " in missing.message
     assert "and 0 CameraInfos received, but no two match; last image: 320 x 240" in missing.message
     assert client.event(event="refused", source="sensors")["code"] == "NO_CLOUD"

@@ -38,9 +38,7 @@ def test_a_ros_before_the_environments_own_is_told_in_one_line(tmp_path, program
     environment = {**os.environ, "PYTHONPATH": f"{other}:{os.environ.get('PYTHONPATH', '')}"}
     done = subprocess.run([sys.executable, "-m", program], env=environment, capture_output=True, text=True)
     name = {"graspd_ros.node": "graspd_node", "graspd_ros.player": "graspd_play"}[program]
-    told = (
-        f"{name}: {package} is that of {other}, not this environment's: unset PYTHONPATH, or do not source another ROS"
-    )
+    told = f"{name}: {package} comes from {other}, not from this environment; unset PYTHONPATH, or source no other ROS"
     assert (done.returncode, done.stderr.splitlines()) == (2, [told])
 
 
@@ -136,8 +134,8 @@ def test_a_robot_that_never_comes_is_waited_for_so_long(start_node, tmp_path):
     arm = description(tmp_path)
     (told,) = told_at_the_start(start_node, arm)
     assert told == (
-        f"graspd_node: parameter arm: {arm} is part of the robot on /robot_description, where nothing came within 10 s"
-        "; start robot_state_publisher first, or name a file in urdf"
+        f"graspd_node: parameter arm: {arm} needs the robot from /robot_description, but none arrived within 10 s"
+        "; start robot_state_publisher first, or give a URDF file as urdf"
     )
 
 

@@ -95,8 +95,8 @@ def refusal(**fields) -> RequestError:
         ({"use_target_point": True, "target_point": Point(z=1e9)}, "within 1000 m"),
         ({"any_object": True, "alone": True}, "any_object: alone is given too"),
         ({"any_object": True, "target_mask": Image(height=1)}, "any_object: target_mask is given too"),
-        ({"any_object": True, "source": GraspRequest.MESH}, "any_object: with source 1; valid with CLOUD=0"),
-        ({"any_object": True, "source": GraspRequest.KNOWN}, "any_object: with source 4; valid with CLOUD=0"),
+        ({"any_object": True, "source": GraspRequest.MESH}, "any_object: given with source 1; valid: CLOUD=0"),
+        ({"any_object": True, "source": GraspRequest.KNOWN}, "any_object: given with source 4; valid: CLOUD=0"),
     ],
 )
 def test_a_field_out_of_range_is_named(fields, culprit):
@@ -166,7 +166,7 @@ def test_a_pose_without_turn_is_a_place_and_a_wrong_one_is_refused():
 
 def test_a_cloud_is_refused_when_none_came_or_it_is_old():
     taker, latest = intake(), GraspRequest(source=GraspRequest.LATEST_CLOUD)
-    with pytest.raises(RequestError, match="no cloud or depth image has come yet") as refused:
+    with pytest.raises(RequestError, match="no cloud or depth image has arrived yet") as refused:
         taker.from_message("a", Settings(), latest)
     assert refused.value.code is ErrorCode.NO_CLOUD
     taker.newest = sensor_frame(np.zeros((3, 3)), stamp=Time(sec=990))
@@ -221,7 +221,7 @@ def test_the_number_of_views_and_their_size_are_bounded():
     few = sensor_frame(np.zeros((3, 3)))
     for _ in range(MOST_VIEWS - 1):
         views = views.add(few, few.read(), settings, lambda *_: np.eye(4))
-    with pytest.raises(RequestError, match="64 views are kept already"):
+    with pytest.raises(RequestError, match="64 views are stored, the most possible"):
         views.add(few, few.read(), settings, lambda *_: np.eye(4))
 
 
@@ -249,7 +249,7 @@ def test_trimming_keeps_points_of_the_workspace_at_most_one_a_voxel(rows, voxel)
 
 def test_a_cloud_too_large_to_keep_is_refused_wherever_it_comes_from():
     huge = PointCloud2(data=array.array("B", bytes(MOST_CLOUD_BYTES + 1)))
-    with pytest.raises(RequestError, match=f"{MOST_CLOUD_BYTES + 1} bytes; at most"):
+    with pytest.raises(RequestError, match=f"{MOST_CLOUD_BYTES + 1} bytes; valid: at most"):
         cloud_frame(huge, 0)
 
 
@@ -350,10 +350,10 @@ def test_every_form_finds_the_file(root: Path, monkeypatch: pytest.MonkeyPatch):
     ("uri", "culprit"),
     [
         ("", "empty"),
-        ("../secret.obj", "outside the allowed mesh_roots"),
-        ("link.obj", "outside the allowed mesh_roots"),
-        ("file:///etc/hostname", "outside the allowed mesh_roots"),
-        ("/etc/hostname", "outside the allowed mesh_roots"),
+        ("../secret.obj", "outside mesh_roots"),
+        ("link.obj", "outside mesh_roots"),
+        ("file:///etc/hostname", "outside mesh_roots"),
+        ("/etc/hostname", "outside mesh_roots"),
         ("file://elsewhere/mug.obj", "unknown form"),
         ("https://elsewhere/mug.obj", "unknown form"),
         ("package://nothing/mug.obj", "'nothing' is not installed"),
@@ -372,7 +372,7 @@ def test_what_may_not_be_read_is_refused_by_name(root: Path, uri: str, culprit: 
 
 
 def test_without_a_usable_root_nothing_may_be_read(root: Path):
-    with pytest.raises(MeshError, match="allows no directory"):
+    with pytest.raises(MeshError, match="names no directory"):
         resolve_mesh("mug.obj", [str(root / "nowhere"), "package://nothing"])
 
 
@@ -466,13 +466,13 @@ def test_a_box_may_be_the_region(tmp_path):
         ({"approach_direction": DOWN, "roll": 0.5}, "roll: use_roll is false"),
         ({"use_roll": True}, "roll: needs approach_direction"),
         ({"region": solid(BOX, 0.1)}, "region: type 1 of 1 dimensions; valid: BOX=1 or SPHERE=2"),
-        ({"region": solid(BALL, 0.1, 0.1)}, "region: 2 dimensions; valid for a SPHERE: one, its radius"),
+        ({"region": solid(BALL, 0.1, 0.1)}, "region: 2 dimensions; valid for a SPHERE: 1, the radius"),
         ({"region": solid(BALL, -0.1)}, "sphere radius: -0.1 m; valid: above 0"),
         ({"region": solid(SolidPrimitive.CONE, 0.1, 0.1)}, "region: type 4 of 2 dimensions"),
         ({"region": solid(BALL, 0.1), "region_pose": Pose(position=Point(x=float("inf")))}, "region_pose: position"),
-        ({"region_mask": Image(height=1)}, "region_mask: with source 1; valid with CLOUD=0"),
+        ({"region_mask": Image(height=1)}, "region_mask: given with source 1; valid with CLOUD=0"),
         ({"region_mask": Image(height=1), "region": solid(BALL, 0.1)}, "region_mask: region is given too"),
-        ({"avoid": [solid(BOX, 1, 1, 1)]}, "avoid: 1 boxes, 0 poses; valid: one avoid_poses for each, at most 64"),
+        ({"avoid": [solid(BOX, 1, 1, 1)]}, "avoid: 1 boxes, 0 poses; valid: one pose for each box, at most 64"),
         ({"avoid": [solid(BALL, 1)], "avoid_poses": [Pose()]}, "avoid: type 2 of 1 dimensions; valid: BOX=1"),
         ({"avoid": [solid(BOX, 1, 0, 1)], "avoid_poses": [Pose()]}, "box size: .*three lengths above 0"),
     ],

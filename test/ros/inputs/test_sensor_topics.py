@@ -140,7 +140,7 @@ def test_a_camera_that_offers_less_is_heard_too_and_its_losses_are_told(node, pu
     watch(node, [topic], lambda told: topic._lost)
     written = "".join(capfd.readouterr())
     assert "/points: " in written
-    assert "were lost on the way: large messages get lost" in written
+    assert "were lost on the way: Fast DDS loses large messages" in written
     assert "config/fastdds.xml" in written
 
 
@@ -197,4 +197,4 @@ def test_a_publisher_that_sends_nothing_or_another_type_is_told(node, publish, m
     silent, other = watch(node, [clouds, images], all)
     assert silent.startswith("/points: a publisher has existed for ")
     assert silent.endswith("but no message has arrived")
-    assert other == "/depth/image_rect: publishers have type sensor_msgs/msg/CompressedImage, this node needs Image"
+    assert other == "/depth/image_rect: its publishers have type sensor_msgs/msg/CompressedImage; this node needs Image"

@@ -116,7 +116,7 @@ def test_whatever_cannot_be_served_is_refused_by_name(client, node):
         ({"source": 9}, "BAD_REQUEST", "source: 9"),
         ({**SPHERE, "hand": "no_such_hand"}, "WRONG_HAND", "'no_such_hand' is not loaded"),
         ({**SPHERE, "object_pose": Pose(position=Point(x=float("nan")))}, "BAD_REQUEST", "object_pose"),
-        ({"source": GraspRequest.MESH, "mesh_uri": "/etc/passwd"}, "BAD_MESH", "outside the allowed mesh_roots"),
+        ({"source": GraspRequest.MESH, "mesh_uri": "/etc/passwd"}, "BAD_MESH", "outside mesh_roots"),
         ({"source": GraspRequest.LATEST_CLOUD}, "NO_CLOUD", "no cloud or depth image"),
     ]
     for number, (fields, _, _) in enumerate(cases):
