@@ -112,7 +112,7 @@ def run_checks() -> list[Check]:
 
 
 def try_code(name: str, code: str, hint: str, needed: bool) -> Check:
-    """Run Python code in a subprocess. The check fails if the code fails. The last output line is its detail."""
+    """Run Python code in a subprocess. The check fails if the code fails. The last output line becomes the detail."""
     try:
         done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=PROBE_TIMEOUT)
     except subprocess.TimeoutExpired:

@@ -67,7 +67,7 @@ class TransformBuffer:
             self._insert(link, stamp, pose)
 
     def lookup(self, target: str, source: str, stamp: int | None = None) -> Float[np.ndarray, "4 4"]:
-        """Return `T_target_source` at `stamp` [ns]. Without a stamp, use the newest time common to all frames between.
+        """Return `T_target_source` at `stamp` [ns]. Without a stamp, use the newest time known for all frames.
 
         Raises TransformError: a frame is unknown, the frames are not connected, or the time is outside the known span.
         """

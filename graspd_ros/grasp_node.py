@@ -364,7 +364,7 @@ class GoalServer:
     """Action server whose goals are handled like other requests.
 
     An invalid goal is accepted and aborted at once, so that the client gets the reason. No method blocks. The worker
-    decides when a goal starts and ends. The executor sends this to the client.
+    decides when a goal starts and ends. The executor's thread tells the client.
 
     Args:
         make_messages: makes the message converter of a new goal, for example `SynthesizeMessages`.

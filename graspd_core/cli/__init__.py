@@ -130,7 +130,7 @@ def build_parser(command: str = "") -> argparse.ArgumentParser:
 
 
 def runnable(parser: argparse.ArgumentParser) -> Iterator[argparse.ArgumentParser]:
-    """Yield all subparsers of a parser, and the parser itself, that run a command."""
+    """Yield the parser and its subparsers, as far as they run a command."""
     for action in parser._actions:
         for below in action.choices.values() if isinstance(action, argparse._SubParsersAction) else ():
             yield from runnable(below)

@@ -31,7 +31,7 @@ def add_command(commands: Any) -> None:
 
 
 def _build(options: argparse.Namespace) -> int:
-    """Add grasps of all objects. Return 0, 3 if an object has too few grasps, 130 if interrupted."""
+    """Add grasps of all objects. Return 0, or 3 if an object has too few grasps, or 130 if interrupted."""
     from graspd_core.hands.library import load_hand
     from graspd_core.library.grasp_library import GraspLibrary
     from graspd_core.mesh.shapes import object_sources

@@ -48,7 +48,7 @@ def add_output_options(parser: argparse.ArgumentParser) -> None:
 
 @contextmanager
 def output_of(options: argparse.Namespace) -> Iterator[None]:
-    """Apply `--quiet` and `--json` inside the context. With `--json`, stdout gets only JSON, stderr all other text."""
+    """Apply `--quiet` and `--json` inside the context. With `--json`, stdout gets only JSON, and stderr all else."""
     global _settings
     quiet, as_json = getattr(options, "quiet", False), getattr(options, "json", False)
     before, _settings = _settings, _OutputSettings(quiet, sys.stdout if as_json else None)

@@ -100,7 +100,7 @@ def save_result(
     frame: str = "",
     stamp: float | None = None,
 ) -> None:
-    """Write a result to a file atomically. `frame` and `stamp` [s] are the frame and time of its poses."""
+    """Write a result to a file atomically. `frame` and `stamp` [s] are the frame and time of the poses."""
     document = result_document(result, target, hand, config)
     document |= {"frame": frame} if frame else {}
     document |= {"stamp": stamp} if stamp is not None else {}

@@ -338,7 +338,7 @@ def cloud_from_depth_message(image: Any, info: Any, *, rectified: bool = False) 
 
 
 def add_transforms(buffer: TransformBuffer, message: Any, *, static: bool) -> tuple[str, ...]:
-    """Add the valid transforms of a tf2_msgs/TFMessage to a buffer. Return one error line for each invalid one."""
+    """Add the valid transforms of a tf2_msgs/TFMessage to a buffer. Return an error line for each invalid transform."""
     refused = []
     for item in message.transforms:
         try:

@@ -220,7 +220,7 @@ def _inside(mesh: TriangleMesh, nodes: _Vectors, distance: _Lengths, spacing: fl
 def _field(
     offset: _Vectors, normals: _Vectors, inside: Bool[np.ndarray, "x y z"], spacing: float
 ) -> Float[np.ndarray, "4 x y z"]:
-    """Return φ and its unit gradient: (x − c)/φ for node x with surface point c, the outward face normal if φ ≈ 0."""
+    """Return φ and its unit gradient at x: (x − c)/φ with surface point c, or the outward face normal if φ ≈ 0."""
     distance = _length(offset)
     phi = np.where(inside, -distance, distance)
     far = distance > NEAR_SURFACE * spacing

@@ -95,7 +95,7 @@ def is_oriented(faces: Faces) -> bool:
 
 
 def edge_counts(faces: Faces) -> tuple[Int[np.ndarray, "edges 2"], Int[np.ndarray, "edges"]]:
-    """Return the vertices of each edge, the lower first, and the number of faces that it belongs to."""
+    """Return the vertices of each edge, the lower first, and the number of faces at the edge."""
     edges, base = np.sort(face_edges(faces), axis=1), int(faces.max(initial=0)) + 1
     keys, counts = np.unique(edges[:, 0] * base + edges[:, 1], return_counts=True)
     return np.column_stack([keys // base, keys % base]), counts

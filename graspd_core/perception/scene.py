@@ -287,8 +287,8 @@ def object_parts(model: ObjectModel) -> tuple[TriangleMesh, ...]:
 def near_scene(scene: Scene) -> tuple[Scene, Float[np.ndarray, "3"]]:
     """Return the scene moved near the origin, and the new origin in the given scene's frame [m].
 
-    The scene moves only if the object is farther from the origin than a hundred times its size. There float32 could not
-    distinguish contacts from gaps, and MuJoCo finds no contacts. Otherwise return the scene itself and zero.
+    The scene moves only if the object is farther from the origin than a hundred times its size. So far away, float32
+    cannot resolve contacts, and MuJoCo finds none. Otherwise return the scene itself and zero.
     """
     far = far_centre(scene.object.mesh.vertices)
     if not far.any():

@@ -373,7 +373,7 @@ def frame_loader(
 ) -> Callable[[], Scene]:
     """Return a function that makes a scene from one sensor frame. The worker's thread calls `lookup`.
 
-    `point`, on or near the target in the frame's coordinates [m], or `mask`, over its pixels, selects the target.
+    The target is selected by `point`, a point on or near the target in `frame` [m], or by `mask`, an image mask.
     """
 
     def load() -> Scene:

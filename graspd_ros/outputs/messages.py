@@ -138,7 +138,7 @@ def ending_of(result: GraspResult) -> AnswerEnding:
 def array_message(
     ending: AnswerEnding, request_id: str, header: Header, elapsed: float, hand: HandModel, pace: Pace
 ) -> GraspArray:
-    """Return the answer, `elapsed` seconds after the request. Raises FloatingPointError if a grasp has a NaN."""
+    """Return the answer to a request after `elapsed` seconds. Raises FloatingPointError if a grasp has a NaN."""
     message = GraspArray(
         header=header,
         request_id=request_id,

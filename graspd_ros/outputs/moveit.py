@@ -103,7 +103,7 @@ def moveit_grasp(
 def attached_object(
     grasp: Grasp, hull: TriangleMesh, hand: HandModel, mass: float = 0.0, messages: ModuleType | None = None
 ) -> Any:
-    """Return the object in the hand as a moveit_msgs/AttachedCollisionObject, from the squeeze of a grasp on.
+    """Return the object that the hand holds after the squeeze, as a moveit_msgs/AttachedCollisionObject.
 
     The object is attached to the hand's base link, and all links of the hand may touch it. Its id is the id of the
     request. The detach posture opens the hand to the pregrasp.

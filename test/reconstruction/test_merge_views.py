@@ -147,5 +147,5 @@ def test_normals_and_points_of_no_surface_are_refused():
     with pytest.raises(CloudError, match="2000 points"):
         field_of(Surfels(surfels.points, np.zeros((2000, 3))), axes_about(surfels.points))
     points = np.random.default_rng(0).normal(0, 0.02, (3000, 3))
-    with pytest.raises(CloudError, match=r"no surface fits its 3000 points \(\d\d% fit\)"):
+    with pytest.raises(CloudError, match=r"only \d\d% of its 3000 points fit one surface"):
         field_of(Surfels(points, points / np.linalg.norm(points, axis=1, keepdims=True)), axes_about(points))

@@ -216,7 +216,7 @@ def _filled(near: Float[np.ndarray, "near 2"], start: Float[np.ndarray, "2"], en
 
 
 def depth_in_metres(image: UInt16[np.ndarray, "height width"] | DepthImage, encoding: str) -> DepthImage:
-    """Return the depth along the optical axis [m], 0 for missing depth: zero, negative, NaN or infinite values.
+    """Return the depth along the optical axis [m]. Zero, negative, NaN and infinite values become 0 (missing depth).
 
     Raises:
         CloudError: the encoding is not a depth encoding, or the pixels have another type than the encoding.
@@ -279,7 +279,7 @@ def _check_image(depth: Float[np.ndarray, "pixels"], camera: PinholeCamera) -> N
 
 
 def depth_encoding(name: str) -> tuple[str, float]:
-    """Return the NumPy type of a pixel and the metres per unit. Raises CloudError for any other encoding."""
+    """Return the NumPy type of a pixel and the metres per unit. Raises CloudError if `name` is no depth encoding."""
     if name not in ENCODINGS:
         remedy = next((f"; {said}" for begins, said in _REMEDIES.items() if name.startswith(begins)), "")
         raise CloudError(f"depth image: encoding {name[:64]!r}; valid for depth: {', '.join(ENCODINGS)}{remedy}")

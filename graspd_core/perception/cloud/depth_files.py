@@ -65,7 +65,7 @@ def load_depth_view(image: str | Path, camera: str | Path, unit: float | None = 
 
 
 def load_depth_camera(path: str | Path) -> DepthCamera:
-    """Read a camera file. Raises CloudError if the file is missing, not JSON, or lacks a key. The error names it."""
+    """Read a camera file. Raises CloudError: the file is missing, not JSON, or lacks a key, which the error names."""
     try:
         told = json.loads(Path(path).read_text(encoding="utf-8"))
     except OSError as error:

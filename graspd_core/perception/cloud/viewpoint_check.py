@@ -214,7 +214,7 @@ def hidden_share(points: Points, viewpoint: Vector, nearer: Float[np.ndarray, "p
 
 
 def _away_share(points: Points, surfaces: Surfaces, viewpoint: Vector) -> float:
-    """Return the fraction of points that face away from the viewpoint. Most points of each surface count as facing."""
+    """Return the fraction of points that face away from the viewpoint, if most points of each surface face it."""
     normal, surface, clear = surfaces
     ray = viewpoint - points
     cosine = (normal * ray).sum(1) / np.maximum(np.linalg.norm(ray, axis=1), 1e-12)

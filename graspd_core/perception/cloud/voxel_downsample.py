@@ -128,7 +128,7 @@ def _unmeasured(views: Sequence[PointCloud], given: int) -> str:
 
 
 def unit_hint(views: Sequence[PointCloud], farthest: float) -> str:
-    """Return a hint for an error on the likely unit of the points, empty if their distances are plausible metres."""
+    """Return a hint about the likely unit of the points, for an error. Empty if distances are plausible metres."""
     some = np.concatenate([view.points[:: 1 + len(view.points) // 10_000] - view.viewpoint for view in views])
     away = float(np.median([0.0, *np.abs(some[np.isfinite(some).all(1)]).max(1, initial=0.0)]))
     for name, per_metre in UNITS_PER_METRE:

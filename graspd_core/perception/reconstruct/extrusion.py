@@ -66,7 +66,7 @@ def _contradicted(
 
 
 def with_foot(surfels: Surfels, free_space: FreeSpace, step: float) -> Surfels:
-    """Return the surfels, and the surface between them and the support if the object stands."""
+    """Return the surfels. If the object stands, add the surface between them and the support."""
     return join(surfels, stand(surfels, free_space, step)) if free_space.standing else surfels
 
 

@@ -251,7 +251,7 @@ def grid_poisson_field(surfels: Surfels, nodes: Nodes, cell: float) -> Grid:
     field, there = ((values - np.average(there, weights=weights)) / slope for values in (field, there))
     near = float((np.abs(there) < 1.0).mean())
     if near < _MIN_NEAR:
-        raise CloudError(f"cloud: no surface fits its {len(there)} points ({near:.0%} fit)")
+        raise CloudError(f"cloud: only {near:.0%} of its {len(there)} points fit one surface; add more views")
     for _ in range(_STEPS):
         push, pushed = at_points(spread(-weights * there) * blur / (square + _REACH**-2))
         # The step length minimises the squared field at the points.

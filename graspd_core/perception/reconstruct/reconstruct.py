@@ -146,7 +146,7 @@ def _closed(
     settings: ReconstructionConfig,
     cells: int,
 ) -> TriangleMesh:
-    """Close the surface by the grid solver. Use Open3D's if `settings` ask for it or the first surface does not fit."""
+    """Close the surface by the grid solver. Use Open3D's solver if `settings` ask for it or no surface fits."""
     adaptive = partial(poisson_field, finest=settings.poisson_cell)
     small = float(np.ptp(seen.points, axis=0).max()) < _LEAST_CELLS * settings.min_cell
     if settings.poisson == "grid" and not small:
@@ -240,8 +240,8 @@ def _finished(mesh: TriangleMesh, seen: Surfels, settings: ReconstructionConfig)
     fitted = float((surface_distance(make_surface(mesh), seen.points) < settings.fit_distance).mean())
     if not is_closed(mesh) or fitted < MIN_FITTED_SHARE:
         raise CloudError(
-            f"cloud: no closed surface fits its {len(seen.points)} points ({fitted:.0%} fit); more views are needed, "
-            "or more points where its walls are thin"
+            f"cloud: no closed surface fits enough of its {len(seen.points)} points ({fitted:.0%}); add more views, "
+            "or more points on thin walls"
         )
     return mesh
 

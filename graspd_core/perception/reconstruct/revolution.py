@@ -278,7 +278,7 @@ def _profile(rows: Float[np.ndarray, "n 4"], step: float) -> Float[np.ndarray, "
 
 
 def _ring(profile, axis: Axis, right, up, counts) -> Surfels:
-    """Return the surfels made by turning each row of the profile to its number of `counts` positions."""
+    """Return the surfels made by turning each profile row about the axis, to as many positions as `counts` gives."""
     rows = np.repeat(np.arange(len(profile)), counts)
     place = np.arange(len(rows)) - np.repeat(np.cumsum(counts) - counts, counts)
     turn = 2 * np.pi * place / np.repeat(counts, counts)

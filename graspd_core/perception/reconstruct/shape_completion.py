@@ -46,7 +46,7 @@ class Completion:
 
 
 def complete_shape(seen: Surfels, free_space: FreeSpace, step: float, settings: ReconstructionConfig) -> Completion:
-    """Return the best guess of the unseen side: by the rule that explains the seen surface and adds most to it."""
+    """Guess the unseen side by the rule that best explains the seen surface and adds most surface to it."""
     from scipy.spatial import KDTree
 
     missing = openness(with_foot(seen, free_space, step), step)

@@ -101,7 +101,7 @@ def select_target(
 def select_part(
     scene: VoxelScene, part: Labels, target: Target, views: Sequence[PointCloud], settings: SegmentationConfig
 ) -> Mask:
-    """Return the voxels of the parts of the selected object at which the target points.
+    """Return the voxels of those parts of the selected object that the target selects.
 
     Args:
         part: part number of each voxel of the selected object, split at seams, -1 for other voxels.
