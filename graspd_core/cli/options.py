@@ -48,7 +48,7 @@ def add_planning_options(parser: argparse.ArgumentParser) -> None:
     """Add the options for hand, grasps, method, trials, and the object's mass and friction."""
     parser.add_argument("--hand", default="allegro_right", metavar="NAME|PATH", help="a hand (see graspd hands)")
     parser.add_argument("-n", "--count", type=int, default=16, help="number of verified grasps (default 16)")
-    parser.add_argument("--method", default=None, metavar="NAME", help="replace the preset's method, with defaults")
+    parser.add_argument("--method", default=None, metavar="NAME", help="method at its defaults (default: the preset's)")
     add_plugin_option(parser)
     parser.add_argument("--preset", default="balanced", help=f"{', '.join(preset_names())}, or a .yaml file")
     parser.add_argument("--seed", type=int, default=0)

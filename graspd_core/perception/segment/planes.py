@@ -71,7 +71,7 @@ class FlatPart:
         return np.clip(INLIER_DEVIATIONS * self.noise * distance**2, self.least, self.most)
 
     def below(self, distance: Float[np.ndarray, "n"]) -> Plane:
-        """Return the plane as the support of an object at the given distances from the camera [m]."""
+        """Return the plane as support of an object at these distances from the camera [m]. Noise sets its `margin`."""
         return replace(self.plane, margin=float(np.median(self.tolerance(distance))) / INLIER_DEVIATIONS)
 
     def beneath(self, points: Points, margin: float) -> Bool[np.ndarray, "n"]:
