@@ -100,14 +100,14 @@ class RobustConfig:
 
 @dataclass(frozen=True)
 class HeldShares:
-    """Fraction of grasps planned from a single view that hold on the true object at its true mass (docs/clouds.md).
+    """Fractions of single-view grasps that hold on the true object at its true mass, by trial results (docs/clouds.md).
 
     Attributes:
-        likeliest: among the grasps whose trial on the likeliest shape holds.
-        places: among the grasps that also hold with the hand misplaced.
-        shapes: among the grasps that also hold on two other shapes of the hidden side.
-        fails_places: among the grasps that hold on the likeliest shape but not with the hand misplaced.
-        fails_shapes: among the grasps that hold with the hand misplaced but not on two other shapes.
+        likeliest: fraction of the grasps that hold on the likeliest shape.
+        places: fraction of the grasps that also hold with the hand misplaced.
+        shapes: fraction of the grasps that also hold on two other shapes of the hidden side.
+        fails_places: fraction of the grasps that hold on the likeliest shape but not with the hand misplaced.
+        fails_shapes: fraction of the grasps that hold with the hand misplaced but not on two other shapes.
     """
 
     likeliest: float

@@ -89,7 +89,7 @@ class ReconstructionConfig:
         open_share: the hidden side is guessed only if at least this fraction of the surface is missing.
         revolution_share: least fraction of the seen surface that a body of revolution must explain.
         symmetry_worth: symmetries with a lower score are ignored as chance. The highest score is 2.6.
-        poisson: solver for the surface: "open3d", or "grid" with Open3D as fallback if its surface does not fit.
+        poisson: solver for the surface: "open3d", or "grid", with Open3D as fallback if no grid surface fits.
         poisson_cell: approximate width of the finest cells of Open3D's solver, twice the camera's noise [m].
         min_cell: least cell width of the grid that the surface is closed on, also twice the noise [m].
         fit_distance: a mesh is refused unless 85 % of the seen points are this near to its surface [m].
@@ -135,9 +135,9 @@ class SceneConfig:
     """Settings for building a scene from point clouds.
 
     Attributes:
-        segmentation: for cutting the object out of the cloud.
-        reconstruction: for making a closed mesh of the object's points.
-        obstacles: for making hulls of the neighbouring objects.
+        segmentation: settings for cutting the object out of the cloud.
+        reconstruction: settings for making a closed mesh of the object's points.
+        obstacles: settings for making hulls of the neighbouring objects.
     """
 
     segmentation: SegmentationConfig = field(default_factory=SegmentationConfig)

@@ -181,7 +181,7 @@ def known_grasps(
     Args:
         library: from `GraspLibrary(path).checked()`.
         scene: scene with the object. Its mesh, friction and given mass identify the entry.
-        hand: hand. Its content identifies the entry, not its name.
+        hand: grasping hand. Its content identifies the entry, not its name.
         count: greatest number of grasps.
         restrictions: as for `plan_grasps`.
         verify: trials that the grasps must have passed. Stricter trials count too.

@@ -48,7 +48,7 @@ def load_scene(
     """Build the scene of one object.
 
     Args:
-        source: a mesh file, a point cloud file (the object is cut out and reconstructed), `shape:NAME`, or a mesh.
+        source: a mesh, its file, `shape:NAME`, or a point cloud or depth image, from which the object is reconstructed.
         mass: mass of the object [kg]. None assumes the most that its volume allows (`heavy_mass`), with a warning.
         friction: Coulomb friction coefficient between hand and object.
         scale: factor that converts the file's coordinates to metres.

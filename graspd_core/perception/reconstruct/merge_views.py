@@ -260,7 +260,7 @@ class Evidence:
         chosen: completion rule that the reconstruction used, empty for none.
         settings: settings of the reconstruction.
         hidden: whether a large part of the surface was hidden.
-        doubts: reasons why the views may not show the true scene. With any, no grasp counts as verified.
+        doubts: reasons why the views may not show the true scene. With any doubt, no grasp counts as verified.
     """
 
     seen: Surfels
