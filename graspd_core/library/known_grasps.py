@@ -67,7 +67,7 @@ class Physics:
 def entry_by_name(library: GraspLibrary, hand: HandModel | None, name: str, physics: Physics) -> LibraryEntry:
     """Return the entry of the object with this name, for this hand (None for any hand).
 
-    If all entries of the object share one mass and friction, these need not be the wanted ones.
+    If all entries of the object have the same mass and friction, `physics` may have others.
 
     Raises:
         ConfigError: the name is unknown, has no entry for this hand or physics, or is not unique.

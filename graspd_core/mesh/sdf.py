@@ -150,7 +150,7 @@ def sample_sdf(
 
 
 def is_solid(sdf: GridSDF) -> bool:
-    """Return True if a node lies inside the object. No node does in open sheets and walls far thinner than a cell."""
+    """Return True if a node lies inside the object. Open sheets and walls far thinner than a cell contain no node."""
     return bool((sdf.field[0] < 0).any())
 
 
