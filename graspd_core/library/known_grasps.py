@@ -137,7 +137,7 @@ def _with_hand(
         return same
     hands = sorted({entry.hand for entry in entries})
     made = f"for {', '.join(hands)}, not for {hand.name}" if hand.name not in hands else "for another form of this hand"
-    raise ConfigError(f"{what}: the library {library.path} has it {made}; `graspd library build --hand` adds it")
+    raise ConfigError(f"{what}: the library {library.path} has it {made}; `graspd library build --hand` adds this hand")
 
 
 def _held_entry(

@@ -192,7 +192,7 @@ def object_hash(source: str) -> str:
         return content_hash(make_shape(source.removeprefix("shape:")))
     path = Path(source)
     if not path.is_file():
-        raise MeshError(f"{path}: no such mesh file; shape:NAME is a built-in shape: {', '.join(sorted(SHAPES))}")
+        raise MeshError(f"{path}: no such mesh file; valid: a file, or shape:NAME with {', '.join(sorted(SHAPES))}")
     if path.suffix.lower().lstrip(".") not in MESH_ENDINGS:
         raise MeshError(f"{path}: unknown mesh ending {path.suffix!r}; valid endings: {', '.join(MESH_ENDINGS)}")
     return hashlib.sha256(path.read_bytes()).hexdigest()

@@ -119,7 +119,7 @@ def attached_object(
     """
     kind = attached_kind(messages)
     if kind is None:
-        raise MoveItMissing("moveit_msgs/AttachedCollisionObject is not installed; valid: moveit_msgs of ROS 2 Jazzy")
+        raise MoveItMissing("moveit_msgs/AttachedCollisionObject is not installed; install moveit_msgs of ROS 2 Jazzy")
     center = hull.vertices.mean(0)
     shape = Mesh(
         vertices=[point_of(vertex) for vertex in hull.vertices - center],
