@@ -9,7 +9,7 @@ from dataclasses import replace
 import numpy as np
 import torch
 
-from graspd_core.config import SceneConfig
+from graspd_core.config import SceneConfig, SegmentationConfig
 from graspd_core.errors import CloudError
 from graspd_core.perception.cloud.point_cloud import PointCloud, Points
 from graspd_core.perception.cloud.viewpoint_check import check_scene, check_viewpoint, fits_nowhere
@@ -17,7 +17,7 @@ from graspd_core.perception.obstacles import make_obstacles
 from graspd_core.perception.reconstruct.merge_views import Evidence, is_all_round, is_unposed
 from graspd_core.perception.reconstruct.reconstruct import Reconstruction, reconstruct
 from graspd_core.perception.scene import ObjectModel, Obstacle, Scene, build_scene, refuse_numbers
-from graspd_core.perception.segment.segment import Segmentation, segment
+from graspd_core.perception.segment.segment import Segmentation, find_things, segment
 from graspd_core.perception.segment.target_selection import Target
 from graspd_core.runtime.worker_process import run_isolated
 from graspd_core.types import Plane
@@ -78,6 +78,14 @@ def scene_from_views(
         ahead=ahead and (lambda model: ahead(model, whole.evidence)),
     )
     return replace(scene, evidence=whole.evidence)
+
+
+def things_from_views(views: Sequence[PointCloud], settings: SegmentationConfig | None = None) -> tuple[Points, ...]:
+    """Return the points [m] of each object that `scene_from_views` can select. See `find_things`.
+
+    Where `run_isolated` uses a child process, later scenes of these views need no segmentation of their own.
+    """
+    return run_isolated(find_things, [replace(view, points=_single(view.points)) for view in views], settings)
 
 
 def reconstruct_object(

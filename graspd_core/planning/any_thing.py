@@ -27,8 +27,7 @@ from graspd_core.optimize.plan_config import load_preset
 from graspd_core.perception.cloud.point_cloud import PointCloud
 from graspd_core.perception.obstacles import with_neighbours
 from graspd_core.perception.scene import Scene
-from graspd_core.perception.scene_from_views import scene_from_views
-from graspd_core.perception.segment.segment import find_things
+from graspd_core.perception.scene_from_views import scene_from_views, things_from_views
 from graspd_core.perception.segment.target_selection import Target
 from graspd_core.planning.plan_grasps import check_request, plan_grasps
 from graspd_core.types import Grasp, GraspResult, Outcome, Plane, Posture, Timing, TriangleMesh, Verdict
@@ -159,7 +158,7 @@ def plan_any_thing(
     build = partial(_scene_among, views, surface=surface, solids=solids, about=about)
     loose = [failure for failure in failures if failure.place is None]
     search = _Search(build, hand, asked, until, loose)
-    seen = [p for p in find_things(views, settings and settings.segmentation) if not _is_solid(p, solids or {})]
+    seen = [p for p in things_from_views(views, settings and settings.segmentation) if not _is_solid(p, solids or {})]
     order = _in_order(seen, failures)
     things = search.first([row for row in order if len(row[1]) < tries], known, enough, most)
     things = search.further(things, [failed for _, failed in order], more)

@@ -320,3 +320,10 @@ def test_things_that_are_found_are_those_that_a_point_of_theirs_means():
         known = {tuple(point) for point in points}
         assert all(tuple(point) in known for point in cut.points)
         assert len(cut.points) > 0.9 * len(points)
+
+
+def test_a_cloud_that_changes_in_place_is_divided_anew():
+    (view,) = views_of(THREE, CAMERA, [POSE])
+    gone, *left = find_things([view])
+    view.points[((view.points >= gone.min(0)) & (view.points <= gone.max(0))).all(1)] = np.nan
+    assert len(find_things([view])) == len(left)

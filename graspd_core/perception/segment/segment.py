@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import pickle
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from hashlib import blake2b
 
 import numpy as np
 from jaxtyping import Float
@@ -141,14 +143,24 @@ class _Parted:
     settings: SegmentationConfig
 
 
+# The last scene, by a hash of its clouds and settings. A request for any object needs it once for each object.
+_LAST: dict[bytes, _Parted] = {}
+
+
 def _parted(views: Sequence[PointCloud], settings: SegmentationConfig, target: Target | None = None) -> _Parted:
-    scene = voxel_downsample(views, settings)
+    key = blake2b(pickle.dumps((tuple(views), settings))).digest()
+    parted = _LAST.get(key)
+    scene = voxel_downsample(views, settings) if parted is None else parted.scene
     if target is not None:
         check_target(target, views)
-    eyes = np.array([view.viewpoint for view in views], dtype=float)
-    parts = find_planes(scene.mean, scene.mean_distance, eyes, settings)
-    ground = find_ground(scene, parts, eyes, settings)
-    return _Parted(scene, eyes, ground, _things(scene, ground, eyes, settings), settings)
+    if parted is None:
+        eyes = np.array([view.viewpoint for view in views], dtype=float)
+        parts = find_planes(scene.mean, scene.mean_distance, eyes, settings)
+        ground = find_ground(scene, parts, eyes, settings)
+        parted = _Parted(scene, eyes, ground, _things(scene, ground, eyes, settings), settings)
+        _LAST.clear()
+        _LAST[key] = parted
+    return parted
 
 
 def _things(scene: VoxelScene, ground: Ground, eyes: Eyes, settings: SegmentationConfig) -> Labels:
