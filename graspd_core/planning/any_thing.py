@@ -24,6 +24,7 @@ from graspd_core.errors import CloudError, ConfigError, MeshError, NoObjectError
 from graspd_core.hands.model import HandModel
 from graspd_core.mesh.surface_queries import make_surface, surface_distance
 from graspd_core.optimize.plan_config import load_preset
+from graspd_core.optimize.restrictions import BoundRestriction, Refusal
 from graspd_core.perception.cloud.point_cloud import PointCloud
 from graspd_core.perception.obstacles import with_neighbours
 from graspd_core.perception.scene import Scene
@@ -228,7 +229,7 @@ class _Search:
         config = config.at_budget(config.rounds.growth) if thing.searches > 1 else config
         asked = {
             "preset": replace(config, rounds=replace(config.rounds, most=1)),
-            "count": self.plan["count"] + 2 * len(lost),
+            "restrictions": (*((_Unlike(lost),) if lost else ()), *self.plan.get("restrictions", ())),
             "seed": self.plan["seed"] + len(failed) + len(self.loose) + _SEED_STEP * (thing.searches - 1),
             "deadline": None if self.until == math.inf else max(self.until - time.perf_counter(), 1e-3),
         }
@@ -323,6 +324,21 @@ def _with_result(thing: ThingPlan, result: GraspResult, lost: Sequence[Posture])
     best = max(left, key=lambda grasp: (grasp.verdict is Verdict.VERIFIED, grasp.probability or 0.0))
     reason = "" if best.verdict is Verdict.VERIFIED else result.message or "no grasp passes the robustness checks"
     return replace(thing, result=result, grasp=best, reason=reason)
+
+
+@dataclass(frozen=True, eq=False)
+class _Unlike(BoundRestriction):
+    """Restriction to grasps that are not like any lost one. It is the same for every scene and hand."""
+
+    lost: Sequence[Posture]
+
+    def bind(self, scene: Scene, hand: HandModel) -> BoundRestriction:
+        """Return this restriction."""
+        return self
+
+    def admit(self, grasps: Sequence[Grasp]) -> Sequence[Grasp | Refusal]:
+        """Return each candidate, or a refusal if it is like a lost grasp."""
+        return [grasp if unlike([grasp], self.lost) else Refusal("like a lost grasp") for grasp in grasps]
 
 
 def unlike(grasps: Sequence[Grasp], lost: Sequence[Posture]) -> list[Grasp]:
