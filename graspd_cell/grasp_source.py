@@ -104,7 +104,7 @@ class InProcessGrasps:
     ) -> None:  # fmt: skip
         self._hand, self._known = hand, tuple[ThingPlan, ...]()
         self._plan = {
-            "settings": scene_config(layout.pick), "surface": TABLE, "tries": tries, "most": most,
+            "settings": scene_config(layout.pick), "surface": TABLE, "tries": tries, "most": most, "more": 4,
             "solids": {f"wall {k}": [box_mesh(wall)] for k, wall in enumerate(layout.solids[1:])},
             "restrictions": (Reach(arm, (0.0, 0.0, 0.0)),), "measure": False, "preset": preset, "seed": seed,
         }  # fmt: skip
