@@ -69,11 +69,11 @@ MAX_PACKAGE_LINES = {
     "graspd_dataset": 2_961,
     "graspd_viewer": 2_428,
     "graspd_cell": 3_775,
-    "test": 33_192,
+    "test": 33_190,
 }
 # Lines that a program reaches through its imports, those inside functions too.
 # The layout aims at 22,000 of the node.
-MAX_REACH = {"graspd_core.cli.synthesize_command": 22_597, "graspd_ros.node": 26_474}
+MAX_REACH = {"graspd_core.cli.synthesize_command": 22_597, "graspd_ros.node": 26_472}
 
 # The launch file imports this one where ROS runs it, perhaps without any library of graspd.
 SHORT = ("graspd_core/paths.py",)
