@@ -415,7 +415,7 @@ class GoalServer:
 
 
 class Goal:
-    """Listener of a request that sends feedback and result to an action client."""
+    """Listen to one request, and send its feedback and result to the action client."""
 
     def __init__(self, node: Node, handle: ServerGoalHandle, messages: Any, on_end: Callable[[], object]) -> None:
         self._node = node

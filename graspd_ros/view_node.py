@@ -139,6 +139,9 @@ def grasp_of(message: Any, joint_names: tuple[str, ...]) -> Grasp:
             raise ValueError("a posture has a number that is not finite, or no unit quaternion")
         return Posture(*made)
 
+    def triple(values: Any) -> tuple[float, float, float]:
+        return values.x, values.y, values.z
+
     def moved(value: float) -> float:
         return value if value >= 0 else float("inf")  # −1 where the simulation diverged
 
@@ -147,7 +150,7 @@ def grasp_of(message: Any, joint_names: tuple[str, ...]) -> Grasp:
         grasp=posture(message.grasp_pose, message.grasp_joints),
         squeeze=posture(message.grasp_pose, message.squeeze_joints),
         contacts=tuple(
-            Contact(c.link, (c.position.x, c.position.y, c.position.z), (c.normal.x, c.normal.y, c.normal.z))
+            Contact(c.link, triple(c.position), triple(c.normal), triple(c.force) if any(triple(c.force)) else None)
             for c in message.contacts
         ),
         score=message.score,

@@ -85,7 +85,7 @@ def contact_parts(contacts: Sequence[Contact]) -> list[Part]:
 
 
 def force_parts(positions: Float[np.ndarray, "n 3"], forces: Float[np.ndarray, "n 3"]) -> list[Part]:
-    """Return one arrow per force on the object [N]. Each arrow ends at the point of application, `positions` [m]."""
+    """Return a part with an arrow for each force on the object above 0.02 N. Arrows end at `positions` [m]."""
     strong = np.linalg.norm(forces, axis=1) > 0.02
     if not strong.any():
         return []

@@ -291,6 +291,8 @@ def test_what_docstrings_and_comments_name_exists():
     modules = {path: text for path, text in sources().items() if path.endswith(".py") and path.startswith(PACKAGES)}
     assert len(modules) > 100
     found = [f"{path}: {name}" for path, text in modules.items() for name in unknown(prose_of(text), tree())]
+    headers = {path: re.findall(r"[\w/]+\.py", text) for path, text in sources().items() if path.endswith(".hpp")}
+    found += [f"{path}: {name}" for path, names in headers.items() for name in names if not exists(name, tree())]
     assert not found, "\n".join(found)
 
 

@@ -54,7 +54,10 @@ class Fingers:
 # The results for the last hands are cached. Hands are hashed by identity.
 @lru_cache(maxsize=8)
 def find_fingers(hand: HandModel) -> Fingers:
-    """Find the fingers: chains that end in a link without children. A chain's tip is the far end of its last solids."""
+    """Find the fingers: chains that end in a link without children.
+
+    A tip is the far end of the last link of a chain that has a collision shape.
+    """
     groups = hand.link_group
     heads = np.unique(groups)
     above = {int(g): int(groups[hand.link_parent[g]]) if hand.link_parent[g] >= 0 else -1 for g in heads}

@@ -153,8 +153,8 @@ def deepest_overlap(hand: HandModel, q: Float[np.ndarray, "postures joints"]) ->
 def adjacent_links(hand: HandModel) -> Bool[np.ndarray, "links links"]:
     """Return the pairs of links that are never checked for collision. The result is cached on disk by hand content.
 
-    These are links of one rigid group, links one joint apart, and links two joints apart with little overlap. Pairs
-    that overlap in the open posture or in every sampled posture are adjacent too.
+    These are links of one rigid group, links one joint apart, and links two joints apart that never overlap by much.
+    Pairs that overlap in the open posture or in every sampled posture are adjacent too.
     """
     build = lambda: {"adjacent": _adjacent_links(hand)}  # noqa: E731
     return kept(hand, "adjacent", hand.num_links, {"adjacent": (hand.num_links,)}, build)["adjacent"]

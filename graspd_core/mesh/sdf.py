@@ -220,7 +220,10 @@ def _inside(mesh: TriangleMesh, nodes: _Vectors, distance: _Lengths, spacing: fl
 def _field(
     offset: _Vectors, normals: _Vectors, inside: Bool[np.ndarray, "x y z"], spacing: float
 ) -> Float[np.ndarray, "4 x y z"]:
-    """Return φ and its unit gradient at x: (x − c)/φ with surface point c, or the outward face normal if φ ≈ 0."""
+    """Return the signed distance φ [m] and its unit gradient at each node, from its nearest point of the surface.
+
+    `offset` is the node minus that point. The gradient is offset/φ, or the face's outward normal near the surface.
+    """
     distance = _length(offset)
     phi = np.where(inside, -distance, distance)
     far = distance > NEAR_SURFACE * spacing

@@ -120,8 +120,10 @@ class Steering:
             return
         if not np.isfinite(self.roll):
             raise ConfigError(f"roll: {self.roll} rad; valid: a finite number")
-        if self.approach_direction is None or self.approach_angle >= np.pi / 2:
-            raise ConfigError("roll: needs approach_direction, and approach_angle below pi/2 (90 degrees)")
+        if self.approach_direction is None:
+            raise ConfigError("roll: no approach_direction is given, about which the hand rolls; give one")
+        if self.approach_angle >= np.pi / 2:
+            raise ConfigError(f"roll: approach_angle is {self.approach_angle:.4g} rad; valid: below pi/2 (90 degrees)")
         if self.roll_zero is not None:
             zero, along = numbers("roll_zero", self.roll_zero, 3), np.array(self.approach_direction, dtype=float)
             if not np.linalg.norm(np.cross(zero, along)) > _PARALLEL * np.linalg.norm(zero) * np.linalg.norm(along):

@@ -94,7 +94,7 @@ def least_friction(world: World, grasp: Grasp, protocol: Protocol, *, stop: Stop
 
 
 def _estimated(world: World, data: Any, protocol: Protocol, direction: np.ndarray, least: float) -> float:
-    """Pull the object in a direction ever harder until it is lost, and return an estimate of the payload there [kg]."""
+    """Pull the object along `direction` ever harder until the hand loses it. Return the estimated payload [kg]."""
     force, resisted = slice(world.object_velocity, world.object_velocity + 3), list[float]()
     for step in range(max(math.ceil(_DOUBLING * math.log2(MOST_PAYLOAD / least)), _WINDOW)):
         data.xfrc_applied[world.object_body, :3] = 2 * protocol.pull * least * 2 ** (step / _DOUBLING) * direction

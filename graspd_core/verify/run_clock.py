@@ -62,7 +62,7 @@ class Run:
         return time.perf_counter() >= self._end
 
     def report(self, stage: Stage, step: int, of: int, best: float, verified: int, found: Grasp | None = None) -> None:
-        """Call the progress hook, if there is one, with the elapsed time and `found` in the given scene's frame."""
+        """Call the progress hook, if there is one, with the elapsed time. Move `found` to the frame of the request."""
         if self._progress is not None:
             found = None if found is None else moved_grasp(found, self.origin)
             self._progress(Progress(stage, step, of, best, verified, time.perf_counter() - self.began, found))

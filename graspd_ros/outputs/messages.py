@@ -202,7 +202,12 @@ def grasp_message(
         ],
         trials=[_trial(trial) for trial in grasp.trials],
         contacts=[
-            ContactMessage(link=c.link, position=point_of(c.position), normal=vector_of(c.normal))
+            ContactMessage(
+                link=c.link,
+                position=point_of(c.position),
+                normal=vector_of(c.normal),
+                force=vector_of(c.force or (0.0, 0.0, 0.0)),
+            )
             for c in grasp.contacts
         ],
         trajectory=trajectory_of(grasp, hand, pace),

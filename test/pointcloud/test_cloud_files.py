@@ -135,7 +135,7 @@ def test_a_pcd_says_where_its_sensor_stood(tmp_path):
     assert cloud.points.tolist() == [[1, 2, 3], [4, 5, 6]]
     assert cloud.viewpoint.tolist() == [0.5, -1, 0.2]
     (tmp_path / "a.pcd").write_text(PCD % "0.5 nan 2")
-    with pytest.raises(CloudError, match=r"a\.pcd: its VIEWPOINT is not 3 finite numbers"):
+    with pytest.raises(CloudError, match=r"a\.pcd: its VIEWPOINT begins with"):
         load_views(tmp_path / "a.pcd")
 
 

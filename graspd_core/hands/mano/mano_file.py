@@ -94,8 +94,11 @@ def _dense(value: Inert, depth: int) -> np.ndarray:
 
 def _selected(value: Inert, depth: int) -> np.ndarray:
     source, index = (numbers(_entry(value, key), depth).ravel() for key in ("a", "idxs"))
-    if index.dtype.kind not in "iu" or (len(index) and not 0 <= index.min() <= index.max() < len(source)):
-        raise ValueError("holds a selection outside its array")
+    if index.dtype.kind not in "iu":
+        raise ValueError(f"holds indices of type {index.dtype}; valid: integers")
+    if len(index) and not 0 <= index.min() <= index.max() < len(source):
+        given = f"indices from {index.min()} to {index.max()} into an array of {len(source)} numbers"
+        raise ValueError(f"holds {given}; valid: 0 to {len(source) - 1}")
     shape = value.state.get("preferred_shape")
     chosen = source[index]
     return chosen if shape is None else chosen.reshape(numbers(shape, depth).astype(np.int64))

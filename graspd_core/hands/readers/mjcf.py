@@ -96,8 +96,11 @@ def pose(position: Float[np.ndarray, "3"], quaternion: Float[np.ndarray, "4"]) -
 def check_type(path: Path, geom: Any, assets: Mapping[str, _MeshAsset]) -> None:
     """Raise HandError if a geom has an unsupported type or an unknown mesh."""
     kind, known = _type_name(geom), (*_SIZES, "mesh")
-    if kind not in known or (geom.meshname and kind != "mesh"):
+    if kind not in known:
         raise fault(path, geom, f"<geom type={kind!r}> is not read; known: {', '.join(known)}")
+    if geom.meshname and kind != "mesh":
+        fitted = f"<geom type={kind!r} mesh={geom.meshname!r}>: no {kind} is fitted to a mesh"
+        raise fault(path, geom, f"{fitted}; give type='mesh', or a size without a mesh")
     if kind == "mesh" and geom.meshname not in assets:
         raise fault(path, geom, f"unknown mesh {geom.meshname!r}; valid: {', '.join(assets) or 'none'}")
 

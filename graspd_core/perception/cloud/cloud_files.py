@@ -371,7 +371,7 @@ def _pcd_viewpoint(path: Path, header: Mapping[str, list[str]]) -> Vector:
     except ValueError:
         place = np.zeros(0)
     if place.shape != (3,) or not np.isfinite(place).all():
-        raise CloudError(f"{path}: its VIEWPOINT is not 3 finite numbers and a quaternion")
+        raise CloudError(f"{path}: its VIEWPOINT begins with {' '.join(words)}; valid: 3 finite numbers [m]")
     return place
 
 

@@ -221,6 +221,7 @@ def test_where_the_base_stands_in_its_file_is_kept(folder: Path) -> None:
         ('size=".01 .02 .01"', 'size=".01 -.02 .01"', "changed.xml:13: .*size 1 must be positive in geom"),
         ('type="ellipsoid"', 'type="hfield"', "body 'tip': <geom type='hfield'> is not read; known: sphere"),
         ('mesh="w"', 'mesh="q"', "unknown mesh 'q'; valid: t, w"),
+        ('type="mesh" mesh="w"', 'type="box" mesh="w"', "mesh='w'>: no box is fitted to a mesh; give type='mesh'"),
         (
             'vertex="0 0 0 .02 0 0 0 .02 0 0 0 .03"',
             'vertex="0 0 0"',

@@ -464,7 +464,7 @@ def test_a_box_may_be_the_region(tmp_path):
         ({"approach_angle": 0.5}, "approach_angle: needs approach_direction"),
         ({"approach_direction": DOWN, "approach_angle": -0.5}, "approach_angle: -0.5 rad; valid: above 0"),
         ({"approach_direction": DOWN, "roll": 0.5}, "roll: use_roll is false"),
-        ({"use_roll": True}, "roll: needs approach_direction"),
+        ({"use_roll": True}, "roll: no approach_direction is given"),
         ({"region": solid(BOX, 0.1)}, "region: type 1 of 1 dimensions; valid: BOX=1 or SPHERE=2"),
         ({"region": solid(BALL, 0.1, 0.1)}, "region: 2 dimensions; valid for a SPHERE: 1, the radius"),
         ({"region": solid(BALL, -0.1)}, "sphere radius: -0.1 m; valid: above 0"),

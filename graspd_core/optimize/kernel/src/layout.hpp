@@ -38,7 +38,7 @@ struct Grid {
     float origin[3], spacing;
 };
 
-// Boxes and round solids of the hand, as in hands/collision_tensors.py.
+// Boxes and round solids of the hand, as in hands/self_collision.py.
 struct Solids {
     int32_t count;
     const float* pose;  // count x 12: T_link_solid
@@ -89,7 +89,7 @@ struct Problem {
     float friction, sharp_reach;
 };
 
-// How the search steps (closed_form_config.py).
+// How the search steps (optimize/closed_form/closed_form_config.py).
 struct Schedule {
     Weights weights, polish_weights;
     float delta_start, delta_end, radius_start;
@@ -97,7 +97,7 @@ struct Schedule {
     int32_t explore_steps, refine_steps, polish_steps, fine_steps, soft;
 };
 
-// How a pregrasp is sought (config/grasp_stages_config.py).
+// How a pregrasp is sought (config/planning_config.py).
 struct Pregrasp {
     float clearance, joint_rate, base_rate, joint_cost, base_cost, self_collision, keep;
     int32_t steps, spheres;  // spheres: whether they are kept out of each other too

@@ -1,4 +1,4 @@
-// The closed-form loss of one pose and its gradient (docs/method.md; methods/problem.py, `evaluate`).
+// The closed-form loss of one pose and its gradient (docs/method.md; optimize/problem.py, `evaluate`).
 #pragma once
 #include "obstacles.hpp"
 #include "sharp_points.hpp"

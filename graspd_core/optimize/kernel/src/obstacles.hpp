@@ -1,4 +1,4 @@
-// Depth of the hand in its support and its neighbours (methods/obstacle_distance.py).
+// Depth of the hand in its support and its neighbours (optimize/obstacle_distance.py).
 #pragma once
 #include "terms.hpp"
 

@@ -1,4 +1,4 @@
-// The schedule of one start: coarse to fine, Adam with projection (methods/closed_form/closed_form.py).
+// The schedule of one start: coarse to fine, Adam with projection (optimize/closed_form/closed_form.py).
 #pragma once
 #include "objective.hpp"
 

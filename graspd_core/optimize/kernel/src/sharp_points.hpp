@@ -1,4 +1,4 @@
-// The object's sharp points against the hand's solids (methods/problem.py, `feature_distance`).
+// The object's sharp points against the hand's solids (optimize/problem.py, `feature_distance`).
 #pragma once
 #include "terms.hpp"
 

@@ -1,4 +1,4 @@
-// How deep the hand's solids are in each other, by separating axes (hands/solid_overlap.py).
+// How deep the hand's solids are in each other, by separating axes (hands/self_collision.py).
 #pragma once
 #include "sharp_points.hpp"
 

@@ -1,4 +1,4 @@
-// From an optimised pose to its pregrasp, and how deep a hand lies in itself (methods/stages).
+// From an optimised pose to its pregrasp, and how deep a hand lies in itself (optimize/grasp_postures.py, hands/self_collision.py).
 #pragma once
 #include "search.hpp"
 #include "solid_overlap.hpp"

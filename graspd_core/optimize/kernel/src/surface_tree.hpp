@@ -37,7 +37,7 @@ struct SurfaceNode {
     double radius;
     int32_t first, count, second, unused;
 };
-static_assert(sizeof(Triangle) == 72 && sizeof(SurfaceNode) == 120, "surface_tree.py allocates them");
+static_assert(sizeof(Triangle) == 72 && sizeof(SurfaceNode) == 120, "verify/compiled_overlap.py allocates them");
 
 // Triangles come into the order of the leaves. There are fewer than two nodes a triangle.
 class SurfaceBuilder {

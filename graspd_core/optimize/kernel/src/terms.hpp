@@ -1,4 +1,4 @@
-// The loss terms that look at one thing each (methods/losses.py), and the choice of the nearest few.
+// The loss terms that look at one thing each (optimize/losses.py), and the choice of the nearest few.
 #pragma once
 #include "distance_grid.hpp"
 #include "kinematics.hpp"

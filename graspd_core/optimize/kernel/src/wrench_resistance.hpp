@@ -1,4 +1,4 @@
-// Resistance of soft contacts against the worst disturbances (contact/wrench_support.py, docs/method.md):
+// Resistance of soft contacts against the worst disturbances (optimize/losses.py, docs/method.md):
 //     v_ik = w_k,lin + w_k,ang × a_i,   h_k = Σ_i s_i max(0, μ √(|v|² - (n·v)²) - n·v),
 //     loss = ¼ log mean_k (h_k / μ + 10⁻³)⁻⁴.
 #pragma once
