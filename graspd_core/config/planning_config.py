@@ -135,6 +135,11 @@ def share_as_light(mass: float, heavy: float) -> float:
     return min(1.0, _LIGHT_GROWTH * mass / heavy)
 
 
+def light_end(heavy: float) -> float:
+    """Return the least mass [kg] that a verified grasp must lift, if the object's volume allows up to `heavy` [kg]."""
+    return LEAST_LIGHT / _LIGHT_GROWTH * heavy
+
+
 @dataclass(frozen=True)
 class CertaintyConfig:
     """How certain a grasp of an object seen by cameras must be to count as verified.

@@ -9,6 +9,7 @@ from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 
 from graspd_core.config import CertaintyConfig
+from graspd_core.config.planning_config import light_end
 from graspd_core.errors import ResourceError
 from graspd_core.hands.model import HandModel
 from graspd_core.optimize.candidates import PlannerInput, find_candidates
@@ -173,6 +174,8 @@ def run_rounds(
             state = _tried_lighter(run, scene, prefetched, state, config.certainty, count)
             if state.good >= count or run.over():
                 break
+    if state.context is not None and state.mass is not None and state.good:
+        state = replace(state, mass=state.context.mass)
     return state
 
 
@@ -183,18 +186,25 @@ def _searched_since(state: RoundsResult, began: float) -> RoundsResult:
 def _tried_lighter(
     run: Run, scene: Scene, prefetched: Prefetched, state: RoundsResult, certainty: CertaintyConfig, count: int
 ) -> RoundsResult:
-    """Try the best grasps again, strongest first, with a lower mass that the strongest grasp can lift."""
+    """Try the best grasps again, strongest first, with a lower mass that the strongest grasp can lift.
+
+    If even the strongest grasp is too weak to be verified, further rounds try theirs with the least mass at which a
+    grasp may be.
+    """
     if state.context is None:
         return state
+    heavy = scene.object.mass
     best, others = state.grasps[:_WEIGHED], state.grasps[_WEIGHED:]
     lifted = payloads(state.context, best, run.known_over)
     most = max(lifted, default=0.0)
-    mass = min(_LIFTED * most, _HALF * scene.object.mass)
+    mass = min(_LIFTED * most, _HALF * heavy)
     if most <= LEAST_PAYLOAD or run.over():
         return state
     context = lighter(scene, prefetched, state.context, certainty, mass, most)
     strongest = sorted(range(len(best)), key=lambda place: -lifted[place])
     tried = run_trials(run, context, tuple(replace(best[place], trials=()) for place in strongest), count, 0)
+    if most < light_end(heavy):
+        context = lighter(scene, prefetched, context, certainty, light_end(heavy), heavy)
     grasps = surest_first((*tried.grasps, *others))
     return replace(state, context=context, mass=mass, grasps=grasps, first=tried.first)
 

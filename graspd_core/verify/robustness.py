@@ -19,10 +19,10 @@ from typing import TypeVar
 
 from graspd_core.config.planning_config import (
     DOUBTED_SHARE,
-    LEAST_LIGHT,
     MASS_ASSUMED,
     MASS_KNOWN,
     HeldShares,
+    light_end,
     share_as_light,
 )
 from graspd_core.errors import GraspdError
@@ -245,7 +245,7 @@ def less_sure(checks: RobustnessChecks, most: float, heavy: float) -> Robustness
     if checks.doubts:
         return checks
     share = share_as_light(most, heavy)
-    if share < LEAST_LIGHT:
+    if most < light_end(heavy):
         doubt = f"the grasp lifts {most:.2g} kg, and too many objects of this volume weigh more"
         return RobustnessChecks((), share * MASS_KNOWN.likeliest, doubts=(doubt,))
     stages = tuple(replace(stage, though_failed=share * stage.though_failed) for stage in checks.stages)

@@ -20,6 +20,7 @@ from graspd_core.config.planning_config import (
     LEAST_LIGHT,
     MASS_ASSUMED,
     MASS_KNOWN,
+    light_end,
     share_as_light,
 )
 from graspd_core.errors import ConfigError
@@ -296,6 +297,23 @@ def test_a_grasp_is_as_sure_as_objects_are_lighter_than_its_own_payload():
         assert verified == (share >= LEAST_LIGHT)
         assert grasp.probability == pytest.approx(share * (PASSED if verified else MASS_KNOWN.likeliest))
     assert {grasp.verdict for grasp in tried} == {Verdict.VERIFIED, Verdict.UNVERIFIED}
+
+
+@pytest.mark.parametrize("times", [1.35, 1.8, 10.0])
+def test_of_an_object_too_heavy_for_the_hand_verified_grasps_lift_most_such_objects(times):
+    seen, hand = seen_from(), load_hand("allegro_right")
+    worlds = build_worlds(seen, hand, object_parts(seen.object), PROTOCOLS["standard"])
+    context = verification.VerificationContext(worlds, None)
+    heavy = times * max(verification.payloads(context, planned().tried, lambda: False))
+    unknown = replace(seen.object.at_mass(heavy), mass_assumed=True)
+    result = plan_grasps(replace(seen, object=unknown), hand, count=1, preset="fast", measure=False)
+    verified = [grasp for grasp in result.tried if grasp.verdict is Verdict.VERIFIED]
+    for grasp in verified:
+        assert payload(worlds.alone, grasp, worlds.protocol) > light_end(heavy) / 1.1
+    if times == 10.0:
+        assert not verified
+        assert result.mass is not None
+        assert result.mass < light_end(heavy)
 
 
 def test_what_is_tried_at_less_mass_begins_with_the_strongest():
