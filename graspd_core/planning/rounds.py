@@ -84,7 +84,7 @@ class RoundsResult:
         optimise_time: time spent in the optimiser [s].
         first: time of the first verified grasp, a `time.perf_counter()` value. None without one.
         refused: number of candidates that restrictions refused, by reason.
-        mass: object mass of the trials [kg] if it is lower than the assumed mass, else None.
+        lowered: mass with which the best grasps were tried again [kg], because none holds the assumed one, else None.
     """
 
     began: float
@@ -93,7 +93,12 @@ class RoundsResult:
     optimise_time: float = 0.0
     first: float | None = None
     refused: Counter[str] = field(default_factory=Counter)
-    mass: float | None = None
+    lowered: float | None = None
+
+    @property
+    def mass(self) -> float | None:
+        """Object mass of the trials [kg] if it is lower than the assumed mass, else None."""
+        return self.context.mass if self.context and self.lowered and self.good else self.lowered
 
     @property
     def good(self) -> int:
@@ -170,12 +175,10 @@ def run_rounds(
         # Lower the mass only after a second round for stronger grasps. Without an unverified grasp, lower it at once.
         doubted = any(grasp.verdict is Verdict.UNVERIFIED for grasp in state.grasps)
         too_heavy = attempt >= len(early) + doubted and not state.good and scene.object.mass_assumed
-        if too_heavy and prefetched is not None and state.mass is None:
+        if too_heavy and prefetched is not None and state.lowered is None:
             state = _tried_lighter(run, scene, prefetched, state, config.certainty, count)
             if state.good >= count or run.over():
                 break
-    if state.context is not None and state.mass is not None and state.good:
-        state = replace(state, mass=state.context.mass)
     return state
 
 
@@ -206,7 +209,7 @@ def _tried_lighter(
     if most < light_end(heavy):
         context = lighter(scene, prefetched, context, certainty, light_end(heavy), heavy)
     grasps = surest_first((*tried.grasps, *others))
-    return replace(state, context=context, mass=mass, grasps=grasps, first=tried.first)
+    return replace(state, context=context, lowered=mass, grasps=grasps, first=tried.first)
 
 
 def _in_rank_order(

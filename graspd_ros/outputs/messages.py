@@ -201,15 +201,7 @@ def grasp_message(
             if value is not None and math.isfinite(value)
         ],
         trials=[_trial(trial) for trial in grasp.trials],
-        contacts=[
-            ContactMessage(
-                link=c.link,
-                position=point_of(c.position),
-                normal=vector_of(c.normal),
-                force=vector_of(c.force or (0.0, 0.0, 0.0)),
-            )
-            for c in grasp.contacts
-        ],
+        contacts=[_contact_message(contact) for contact in grasp.contacts],
         trajectory=trajectory_of(grasp, hand, pace),
         trajectory_base_poses=base_poses(grasp, header.frame_id, header.stamp),
     )
@@ -225,6 +217,13 @@ def grasp_message(
         message.mount_pregrasp_pose = mount_pose(grasp.pregrasp, hand.mount)
         message.mount_grasp_pose = mount_pose(grasp.grasp, hand.mount)
     return message
+
+
+def _contact_message(contact: Contact) -> ContactMessage:
+    position, normal, force = contact.position, contact.normal, contact.force or (0.0, 0.0, 0.0)
+    return ContactMessage(
+        link=contact.link, position=point_of(position), normal=vector_of(normal), force=vector_of(force)
+    )
 
 
 def progress_message(progress: Progress, request_id: str, frame: str, stamp: Time, elapsed: float) -> GraspProgress:
