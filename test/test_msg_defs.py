@@ -50,7 +50,7 @@ def test_every_field_says_what_it_is(path: Path):
         name
         for kind, name, comment in fields
         if kind.removesuffix("[]") in QUANTITIES
-        and not re.search(r"\[(m|m2|s|rad|kg)\]|without unit|from 0 to 1", comment)
+        and not re.search(r"\[(m|m2|s|rad|kg|N)\]|without unit|from 0 to 1", comment)
     ]
     assert not unitless, f"{path.name}: no unit on {unitless}"
     assert path.read_text().startswith("# "), f"{path.name} does not say what it is for"

@@ -206,7 +206,7 @@ def _tried_lighter(
     context = lighter(scene, prefetched, state.context, certainty, mass, most)
     strongest = sorted(range(len(best)), key=lambda place: -lifted[place])
     tried = run_trials(run, context, tuple(replace(best[place], trials=()) for place in strongest), count, 0)
-    if most < light_end(heavy):
+    if context.checks is not None and context.checks.doubts:
         context = lighter(scene, prefetched, context, certainty, light_end(heavy), heavy)
     grasps = surest_first((*tried.grasps, *others))
     return replace(state, context=context, lowered=mass, grasps=grasps, first=tried.first)

@@ -252,7 +252,7 @@ def test_a_block_without_a_candidate_is_a_block(copied: DatasetStore):
         (["shape:box", "--out", "nowhere://x"], "nowhere://x"),
         (
             ["shape:box", "--out", "x", "--address", "127.0.0.1:9"],
-            "127.0.0.1:9: Connection refused; start one",
+            "127.0.0.1:9: Connection refused; start Ray",
         ),
     ],
 )

@@ -121,6 +121,7 @@ CASES = {
     "random_closure.touching": Case(99, (("grasp_stages.touch_reach", 0.001),)),
     "grasp_stages.slide_stiffness": Case(hand="parallel_gripper"),
     "grasp_stages.effort_share": Case(1e-4),
+    "grasp_stages.link_force": Case(0.1),
     "rounds.most": Case(1, TWO_ROUNDS, count=20),
     "rounds.growth": Case(6.0, TWO_ROUNDS, count=20),
     "rounds.first_budget": Case(1.0, verify="standard", brief=True),

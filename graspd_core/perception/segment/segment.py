@@ -148,7 +148,7 @@ _LAST: dict[bytes, _Parted] = {}
 
 
 def _parted(views: Sequence[PointCloud], settings: SegmentationConfig, target: Target | None = None) -> _Parted:
-    key = blake2b(pickle.dumps((tuple(views), settings))).digest()
+    key = blake2b(pickle.dumps((tuple(views), vars(settings)))).digest()
     parted = _LAST.get(key)
     scene = voxel_downsample(views, settings) if parted is None else parted.scene
     if target is not None:
