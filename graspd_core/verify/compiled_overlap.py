@@ -1,7 +1,7 @@
 """Compute distances to a mesh and overlaps of a hand with the compiled kernel, while other Python threads run.
 
-`mesh/surface_queries` and `prepared_grasp` do the same in Python. The tests compare the kernel with them, and they are
-used if there is no kernel. The results are equal up to rounding.
+`mesh/surface_queries` and `prepared_grasp` do the same in Python, with results that are equal up to rounding. They are
+the reference in the tests, and the fallback if there is no kernel.
 """
 
 from __future__ import annotations
@@ -114,7 +114,7 @@ def _doubles(values: object) -> np.ndarray:
 
 
 def _core(solid: Primitive) -> tuple[float, ...]:
-    """Return the half extents of a solid along its own axes [m], without the radius of a sphere or capsule."""
+    """Return a primitive's half extents along its own axes [m], of a sphere or capsule without the radius."""
     if solid.kind == "box":
         return solid.size
     if solid.kind == "cylinder":
@@ -123,7 +123,7 @@ def _core(solid: Primitive) -> tuple[float, ...]:
 
 
 def _ball(solid: Primitive) -> tuple[float, ...]:
-    """Return centre and radius of a solid's bounding sphere, in the solid's own frame [m]."""
+    """Return centre and radius of a primitive's bounding sphere, in the primitive's own frame [m]."""
     if solid.kind == "hull":
         center = (solid.vertices.min(0) + solid.vertices.max(0)) / 2
         return (*center, float(np.linalg.norm(solid.vertices - center, axis=1).max()))
@@ -142,9 +142,10 @@ def depth_in_hand(
     points: Float[np.ndarray, "n 3"],
     link_of: Int[np.ndarray, "n"] | None = None,
 ) -> float:
-    """Return the greatest depth of any point inside any primitive [m], 0 if no point is inside.
+    """Return the greatest depth of any point inside the hand's primitives [m], 0 if no point is inside.
 
-    If `link_of` gives each point's link, the primitives of this link and of its adjacent links are skipped.
+    `links` are link poses in the frame of `points`. If `link_of` gives each point's link, the primitives of this link
+    and of its adjacent links are skipped.
     """
     compiled, depth, points = compiled_hand(hand), np.empty(1), _doubles(points)
     of = None if link_of is None else np.ascontiguousarray(link_of, dtype=np.int32)

@@ -4,8 +4,7 @@ Up to the stop, a trial has the same states as a full one. It can pass where a f
 where a full trial would pass. A slowly sliding object may reach an edge and slip suddenly, so the drift is multiplied
 by a safety factor. Contact jitter hides the drift within a few steps. The drift is therefore measured over several
 windows, and one small drift is enough. At low friction or with few fingers, the object must also be at rest. The
-numbers come from pull trajectories of four hands on eleven shapes and ten scans. `graspd bench early` measures their
-effect.
+rules come from pulls with four hands on eleven shapes and ten scans. `graspd bench early` measures their effect.
 """
 
 from __future__ import annotations
@@ -73,7 +72,7 @@ class ObjectState:
 def stop_rule(protocol: Protocol, fingers: int, *, rough: bool = False) -> StopRule | None:
     """Return the stop rule for a protocol and a number of fingers. Return None if the protocol forbids early stops.
 
-    If `rough` is set, `ROUGH` replaces `FIRM`.
+    If `rough` is set, the rule for high friction is `ROUGH`, which stops sooner but may miss a late slip.
     """
     if protocol.full_length:
         return None

@@ -54,7 +54,7 @@ def hold_trial(
 
 
 def gave_up(error: Exception) -> str:
-    """Return the reason of a trial that a MuJoCo error ended."""
+    """Return, as the reason of a failed trial, a text about the MuJoCo error that ended it."""
     return f"the simulation gave up: {str(error).splitlines()[0]}"
 
 
@@ -93,7 +93,7 @@ def step_until_known(
     """Simulate `steps` steps, or fewer if the stop rule knows that the object stays within the limits.
 
     Return why the trial failed, empty if it did not. Update `worst`, the greatest travel [m] and rotation [rad]. If
-    `rough` is set, a rougher rule applies (`stop_rule`), and a broken limit ends the pull sooner.
+    `rough` is set, the pull stops earlier (`stop_rule`), and the limits are checked more often.
     """
     rule, done = stop_rule(protocol, world.fingers, rough=rough), 0
     recent = deque[ObjectState](maxlen=1 + max(rule.windows) // LOOK_EVERY if rule else 0)

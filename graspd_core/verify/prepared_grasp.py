@@ -200,7 +200,7 @@ def _link_balls(hand: HandModel) -> tuple[Float[np.ndarray, "links 3"], Float[np
 
 
 def arrival(context: MetricsContext, grasp: Grasp, support: Plane | None) -> Posture | None:
-    """Return an open posture at the grasp that the hand reaches from the pregrasp on a straight, collision-free path.
+    """Return a posture at the grasp with fingers as open as possible and a collision-free path from the pregrasp.
 
     graspd's own trial closes the fingers while the hand approaches. Some planners close them only after arriving, when
     the open fingers may penetrate the object. This function therefore closes the fingers in part or moves the hand back
@@ -339,7 +339,7 @@ def _root_cells(
 def _solid_distance(
     solids: _PlacedSolids, which: Int[np.ndarray, "n"], points: Float[np.ndarray, "n 3"]
 ) -> Float[np.ndarray, "n"]:
-    """Return each point's signed distance [m] to the primitive `which` (ascending index). A lower bound for hulls."""
+    """Return each point's signed distance [m] to primitive `which`, a lower bound for hulls. `which` must ascend."""
     local = np.einsum("nji,nj->ni", solids.rotations[which], points - solids.translations[which])
     hulls = int(np.searchsorted(which, len(solids.smooth.link)))
     smooth = local_distance(solids.smooth, torch.as_tensor(local[:hulls]), torch.as_tensor(which[:hulls])).numpy()
@@ -412,7 +412,7 @@ Hull = tuple[float, Float[np.ndarray, "6"], float]
 
 
 def compiled_hull(wrenches: Float[np.ndarray, "n 6"]) -> Hull | None:
-    """Build the hull with the compiled kernel. Return None if there is no kernel or the kernel fails."""
+    """Build the wrenches' convex hull in the compiled kernel. None without it, on failure, or above 256 wrenches."""
     library = kernel().library
     if library is None or len(wrenches) > _MOST_WRENCHES:
         return None
@@ -423,7 +423,7 @@ def compiled_hull(wrenches: Float[np.ndarray, "n 6"]) -> Hull | None:
 
 
 def qhull(wrenches: Float[np.ndarray, "n 6"]) -> Hull:
-    """Build the hull with Qhull."""
+    """Build the convex hull of wrenches with Qhull."""
     from scipy.spatial import ConvexHull
 
     # QJ perturbs the input. It takes half the time of merging facets and is deterministic.

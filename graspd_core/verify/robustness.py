@@ -63,7 +63,7 @@ def results_in_order(
 ) -> Generator[Result]:
     """Yield the result of each item in order, until `over` returns true.
 
-    Closing the iterator ends the work that was started ahead, by the stop hook.
+    If the caller closes the iterator, the stop hooks of the work that was started ahead return true.
 
     Args:
         over: ends the iteration. Only the calling thread calls it.

@@ -30,7 +30,7 @@ class Run:
         began: start of the run, a `time.perf_counter()` value.
         cancelled: whether the stop hook has returned true.
         watch: hook that gets snapshots of the hands, or None.
-        origin: origin of the planning frame, in the frame of the given scene [m].
+        origin: origin of the planning frame, in the frame of the request [m].
     """
 
     def __init__(
@@ -68,7 +68,7 @@ class Run:
             self._progress(Progress(stage, step, of, best, verified, time.perf_counter() - self.began, found))
 
     def show(self, seen: Snapshot) -> None:
-        """Call the watch hook, if there is one, with positions in the given scene's frame."""
+        """Call the watch hook, if there is one, with positions in the frame of the request."""
         if self.watch is not None:
             self.watch(replace(seen, positions=seen.positions + self.origin))
 
@@ -92,7 +92,7 @@ def result_of(
 ) -> GraspResult:
     """Return the result of a run. Its outcome is success if at least `count` grasps are usable.
 
-    `ended_early` is the outcome if there are too few usable grasps because the run ended early.
+    `ended_early` is the outcome if an early end left too few of them. `refused` counts refused candidates by reason.
     """
     few = Outcome.TOO_FEW if grasps else Outcome.NO_CANDIDATES
     enough = sum(grasp.usable for grasp in grasps) >= count

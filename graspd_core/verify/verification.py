@@ -134,8 +134,8 @@ def lighter(
 ) -> VerificationContext:
     """Return the context with a lower object `mass` [kg] than the assumed one.
 
-    A grasp then has a lower probability, because the object may weigh more than its payload. `most` is the greatest
-    payload of any grasp [kg]. If it is too low for a verified grasp, no robustness check runs.
+    The probability of a grasp is then lower, because the object may weigh more than the grasp can lift. `most` is the
+    greatest payload of any grasp [kg]. If `most` is too low for a verified grasp, no robustness check runs.
     """
     trials, others = context.trials, [world.altered(mass) for world in ahead.others]
     around = trials.around and altered(trials.around, mass=mass)
@@ -287,7 +287,7 @@ def _best_first(
 
 
 def _at_once(threads: int, stage: CheckStage, grasp: Grasp, stop: StopHook) -> Results:
-    """Run the checks that every grasp needs in parallel, then the others one by one."""
+    """Yield trial results. The checks that every grasp needs run in parallel, then the others one by one."""
     first, others = stage.items[: stage.least], stage.items[stage.least :]
     yield from results_in_order(stop, lambda item, ended: item.hold(grasp, ended), first, threads, lambda: len(first))
     yield from one_by_one(replace(stage, items=others), grasp, stop)
