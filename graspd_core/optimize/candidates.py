@@ -148,7 +148,7 @@ def assemble(
 
 
 def finished(problem: Problem, hand: HandModel, some: Staged) -> list[Grasp]:
-    """Return the grasps of the poses that `staged` has prepared, with their scores, in the same order."""
+    """Return a grasp with its score for each pose that `staged` has prepared (`some`), in the same order."""
     scores = score(problem, some)
     if problem.obstacles is not None:
         depth = -gap_on_path(problem.obstacles, problem.hand.kinematics, some.opened, some.poses)

@@ -106,7 +106,7 @@ def find_contacts(problem: Problem, poses: Poses, reach: float) -> ContactSet:
 
 
 def _with_features(problem: Problem, poses: Poses, found: ContactSet, reach: float) -> ContactSet:
-    """Add a slot for each solid of the hand: the object's sharp point nearest to it, with the solid's inward normal."""
+    """Add a slot for each primitive of the hand: the object's sharp point nearest to it, with its inward normal."""
     pick, nearest, outward = nearest_features(problem, poses)
     return ContactSet(
         torch.cat([found.link, problem.hand.solids.link]),
@@ -120,7 +120,7 @@ def _with_features(problem: Problem, poses: Poses, found: ContactSet, reach: flo
 def nearest_features(
     problem: Problem, poses: Poses
 ) -> tuple[Int[Tensor, "batch solids"], Float[Tensor, "batch solids"], Float[Tensor, "batch solids 3"]]:
-    """Return the sharp point nearest to every solid of the hand, as index, signed distance [m] and its gradient."""
+    """Return the sharp point nearest to each primitive of the hand: index, signed distance [m] and its gradient."""
     solids = problem.hand.solids
     if (compiled := problem.compiled) is not None:
         x = pack(poses).contiguous()
@@ -141,7 +141,7 @@ def nearest_features(
 
 @torch.no_grad()
 def self_overlap(problem: Problem, joints: Joints) -> Values:
-    """Return the greatest penetration depth between two solids of links that are not adjacent [m]."""
+    """Return the greatest penetration depth between two primitives of links that are not adjacent [m]."""
     if (compiled := problem.compiled) is not None:
         deepest = joints.new_empty(len(joints))
         compiled.call("graspd_self_overlap", len(joints), joints.contiguous(), deepest)
@@ -215,7 +215,7 @@ def _find_pregrasp(
 def settle(problem: Problem, poses: Poses, stop: Callable[[], bool] = lambda: False) -> Poses:
     """Return nearby poses that penetrate the object less. The base may shift but does not turn.
 
-    The loss penalises object surface points inside the hand's solids, and contact candidates inside the object.
+    The loss penalises object surface points inside the hand's primitives, and contact candidates inside the object.
     Candidates that touch the object are kept near it.
     """
     if (compiled := problem.of_surface.compiled) is not None:
@@ -249,7 +249,7 @@ def _settle(problem: Problem, poses: Poses, stop: Callable[[], bool]) -> Rows:
 
 
 def _sunk_surface(on_surface: Problem, placed: HandPlacement, poses: Poses, x: Rows) -> Values:
-    """Return the squared depth of the deepest object point inside each solid of the hand, summed over solids [mm²]."""
+    """Return the sum, over the hand's primitives, of the squared depth of the deepest object point inside [mm²]."""
     solids, features = on_surface.hand.solids, on_surface.object.features
     if not len(features) or not len(solids.link):
         return x.new_zeros(len(x))
@@ -429,7 +429,7 @@ def _cone_edges(
 def _balancing_weights(
     wrenches: Float[np.ndarray, "batch edges 6"], allowed: Bool[np.ndarray, "batch edges"]
 ) -> Float[np.ndarray, "batch edges"]:
-    """Minimise ‖W x‖² + 10² (Σ x − 1)² + ridge² ‖x‖² over x ≥ 0, exactly.
+    """Return the x ≥ 0 that minimises ‖W x‖² + 10² (Σ x − 1)² + ridge² ‖x‖². W has the `allowed` `wrenches` as columns.
 
     Let G have the six wrench components and the sum as rows, and t = (0, …, 0, 10). The unknown of the dual is the
     residual r = t − G x, which has seven components. It minimises ‖r‖²/2 + ‖max(Gᵀr, 0)‖² / 2 ridge² − t·r. Then

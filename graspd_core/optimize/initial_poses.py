@@ -87,8 +87,8 @@ def draw_starts(
     As in Grasp'D, the palm faces a random surface point with a random roll. Points are on the hull, so that no palm
     starts inside a hollow. Narrow cross-sections are preferred. A share `fingertips` of the starts has half-closed
     fingers, with the fingertips at the point, because an open hand does not reach small or low objects. Poses are
-    unlikely if the hand, or its retreat, penetrates an obstacle. With restrictions, at most `_MOST_POOLS` pools are
-    drawn. If they allow too few starts, the result has fewer than `count`, perhaps none.
+    rarely drawn if the hand, or its retreat, penetrates an obstacle. With restrictions, at most `_MOST_POOLS` pools are
+    drawn. If they hold too few allowed poses, fewer than `count` starts are returned, perhaps none.
     """
     generator = torch.Generator().manual_seed(seed)
     obstacles = make_obstacle_tensors(scene, hand, "cpu", torch.float64)
@@ -156,7 +156,7 @@ def _aimed(
 ) -> StartPool:
     """Turn and move the hands of a pool so that they meet `aim`. The joints do not change.
 
-    The grip faces a wanted place, at its standoff from the `surface` points near the palm's axis.
+    Each grip faces a random wanted place, else a `surface` point [m], at its standoff from the first surface before it.
     """
     count, rotation = len(pool.joints), pool.rotation
     if aim.direction is not None:

@@ -69,17 +69,17 @@ def wrench_support(
 
 
 def soft_contact(distance: Distances, radius: Values, delta: float) -> Distances:
-    """Return the activation s = exp(−|φ − r| / δ): one on the padded surface φ = r, with a gradient everywhere else."""
+    """Return exp(−|`distance` − `radius`| / `delta`): one on the padded surface, with a gradient everywhere else."""
     return (-(distance - radius[:, None]).abs() / delta).exp()
 
 
 def hard_contact(distance: Distances, radius: Values, delta: float) -> Distances:
-    """Return 1 within δ of the padded surface, else 0. There is no gradient. This is the ablation of `soft_contact`."""
+    """Return 1 within `delta` [m] of the padded surface, else 0, without gradient: the ablation of `soft_contact`."""
     return ((distance - radius[:, None]).abs() <= delta).to(distance)
 
 
 def wrench_resistance(support: Float[Tensor, "batch directions"], friction: float, sharpness: float = 4.0) -> Values:
-    """Return the soft maximum over disturbances of −log(h_k / μ + h₀). High if one disturbance is hardly resisted."""
+    """Return the soft maximum of −log(h_k / μ + h₀) over `support` h_k. High if one disturbance is hardly resisted."""
     resisted = -(support / friction + _SUPPORT_FLOOR).log()
     count = support.shape[-1]
     return (torch.logsumexp(sharpness * resisted, -1) - torch.log(torch.tensor(float(count)))) / sharpness

@@ -1,7 +1,7 @@
 """Measure the hand's distance from the support plane and from the obstacles around the object.
 
-The solids of the hand are convex. So a solid is clear of the support if all its extreme points are clear: corners of
-boxes and hulls, balls at the ends of spheres and capsules, rim points of cylinders. Obstacles are also tested against
+The hand's primitives are convex. So a primitive is clear of the support if all its extreme points are clear: corners
+of boxes and hulls, balls at ends of spheres and capsules, rim points of cylinders. Obstacles are also tested against
 the collision spheres (`hands.self_collision`), which extend a little out of flat faces. Gradients are exact, except for
 the interpolated distance to obstacles.
 """
@@ -48,7 +48,7 @@ class ObstacleTensors:
     """Support and obstacles, and the points of the hand that are tested against them.
 
     Attributes:
-        corner_matrix: places the extreme points of the hand's solids, see `hands.kinematics.placement`.
+        corner_matrix: places the extreme points of the hand's primitives, see `hands.kinematics.placement`.
         corner_radii: radii of the balls about the extreme points [m].
         sphere_matrix: places the centres of the collision spheres in the same way.
         sphere_radii: radii of the collision spheres [m].
@@ -131,14 +131,14 @@ def hand_reach(hand: HandModel) -> float:
 
 
 def extreme_points(hand: HandModel) -> tuple[Float[np.ndarray, "corners 3"], Float[np.ndarray, "corners"], np.ndarray]:
-    """Return balls whose convex hull is the hand's solids: centres in link frames [m], radii [m] and links."""
+    """Return balls whose convex hulls are the hand's primitives: centres in link frames [m], radii [m] and links."""
     solids = extreme_points_of_solids(hand)
     points, radii, links = zip(*((p, np.full(len(p), r), np.full(len(p), link)) for p, r, link in solids), strict=True)
     return np.concatenate(points), np.concatenate(radii), np.concatenate(links)
 
 
 def extreme_points_of_solids(hand: HandModel) -> list[tuple[Float[np.ndarray, "n 3"], float, int]]:
-    """Return for each solid of the hand its extreme points in the link frame [m], their radius [m], and the link."""
+    """Return each primitive's extreme points in the link frame [m], their radius [m], and the link."""
     found = ((*_extremes(primitive), primitive) for primitive in hand.primitives)
     return [(at @ solid.rotation.T + solid.translation, radius, solid.link) for at, radius, solid in found]
 

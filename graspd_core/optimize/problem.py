@@ -93,9 +93,9 @@ class HandTensors:
         coarse: the first contact candidates, evenly spread. Used in most steps.
         fine: all contact candidates. Used in the last steps.
         reach: attraction range of each group of candidates [m].
-        solids: collision primitives.
-        group_of_solid: first candidate group on the rigid group of each solid. The number of groups stands for none.
-        solid_pairs: pairs of solids whose links are not adjacent.
+        solids: collision primitives, without hulls.
+        group_of_solid: first candidate group on each primitive's rigid group. The number of groups if there is none.
+        solid_pairs: pairs of `solids` whose links are not adjacent.
         spheres: spheres for self-collision.
         lower, upper: joint limits [rad] or [m].
         pivot: point about which a solver turns the hand, base frame [m].
@@ -318,7 +318,7 @@ def build_problem(
     device: str = "cpu",
     dtype: torch.dtype = torch.float32,
 ) -> Problem:
-    """Convert scene and hand to tensors. `seed` fixes the random disturbances, which follow the signed axes."""
+    """Convert scene and hand to tensors. `seed` fixes the random disturbances, which come after the signed axes."""
     return Problem(
         hand=make_hand_tensors(hand, settings.candidates, settings.patch_size, device, dtype),
         object=make_object_tensors(scene, settings, device, dtype),
@@ -349,7 +349,7 @@ def self_collision(problem: Problem, links: SE3) -> Values:
 
 
 def solid_collision(problem: Problem, links: SE3) -> Values:
-    """Return a tenth of the squared overlap of the hand's solids with each other [mm²]. It is exact for boxes."""
+    """Return a tenth of the squared overlap of the hand's primitives with each other [mm²]. It is exact for boxes."""
     row, depth = solid_overlaps(problem.hand.solids, problem.hand.solid_pairs, links)
     return depth.new_zeros(len(links.translation)).index_add(0, row, (1e3 * depth) ** 2 / 10.0)
 
@@ -363,7 +363,7 @@ def obstacle_depth(obstacles: ObstacleTensors, base: SE3, links: SE3) -> Values:
 def feature_distance(
     problem: Problem, features: Float[Tensor, "features 3"], placed: HandPlacement
 ) -> tuple[Float[Tensor, "batch pairs"], Int[Tensor, "batch pairs"]]:
-    """Find the nearest pairs of a sharp point and a solid of the hand. Return distances [m] and solids of the pairs."""
+    """Return distance [m] and primitive index of the nearest pairs of a sharp point and a primitive of the hand."""
     in_base = placed.base.apply_inverse(features)
     with torch.no_grad():
         every = solid_bound(problem.hand.solids, placed.links, in_base)

@@ -265,12 +265,12 @@ def adam_step(state: Adamax, gradient: Variable, rate: float, count: int, memory
 
 
 def excess(value: Float[Tensor, "*shape"], bound: float) -> Float[Tensor, "*shape"]:
-    """Return the violation of a constraint g < C: max(g − C, 0). This is the gradient of the Lagrangian in λ."""
+    """Return the violation max(`value` − `bound`, 0) of a constraint: the Lagrangian's gradient in the multiplier."""
     return (value - bound).clamp_min(0.0)
 
 
 def damped(broken: Variable, multiplier: Variable, damping: float) -> Variable:
-    """Return the term of a violated constraint in the Lagrangian: λ c + d c² / 2."""
+    """Return a constraint's term in the Lagrangian: λ c + d c² / 2, with violation c = `broken` and `damping` d."""
     return broken * (multiplier + 0.5 * damping * broken)
 
 
