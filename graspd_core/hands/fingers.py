@@ -129,13 +129,13 @@ def _mates(
 
 
 def _stand_up(roots: Float[np.ndarray, "3 3"], pair: Float[np.ndarray, "2 3"]) -> bool:
-    """Return True if two fingers stand up from the plane of all three roots. A human-like hand's fingers lie in it."""
+    """Return True if two fingers of directions `pair` leave the plane of all roots. A human-like hand's lie in it."""
     across = np.cross(roots[1] - roots[0], roots[2] - roots[0])
     return bool(abs(pair.mean(0) @ units(across, 1e-6)) > _UPRIGHT)
 
 
 def palm_points(hand: HandModel, fingers: Fingers) -> Float[np.ndarray, "points 3"]:
-    """Return surface points of the palm, base frame [m]. If the palm has no solids, return the finger roots."""
+    """Return surface points of the palm, base frame [m]. If it has no collision shape, return the finger roots."""
     poses = link_poses(hand, straight_joints(hand))
     found = _group_surface(hand, poses, fingers.palm, 400, np.random.default_rng(0))
     return found if len(found) else fingers.roots

@@ -134,7 +134,7 @@ def _strong_joints(hand: HandModel) -> tuple[str, ...]:
 def _open_linkages(
     hand: HandModel, rotations: Float[np.ndarray, "links 3 3"], translations: Float[np.ndarray, "links 3"]
 ) -> tuple[str, ...]:
-    """Warn of an open linkage: two free joints are side by side on one link, and one of them moves only one link."""
+    """Return a warning of an open linkage: two free joints side by side on a link, one of which moves only one link."""
     parents = {link: int(hand.link_group[hand.link_parent[link]]) for link in np.flatnonzero(hand.link_joint >= 0)}
     coupled = {mimic.link for mimic in hand.mimics}
     free = [link for link in parents if link not in coupled and hand.joint_kind[link] == "revolute"]
@@ -154,7 +154,7 @@ def _open_linkages(
 
 
 def _palms(hand: HandModel, translations: Float[np.ndarray, "links 3"]) -> tuple[str, ...]:
-    """Warn of two palms: two links far apart with several children each, neither an ancestor of the other."""
+    """Return a warning if there are two palms: links far apart with several children each, neither above the other."""
     counts = Counter(int(hand.link_parent[link]) for link in np.flatnonzero(hand.link_joint >= 0))
     branches = sorted(link for link, count in counts.items() if count > 1)
 

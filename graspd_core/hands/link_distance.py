@@ -5,8 +5,8 @@ or an axis the gradient is zero (see `se3.safe_norm`). There are two approximati
 in a single primitive is a lower bound. The distance to a hull is the greatest distance to its face planes. It is exact
 inside, and a lower bound outside near edges and corners.
 
-`CollisionTensors` hold all boxes and round solids of a hand, to compute the distance of object points to every link.
-They do not contain hulls. Hulls are tested by their contact candidates.
+`CollisionTensors` hold all primitives of a hand except hulls, to compute the distance of object points to every link.
+Hulls are tested by their contact candidates.
 """
 
 from __future__ import annotations
@@ -45,7 +45,7 @@ def primitive_sdf(primitive: Primitive, points: _Places) -> _Distances:
 
 
 def _core_of(primitive: Primitive) -> tuple[tuple[float, ...], float]:
-    """Return a box or round solid as a core and the radius by which it is grown (see `CollisionTensors`) [m]."""
+    """Return a primitive other than a hull as a core and the radius that grows it (see `CollisionTensors`) [m]."""
     size = primitive.size
     if primitive.kind == "box":
         return size, 0.0
@@ -136,7 +136,7 @@ class CollisionTensors:
 
 
 def make_collision_tensors(hand: HandModel, device: torch.device | str, dtype: torch.dtype) -> CollisionTensors:
-    """Return the hand's boxes and round solids as tensors. The last results are cached."""
+    """Return the hand's primitives except hulls as tensors. The last results are cached."""
     return _make_collision_tensors(hand, torch.device(device), dtype)
 
 
@@ -162,7 +162,7 @@ def _make_collision_tensors(hand: HandModel, device: torch.device, dtype: torch.
 def solid_distance(
     solids: CollisionTensors, links: SE3, points: Float[Tensor, "batch points 3"]
 ) -> Float[Tensor, "batch points solids"]:
-    """Return the signed distance [m] of base-frame points to every solid. `links` are the poses of `forward`."""
+    """Return the signed distance [m] of base-frame points to every primitive. `links` are the poses of `forward`."""
 
     def whole(links: SE3, points: Tensor) -> Tensor:
         return _distance(_to_solids(solids, links, points), solids.core, solids.radius, solids.is_round)
@@ -202,7 +202,7 @@ def _to_solids(
 def pair_distance(
     solids: CollisionTensors, links: SE3, points: Float[Tensor, "batch pairs 3"], which: Int[Tensor, "batch pairs"]
 ) -> Float[Tensor, "batch pairs"]:
-    """Return the signed distance [m] of each base-frame point to its solid. `which` has the solids' indices."""
+    """Return the signed distance [m] of each base-frame point to its primitive, whose index is in `which`."""
     rows = torch.arange(len(points), device=points.device)[:, None]
     in_link = links[rows, solids.link[which]].apply_inverse(points[..., None, :])
     local = SE3(solids.rotation, solids.translation)[which].apply_inverse(in_link).squeeze(-2)
@@ -210,9 +210,9 @@ def pair_distance(
 
 
 def local_distance(solids: CollisionTensors, local: _Places, which: Int[Tensor, "*batch"]) -> _Distances:
-    """Return the signed distance [m] of each point to one solid.
+    """Return the signed distance [m] of each point to one primitive.
 
-    `which` is the index of each point's solid. `local` has each point in the frame of its solid.
+    `which` is the index of each point's primitive. `local` has each point in the frame of its primitive [m].
     """
     return _distance(local, solids.core[which], solids.radius[which], solids.is_round[which])
 

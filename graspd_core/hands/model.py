@@ -25,11 +25,11 @@ METRES_PER_RADIAN = 0.05
 
 @dataclass(frozen=True, eq=False)
 class Primitive:
-    """A convex collision solid, fixed to a link.
+    """A convex collision shape, fixed to a link.
 
     Attributes:
         link: index of the link.
-        kind: kind of the solid.
+        kind: kind of the shape.
         rotation: `R_link_primitive`. Capsules and cylinders lie along the primitive's z axis.
         translation: origin of the primitive in the link frame [m].
         size: three half extents (box), radius (sphere), radius and half length (capsule, cylinder), () (hull) [m].
@@ -108,7 +108,7 @@ class HandModel:
         link_mass: mass of each link [kg]. Zero if the file gives none.
         link_com: centre of mass, link frame [m].
         link_inertia: inertia about the centre of mass, in link axes [kg·m²].
-        primitives: collision solids.
+        primitives: convex collision shapes.
         adjacent: True for pairs of links that are never checked for collision. Symmetric, True on the diagonal.
         candidate_points: contact candidates, in the frames of their links [m].
         candidate_normals: outward unit normals at the candidates.

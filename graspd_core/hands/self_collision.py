@@ -1,11 +1,11 @@
-"""Fill links with spheres for a cheap differentiable self-collision term, and measure the overlap of links and solids.
+"""Fill links with spheres for a differentiable self-collision term, and measure overlaps of links and primitives.
 
-The spheres extend beyond the flat faces of long boxes, by up to a fifth of the half thickness, and beyond thin solids.
+The spheres extend beyond the flat faces of long boxes, by up to a fifth of the half thickness, and beyond thin shapes.
 Metrics use signed distances instead. The term tests every pair of spheres, so the number of spheres is limited. If a
 hand has too many, the spheres that extend farthest are kept.
 
-The overlap of two solids is found by the separating axis test. A separating axis of two boxes is a face normal, or the
-cross product of two edges. For boxes the least overlap along these fifteen directions is the exact depth. Round solids
+The overlap of two primitives is found by the separating axis test. A separating axis of two boxes is a face normal or
+a cross product of two edges. For boxes the least overlap along these fifteen directions is the exact depth. Round ones
 need three more directions. If an edge meets a rim, the depth is slightly too large. Hulls are excluded. Gradients are
 exact if a single direction has the least overlap.
 """
@@ -38,7 +38,7 @@ _BARE, _RIM = 0.001, 0.01
 def collision_spheres(
     hand: HandModel,
 ) -> tuple[Float[np.ndarray, "spheres 3"], Float[np.ndarray, "spheres"], Int[np.ndarray, "spheres"]]:
-    """Return centres in link frames [m], radii [m] and links of at most `MOST_OF_HAND` spheres that fill the solids."""
+    """Return centres in link frames [m], radii [m] and links of at most `MOST_OF_HAND` spheres that fill the links."""
     centers, radii, links = [], [], []
     for primitive in hand.primitives:
         at, radius = _fill(primitive)
@@ -182,7 +182,7 @@ _RATHER_FACES = 1e-6
 
 
 def solid_pairs(hand: HandModel) -> Int[np.ndarray, "pairs 2"]:
-    """Return the pairs of solids whose links are not adjacent. Hulls are not counted as solids here."""
+    """Return the index pairs of primitives whose links are not adjacent. Hulls are left out and not counted."""
     link = np.array([p.link for p in hand.primitives if p.kind != "hull"], dtype=np.int64)
     return np.argwhere(np.triu(~hand.adjacent[np.ix_(link, link)], 1))
 
@@ -215,7 +215,7 @@ def solid_overlaps(
 def _width(
     solids: CollisionTensors, which: Int[Tensor, "n"], local: Float[Tensor, "n directions 3"]
 ) -> Float[Tensor, "n directions"]:
-    """Return half the extent of each solid [m] along directions given in the solid's frame."""
+    """Return half the extent of each primitive [m] along directions given in the primitive's frame."""
     core, round_one = solids.core[which][:, None], solids.is_round[which][:, None] > 0
     x, y, z = local.abs().unbind(-1)
     radial = (x * x + y * y).clamp_min(1e-24).sqrt()

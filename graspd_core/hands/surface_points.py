@@ -1,6 +1,6 @@
 """Sample the hand's outer surface: contact candidates for the optimiser, dense samples for the metrics.
 
-Points inside another solid of the same rigid group are left out. Points that are inside the next link at every joint
+Points inside another primitive of the rigid group are left out. Points that are inside the next link at every joint
 value are left out too. Random points are uniform by area. Feature points lie on edges, corners and rims.
 """
 
@@ -232,7 +232,7 @@ def dense_samples(hand: HandModel, *, count: int = 4000, seed: int = 1) -> Sampl
     """Return at least `count` random points of the outer surface: points in link frames [m], links, areas [m²].
 
     The points are independent of the candidates. The areas sum to the area of the outer surface. Raises HandError:
-    almost all of the hand's surface lies inside other solids.
+    almost all of the hand's surface lies inside other primitives.
     """
     rng = np.random.default_rng(seed)
     drawn, pool = count, _exposed(hand, _random_pool(hand, count, rng))
@@ -324,7 +324,7 @@ def _exposed(hand: HandModel, pool: _Pool) -> _Pool:
 
 
 def _covered_in_group(hand: HandModel, pool: _Pool) -> Bool[np.ndarray, "points"]:
-    """Return True for points inside another solid of their group, right in front of its surface, or flush with it."""
+    """Return True for points in another primitive of their group, right in front of its surface, or flush with it."""
     poses = link_poses(hand, hand.open_posture)
     placed = in_base(poses, pool.points, pool.links)
     raised = in_base(poses, pool.points + _CREASE * pool.normals, pool.links)
@@ -359,9 +359,9 @@ def _distance(poses: LinkPoses, primitive: Primitive, points: Points) -> Float[n
 
 
 def parent_groups(hand: HandModel) -> Int[np.ndarray, "links"]:
-    """Return for each group its nearest ancestor group with solids, -1 for none.
+    """Return for each group its nearest ancestor group with primitives, -1 for none.
 
-    Groups without solids are skipped, because a joint with several axes is a chain of hinges with massless links.
+    Groups without them are skipped, because a joint with several axes is a chain of hinges with massless links.
     """
     parent = hand.link_parent
     above = np.where(parent >= 0, hand.link_group[np.maximum(parent, 0)], -1)

@@ -37,7 +37,7 @@ _WIDEST, _LONGEST_SLIDE = 4 * np.pi, 2.0
 
 @dataclass(frozen=True, eq=False)
 class LinkSpec:
-    """A link of a file: mass [kg], centre of mass [m], inertia about it in link axes [kg·m²], and solids."""
+    """A link of a file: mass [kg], centre of mass [m], inertia about it in link axes [kg·m²], and primitives."""
 
     name: str
     mass: float = 0.0
@@ -83,7 +83,7 @@ class JointSpec:
 
 
 def refuse_crowds(path: Path, links: int, joints: int, solids: int) -> None:
-    """Raise HandError if a file has too many links, joints or solids for a hand. Call this before reading them."""
+    """Raise HandError if a file has too many links, joints or shapes for a hand. Call this before reading them."""
     for what, count, most in (
         ("links", links, _MOST_LINKS),
         ("joints", joints, _MOST_LINKS),

@@ -166,7 +166,7 @@ def visual_solids(hand: HandModel, prefix: str = "") -> tuple[Primitive, ...]:
     """Return the shapes for a viewer, in link frames as `hand.primitives`.
 
     A `hull` among them need not be convex. All meshes together are simplified to about 4000 triangles, at most 6000.
-    Links without visual shapes, and hands without a URDF, get their collision solids.
+    Links without visual shapes, and hands without a URDF, get their collision shapes.
 
     Args:
         hand: any loaded hand.
