@@ -3,8 +3,8 @@
 Objects with fewer earlier failures come first. Among equals, higher objects come first, because nothing lies on them.
 Each object gets one round of the planner. The first verified grasp ends the search. After `enough` objects, a likely
 grasp also ends it, to limit its time. If no grasp is likely, some objects get further rounds. Each of these begins with
-the full mass, while later rounds of one `plan_grasps` keep a mass that was lowered. Plans of an earlier request count
-for objects whose points are the same. `result_of_things` returns the result of one request.
+the full mass, while later rounds of one `plan_grasps` keep a mass that was lowered. An object with unchanged points
+keeps the unverified plan of an earlier request. `result_of_things` returns the result of one request.
 """
 
 from __future__ import annotations
@@ -186,7 +186,7 @@ class _Search:
     loose: Sequence[Failure]
 
     def is_over(self, things: Sequence[ThingPlan], enough: int) -> bool:
-        """Return True if time is up, a grasp is verified, or one is likely after rounds for `enough` objects."""
+        """Return True if stopped, out of time, a grasp is verified, or one is likely after `enough` objects."""
         stopped = (self.plan.get("stop") or bool)()
         likely = any(thing.is_likely for thing in things) and sum(thing.searches > 0 for thing in things) >= enough
         return stopped or time.perf_counter() > self.until or likely or any(thing.surety > 1.0 for thing in things)
@@ -316,7 +316,7 @@ def _unchanged(now: Float[np.ndarray, "_ 3"], before: Float[np.ndarray, "_ 3"]) 
 
 
 def _with_result(thing: ThingPlan, result: GraspResult, lost: Sequence[Posture]) -> ThingPlan:
-    """Return the plan with this result and its surest grasp that is unlike all lost ones."""
+    """Return the plan with this result and its surest grasp that is unlike every posture in `lost`."""
     left = [grasp for grasp in unlike(result.tried, lost) if grasp.verdict is not Verdict.FAILED]
     if not left:
         reason = result.message or next((g.reason for g in result.tried if g.reason), "") or result.outcome.value
@@ -328,7 +328,7 @@ def _with_result(thing: ThingPlan, result: GraspResult, lost: Sequence[Posture])
 
 @dataclass(frozen=True, eq=False)
 class _Unlike(BoundRestriction):
-    """Restriction to grasps that are not like any lost one. It is the same for every scene and hand."""
+    """Restriction to grasps that are not like a failed one (`lost`). It is the same for every scene and hand."""
 
     lost: Sequence[Posture]
 
@@ -337,7 +337,7 @@ class _Unlike(BoundRestriction):
         return self
 
     def admit(self, grasps: Sequence[Grasp]) -> Sequence[Grasp | Refusal]:
-        """Return each candidate, or a refusal if it is like a lost grasp."""
+        """Return each candidate, or a refusal if it is like a failed grasp."""
         return [grasp if unlike([grasp], self.lost) else Refusal("like a lost grasp") for grasp in grasps]
 
 

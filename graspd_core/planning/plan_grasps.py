@@ -181,7 +181,7 @@ def _why_few(run: Run, scene: Scene, bound: BoundRestrictions, found: RoundsResu
 
 
 def _less_sure(scene: Scene, far: Float[np.ndarray, "3"], result: GraspResult) -> GraspResult:
-    """Return the result of a run without a verified grasp, with a message and, if possible, the next best view."""
+    """Return the result with a message why no grasp is robust and, if possible, the next best view, moved by `far`."""
     held = sum(grasp.verdict is Verdict.UNVERIFIED for grasp in result.tried)
     if scene.evidence is None or not held:
         return result

@@ -84,7 +84,7 @@ class RoundsResult:
         optimise_time: time spent in the optimiser [s].
         first: time of the first verified grasp, a `time.perf_counter()` value. None without one.
         refused: number of candidates that restrictions refused, by reason.
-        lowered: mass with which the best grasps were tried again [kg], because none holds the assumed one, else None.
+        lowered: mass of the second trials of the best grasps [kg] if none holds the assumed mass, else None.
     """
 
     began: float
@@ -133,7 +133,7 @@ def run_rounds(
     device: str,
     measure: bool = True,
 ) -> RoundsResult:
-    """Find and try candidates, round by round, until `count` grasps are good.
+    """Find and try candidates, round by round, until `count` grasps are `RoundsResult.good`.
 
     If many grasps are requested, a small batch comes first, for an early answer. If too few grasps hold, the next round
     starts from other initial poses. Candidates that a restriction refuses are not tried. `prefetched` holds the worlds
@@ -191,8 +191,8 @@ def _tried_lighter(
 ) -> RoundsResult:
     """Try the best grasps again, strongest first, with a lower mass that the strongest grasp can lift.
 
-    If even the strongest grasp is too weak to be verified, further rounds try theirs with the least mass at which a
-    grasp may be.
+    If even the strongest grasp is too weak to be verified, further rounds try their grasps with the least mass at
+    which a grasp may be verified.
     """
     if state.context is None:
         return state

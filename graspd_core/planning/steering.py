@@ -151,7 +151,7 @@ class Steering:
 
 @dataclass(frozen=True, eq=False)
 class BoundSteering(BoundRestriction):
-    """`Steering` bound to one hand in one scene. `wanted` tells the optimiser where to draw initial poses."""
+    """`Steering` bound to one hand in one scene. `wanted` is the aim of the initial poses."""
 
     steering: Steering
     scene: Scene
