@@ -3,8 +3,8 @@
 An arm is a chain of links from its base to the tip link that carries the hand. graspd's URDF reader reads it. Forward
 kinematics and Jacobians come from pytorch-kinematics, which is imported when an arm is used.
 
-Collision solids become capsules: all points within a radius of a segment. Spheres and capsules do not change. Any other
-solid is replaced by a larger enclosing capsule. Distances between capsules and to a plane are exact.
+Collision shapes become capsules: all points within a radius of a segment. Spheres and capsules do not change. Any other
+shape is replaced by a larger enclosing capsule. Distances between capsules and to a plane are exact.
 """
 
 from __future__ import annotations
@@ -54,7 +54,7 @@ class Capsules:
 
 
 def capsules_about(primitives: Sequence[Primitive]) -> Capsules:
-    """Return an enclosing capsule of each solid. Spheres and capsules are exact."""
+    """Return an enclosing capsule of each primitive. Spheres and capsules are exact."""
     rows = [_about(primitive) for primitive in primitives]
     turned = [
         [primitive.rotation @ point + primitive.translation for point in row[:2]]
@@ -66,7 +66,7 @@ def capsules_about(primitives: Sequence[Primitive]) -> Capsules:
 
 
 def _about(primitive: Primitive) -> tuple[Float[np.ndarray, "3"], Float[np.ndarray, "3"], float]:
-    """Return the end points and the radius of a capsule around a solid, in the solid's frame [m]."""
+    """Return the end points and the radius of a capsule around a primitive, in the primitive's frame [m]."""
     size, up = primitive.size, np.array([0.0, 0.0, 1.0])
     if primitive.kind == "sphere":
         return np.zeros(3), np.zeros(3), size[0]
@@ -138,7 +138,7 @@ class Arm:
         tip: index of the link that carries the hand.
         lower, upper: joint limits of the URDF or narrower ones [rad] or [m].
         seed: collision-free joint values, near which the solutions stay if possible [rad] or [m].
-        capsules: capsules that enclose the collision solids of the links.
+        capsules: capsules that enclose the collision shapes of the links.
         mounts: poses of hands on the tip, by hand name. Other hands use the mount of their own description.
     """
 

@@ -1,7 +1,7 @@
 """Check collisions of an arm's capsules with the support, the object, obstacles, the hand, and each other.
 
 The support is a plane. Object and obstacles are signed distance fields, sampled along the segment of each capsule. The
-samples are so dense that their padding is less than an eighth of the radius. The base is checked against the arm only.
+samples are balls that cover the capsule, larger by less than an eighth. The base is checked against the arm only.
 The first moving link is not checked against the support, because it only turns above the support.
 """
 

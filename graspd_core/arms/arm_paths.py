@@ -243,7 +243,7 @@ def _followed(
 def _hits_on_path(
     task: ArmTask, path: Float[Tensor, "postures way joints"], joints: Float[Tensor, "postures hand_joints"]
 ) -> Hits:
-    """Return the deepest collisions of each path: with the scene at every waypoint, with arm and hand at the stages."""
+    """Return the deepest collisions on each path: with the scene at all waypoints, with arm and hand only at stages."""
     count = len(path)
     scene = hits_of_scene(task.arm, task.scene, task.base, arm_links(task.arm, path.flatten(0, 1)))
     links = arm_links(task.arm, path[:, list(STAGE_ROWS)].flatten(0, 1))

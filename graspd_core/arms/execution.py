@@ -144,7 +144,7 @@ def execution_of(
 
 
 def lift_time(grasp: Grasp, mass: float | None, pace: ExecutionPace) -> float:
-    """Return the duration of the lift [s]. It is shorter if the grasp's payload exceeds `mass` [kg] by more."""
+    """Return the duration of the lift [s]. The more the grasp's payload exceeds `mass` [kg], the shorter it is."""
     payload = (grasp.metrics or {}).get("payload")
     spare = 0.0 if not payload or not mass else _GRAVITY * (pace.payload_share * payload / mass - 1.0)
     return math.sqrt(PEAK_ACCELERATION * LIFT / min(max(spare, pace.gentlest), pace.strongest))
@@ -153,7 +153,7 @@ def lift_time(grasp: Grasp, mass: float | None, pace: ExecutionPace) -> float:
 def squeeze_efforts(
     grasp: Grasp, hand: HandModel, settings: GraspStagesConfig | None = None
 ) -> Float[np.ndarray, "joints"]:
-    """Return the hand's joint efforts [N·m] or [N], within limits, if the object stops the squeeze at the grasp."""
+    """Return the joint efforts [N·m] or [N] of the squeeze targets if the joints stay at the grasp, within limits."""
     settings = settings or GraspStagesConfig()
     gain = np.where(hand.slides, settings.slide_stiffness, settings.stiffness)
     return np.clip(gain * (grasp.squeeze.joint_positions - grasp.grasp.joint_positions), -hand.effort, hand.effort)
@@ -166,7 +166,7 @@ def _both(arm: np.ndarray, hand: np.ndarray) -> np.ndarray:
 def _from_rest_to_rest(
     rows: np.ndarray, limits: np.ndarray, least: float, shortest: float
 ) -> tuple[Float[np.ndarray, "rows"], Float[np.ndarray, "rows joints"]]:
-    """Return times [s] and joint speeds of rows that are evenly spaced along their path. Speeds are 0 at both ends."""
+    """Return times [s] and joint speeds of evenly spaced `rows`, within speed `limits` and least durations [s]."""
     share = np.linspace(0.0, 1.0, len(rows))
     # The cubic covers the share 3t² − 2t³ at time t. This is solved for t.
     time = 0.5 - np.sin(np.arcsin(1.0 - 2.0 * share) / 3.0)

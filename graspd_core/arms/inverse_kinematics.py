@@ -138,7 +138,7 @@ def _step(
     q: Float[Tensor, "batch joints"],
     limits: Sequence[Tensor] | None,
 ) -> Float[Tensor, "batch joints"]:
-    """Return the step `Jᵀ (J Jᵀ + λ I)⁻¹ e`, with weighted rotation rows, without joints that would leave limits."""
+    """Return the step `Jᵀ (J Jᵀ + λ I)⁻¹ e` with J and e = `wrong` weighted, without joints that would leave limits."""
     weight = wrong.new_tensor(_WEIGHTS)
     jacobian, wrong = jacobian * weight[:, None], wrong * weight
     if limits is not None:
