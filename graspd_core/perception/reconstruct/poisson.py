@@ -133,7 +133,7 @@ def _beneath_floors(surfels: Surfels, lowest: float) -> Points:
 
 
 def march(value: Grid, axes: Sequence[Float[np.ndarray, "_"]]) -> TriangleMesh:
-    """Return the zero surface of a field by marching cubes. Its normals point to where the field grows."""
+    """Return the zero surface of a field on nodes at the coordinates `axes` [m]. Normals point to higher values."""
     import igl
 
     cell = float(axes[0][1] - axes[0][0])
