@@ -93,8 +93,7 @@ def reconstruct_object(
 ) -> tuple[Reconstruction, Plane | None, tuple[Obstacle, ...], tuple[str, ...]]:
     """Return the object's reconstructed surface, its support, its obstacles and the warnings.
 
-    Raises:
-        CloudError: see `segment` and `reconstruct`, or a camera cannot have been at its stated position.
+    Raises CloudError: see `segment` and `reconstruct`, or a camera cannot have been at its stated position.
     """
     # Round to float32, so that a cloud gives the same scene in float32 and float64.
     views = [replace(view, points=_single(view.points)) for view in views]

@@ -195,7 +195,7 @@ def _outside_hull(points: Points, nodes: Float[np.ndarray, "m 3"], cell: float) 
 
 
 def _one_solid(value: Grid, cell: float) -> Grid:
-    """Keep only the largest solid, fill its inner cavities, and keep it clear of the grid's border."""
+    """Return the field of the largest body alone, without inner cavities, and clear of the grid's border."""
     from scipy.ndimage import label
 
     border = np.ones(value.shape, dtype=bool)
