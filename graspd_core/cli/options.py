@@ -102,7 +102,7 @@ def not_loaded_document(result: GraspResult) -> dict[str, Any]:
 
 
 def summary(result: GraspResult, wanted: int, different: int) -> str:
-    """Return a short text: of `wanted` grasps, how many are usable, and how many of these are no near-duplicates."""
+    """Return text about a result: usable grasps of `wanted`, `different` ones (no near-duplicates), times, metrics."""
     from graspd_core.verify.metrics import METRICS
 
     good = good_grasps(result)
