@@ -198,7 +198,7 @@ def _inside(mesh: TriangleMesh, nodes: _Vectors, distance: _Lengths, spacing: fl
     """Return which nodes lie inside.
 
     Around a closed surface the winding number is constant in each region without surface. Two neighbouring nodes that
-    are both over half a cell from the surface have none between them, so one query does for a region. Around an open
+    are both over half a cell from the surface have none between them, so one query answers for a region. Around an open
     surface the number also changes in free space, so every node is queried.
     """
     from scipy.ndimage import label
