@@ -285,7 +285,7 @@ class Timing:
 
 @dataclass(frozen=True)
 class AuditCount:
-    """Deprecated counts, always zero. Version 0.3 removes them. `graspd bench early` compares both trial lengths."""
+    """Deprecated counts, always zero. Version 0.3 removes them. `graspd bench early` checks trials that stop early."""
 
     audited: int = 0
     disagreed: int = 0

@@ -137,7 +137,7 @@ def as_text(hand: HandModel) -> str:
 
 
 def as_yaml(hand: HandModel, urdf: str) -> str:
-    """Return an editable hand description in YAML. `urdf` is the path to the hand's file from there."""
+    """Return an editable hand description in YAML. `urdf` is the hand's file, relative to the description."""
     lines = [f"urdf: {_quoted(urdf)}", "", "palm:", f"  link: {_quoted(hand.base_link)}"]
     lines += [f"  center: {_list(hand.palm_center)}", f"  normal: {_list(hand.palm_normal)}"]
     lines += ["", f"approach: {_list(hand.approach)}"]

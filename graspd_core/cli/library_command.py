@@ -60,7 +60,7 @@ def _build(options: argparse.Namespace) -> int:
 
 
 def _add_object(options: argparse.Namespace, library: GraspLibrary, source: str, scale: float, *rest: Any) -> int:
-    """Plan the missing grasps of an object and add them. Return the object's new number of grasps."""
+    """Plan and add the missing grasps (`rest`: hand, config, request, stop). Return the object's number of grasps."""
     from graspd_core.library.grasp_library import entry_of
     from graspd_core.library.known_grasps import add_planned
     from graspd_core.perception.load_scene import load_scene

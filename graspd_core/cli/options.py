@@ -102,7 +102,7 @@ def not_loaded_document(result: GraspResult) -> dict[str, Any]:
 
 
 def summary(result: GraspResult, wanted: int, different: int) -> str:
-    """Return a short text about a result. `different` is the number of usable grasps without near-duplicates."""
+    """Return text about a result: usable grasps of `wanted`, `different` ones (no near-duplicates), times, metrics."""
     from graspd_core.verify.metrics import METRICS
 
     good = good_grasps(result)

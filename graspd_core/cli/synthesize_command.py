@@ -113,7 +113,7 @@ def run(options: argparse.Namespace) -> int:
 
 
 def _any_object(options: argparse.Namespace, config: PlanConfig, request: dict[str, Any], deadline: Deadline) -> int:
-    """Plan for any object of a cloud, and report like `run`. Raises ConfigError: no cloud is given, or `--view` is."""
+    """Plan for any object of a cloud. Return the exit status. Raises ConfigError: it is no cloud, or `--view`."""
     from graspd_core.hands.library import load_hand
     from graspd_core.perception.cloud.cloud_files import is_cloud_file
     from graspd_core.perception.cloud.depth_files import is_depth_image

@@ -26,7 +26,7 @@ def from_mapping(cls: type[T], values: Any, where: str = "config", start: T | No
     """Build a config dataclass from nested mappings.
 
     Missing values come from `start`, or else from the defaults of the class. Raises ConfigError for an unknown key or a
-    value of the wrong type. The error names the dotted key and the valid choices.
+    value of the wrong type. The error names the dotted key, which begins with `where`, and the valid choices.
     """
     fields = dataclasses.fields(typing.cast(Any, cls))
     factories = {f.name: f.default_factory for f in fields if f.default_factory is not dataclasses.MISSING}

@@ -100,14 +100,14 @@ class RobustConfig:
 
 @dataclass(frozen=True)
 class HeldShares:
-    """Fractions of single-view grasps that hold on the true object at its true mass, by trial results (docs/clouds.md).
+    """Fractions of single-view grasps that hold on the true object with its true mass, by trials (docs/clouds.md).
 
     Attributes:
-        likeliest: fraction of the grasps that hold on the likeliest shape.
-        places: fraction of the grasps that also hold with the hand misplaced.
-        shapes: fraction of the grasps that also hold on two other shapes of the hidden side.
-        fails_places: fraction of the grasps that hold on the likeliest shape but not with the hand misplaced.
-        fails_shapes: fraction of the grasps that hold with the hand misplaced but not on two other shapes.
+        likeliest: among grasps that hold on the likeliest shape in trials.
+        places: among those that also hold with the hand misplaced.
+        shapes: among those that also hold on two other shapes of the hidden side.
+        fails_places: among grasps that hold on the likeliest shape but not with the hand misplaced.
+        fails_shapes: among grasps that hold with the hand misplaced but not on two other shapes.
     """
 
     likeliest: float

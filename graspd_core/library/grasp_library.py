@@ -51,7 +51,7 @@ class LibraryEntry:
         friction: Coulomb coefficient.
         verify: name of the trials that the grasps passed, one of `STRICTNESS`.
         hand: name of the hand.
-        hand_content: hash of the hand's kinematics and solids.
+        hand_content: hash of the hand's kinematics and collision shapes.
     """
 
     name: str
@@ -180,7 +180,7 @@ class GraspLibrary:
             return [name for (name,) in base.execute("SELECT DISTINCT name FROM records ORDER BY name")]
 
     def of_mesh(self, wanted: LibraryEntry, *, any_mass: bool = False) -> list[LibraryEntry]:
-        """Return entries with the content of `wanted` and at least as strict trials, strictest first."""
+        """Return entries as strict as `wanted`, strictest first. Mesh, hand, friction, mass (not `any_mass`) agree."""
         names = ("mesh_sha256", "hand_content", "friction", *(() if any_mass else ("mass",)))
         same = {name: getattr(wanted, name) for name in names}
         return strict_enough([entry for entry, _ in self.entries(**same)], wanted.verify)
@@ -188,8 +188,7 @@ class GraspLibrary:
     def grasps(self, entry: LibraryEntry, hand: HandModel) -> tuple[Grasp, ...]:
         """Return the verified grasps of an entry in the object frame, none for an unknown entry.
 
-        Raises:
-            FormatError: the library or the record is damaged.
+        Raises FormatError: the library or the record is damaged.
         """
         with self._reading() as base:
             row = base.execute("SELECT document FROM records WHERE key = ?", (entry.key,)).fetchone()

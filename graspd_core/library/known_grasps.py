@@ -67,7 +67,7 @@ class Physics:
 def entry_by_name(library: GraspLibrary, hand: HandModel | None, name: str, physics: Physics) -> LibraryEntry:
     """Return the entry of the object with this name, for this hand (None for any hand).
 
-    If all entries of the object have the same mass and friction, `physics` may have others.
+    If all entries of the object have the same mass and friction, those of `physics` do not count.
 
     Raises:
         ConfigError: the name is unknown, has no entry for this hand or physics, or is not unique.
@@ -325,7 +325,7 @@ def _held(
 
 
 def clearance(scene: Scene, hand: HandModel, grasps: Sequence[Grasp]) -> Float[np.ndarray, "grasps"]:
-    """Return each hand's least distance [m] to support and obstacles from pregrasp to squeeze, inf without both."""
+    """Return per grasp the hand's least distance [m] to support or obstacles, pregrasp to squeeze, inf without both."""
     obstacles = make_obstacle_tensors(scene, hand, "cpu", torch.float64)
     if obstacles is None or not grasps:
         return np.full(len(grasps), np.inf)

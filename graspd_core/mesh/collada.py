@@ -79,7 +79,7 @@ def _joined(root: ET.Element) -> TriangleMesh:
 
 
 def _instances(roots: list[ET.Element], named: dict[str, ET.Element]) -> list[tuple[np.ndarray, ET.Element]]:
-    """Return every geometry below the nodes, with its pose in the scene."""
+    """Return each geometry below the nodes `roots` with its pose in the scene. `named` maps "#id" to elements."""
     placed: list[tuple[np.ndarray, ET.Element]] = []
     stack = [(np.eye(4), node) for node in reversed(roots)]
     visits = 0
@@ -123,7 +123,7 @@ def _pose(node: ET.Element) -> Float[np.ndarray, "4 4"]:
 def _surface(
     geometry: ET.Element, named: dict[str, ET.Element]
 ) -> tuple[Float[np.ndarray, "vertices 3"], Int[np.ndarray, "faces 3"]]:
-    """Return the vertices and faces of a geometry in its own frame. Vertices that parts share stay shared."""
+    """Return the vertices and faces of a geometry in its own frame. `named` maps "#id" to elements."""
     vertices, faces, count = [np.zeros((0, 3))], [np.zeros((0, 3), dtype=np.int64)], 0
     known: dict[ET.Element, tuple[int, int]] = {}
     for element in geometry.iterfind("mesh/*"):

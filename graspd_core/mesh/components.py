@@ -23,8 +23,8 @@ TINY, STAYS = 0.05, 0.98
 def drop_small_components(mesh: TriangleMesh) -> tuple[TriangleMesh, int]:
     """Return the mesh without its small floating pieces, and the number of dropped pieces.
 
-    A dropped piece has under 5 % of the body's extent, shares no vertex with the rest, and is farther from the rest
-    than its own extent. A bump, a screw's head or a loose triangle that touches the body stays.
+    A dropped piece has under 5 % of the extent of the piece with the most area, and is farther from the rest than its
+    own extent. Pieces with such extents all stay if they hold over 2 % of the area.
     """
     piece = face_components(mesh)
     count = int(piece.max()) + 1
@@ -98,7 +98,7 @@ def bodies_apart(mesh: TriangleMesh) -> tuple[int, float]:
 def _points(
     mesh: TriangleMesh, pieces: Int[np.ndarray, "faces"]
 ) -> tuple[Float[np.ndarray, "points 3"], Int[np.ndarray, "points"]]:
-    """Return the vertices of all faces and points spread over the faces by area, with the piece of each point."""
+    """Return points of the surface and the piece of each: all used vertices, and points spread evenly by area."""
     rng = np.random.default_rng(0)
     corners = mesh.vertices[mesh.faces]
     area = np.linalg.norm(scaled_normals(mesh.vertices, mesh.faces), axis=1)
@@ -114,7 +114,7 @@ def _grown(
     among: Bool[np.ndarray, "points"],
     reach: float,
 ) -> Bool[np.ndarray, "points"]:
-    """Return the points in `among` of the longest piece, and of pieces linked to it by gaps below `reach` [m]."""
+    """Return which points in `among` are on the longest piece, or linked to it by gaps below `reach` [m]."""
     low, high = np.full((2, int(owner.max()) + 1, 3), np.inf)
     np.minimum.at(low, owner[among], points[among])
     np.minimum.at(high, owner[among], -points[among])

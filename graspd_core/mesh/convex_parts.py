@@ -82,7 +82,7 @@ def convex_parts(
 
 
 def _cut_up(sdf: GridSDF, points: Points, tolerance: float, most: int) -> list[Points]:
-    """Cut the cluster with the largest bulge until all bulges are within `tolerance` [m] or `most` clusters exist."""
+    """Cut points into at most `most` clusters, largest bulge first, until all bulges are within `tolerance` [m]."""
     ticket = count()
     heap: list[tuple[float, int, Points]] = []
     done: list[Points] = []
@@ -118,8 +118,8 @@ def _promising_cuts(sdf: GridSDF, cluster: Points) -> list[_Cut]:
     """Return the best cut across each coordinate axis and each principal axis, at most `SHORTLIST` cuts, best first.
 
     Segments between points of a cluster lie in its hull. So the bulge is sampled by how far their midpoints lie outside
-    the object. After a cut, only segments with both ends on one side remain. Their mean distance times the number of
-    points on that side estimates the volume of the bulge. One set of segments scores all cuts without computing hulls.
+    the object. After a cut, only segments with both ends on one side remain. The mean of these distances times the
+    number of points on that side estimates the bulge's volume. One set of segments scores all cuts without any hull.
     """
     pairs = (PAIRS * len(cluster)).astype(int)
     outside = (_outside(sdf, cluster[pairs].mean(1)) - _blur(sdf, cluster)).clip(0)
@@ -160,7 +160,7 @@ def _bulge_left(sdf: GridSDF, points: Points, cut: _Cut) -> float:
 
 
 def _join(sdf: GridSDF, clusters: list[Points], tolerance: float, most: int) -> list[Points]:
-    """Join the touching pair of least bulge while that is within `tolerance` [m] or over `most` clusters remain."""
+    """Join touching pairs, least bulge first, within `tolerance` [m] or while over `most` remain. Return clusters."""
     alive = dict(enumerate(clusters))
     boxes = {name: (cluster.min(0), cluster.max(0) + OVERLAP) for name, cluster in alive.items()}
     heap: list[tuple[float, bool, int, int]] = []
@@ -258,7 +258,7 @@ def even_directions(count: int) -> Float[np.ndarray, "3 count"]:
 
 
 def limited_hull(points: Points, most: int) -> TriangleMesh:
-    """Return a hull of at most `most` points: first the extremes along even directions, then the farthest outside."""
+    """Return the hull of at most `most` of the points, which approximates the full hull. Flat points give a plate."""
     hull = _hull(points)
     if hull is None:
         return _slab(points)

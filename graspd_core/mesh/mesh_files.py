@@ -322,7 +322,7 @@ def _refuse_path(path: Path) -> None:
 
 
 def _without_strays(mesh: TriangleMesh, source: str) -> tuple[TriangleMesh, tuple[str, ...]]:
-    """Drop vertices that no face uses, with a warning. Raises MeshError if the rest is no mesh."""
+    """Drop vertices that no face uses. Return mesh and warnings. Raises MeshError: empty, bad index, not finite."""
     if len(mesh.vertices) == 0 or len(mesh.faces) == 0:
         raise MeshError(f"{source}: empty mesh ({len(mesh.vertices)} vertices, {len(mesh.faces)} faces)")
     if mesh.faces.min() < 0 or mesh.faces.max() >= len(mesh.vertices):
@@ -352,7 +352,7 @@ def _doubted_size(mesh: TriangleMesh, source: str, scale: float) -> list[str]:
 
 
 def _distinct(mesh: TriangleMesh, source: str) -> tuple[TriangleMesh, int, int]:
-    """Merge coincident vertices. Drop degenerate and repeated faces, and return how many of each were dropped."""
+    """Merge coincident vertices. Return the mesh, and the numbers of degenerate and of repeated faces dropped."""
     vertices, faces = topology.merge_vertices(mesh)
     distinct = topology.drop_degenerate(vertices, faces)
     unique = topology.drop_repeated(distinct)

@@ -157,8 +157,8 @@ def is_solid(sdf: GridSDF) -> bool:
 def _closest_to_nodes(surface: Surface, nodes: _Vectors, spacing: float) -> tuple[_Vectors, _Vectors]:
     """Return a surface point for each grid node and its face normal. Within `BAND`, it is exactly the closest point.
 
-    Beyond `BAND`, normals are zero. The grid is divided into blocks. The exact distance of a block's middle node gives
-    lower bounds for the block's other nodes. Nodes beyond `BAND` by this bound start with the middle node's point.
+    Beyond `BAND`, normals are zero. The exact distance of the middle node of each block of nodes gives lower bounds for
+    the others. Nodes beyond `BAND` by this bound get the middle node's point, or a nearer one of neighbours (`_sweep`).
     """
     counts = nodes.shape[1:]
     middles = [np.minimum(np.arange(_BLOCK // 2, n + _BLOCK // 2, _BLOCK), n - 1) for n in counts]
@@ -181,7 +181,7 @@ def _closest_to_nodes(surface: Surface, nodes: _Vectors, spacing: float) -> tupl
 
 
 def _sweep(nodes: _Vectors, closest: _Vectors, squared: _Lengths) -> None:
-    """Replace each node's surface point in place by a neighbour's if that is nearer, along each axis and back."""
+    """Give nodes a neighbour's surface point if it is nearer. Update `closest` and `squared` distances in place."""
     for axis in range(3):
         # These are views with this axis first, so writing to them changes the arrays.
         at, to, best = np.moveaxis(nodes, axis + 1, 1), np.moveaxis(closest, axis + 1, 1), np.moveaxis(squared, axis, 0)
@@ -198,7 +198,7 @@ def _inside(mesh: TriangleMesh, nodes: _Vectors, distance: _Lengths, spacing: fl
     """Return which nodes lie inside.
 
     Around a closed surface the winding number is constant in each region without surface. Two neighbouring nodes that
-    are both over half a cell away have no surface between them, so one query answers for the region. Around an open
+    are both over half a cell from the surface have none between them, so one query answers for a region. Around an open
     surface the number also changes in free space, so every node is queried.
     """
     from scipy.ndimage import label

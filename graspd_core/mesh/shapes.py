@@ -113,7 +113,7 @@ def _box(half: tuple[float, float, float], centre: tuple[float, float, float] = 
 
 
 def _revolve(profile, closed: bool = False) -> TriangleMesh:
-    """Revolve an (r, z) profile about z: a curve that rises from axis to axis, or a counter-clockwise loop."""
+    """Revolve an (r, z) profile about z. It rises from axis to axis, or is a counter-clockwise loop (`closed`)."""
     profile = np.asarray(profile, dtype=float)
     if not closed:
         profile[[0, -1], 0] = 0.0
@@ -132,7 +132,7 @@ def _ribbon(outer: Float[np.ndarray, "n 2"], inner: Float[np.ndarray, "n 2"], ha
 
 
 def _stitch(rings: Float[np.ndarray, "rows columns 3"], wrap_rows: bool) -> TriangleMesh:
-    """Join consecutive closed rings by triangles. Rings that are single points become poles."""
+    """Join each closed ring to the next by triangles, with `wrap_rows` the last to the first. Point rings are poles."""
     rows, columns = rings.shape[:2]
     index = np.arange(rows * columns).reshape(rows, columns)
     low = index if wrap_rows else index[:-1]

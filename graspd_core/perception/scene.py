@@ -196,6 +196,7 @@ def build_scene(
         mesh: surface of the object [m].
         mass: mass of the object [kg]. None assumes `heavy_mass` of its volume and adds a warning.
         scale: factor by which the file's coordinates were multiplied, for the record and for messages.
+        started: time when loading began (`time.perf_counter`), for the scene's timing. None means now.
         support: plane that the object stands on, or None.
         obstacles: other bodies near the object.
         confidence: confidence at each vertex, 1 if seen, 0 if guessed. None if all of the surface is known.

@@ -83,7 +83,7 @@ def scene_from_views(
 def things_from_views(views: Sequence[PointCloud], settings: SegmentationConfig | None = None) -> tuple[Points, ...]:
     """Return the points [m] of each object that `scene_from_views` can select. See `find_things`.
 
-    Where `run_isolated` uses a child process, later scenes of these views need no segmentation of their own.
+    The segmentation is kept, so scenes that are built next from the same views and settings reuse it.
     """
     return run_isolated(find_things, [replace(view, points=_single(view.points)) for view in views], settings)
 
@@ -93,8 +93,7 @@ def reconstruct_object(
 ) -> tuple[Reconstruction, Plane | None, tuple[Obstacle, ...], tuple[str, ...]]:
     """Return the object's reconstructed surface, its support, its obstacles and the warnings.
 
-    Raises:
-        CloudError: see `segment` and `reconstruct`, or a camera cannot have been at its stated position.
+    Raises CloudError: see `segment` and `reconstruct`, or a camera cannot have been at its stated position.
     """
     # Round to float32, so that a cloud gives the same scene in float32 and float64.
     views = [replace(view, points=_single(view.points)) for view in views]
@@ -148,7 +147,7 @@ def _camera_doubts(seen: Segmentation, views: Sequence[PointCloud]) -> tuple[str
 
 
 def _is_whole_object(views: Sequence[PointCloud]) -> bool:
-    """Check the camera positions. Return True if the check fails because the only cloud shows all sides."""
+    """Return True if `check_scene` fails, but the only cloud shows all sides. Raises CloudError: it fails otherwise."""
     try:
         check_scene(views)
     except CloudError:

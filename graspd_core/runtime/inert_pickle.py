@@ -88,7 +88,7 @@ def _is_plain(key: object) -> bool:
 
 
 def _with_plain_keys(name: str, keys: slice) -> Callable[[Any], None]:
-    """Return the base class's method `name`, preceded by a check of the keys at `keys` in the stack."""
+    """Return the base class's method `name`, preceded by a check of the dictionary keys at `keys` in the stack."""
 
     def act(reader: Any) -> None:
         if not all(map(_is_plain, reader.stack[keys])):

@@ -93,9 +93,9 @@ class PinholeCamera:
 def camera_from_calibration(
     width: int, height: int, matrix: _Numbers, distortion: _Numbers = (), model: str = "plumb_bob"
 ) -> PinholeCamera:
-    """Return the camera of a CameraInfo, from its `width`, `height`, `k` (row by row), `d` and `distortion_model`.
+    """Return a camera from image size [pixels], camera matrix (row by row), distortion coefficients and their model.
 
-    Raises CloudError if the model is unknown or has fewer coefficients than `d`, or if `k` is not a calibration.
+    Raises CloudError if `model` is unknown or has fewer coefficients than given, or `matrix` is not a calibration.
     """
     if len(matrix) != 9:
         raise CloudError(f"camera: its matrix K has {len(matrix)} numbers; 9 are needed")
@@ -178,9 +178,9 @@ def _lens(ideal: _Places, coefficients: _Numbers) -> tuple[_Places, Float[np.nda
 def reaches_image_border(
     points: Float[np.ndarray, "points 3"], eye: Vector, mine: Bool[np.ndarray, "points"], width: float
 ) -> bool:
-    """Return True if an object touches an image border: a side of the view's outline that other points touch too.
+    """Return True if the points `mine` touch an image border: a side of the view's outline that others touch too.
 
-    The outline is the convex hull of all viewing directions. Points within `width` [rad] of the outline touch it.
+    The outline is the hull of the directions from `eye` to all points. Points within `width` [rad] of it touch it.
     """
     if not mine.any():
         return False
@@ -240,7 +240,7 @@ def cloud_from_depth(
         T_frame_camera: pose of the camera (z forward, x right, y down).
 
     Raises:
-        CloudError: image and camera differ in size, depth was cut to 8 bits, or K is for another resolution.
+        CloudError: image and camera differ in size, depth was cut to 8 bits, or the camera fits another resolution.
     """
     if depth.shape != (camera.height, camera.width):
         raise CloudError(

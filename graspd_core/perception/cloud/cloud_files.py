@@ -77,7 +77,7 @@ def read_ply_points(data: bytes) -> Points:
 
 
 def _pcd_header(data: bytes) -> tuple[dict[str, list[str]], int]:
-    """Return the words of a pcd file's header by their key, and where the points begin."""
+    """Return the words of a pcd file's header by their key, and the byte offset of the points."""
     header: dict[str, list[str]] = {}
     at = 0
     while at < len(data) and "DATA" not in header:
@@ -227,7 +227,7 @@ def load_views(path: str | Path, viewpoint: Vector | None = None) -> tuple[Point
 
 
 def recording_told(path: Path) -> str:
-    """Return the end of an error about a recording: its kind, and the command that reads or converts it."""
+    """Return the text that ends an error message: the kind of a recording, and the command to read or convert it."""
     if path.suffix.lower() != ".bag":
         return f"is a recording of ROS 2; read it with graspd replay {path.name}"
     return f"is a bag of ROS 1; convert it first: rosbags-convert --src {path.name} --dst {path.stem}"

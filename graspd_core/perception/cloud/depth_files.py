@@ -100,7 +100,7 @@ def _camera_of(told: Mapping[str, Any]) -> DepthCamera:
 
 
 def _matrix(told: Mapping[str, Any]) -> list[float]:
-    """Return the nine numbers of the camera matrix K, row by row."""
+    """Return the nine numbers of the camera matrix, row by row, from the keys of a camera file."""
     if "K" in told:
         return _numbers(told["K"], None, "K").reshape(-1).tolist()
     if "intrinsic_matrix" in told:

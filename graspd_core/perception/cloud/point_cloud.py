@@ -54,7 +54,7 @@ def transform_cloud(cloud: PointCloud, T_a_b: Float[np.ndarray, "4 4"]) -> Point
 
 
 def measured(points: Points, viewpoint: Vector) -> Bool[np.ndarray, "n"]:
-    """Return which points were measured: finite, not zero and not at the camera. Drivers fill gaps with others."""
+    """Return which points were measured. Drivers set missing points to NaN, infinity, zero or the camera's place."""
     zero = near = finite = np.ones(len(points), dtype=bool)
     # Computed column by column, because NumPy takes ten times as long for `all` over many short rows.
     for column, place in zip(points.T, viewpoint, strict=True):

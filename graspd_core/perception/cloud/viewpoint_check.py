@@ -114,10 +114,10 @@ def check_viewpoint(thing: PointCloud, view: PointCloud, up: Vector | None = Non
         up: normal of the support plane of the object, None if the support is not seen.
 
     Returns:
-        A warning if cameras in many other positions would see the same. Otherwise an empty string.
+        A warning if many other positions fit as well or the surface looks hollow. Otherwise an empty string.
 
     Raises:
-        CloudError: the camera cannot have stood there. The error says why.
+        CloudError: the camera cannot have been at the viewpoint. The error says why.
     """
     from scipy.spatial import KDTree
 
@@ -180,7 +180,7 @@ def _said(viewpoint: Vector) -> str:
 def hidden_share(points: Points, viewpoint: Vector, nearer: Float[np.ndarray, "points"], tree: Any) -> float:
     """Return the fraction of points that a surface hides from the viewpoint.
 
-    In the image, points that are nearer by `nearer` [m] surround a hidden point and most of its neighbours in space.
+    In the image, points nearer to the camera by over `nearer` [m] surround a hidden point and most of its neighbours.
     `tree` is the KD-tree of the points.
     """
     from scipy.spatial import KDTree
@@ -214,7 +214,7 @@ def hidden_share(points: Points, viewpoint: Vector, nearer: Float[np.ndarray, "p
 
 
 def _away_share(points: Points, surfaces: Surfaces, viewpoint: Vector) -> float:
-    """Return the fraction of points that face away from the viewpoint, if most points of each surface face it."""
+    """Return the fraction of points that face away from the viewpoint, if each surface mostly faces it."""
     normal, surface, clear = surfaces
     ray = viewpoint - points
     cosine = (normal * ray).sum(1) / np.maximum(np.linalg.norm(ray, axis=1), 1e-12)

@@ -71,7 +71,7 @@ def with_foot(surfels: Surfels, free_space: FreeSpace, step: float) -> Surfels:
 
 
 def stand(surfels: Surfels, free_space: FreeSpace, step: float) -> Surfels:
-    """Return the walls between the lowest seen points and the support, and the bottom between these walls."""
+    """Return walls from the lowest seen points down to the support, and the bottom. Empty if walls are doubtful."""
     lowest = float(np.percentile(surfels.points[:, 2], 1))
     band = take(surfels, surfels.points[:, 2] < lowest + 3 * step)
     wall = np.abs(band.normals[:, 2]) < MAX_WALL_COSINE

@@ -133,7 +133,7 @@ def _beneath_floors(surfels: Surfels, lowest: float) -> Points:
 
 
 def march(value: Grid, axes: Sequence[Float[np.ndarray, "_"]]) -> TriangleMesh:
-    """Return the zero surface of a field by marching cubes. Its normals point to where the field grows."""
+    """Return the zero surface of a field on nodes at the coordinates `axes` [m]. Normals point to higher values."""
     import igl
 
     cell = float(axes[0][1] - axes[0][0])
@@ -195,7 +195,7 @@ def _outside_hull(points: Points, nodes: Float[np.ndarray, "m 3"], cell: float) 
 
 
 def _one_solid(value: Grid, cell: float) -> Grid:
-    """Keep only the largest solid, fill its inner cavities, and keep it clear of the grid's border."""
+    """Return the field of the largest body alone, without inner cavities, and clear of the grid's border."""
     from scipy.ndimage import label
 
     border = np.ones(value.shape, dtype=bool)

@@ -246,7 +246,7 @@ def _ends(profile: Rows, axis: Axis, right, up, free_space: FreeSpace, step: flo
 
 
 def _foot(rim, way: float, ground: float, step: float) -> Rows:
-    """Return a parabola from an overhanging rim, starting along its tangent, to where the axis meets the support."""
+    """Return a parabola that leaves the rim along its tangent and ends where the axis meets the support, or no rows."""
     height, radius = way * -rim[0] + ground, rim[1]
     along, across = way * rim[2], rim[3]
     if along < 0.15 or height < 2 * step:

@@ -194,7 +194,7 @@ def _outline(points: Points, normals: Points, near: Int[np.ndarray, "n near"]) -
 def _bend(
     points: Points, normals: Points, one: Int[np.ndarray, "pairs"], other: Int[np.ndarray, "pairs"]
 ) -> Float[np.ndarray, "n"]:
-    """Return the mean curvature at each point [1/m], from the given pairs. It is negative on concave surfaces."""
+    """Return the mean curvature at each point [1/m] over its neighbour pairs (`one`, `other`), negative if concave."""
     way = points[other] - points[one]
     squared = np.einsum("pd,pd->p", way, way)
     # Close pairs measure noise rather than curvature.
@@ -267,7 +267,7 @@ def _near(
     settings: SegmentationConfig,
     support: FlatPart | None,
 ) -> bool:
-    """Return True if two clusters, the larger first, are near enough to be one object. Hanging ones may be farther."""
+    """Return True if clusters `apart` [m] are near enough to be one object. If one hangs (`hang`), more is allowed."""
     if support is None:  # two objects behind each other look like two sides of one object
         return apart <= settings.unsupported_reach
     if apart <= max(link, settings.gap) or _share_within(b, a, support) >= OUTLINE_SHARE:

@@ -127,7 +127,7 @@ def _refine(
     gate: float,
     settings: SegmentationConfig,
 ) -> FlatPart | None:
-    """Refine a plane by iterated weighted least squares. None for too few inliers or a curved surface."""
+    """Fit the plane `guess` (n, d with n·x + d = 0) to the points `left`. None: few inliers or a curved surface."""
     least, most = settings.plane_tolerance, settings.max_plane_tolerance
     size = float(np.linalg.norm(guess[:3]))
     if not size > 0:

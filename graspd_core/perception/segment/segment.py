@@ -218,7 +218,7 @@ def _obstacles(parted: _Parted, chosen: Mask) -> tuple[Float[np.ndarray, "_ 3"],
 
 
 def _doubts(parted: _Parted, chosen: Mask, crowded: bool) -> tuple[str, ...]:
-    """Return warnings about the segmentation."""
+    """Return warnings about the segmentation. `crowded`: whether there are obstacles."""
     scene, ground, settings = parted.scene, parted.ground, parted.settings
     doubts = []
     if scene.size > 0.5 * settings.gap:

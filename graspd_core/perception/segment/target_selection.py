@@ -145,8 +145,8 @@ def _thing_of(
 ) -> int:
     """Return the object that a point selects: the one that contains it, else the nearest within `target_reach`.
 
-    A point is inside an object if the object's hull contains it or the object hides it from a camera, and if its depth
-    is at most half the object's length. Deeper than `MIDDLE_SHARE` of the length, a nearer object is preferred.
+    An object contains a point that is in its hull or hidden by it, at most half its length away from its seen points.
+    If this distance is over `MIDDLE_SHARE` of the length, the nearest object within `target_reach` is preferred.
     """
     away = np.linalg.norm(scene.mean - point, axis=1)
     things = [np.flatnonzero(label == k) for k in range(int(label.max(initial=-1)) + 1)]
@@ -191,7 +191,7 @@ def _holds(points: Points, point: Vector) -> bool:
 
 
 def _masked(scene: VoxelScene, label: Labels, many: int, meant: Mask, least: float) -> Mask:
-    """Return the voxels of the objects under a mask. A cluster counts if the mask covers at least half of it."""
+    """Return voxels of objects that mask `meant` covers most or by half: all above share `least`, else the masked."""
     of_first = scene.voxel[scene.of_view(0)]
     shown, covered = (
         np.bincount(label[rows][label[rows] >= 0], minlength=many) for rows in (of_first, of_first[meant[of_first]])
@@ -209,7 +209,7 @@ def _covered(label: Labels, meant: Mask, things: list[int], share: Float[np.ndar
 
 
 def _off_axis(thing: Points, scene: VoxelScene, views: Sequence[PointCloud]) -> float:
-    """Return the angle between the first non-empty view's axis and an object [rad], the 5th percentile of points."""
+    """Return the 5th percentile of the angles [rad] between an object's points and the first non-empty view's axis."""
     first = next(k for k, rows in enumerate(scene.rows) if len(rows))
     axis, viewpoint = views[first].forward, views[first].viewpoint
     if axis is None:
