@@ -168,7 +168,7 @@ class ImagePairs:
         return image, info
 
     def unpaired(self) -> str:
-        """Return one line about images without a matching CameraInfo, empty before they have waited `UNPAIRED`."""
+        """Return a line about images that wait longer than `UNPAIRED` [s] for a matching CameraInfo, or ""."""
         if self._waiting is None or self._clock() - self._alone_since < UNPAIRED:
             return ""
         last = next(reversed(self._infos.values()), None)
@@ -288,7 +288,7 @@ def trimmed(cloud: PointCloud, settings: Settings) -> PointCloud:
 
 
 def within(cloud: PointCloud, settings: Settings) -> Bool[np.ndarray, "n"]:
-    """Return True for points inside the workspace, False for NaN. Raises RequestError if no point is inside."""
+    """Return whether each point is inside the workspace. NaN is outside. Raises RequestError if no point is inside."""
     points, low, high = cloud.points, np.array(settings.roi_min), np.array(settings.roi_max)
     inside = np.asarray(((points >= low) & (points <= high)).all(1))
     if inside.any():
