@@ -171,7 +171,7 @@ class RecentRuns:
 
 
 def unlike(grasps: Iterable[Grasp], excluded: Sequence[Matrix]) -> list[Grasp]:
-    """Return the grasps that are not similar to any of the base-link poses."""
+    """Return the grasps that are not similar to any of the `excluded` base-link poses."""
     return [grasp for grasp in grasps if not any(_alike(matrix_of_posture(grasp.grasp), pose) for pose in excluded)]
 
 

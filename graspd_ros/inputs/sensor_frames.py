@@ -104,7 +104,7 @@ class SensorFrame:
 
 
 def cloud_frame(message: PointCloud2, arrived: int) -> SensorFrame:
-    """Return a cloud message as a frame. Its points are read on use. Raises RequestError if the cloud is too large."""
+    """Return a cloud that arrived at `arrived` [ns] as a frame. It is read on use. Raises RequestError: too large."""
     if len(message.data) > MOST_CLOUD_BYTES:
         fault = f"the cloud has {len(message.data)} bytes; valid: at most {MOST_CLOUD_BYTES}"
         raise RequestError(ErrorCode.BAD_CLOUD, fault)
@@ -114,7 +114,7 @@ def cloud_frame(message: PointCloud2, arrived: int) -> SensorFrame:
 
 
 def depth_sensor_frame(image: DepthMessage, info: CameraInfo, arrived: int) -> SensorFrame:
-    """Return a depth image with its calibration as a frame. Its points are read on use."""
+    """Return a depth image with calibration, arrived at `arrived` [ns], as a frame. Its points are read on use."""
 
     def read(place: CameraPlace = ORIGIN, lookup: object = None) -> PointCloud:
         # The camera of a depth image is at the origin of its frame.
