@@ -147,7 +147,7 @@ class Picker:
         self.why_ended = ""
 
     def empty_the_bin(self, most: int = 500) -> Iterator[Attempt]:
-        """Take one object after another and yield each attempt. Afterwards `why_ended` says why the loop ended.
+        """Take one object after another. Yield up to `most` attempts. Then `why_ended` says why the loop ended.
 
         Raises:
             Cancelled: the caller cancelled.
@@ -174,7 +174,7 @@ class Picker:
         self.why_ended = f"{most} attempts"
 
     def attempt(self, offer: Offer, world: SeenWorld, began: float, number: int = 1) -> Attempt:
-        """Carry one object to the place bin and return the outcome."""
+        """Carry one object to the place bin and return the outcome. `began` is robot time at the image [s]."""
         taking: _Taking | None = None
         try:
             assert offer.grasp is not None
