@@ -334,7 +334,7 @@ def cooling(progress: float) -> float:
 
 
 def jump(uniform: Float[Tensor, "*batch"], temperature: float) -> Float[Tensor, "*batch"]:
-    """Map uniform numbers in [0, 1) to jumps in [-1, 1] by Ingber's distribution, mostly of the size of `temperature`."""
+    """Map uniform numbers in [0, 1) to jumps in [-1, 1] by Ingber's distribution, mostly of size `temperature`."""
     side = 2 * uniform - 1
     return side.sign() * temperature * ((1 + 1 / temperature) ** side.abs() - 1)
 
