@@ -56,7 +56,7 @@ _DISTANCES = (7.0, 13.0, 20.0, 28.0, 38.0, 50.0, 64.0)
 
 @contextmanager
 def figure(width: float, height: float, **grid: Any) -> Iterator[tuple[Any, Any]]:
-    """Yield a figure of `width` by `height` [inches] and its axes in the common style. Close it at the end."""
+    """Yield a figure of `width` by `height` [inches] and its axes, made by `subplots(**grid)`. Close it at the end."""
     with Extra("bench"):
         import matplotlib
 
@@ -205,7 +205,7 @@ def draw_charts(records: Sequence[Record], path: Path) -> dict[str, Path]:
 
 
 def about_records(records: Sequence[Record], kind: str) -> str:
-    """Return two lines for a chart: hands and objects, then the number of grasps and the meaning of the bars."""
+    """Return two lines on runs of `kind` ("" if none): hands and objects, number of grasps and meaning of the bars."""
     rows = [r for r in records if r.get("kind") == kind and not r["error"] and is_preset(r["name"])]
     if not rows:
         return ""
@@ -224,7 +224,7 @@ def about_records(records: Sequence[Record], kind: str) -> str:
 
 
 def draw_planned(presets: dict[str, list[Row]], path: Path, about: str = "") -> Path | None:
-    """Draw CPU seconds per verified grasp against those to the first such grasp. Return the PNG's path, or None."""
+    """Draw CPU seconds per verified grasp against those to the first one. Return the PNG's path, None without data."""
     panel = Panel("cpu_per_verified", "CPU seconds per verified grasp, all included")
     points = points_of(presets, "first_cpu", panel)
     if not points:

@@ -75,7 +75,7 @@ class Row:
         count: number of requested grasps.
         given: number of grasps found.
         held: number of grasps that passed the standard hold trial.
-        spent: CPU time of the optimiser and of those trials [s].
+        spent: CPU time of the optimiser and of the standard hold trials [s].
         values: numbers by name, None if not measured: medians over grasps (`_grasp_figures`), shares of the requested
             grasps (`TRIAL_FIGURES`), and times [s]. `cpu_per_grasp` is that of the optimiser, `cpu_per_verified` is
             `spent` / `held`. `first_cpu` and `first_wall` are the times to the first verified grasp.
@@ -105,7 +105,7 @@ class Spread:
 
 
 def rows(records: Iterable[Record], kind: str = "raw") -> list[Row]:
-    """Return a row for every name and object, in the order of the records. Failed cells are left out."""
+    """Return a row for every name and object of the records of `kind`, in their order. Failed cells are left out."""
     groups: dict[tuple[str, str], list[Record]] = {}
     # A record without grasps does not show its trials. It then counts as tried in those of all other records.
     ran = {TRIAL_FIGURES[0]}

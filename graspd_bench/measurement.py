@@ -269,7 +269,7 @@ def run_pace(cell: Cell) -> dict[str, Any]:
 
 
 def grasp_steps(cell: Cell) -> int | None:
-    """Return the number of optimiser steps of a batch, summed over starts. None if the method is not closed_form."""
+    """Return the optimiser steps of a batch, summed over its start postures. None if the method is not closed_form."""
     s = cell.settings.settings
     if not isinstance(s, ClosedFormConfig):
         return None
@@ -278,7 +278,7 @@ def grasp_steps(cell: Cell) -> int | None:
 
 
 def run_start(cell: Cell) -> dict[str, Any]:
-    """Time a new process from its start to its first verified grasp [s]. The disk cache is off."""
+    """Run a new process up to its first verified grasp. Return its CPU and wall time [s]. The disk cache is off."""
     environment = {**os.environ, "GRASPD_CACHE": "off", "OMP_NUM_THREADS": "1"}
     command = [sys.executable, "-c", _FRESH, cell.object, cell.hand, str(cell.seed)]
     began = time.perf_counter()

@@ -166,7 +166,7 @@ def all_shapes() -> tuple[str, ...]:
 
 
 def find_objects(sources: Sequence[str]) -> tuple[str, ...]:
-    """Return the objects that `object_sources` finds. Raises MeshError: no such object, or two with equal names."""
+    """Return the objects of `sources`, with folders expanded. Raises MeshError: unknown object, or equal names."""
     found = object_sources(sources)
     names = [object_name(source) for source in found]
     if twice := sorted({name for name in names if names.count(name) > 1}):

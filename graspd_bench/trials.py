@@ -179,7 +179,7 @@ def _fall(world: World, data: Any, protocol: Protocol, stop: Callable[[], bool])
 
 
 def _end(states: list[ObjectState], checks: int) -> Float[np.ndarray, "3"] | None:
-    """Predict the centre of mass after 2 s from the even creep of soft contacts [m]. None if it is not yet certain."""
+    """Predict the centre of mass after all `checks` from `states`, if it creeps evenly [m]. None if uncertain."""
     recent = states[-2 * _WINDOW - 1 :]
     if len(recent) <= 2 * _WINDOW or not all(s.speed < CREEPING.speed and s.spin < CREEPING.spin for s in recent):
         return None

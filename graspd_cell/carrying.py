@@ -68,7 +68,7 @@ _HEIGHTS = (0.08, 0.12, 0.17, 0.22, 0.28)
 
 
 def dropped_box(thing: Points) -> Box:
-    """Return a box on the table that covers an object released at the points `thing` [m]. No camera sees that place."""
+    """Return a box on the table that covers an object released at the points `thing` [m], which no camera sees."""
     low, high = thing.min(0), thing.max(0)
     half, rise = 0.5 * (high - low)[:2], 0.5 * float(high[2] - low[2])
     x, y = (0.5 * (low + high))[:2].tolist()

@@ -169,7 +169,7 @@ class AttemptWatch:
         self._robot.clear_forces()
 
     def note(self, attempt: Attempt, cpu: float) -> Record:
-        """Add the record of an attempt that has just ended."""
+        """Add and return the record of an attempt that has just ended. `cpu` is graspd's CPU time [s]."""
         now = self._robot.referee()
         moved = {name: place for name, place in now.places.items() if place != self._before.places[name]}
         target = self._target(attempt.place)

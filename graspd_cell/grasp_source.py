@@ -88,7 +88,7 @@ def scene_config(source: Bin) -> SceneConfig:
 
 
 class InProcessGrasps:
-    """Grasp source that runs graspd as a library. It keeps the doubtful plans of objects that did not move.
+    """Grasp source that runs graspd as a library. It reuses an unmoved object's plan if that has no verified grasp.
 
     Args:
         arm, hand, layout: parts of the cell.

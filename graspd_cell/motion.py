@@ -111,7 +111,7 @@ _SAMPLES = 4000
 
 
 def balls_about(points: Points, spacing: float = _SPACING, radius: float = _BALL) -> Balls:
-    """Return a ball of radius `radius` [m] at one point in every cube of side `spacing` [m]."""
+    """Return a ball of `radius` [m] at one point of every cube of side `spacing` [m] that has points."""
     kept = np.unique(voxel_keys(points - points.min(0), spacing), return_index=True)[1]
     return Balls(points[kept], np.full(len(kept), radius))
 

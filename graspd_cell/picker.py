@@ -147,7 +147,7 @@ class Picker:
         self.why_ended = ""
 
     def empty_the_bin(self, most: int = 500) -> Iterator[Attempt]:
-        """Take one object after another and yield each attempt. Afterwards `why_ended` says why the loop ended.
+        """Take one object after another. Yield up to `most` attempts. Then `why_ended` says why the loop ended.
 
         Raises:
             Cancelled: the caller cancelled.
@@ -174,7 +174,7 @@ class Picker:
         self.why_ended = f"{most} attempts"
 
     def attempt(self, offer: Offer, world: SeenWorld, began: float, number: int = 1) -> Attempt:
-        """Carry one object to the place bin and return the outcome."""
+        """Carry one object to the place bin and return the outcome. `began` is robot time at the image [s]."""
         taking: _Taking | None = None
         try:
             assert offer.grasp is not None
@@ -334,7 +334,7 @@ class Picker:
         return Mover(arm_shape(self._arm), world, hand_balls(self._arm, self._hand, fingers))
 
     def _held_now(self, taking: _Taking, here: np.ndarray) -> np.ndarray:
-        """Return surface points of the held object's hull [m], which moves with the hand's base link."""
+        """Return surface points of the held object's hull, base frame [m], when the arm is at joint values `here`."""
         offer = taking.offer
         assert offer.surface is not None
         assert offer.grasp is not None
@@ -362,7 +362,7 @@ class Picker:
             self._follow(timed(self._arm, path, speeds), stop)
 
     def _follow_gate(self, execution: Execution, gate: str) -> None:
-        """Execute the part of the grasp's trajectory that ends at a gate."""
+        """Execute the grasp's trajectory from the gate before `gate` to `gate`, a point where all joints rest."""
         rows = execution.rows_to(gate)
         times = execution.times[rows] - execution.times[rows.start]
         positions = np.concatenate([execution.arm[rows], execution.hand[rows]], 1)[1:]

@@ -41,7 +41,7 @@ class Report:
     hardest: Mapping[str, float]
 
     def hard(self, target: str = "") -> dict[str, float]:
-        """Return the pairs whose force exceeds `HARD`, except the hand on its target object."""
+        """Return the forces above `HARD` by pair [N], except that of the hand on the object `target`."""
         return {pair: force for pair, force in self.hardest.items() if force > HARD and pair != f"hand on {target}"}
 
 

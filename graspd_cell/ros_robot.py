@@ -185,7 +185,7 @@ class RosRobot:
         return client.send_goal_async(goal_of(motion))
 
     def _wait_for(self, future: Any, end: float, stop: Callable[[], bool], watched: Any = ()) -> None:
-        """Wait for an answer. Raises MotionAborted: stopped, timeout, silence, or a controller aborted."""
+        """Wait for `future`. Raises MotionAborted: stopped, robot time over `end` [s], silence, `watched` failed."""
         while not future.done() or watched:
             if stop():
                 raise MotionAborted("the motion was stopped")

@@ -130,7 +130,7 @@ class SimulatedRobot:
             self.step(min(_LOOK_EVERY, steps - done))
 
     def parts_of(self, motion: JointMotion) -> list[tuple[TrajectoryController, JointMotion]]:
-        """Return the controllers of a motion, each with its part. Unknown joints go to the arm's, where they fail."""
+        """Return the controllers of a motion, each with its part. Unknown joints go to the arm controller and fail."""
         hand = tuple(name for name in motion.names if name in self.hand.limits.names)
         arm = tuple(name for name in motion.names if name not in hand)
         if not hand or not arm:

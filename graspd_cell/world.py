@@ -236,7 +236,7 @@ def put_robot(world: CellWorld, data: Any, values: Float[np.ndarray, "joints"]) 
 
 
 def _touching(world: CellWorld) -> set[tuple[str, str]]:
-    """Return pairs of an arm link and another link that intersect at the start, because their solids are too wide."""
+    """Return pairs of an arm link and another link whose collision shapes, being too wide, overlap at the start."""
     import mujoco
 
     data = mujoco.MjData(world.model)

@@ -106,7 +106,7 @@ def _one_thread() -> None:
 
 
 def _kept(key: str, pickled: bytes) -> Any:
-    """Return the unpickled value: always the same instance, because worlds are cached by the identity of scenes."""
+    """Return the unpickled value of a key, each time the same instance, because worlds are cached by scene identity."""
     if key not in _loaded:
         _loaded[key] = pickle.loads(pickled)
     _loaded.move_to_end(key)

@@ -164,8 +164,8 @@ def link_gaps(problem: Problem, poses: Poses, sphere_links: Int[Tensor, "spheres
     """Return the gaps [m] of every link: its signed distance to the object, then its clearance to other links.
 
     The clearance is minus the overlap of proxy spheres, so it is never positive. Adjacent links do not count.
-    The distance is infinite if the link has neither contact candidates nor solids. The clearance is infinite if the
-    link has no proxy spheres.
+    The distance is infinite if the link has neither contact candidates nor collision shapes. The clearance is infinite
+    if the link has no proxy spheres.
     """
     placed = hand_forward(problem, problem.hand.fine, poses)
     count = placed.links.translation.shape[1]

@@ -128,7 +128,7 @@ def checked_order(order: Sequence[str], hand: HandModel) -> tuple[str, ...]:
 
 
 def find_beside(named: Any, file: Path, where: str) -> str:
-    """Search the folders above `file`, nearest first, for the file `named`. Raises FormatError: it does not exist."""
+    """Return the path of the file `named` in the nearest folder above `file` with it. Raises FormatError: none."""
     if isinstance(named, str) and named and "\0" not in named:
         for folder in file.resolve().parents:
             if (folder / named).is_file():

@@ -169,7 +169,7 @@ def failed_report(store: DatasetStore, job: Job, error: BaseException) -> Report
 
 
 class _Child:
-    """The child process of this process. The first call starts it."""
+    """The child process of this process. The first `call` starts it."""
 
     def __init__(self) -> None:
         self._process: WorkerProcess | None = None

@@ -33,7 +33,7 @@ def nanoseconds(stamp: Time | Duration) -> int:
 
 
 def set_nanoseconds(stamp: Time | Duration, value: int) -> None:
-    """Set a stamp or a duration in a message [ns]."""
+    """Set a stamp or a duration to `value` [ns]."""
     stamp.sec, stamp.nanosec = divmod(value, SECOND)
 
 
@@ -92,7 +92,7 @@ def matrix_of_pose(pose: Pose) -> Matrix:
 
 
 def near(point: Point, name: str, what: str = "") -> Float[np.ndarray, "3"]:
-    """Return the point [m] of the field `name`. Raises RequestError if it is not finite or over 1 km away."""
+    """Return a point as an array [m]. Raises RequestError on `name` (part `what`): not finite, or over 1 km away."""
     place = array_of(point)
     if not (np.abs(place) <= _FARTHEST).all():
         raise bad_request(f"{name}: {what}{place.tolist()}; valid: finite, within {_FARTHEST:g} m")
@@ -100,7 +100,7 @@ def near(point: Point, name: str, what: str = "") -> Float[np.ndarray, "3"]:
 
 
 def pose_matrix(pose: Pose, name: str = "object_pose") -> Matrix:
-    """Return a pose as a matrix. An all-zero quaternion means no rotation. Raises RequestError if it is not valid."""
+    """Return a pose as a matrix. A zero quaternion means no rotation. Raises RequestError on field `name`: invalid."""
     near(pose.position, name, "position ")
     length = float(np.linalg.norm(wxyz_of(pose.orientation)))
     if length == 0:

@@ -36,7 +36,7 @@ class PlanningMessages:
         self._up: tuple[str, tuple[float, float, float]] | None = None
 
     def watching(self, request: Request, goal: Any) -> Request:
-        """Return the goal's request. Store the object that the hand may touch and, on loading, the up direction."""
+        """Return the goal's request, whose `load` stores the up direction. Store the object that the hand may touch."""
         self._touch = (goal.object.name,) if goal.object.name else ()
 
         def loaded() -> Scene:

@@ -39,7 +39,7 @@ def warm_up_library(settings: Settings, hand: HandModel) -> None:
 
 
 def named_loader(known: KnownObject, settings: Settings) -> Callable[[], Scene]:
-    """Return a function that loads the mesh of the library object with the name in `known`."""
+    """Return a function that loads the library object with the name in `known` as a scene."""
 
     def load() -> Scene:
         entry = find_entry(known, settings, None)
@@ -58,9 +58,9 @@ def answer_known(
     restrictions: Sequence[Steering | Reach],
     **plan: Any,
 ) -> tuple[GraspResult, Scene | None]:
-    """Return grasps that differ from the excluded poses, and the scene (None if not loaded).
+    """Return grasps unlike the `excluded` base-link poses, and the scene (None if not loaded).
 
-    If the library has too few grasps, more are planned. Raises GraspdError as `find_entry`, loading and planning do.
+    If the library has too few, plan more with the arguments `plan`. Raises GraspdError as `find_entry` and planning do.
     """
     began, settings = time.perf_counter(), request.settings
     count, library = settings.num_grasps, GraspLibrary(Path(settings.grasp_library))

@@ -175,7 +175,7 @@ def _refuse_arguments(args: list[str]) -> None:
 
 
 def _spinning(executor: Executor, wake: threading.Event, fail: Callable[[], None]) -> threading.Thread:
-    """Start and return a thread that spins the executor until `wake` is set. An earlier end calls `fail`."""
+    """Start and return a thread that spins the executor. If it ends before `wake` is set, it calls `fail`."""
 
     def spin() -> None:
         try:

@@ -200,7 +200,7 @@ class Settings:
 
 
 class LiveSettings:
-    """Settings of a node, updated when a parameter changes. `now` has the current values. It logs doubtful values.
+    """Settings of a node, updated when a parameter changes. `now` has the current values. Doubtful ones are logged.
 
     `frames` returns the frames in /tf. Raises ConfigError if a start value is not a valid choice, and rclpy's
     ParameterException if its type is wrong or it is out of range.

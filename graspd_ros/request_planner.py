@@ -171,7 +171,7 @@ class RecentRuns:
 
 
 def unlike(grasps: Iterable[Grasp], excluded: Sequence[Matrix]) -> list[Grasp]:
-    """Return the grasps that are not similar to any of the base-link poses."""
+    """Return the grasps that are not similar to any of the `excluded` base-link poses."""
     return [grasp for grasp in grasps if not any(_alike(matrix_of_posture(grasp.grasp), pose) for pose in excluded)]
 
 
@@ -323,7 +323,7 @@ class Planner:
 def _any_object(
     request: Request, hand: HandModel, failures: Sequence[Failure], **plan: Any
 ) -> tuple[GraspResult, Scene | None, tuple[tuple[Float[np.ndarray, "3"], str], ...]]:
-    """Plan for any object of the request's views. Return result, scene, and place and reason of each object seen."""
+    """Plan for any object seen. Return result, scene, and each object's place [m] and why it has no verified grasp."""
     assert request.views is not None
     (views, told), settings = request.views(), request.settings
     about = {"settings": load_scene_config(settings.scene_config) if settings.scene_config else None}

@@ -53,8 +53,8 @@ _FIGURES = (
 def bench_page(folder: Path, *, served: bool = False) -> tuple[str, dict[str, Record]]:
     """Return the HTML page of a benchmark's folder, and the records of its raw runs by key.
 
-    Raises:
-        FormatError: the folder has no readable results, or no raw grasps of a preset.
+    If `served`, the page can ask the server to show the grasps of a run.
+    Raises FormatError: the folder has no readable results, or no raw grasps of a preset.
     """
     records = read_results(folder / "results.json")
     try:

@@ -50,7 +50,7 @@ class Part:
 
 
 def hand_parts(hand: HandModel) -> dict[int, Part]:
-    """Return the collision solids of each link that has any, by link index, in the link's frame [m]."""
+    """Return the collision shapes of each link that has any as one part, by link index, in the link's frame [m]."""
     parts = {}
     for link, primitives in enumerate(hand.primitives_of):
         if primitives:
@@ -76,7 +76,7 @@ def scene_parts(scene: Scene) -> list[Part]:
 
 
 def contact_parts(contacts: Sequence[Contact]) -> list[Part]:
-    """Return one arrow per contact along the object's outward normal."""
+    """Return a part with an arrow per contact along the object's outward normal. No part without contacts."""
     if not contacts:
         return []
     starts = np.array([contact.position for contact in contacts])
@@ -94,7 +94,7 @@ def force_parts(positions: Float[np.ndarray, "n 3"], forces: Float[np.ndarray, "
 
 
 def weakest_parts(push: Float[np.ndarray, "6"], target: ObjectModel) -> list[Part]:
-    """Return arrows of the disturbance that a grasp resists least: its force, and the axis of its torque."""
+    """Return parts with arrows for force and torque of the unit disturbance `push`. Leave out components up to 0.05."""
     center, parts = target.center_of_mass, []
     for name, part, colour in (("weakest/force", push[:3], WEAKEST), ("weakest/turn", push[3:], TURN)):
         share = float(np.linalg.norm(part))

@@ -88,7 +88,7 @@ def legend_html() -> str:
 
 
 def table_html(grasps: Sequence[Grasp], ranks: Sequence[int], chosen: int | None) -> str:
-    """Return the rows of the table around the selected grasp."""
+    """Return counts by filter, and the table's rows around the grasp of rank `chosen`, as HTML."""
     if not ranks:
         return "<i>no grasp passes this filter</i>"
     middle = ranks.index(chosen) if chosen in ranks else 0

@@ -1,4 +1,4 @@
-"""Live view of a run: starts during the optimisation, candidates, and verdicts of the trials."""
+"""Live view of a run: hands during the optimisation, candidates, and verdicts of the trials."""
 
 from __future__ import annotations
 

@@ -66,7 +66,7 @@ def run(options: argparse.Namespace) -> int:
 
 @contextmanager
 def watched(options: argparse.Namespace, scene: Scene, hand: HandModel, config: PlanConfig) -> Iterator[Watched]:
-    """Yield the hooks of a page for a run with --view. The run begins when a visitor is there or after a minute."""
+    """Yield the hooks of a page for a run with --view, when a visitor has opened the page or a minute has passed."""
     from graspd_viewer.session import make_session, seen_points
     from graspd_viewer.viewer import Viewer
 

@@ -98,7 +98,7 @@ class PostureSpace:
 
 
 def posture_space(hand: HandModel, dimensions: int, seed: int) -> PostureSpace:
-    """Return the space of the first principal components of random postures. It has fewer if few joints vary."""
+    """Return the space of the first `dimensions` principal components of random postures, fewer if few joints vary."""
     rng = np.random.default_rng(seed)
     fingers = finger_of(hand)
     span = hand.upper - hand.lower
@@ -334,7 +334,7 @@ def cooling(progress: float) -> float:
 
 
 def jump(uniform: Float[Tensor, "*batch"], temperature: float) -> Float[Tensor, "*batch"]:
-    """Map uniform numbers in [0, 1) to jumps from −1 to 1 by Ingber's distribution (1989). Most are of size T."""
+    """Map uniform numbers in [0, 1) to jumps in [-1, 1] by Ingber's distribution, mostly of size `temperature`."""
     side = 2 * uniform - 1
     return side.sign() * temperature * ((1 + 1 / temperature) ** side.abs() - 1)
 

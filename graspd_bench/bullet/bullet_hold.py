@@ -136,7 +136,7 @@ def _start_penetration(run: _Run) -> float:
 
 
 def _move(run: _Run, start: Posture, end: Posture) -> str:
-    """Move the targets linearly from `start` to `end`. Return the reason if the trial failed, otherwise ""."""
+    """Move base and joint targets linearly to `end`. Return the reason if the trial failed, otherwise ""."""
     steps = round(run.protocol.stage_time / TIMESTEP)
     # A quaternion and its negative are the same rotation. The sign makes the base turn the shorter way.
     sign = 1.0 if start.quaternion_wxyz @ end.quaternion_wxyz >= 0 else -1.0

@@ -1,7 +1,7 @@
 """Hand and object in PyBullet, the second simulator, and the displacement trial.
 
 The URDF of the hand is written from the HandModel and not read from the hand's own file. Both simulators thus use the
-same solids, masses and joint frames. The object consists of convex parts.
+same collision shapes, masses and joint frames. The object consists of convex parts.
 
 A BulletWorld is plain data, from which every trial builds its own simulation. Bullet keeps contacts and solver state
 between trials, so with a shared simulation a result would depend on earlier trials.
@@ -80,7 +80,7 @@ def load_hand_urdf(client: int, hand: HandModel, armature: float) -> tuple[int, 
 
 
 def hand_urdf(hand: HandModel, armature: float) -> str:
-    """Return the URDF text. It names links and joints by number, and the mesh of hull i as file hull<i>.obj."""
+    """Return the URDF. Moved links include the `armature` [kg·m²]. Names are link<i>, joint<i> and hull<i>.obj."""
     robot = ET.Element("robot", name=hand.name)
     for link in range(hand.num_links):
         element = ET.SubElement(robot, "link", name=f"link{link}")

@@ -204,7 +204,7 @@ def _shadow(depth: Depth, camera: PinholeCamera, baseline: float) -> Bool[np.nda
 
 
 def _grazing(depth: Depth, camera: PinholeCamera, limit: float, edge: np.ndarray, rng: np.random.Generator):
-    """Return the pixels without depth because of a small viewing angle. Edges have no normal and are exempt."""
+    """Draw the pixels that lose depth at grazing angles below `limit` [rad]. Edges have no normal and are exempt."""
     if not limit:
         return np.zeros(depth.shape, dtype=bool)
     rays = np.nan_to_num(camera_rays(camera))
@@ -217,7 +217,7 @@ def _grazing(depth: Depth, camera: PinholeCamera, limit: float, edge: np.ndarray
 
 
 def _field(shape: tuple[int, ...], blur: float, white: float, rng: np.random.Generator) -> Depth:
-    """Return random numbers of unit variance. `white` is the uncorrelated share of the variance, the rest is smooth."""
+    """Return noise of unit variance. The share `white` of it is uncorrelated, the rest blurred by `blur` [pixels]."""
     from scipy.ndimage import gaussian_filter
 
     smooth = gaussian_filter(rng.standard_normal(shape), blur, mode="wrap") / _blurred_scale(shape, blur)

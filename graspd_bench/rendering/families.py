@@ -99,7 +99,7 @@ def _box(centre: tuple[float, float, float], half: tuple[float, float, float], r
 
 
 def _revolved(profile: list[tuple[float, float]], flat: float = 1.0) -> Field:
-    """Return a body of revolution about z with rounded ends. `profile` lists (height, radius), `flat` scales y."""
+    """Return the distance field of a body revolved about z. `profile` lists (height, radius) [m], `flat` scales y."""
     heights, radii = np.array(profile).T
 
     def field(points: Points) -> Distance:
@@ -113,7 +113,7 @@ def _revolved(profile: list[tuple[float, float]], flat: float = 1.0) -> Field:
 
 
 def _blend(*fields: Field, width: float = 0.004) -> Field:
-    """Return the smooth union of bodies. `width` is the approximate width of the fillets [m]."""
+    """Return the distance field of the smooth union of bodies. Fillets are about `width` [m] wide."""
 
     def field(points: Points) -> Distance:
         joined = fields[0](points)

@@ -132,7 +132,7 @@ def resting_pose(mesh: TriangleMesh, rng: np.random.Generator) -> Float[np.ndarr
 
 
 def crowded(target: TriangleMesh, others: Sequence[TriangleMesh], rng: np.random.Generator) -> tuple[TriangleMesh, ...]:
-    """Place other objects at rest around a target, each 2 to 5 cm away from all placed before it."""
+    """Return `others` placed at rest around the target, each 2 to 5 cm away from all placed before it."""
     from scipy.spatial import KDTree
 
     placed, begun = [target], rng.uniform(0, 2 * np.pi)

@@ -282,7 +282,7 @@ def _shape(name: str, **settings: Any) -> Callable[[Path], Scene]:
 
 
 def _poisoned(channel: int, value: float) -> Callable[[Path], Scene]:
-    """Return a function that loads a scene and sets a bad value in its SDF, at a grid node on the surface."""
+    """Return a function that loads a scene and sets `value` in `channel` of its SDF, at a grid node on the surface."""
 
     def scene(folder: Path) -> Scene:
         clean = load_scene("shape:cylinder")

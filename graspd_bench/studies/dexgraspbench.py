@@ -182,9 +182,9 @@ def write_armature(xml: Path, to: Path, armature: float) -> Path:
 
 
 def evaluate(case: BenchCase, written: Path, xml: Path, paths: Sequence[Path]) -> list[Record]:
-    """Run DexGraspBench on grasp files. Return for each grasp `held`, `travel` [m] and `turn` [deg].
+    """Run DexGraspBench on the grasp files `paths` in `written`. Return for each `held`, `travel` [m], `turn` [deg].
 
-    Raises ConfigError: DexGraspBench ended with an error, or gave no result for a grasp.
+    `xml` is the hand's MJCF. Raises ConfigError: DexGraspBench ended with an error, or gave no result for a grasp.
     """
     results = Path(tempfile.mkdtemp(dir=written.parent))
     options = {"task": "eval", "hand": "allegro", "setting": "fc", "exp_name": "graspd", "n_worker": "1"}
@@ -236,7 +236,7 @@ def _run(command: Sequence[str], folder: Path, patience: float) -> str:
 
 
 def why_failed(there: Record) -> str:
-    """Return why a grasp did not hold in DexGraspBench, in a few words."""
+    """Return why a grasp with the result `there` did not hold in DexGraspBench, in a few words."""
     # DexGraspBench reports a refused pregrasp by such values.
     if there["travel"] >= 100 and there["turn"] >= 100:
         return "refused: the pregrasp overlaps the object, or the hand itself, by more than 1 cm"
@@ -254,7 +254,7 @@ def bench_summary(record: Record) -> str:
 
 
 def _pairs(records: Sequence[Record], variant: str) -> list[tuple[bool, Record]]:
-    """Return for every grasp whether our trial verified it, and the result of DexGraspBench."""
+    """Return for every grasp whether our trial verified it, and DexGraspBench's result with a variant of the hand."""
     return [
         (own["verified"], there)
         for record in records

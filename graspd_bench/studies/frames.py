@@ -61,7 +61,7 @@ def frame_cases(request: Request) -> tuple[Frame, ...]:
 
 
 def run_frame(case: Frame) -> Record:
-    """Plan on the object at the view axis. If its IoU is at most 0.5, plan on the one at the reference's centre."""
+    """Plan at the view axis. If object and reference have an IoU of at most 0.5, plan at the reference's centre."""
     cloud, reference = read_frame(Path(case.folder))
     hand = load_hand(case.hand)
     target, found = None, {}

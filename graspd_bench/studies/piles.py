@@ -111,7 +111,7 @@ def dropped_pile(case: PileCase) -> tuple[FreeBody, ...]:
 
 
 def seen_pile(case: PileCase, bodies: Sequence[FreeBody], look: int) -> tuple[list[PointCloud], Any]:
-    """Return the views, and the label of each point in the order of the views: an index in `bodies`, or the table."""
+    """Return the views of look number `look`, and the label of each point: an index in `bodies`, or the table."""
     meshes = [moved(body.model.mesh, body.pose) for body in bodies]
     table = tabletop("sphere")
     stage = TabletopScene(meshes[0], np.eye(4), tuple(meshes[1:]), table.table, table.support)
@@ -199,7 +199,7 @@ def _take_one(
     truth: Int[np.ndarray, "points"],
     seen: Sequence[Float[np.ndarray, "_ 3"]],
 ) -> bool:
-    """Plan for segments with fewest failures first. Execute one verified grasp. Return False if there is none."""
+    """Plan for the segments `seen`, fewest failures first. Execute one verified grasp. Return False without one."""
     cloud = KDTree(np.vstack([view.points for view in views]))
     order = sorted(seen, key=lambda points: (run.failed_before(points.mean(0)), -float(points[:, 2].max())))
     for points in order:

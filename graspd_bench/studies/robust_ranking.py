@@ -101,7 +101,7 @@ def orders(
 
 
 def correlation(rows: Sequence[Record], key: str) -> float:
-    """Return Spearman's correlation of a score and the share held, averaged over plans in which both vary, or NaN."""
+    """Return Spearman's correlation of the score `key` and the share held, mean over plans where both vary, or NaN."""
     from scipy.stats import rankdata
 
     found = [

@@ -247,7 +247,7 @@ def _marks(own: Sequence[Record]) -> str:
 
 
 def calibration(stated: Sequence[tuple[float, bool]], where: str = "") -> list[str]:
-    """Return the Brier score and the share held per tenth of probability. `stated` has pairs (probability, held)."""
+    """Return Brier score and share held per tenth of probability. `where` describes the pairs (probability, held)."""
     if not stated:
         return []
     body = []

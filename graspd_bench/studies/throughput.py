@@ -70,7 +70,7 @@ def throughput_sections(records: Sequence[Record], chart: Path | None) -> Sectio
 
 
 def _figures(rows: Sequence[Record]) -> list[float]:
-    """Return tried per verified grasps. For each number of threads add verified grasps per s, CPU ms per grasp."""
+    """Return grasps tried per verified grasp, then verified grasps per s and CPU ms per grasp for each thread count."""
     found = [sum(row["tried"] for row in rows) / sum(row["verified"] for row in rows)]
     for threads in THREADS:
         here = [row for row in rows if row["threads"] == threads]

@@ -74,7 +74,7 @@ class RequestBuilder:
         self._started = time.strftime("%Y%m%dT%H%M%S")
 
     def new_id(self, kind: str) -> str:
-        """Return an id that stays unique after a restart, because output files are named by it."""
+        """Return an id that begins with `kind`. It stays unique after a restart, because it names output files."""
         return f"{kind}-{self._started}-{next(self._numbers)}"
 
     def forget(self) -> None:
@@ -114,7 +114,7 @@ class RequestBuilder:
     ) -> Request:
         """Return the request of a GraspRequest.
 
-        Raises GraspdError: a field is invalid, the mesh is not readable, or the cloud is missing, old or not in /tf.
+        Raises GraspdError: a field is invalid, the mesh or cloud is missing or refused, or a frame is not in /tf.
         """
         check_request(message, self._hand)
         if message.any_object and not settings.segment:

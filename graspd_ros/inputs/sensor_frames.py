@@ -104,7 +104,7 @@ class SensorFrame:
 
 
 def cloud_frame(message: PointCloud2, arrived: int) -> SensorFrame:
-    """Return a cloud message as a frame. Its points are read on use. Raises RequestError if the cloud is too large."""
+    """Return a cloud that arrived at `arrived` [ns] as a frame. It is read on use. Raises RequestError: too large."""
     if len(message.data) > MOST_CLOUD_BYTES:
         fault = f"the cloud has {len(message.data)} bytes; valid: at most {MOST_CLOUD_BYTES}"
         raise RequestError(ErrorCode.BAD_CLOUD, fault)
@@ -114,7 +114,7 @@ def cloud_frame(message: PointCloud2, arrived: int) -> SensorFrame:
 
 
 def depth_sensor_frame(image: DepthMessage, info: CameraInfo, arrived: int) -> SensorFrame:
-    """Return a depth image with its calibration as a frame. Its points are read on use."""
+    """Return a depth image with calibration, arrived at `arrived` [ns], as a frame. Its points are read on use."""
 
     def read(place: CameraPlace = ORIGIN, lookup: object = None) -> PointCloud:
         # The camera of a depth image is at the origin of its frame.
@@ -168,7 +168,7 @@ class ImagePairs:
         return image, info
 
     def unpaired(self) -> str:
-        """Return one line about images without a matching CameraInfo, empty before they have waited `UNPAIRED`."""
+        """Return a line about images that wait longer than `UNPAIRED` [s] for a matching CameraInfo, or ""."""
         if self._waiting is None or self._clock() - self._alone_since < UNPAIRED:
             return ""
         last = next(reversed(self._infos.values()), None)
@@ -288,7 +288,7 @@ def trimmed(cloud: PointCloud, settings: Settings) -> PointCloud:
 
 
 def within(cloud: PointCloud, settings: Settings) -> Bool[np.ndarray, "n"]:
-    """Return True for points inside the workspace, False for NaN. Raises RequestError if no point is inside."""
+    """Return whether each point is inside the workspace. NaN is outside. Raises RequestError if no point is inside."""
     points, low, high = cloud.points, np.array(settings.roi_min), np.array(settings.roi_max)
     inside = np.asarray(((points >= low) & (points <= high)).all(1))
     if inside.any():

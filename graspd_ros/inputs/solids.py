@@ -1,4 +1,4 @@
-"""Shapes in messages: solids, meshes, the support plane, and collision objects of a planning scene.
+"""Shapes in messages: primitives, meshes, the support plane, and collision objects of a planning scene.
 
 Collision objects arrive as `moveit_msgs/CollisionObject` and are obstacles of every later request.
 """
@@ -28,12 +28,12 @@ _SIZES = {SolidPrimitive.BOX: 3, SolidPrimitive.SPHERE: 1, SolidPrimitive.CYLIND
 
 
 def mesh_shapes(shapes: Collection[Mesh], poses: Collection[Pose], owner: str) -> list[TriangleMesh]:
-    """Return meshes at their poses, or at the origin without poses. Raises RequestError on `owner` for invalid ones."""
+    """Return meshes at their poses, or at the origin without. Raises RequestError about `owner`: one is invalid."""
     return _placed("mesh", _mesh, shapes, poses, owner)
 
 
 def primitive_shapes(shapes: Collection[SolidPrimitive], poses: Collection[Pose], owner: str) -> list[TriangleMesh]:
-    """Return the meshes of primitives at their poses. Raises RequestError on `owner` for an invalid primitive."""
+    """Return the meshes of primitives at their poses. Raises RequestError about `owner`: one is invalid."""
     return _placed("primitive", _primitive, shapes, poses, owner)
 
 
@@ -89,7 +89,7 @@ def _solid(kind: int, sizes: np.ndarray) -> Any:
 
 
 def bad_message(owner: str, message: str) -> RequestError:
-    """Return the error about an invalid part of the message of `owner`."""
+    """Return the error with the prefix `owner`, the name of the object that the message is about."""
     return bad_request(f"{owner}: {message}")
 
 
@@ -106,7 +106,7 @@ def plane_of(surface: PlaneMessage, T_object_frame: Matrix | None = None) -> Pla
 
 
 def with_support(load: Callable[[], Scene], plane: Plane | None) -> Callable[[], Scene]:
-    """Return a loader that adds the support plane to the scene. Its normal points to the object's side."""
+    """Return a loader that adds the support `plane`, if any, to the scene, with its normal towards the object."""
     if plane is None:
         return load
 

@@ -112,7 +112,7 @@ def _arm(name: str, robot_description: str) -> Arm:
 
 
 def heard_robot(node: Node, arm: str) -> str:
-    """Return the URDF from the topic robot_description. Without an arm, or if its file names a URDF, return "".
+    """Return the URDF from the topic robot_description. Return "" without an arm, or if the arm file names a URDF.
 
     Call this before the node is spun. Raises GraspdError if no URDF arrives in time, or the URDF lacks the arm.
     """

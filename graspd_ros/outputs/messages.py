@@ -360,8 +360,8 @@ def _point(posture: Posture, hand: HandModel, at: float) -> JointTrajectoryPoint
 def arm_trajectory(grasp: Grasp, path: ArmPath, pace: Pace) -> JointTrajectory:
     """Return all waypoints of the arm without velocities, so that controllers pass them without stopping.
 
-    The arm must start at the retreat, which is the point at `pace.shortest`. Points of a stage are evenly spaced in
-    time. Joints stay below `pace.joint_speed` and the hand below `pace.base_speed`.
+    The arm must start at the retreat, the first point, whose time is `pace.shortest` [s]. Points of a stage are
+    evenly spaced in time. Joints stay below `pace.joint_speed` and the hand below `pace.base_speed`.
     """
     from graspd_core.arms.arm_paths import LIFT
 
@@ -381,7 +381,7 @@ def arm_trajectory(grasp: Grasp, path: ArmPath, pace: Pace) -> JointTrajectory:
 def execution_message(
     grasp: Grasp, path: ArmPath, hand: HandModel, pace: Pace, mass: float | None = None
 ) -> GraspExecution:
-    """Return the motion of arm and hand from retreat to the end of the lift, with the point index of each gate."""
+    """Return the motion from retreat to the end of the lift, with the point index of each gate (all joints rest)."""
     from graspd_core.arms.execution import GATES, ExecutionPace, execution_of
 
     own = ExecutionPace(pace.joint_speed, pace.base_speed, pace.base_speed, pace.shortest)
@@ -413,9 +413,9 @@ def result_markers(
     parts: Sequence[str] = USUAL_PARTS,
     solids: Sequence[Primitive] | None = None,
 ) -> MarkerArray:
-    """Return the markers of the best `most` grasps. `solids` draw the hand. None uses its collision solids.
+    """Return the markers of the namespaces `parts` for the best `most` grasps, and for all rejected ones.
 
-    The first marker deletes all earlier ones, so that a result without grasps clears the display.
+    The first marker deletes all earlier ones. `solids` are drawn as the hand. None takes its collision shapes.
     """
     header = Header(frame_id=frame, stamp=stamp)
     markers = [Marker(header=header, action=Marker.DELETEALL)]
@@ -462,7 +462,7 @@ def _rejected(grasp: Grasp, rank: int) -> Iterator[Marker]:
 def _hand(
     hand: HandModel, solids: Sequence[Primitive], posture: Posture, colour: tuple[float, float, float]
 ) -> Iterator[Marker]:
-    """Yield the markers of the hand's solids. A capsule is drawn as a cylinder and two spheres."""
+    """Yield the markers of the hand's shapes `solids`. A capsule is drawn as a cylinder and two spheres."""
     T_frame_base = matrix_of_posture(posture)
     rotations, translations = link_poses(hand, posture.joint_positions)
     for solid in solids:

@@ -256,7 +256,7 @@ class Publishers:
                 self._publishers[type(message)].publish(message)
 
     def emit(self, event: str, request_id: str, source: str, **details: Any) -> None:
-        """Publish one event on ~/status."""
+        """Publish one event on ~/status, with `details` as further fields."""
         stamp = self._node.get_clock().now().nanoseconds * 1e-9
         line = {"event": event, "request": request_id, "source": source, "stamp": stamp, **details}
         self.publish(String(data=status_line(line)))
@@ -434,7 +434,7 @@ class Responses:
         self._publish(answer, request.listener)
 
     def drawn(self, settings: Settings) -> Sequence[Primitive]:
-        """Return the solids with which markers draw the hand. The first call may take seconds to read large meshes."""
+        """Return the shapes that markers draw as the hand. The first call may take seconds to read large meshes."""
         if settings.marker_geometry != "visual":
             return self._hand.primitives
         if self._visuals is None:
@@ -475,7 +475,7 @@ class Responses:
         self._log().error(f"{request_id or source}: {message}{detail}")
 
     def _report_superseded(self, request_id: str) -> None:
-        """Publish and reset the number of clouds that were superseded since the last report."""
+        """Publish and reset the number of clouds superseded since the last report. The event gets `request_id`."""
         count, self._superseded = self._superseded, 0
         if count:
             self._superseded_reported = time.monotonic()
