@@ -257,7 +257,10 @@ class Mover:
         return float(self.shape.links(q[None])[1][0, self.shape.arm.tip, 2])
 
     def clearances(self, q: Path) -> Float[np.ndarray, "rows balls"]:
-        """Return distances of the checked balls to obstacles, then gaps between own balls plus the margin [m]."""
+        """Return distances of the checked balls to obstacles, then distances between own balls [m].
+
+        The margin is added to the latter, so that own balls may come close but not overlap.
+        """
         shape = self.shape
         coarse, pairs, with_carried = self._own
         balls, carried = self._placed(q, self.carried)

@@ -95,7 +95,7 @@ def find_fingers(hand: HandModel) -> Fingers:
 def _far_end(
     reached: Float[np.ndarray, "points 3"], root: Float[np.ndarray, "3"], middle: Float[np.ndarray, "3"]
 ) -> Float[np.ndarray, "3"]:
-    """Return the mean of the points farthest from a finger's root, or from the palm if the root is among the points."""
+    """Return the mean of the points farthest from a finger's root. If it lies near the root, use the palm instead."""
     for origin in (root, middle):
         distance = np.linalg.norm(reached - origin, axis=1)
         end = reached[distance >= np.quantile(distance, 0.85)].mean(0)

@@ -180,7 +180,10 @@ class GraspLibrary:
             return [name for (name,) in base.execute("SELECT DISTINCT name FROM records ORDER BY name")]
 
     def of_mesh(self, wanted: LibraryEntry, *, any_mass: bool = False) -> list[LibraryEntry]:
-        """Return entries as strict as `wanted`, strictest first. Mesh, hand, friction, mass (not `any_mass`) agree."""
+        """Return entries at least as strict as `wanted`, strictest first.
+
+        They have its mesh, hand, friction and mass. With `any_mass`, the mass may differ.
+        """
         names = ("mesh_sha256", "hand_content", "friction", *(() if any_mass else ("mass",)))
         same = {name: getattr(wanted, name) for name in names}
         return strict_enough([entry for entry, _ in self.entries(**same)], wanted.verify)

@@ -151,7 +151,8 @@ def make_hand_tensors(
 ) -> HandTensors:
     """Convert a hand to tensors. The coarse set is the first `candidates` of the hand's contact candidates.
 
-    Candidates are grouped by rigid groups of links, or by patches of about `patch_size`. The last hands are cached.
+    Each rigid group of links is one group of candidates. If `patch_size` is not 0, it is split into patches of about
+    `patch_size` coarse candidates. The tensors of recent hands are cached.
     """
 
     def tensor(values: np.ndarray) -> Tensor:
@@ -318,7 +319,10 @@ def build_problem(
     device: str = "cpu",
     dtype: torch.dtype = torch.float32,
 ) -> Problem:
-    """Convert scene and hand to tensors. `seed` fixes the random disturbances, which come after the signed axes."""
+    """Convert scene and hand to tensors.
+
+    The disturbances are the 12 signed axes of wrench space, then random directions drawn with `seed`.
+    """
     return Problem(
         hand=make_hand_tensors(hand, settings.candidates, settings.patch_size, device, dtype),
         object=make_object_tensors(scene, settings, device, dtype),

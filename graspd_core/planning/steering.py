@@ -252,7 +252,7 @@ def hand_side(hand: HandModel) -> Float[np.ndarray, "3"]:
 
 
 def zero_of_roll(direction: Float[np.ndarray, "3"]) -> Float[np.ndarray, "3"]:
-    """Return the default direction of the hand's side at roll 0: a unit vector normal to the unit approach."""
+    """Return the default zero direction of the roll: z, or x for a steep approach, projected normal to the approach."""
     up = np.eye(3)[0 if abs(direction[2]) > _VERTICAL else 2]
     square = up - (up @ direction) * direction
     return square / np.linalg.norm(square)

@@ -91,8 +91,10 @@ def _with_plain_keys(name: str, keys: slice) -> Callable[[Any], None]:
     """Return the base class's method `name`, preceded by a check of the dictionary keys at `keys` in the stack."""
 
     def act(reader: Any) -> None:
-        if not all(map(_is_plain, reader.stack[keys])):
-            raise pickle.UnpicklingError("a dictionary has an invalid key; valid: text, integers from 0 to 2**32 - 1")
+        wrong = [key for key in reader.stack[keys] if not _is_plain(key)]
+        if wrong:
+            given = f"dictionary key {_short_text(wrong[0])}"
+            raise pickle.UnpicklingError(f"{given}; valid: text, bytes, integers from 0 to 2**32 - 1")
         getattr(pickle._Unpickler, name)(reader)
 
     return act
@@ -109,7 +111,8 @@ class _Reader(pickle._Unpickler):
     def _call(self) -> None:
         arguments = self.stack.pop()
         if not isinstance(arguments, tuple) or len(arguments) > _MOST_ARGUMENTS:
-            raise pickle.UnpicklingError(f"a call has invalid arguments; valid: a tuple of at most {_MOST_ARGUMENTS}")
+            given = f"a call with arguments {_short_text(arguments)}"
+            raise pickle.UnpicklingError(f"{given}; valid: a tuple of at most {_MOST_ARGUMENTS}")
         self.stack[-1] = self.stack[-1](*arguments)
 
     def _put(self) -> None:

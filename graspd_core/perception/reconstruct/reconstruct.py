@@ -238,11 +238,12 @@ def _finished(mesh: TriangleMesh, seen: Surfels, settings: ReconstructionConfig)
     except MeshError as error:
         raise CloudError(f"cloud: no usable surface fits its {len(seen.points)} points ({error})") from None
     fitted = float((surface_distance(make_surface(mesh), seen.points) < settings.fit_distance).mean())
-    if not is_closed(mesh) or fitted < MIN_FITTED_SHARE:
-        raise CloudError(
-            f"cloud: no closed surface fits enough of its {len(seen.points)} points ({fitted:.0%}); add more views, "
-            "or more points on thin walls"
-        )
+    advice = "add more views, or more points on thin walls"
+    if not is_closed(mesh):
+        raise CloudError(f"cloud: the surface of its {len(seen.points)} points is not closed; {advice}")
+    if fitted < MIN_FITTED_SHARE:
+        share = f"{fitted:.0%} of its {len(seen.points)} points"
+        raise CloudError(f"cloud: the surface fits {share}, at least {MIN_FITTED_SHARE:.0%} are needed; {advice}")
     return mesh
 
 

@@ -179,7 +179,11 @@ class Revolution:
 
 
 def find_revolution(surfels: Surfels, free_space: FreeSpace, step: float) -> Revolution | None:
-    """Return the best body of revolution, or None. Its axis is vertical, across the view, or met by all normals."""
+    """Return the best body of revolution, or None.
+
+    Up to two axes are tried: one that all normals meet, and a vertical one (without a support, perpendicular to the
+    view).
+    """
     met = meeting_direction(surfels)
     # Every axis fits a ball. An axis across the view shows its back.
     axes = [fit_axis(surfels, UP if free_space.standing else ACROSS_VIEW)]

@@ -75,7 +75,7 @@ def select_target(
 
     Args:
         label: object number of each voxel, -1 for none.
-        free: object numbers to select from without a target.
+        free: numbers of the objects to choose from if the target is empty.
         target: a valid target (`check_target`).
         settings: greatest distance of a point from its object, and least fraction of an object in a box or mask.
 
