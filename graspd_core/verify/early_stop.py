@@ -3,8 +3,9 @@
 Up to the stop, a trial has the same states as a full one. It can pass where a full trial would fail, but it never fails
 where a full trial would pass. A slowly sliding object may reach an edge and slip suddenly, so the drift is multiplied
 by a safety factor. Over a few steps, contact jitter is larger than the drift. The drift is therefore measured over
-windows of several lengths. The hold ends if the drift of any one window is small enough. At low friction or with few fingers, the object must also be at rest. The
-rules come from pulls with four hands on eleven shapes and ten scans. `graspd bench early` measures their effect.
+windows of several lengths. The hold ends if the drift of any one window is small enough. At low friction or with few
+fingers, the object must also be at rest. The rules come from pulls with four hands on eleven shapes and ten scans.
+`graspd bench early` measures their effect.
 """
 
 from __future__ import annotations
