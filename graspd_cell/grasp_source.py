@@ -88,7 +88,7 @@ def scene_config(source: Bin) -> SceneConfig:
 
 
 class InProcessGrasps:
-    """Grasp source that runs graspd as a library. It reuses an unmoved object's plan if that has no verified grasp.
+    """Grasp source that runs graspd as a library.
 
     Args:
         arm, hand, layout: parts of the cell.
@@ -99,12 +99,12 @@ class InProcessGrasps:
     """
 
     def __init__(
-        self, arm: Arm, hand: HandModel, layout: CellLayout, *, preset: str = "balanced", most: int = 6,
+        self, arm: Arm, hand: HandModel, layout: CellLayout, *, preset: str = "balanced", most: int = 4,
         seed: int = 0, tries: int = 4,
     ) -> None:  # fmt: skip
-        self._hand, self._known = hand, tuple[ThingPlan, ...]()
+        self._hand, self._source = hand, layout.pick
         self._plan = {
-            "settings": scene_config(layout.pick), "surface": TABLE, "tries": tries, "most": most, "more": 4,
+            "settings": scene_config(layout.pick), "surface": TABLE, "tries": tries, "most": most,
             "solids": {f"wall {k}": [box_mesh(wall)] for k, wall in enumerate(layout.solids[1:])},
             "restrictions": (Reach(arm, (0.0, 0.0, 0.0)),), "measure": False, "preset": preset, "seed": seed,
         }  # fmt: skip
@@ -114,10 +114,9 @@ class InProcessGrasps:
         """Return the most reliable grasp of an object in the pick bin. See `GraspSource`."""
         began = time.perf_counter()
         try:
-            found = plan_any_thing([cloud_of(view)], self._hand, failures=failures, known=self._known, **self._plan)
+            found = plan_any_thing([cloud_of(view)], self._hand, failures=failures, **self._plan)
         except CloudError as error:
             return Offer(None, reason=str(error), exhausted=True, seconds=time.perf_counter() - began)
-        self._known = found
         return _offer(found, time.perf_counter() - began)
 
 

@@ -1,17 +1,14 @@
 """Planning for any object of a scene: find one object with a verified grasp, else rank the objects by probability.
 
 Objects with fewer earlier failures come first. Among equals, higher objects come first, because nothing lies on them.
-Each object gets one round of the planner. The first verified grasp ends the search. After `enough` objects, a likely
-grasp also ends it, to limit its time. If no grasp is likely, some objects get further rounds. Each of these begins with
-the full mass, while later rounds of one `plan_grasps` keep a mass that was lowered. An object with unchanged points
-keeps the unverified plan of an earlier request. `result_of_things` returns the result of one request.
+An object without failures gets one round of the planner. The first verified grasp ends the search. After `enough`
+objects, a likely grasp also ends the search, to limit its time. `result_of_things` returns the result of one request.
 """
 
 from __future__ import annotations
 
-import math
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any
@@ -24,7 +21,6 @@ from graspd_core.errors import CloudError, ConfigError, MeshError, NoObjectError
 from graspd_core.hands.model import HandModel
 from graspd_core.mesh.surface_queries import make_surface, surface_distance
 from graspd_core.optimize.plan_config import load_preset
-from graspd_core.optimize.restrictions import BoundRestriction, Refusal
 from graspd_core.perception.cloud.point_cloud import PointCloud
 from graspd_core.perception.obstacles import with_neighbours
 from graspd_core.perception.scene import Scene
@@ -40,13 +36,8 @@ LIKE_DISTANCE, LIKE_TURN = 0.015, 0.26
 OUT_OF_TRIES, NOT_LOOKED_AT = "failed too often", "not planned for"
 # An object within this distance of an earlier failure's place is the same object [m].
 _SAME_PLACE = 0.04
-# Least probability of a likely grasp. It is less for grasps that may be too weak, and more for grasps that only fail a
-# robustness check (`HeldShares`).
-_LIKELY = 0.7
-# An object is unchanged if the mean and spread of its points differ by at most this [m], their number by this fraction.
-_MOVED, _GAINED = 0.003, 0.1
-# Difference between the seeds of two rounds for one object.
-_SEED_STEP = 7919
+# Least probability of a likely grasp.
+_LIKELY = 0.5
 # Points are of a known solid if this fraction of them is within this distance of its surface [m].
 _STRAY, _NEARLY_ALL = 0.016, 0.9
 
@@ -64,10 +55,6 @@ class Failure:
     grasp: Posture | None = None
 
 
-# The points of an object [m], and its earlier failures.
-_Seen = tuple[Float[np.ndarray, "_ 3"], list[Failure]]
-
-
 @dataclass(frozen=True, eq=False)
 class ThingPlan:
     """The plan for one object of a scene.
@@ -79,7 +66,6 @@ class ThingPlan:
         grasp: the best grasp, verified or not. None if there is none.
         reason: why there is no verified grasp. Empty if there is one.
         looked_at: whether this request tried to find a grasp for the object.
-        searches: number of rounds for the object, of earlier requests too.
     """
 
     points: Float[np.ndarray, "_ 3"]
@@ -88,7 +74,6 @@ class ThingPlan:
     grasp: Grasp | None = None
     reason: str = ""
     looked_at: bool = True
-    searches: int = 0
 
     @property
     def place(self) -> Float[np.ndarray, "3"]:
@@ -97,7 +82,7 @@ class ThingPlan:
 
     @property
     def is_likely(self) -> bool:
-        """Whether the grasp's probability is at least 0.7 or unknown. False without a grasp."""
+        """Whether the grasp's probability is at least 0.5 or unknown. False without a grasp."""
         return self.grasp is not None and (self.grasp.probability is None or self.grasp.probability >= _LIKELY)
 
     @property
@@ -123,8 +108,6 @@ def plan_any_thing(
     deadline: float | None = None,
     enough: int = 2,
     most: int | None = None,
-    more: int = 2,
-    known: Sequence[ThingPlan] = (),
     **plan: Any,
 ) -> tuple[ThingPlan, ...]:
     """Plan for one object after the other until one has a verified grasp. Return all objects, by descending `surety`.
@@ -142,103 +125,34 @@ def plan_any_thing(
         deadline: time after which the whole search ends [s]. None for no limit.
         enough: number of objects after which a likely grasp ends the search.
         most: greatest number of objects that are planned for. None for all.
-        more: greatest number of further rounds if no grasp is likely.
-        known: plans of an earlier request. Those without a verified grasp are kept for unchanged objects.
         plan: other keyword arguments of `plan_grasps`. `seed` is increased by the object's number of failures.
 
     Raises:
         CloudError: a cloud is empty, all NaN, or has too few points.
         ConfigError: see `plan_grasps`. If a region misses an object, the object's `reason` says so instead.
     """
-    until = time.perf_counter() + (math.inf if deadline is None else deadline)
+    began, things, over = time.perf_counter(), list[ThingPlan](), False
     asked = {"seed": 0, "count": 1, "verify": "standard", "device": "cpu", "preset": "balanced"} | plan
     check_request(deadline=deadline, **{name: asked[name] for name in ("count", "seed", "verify", "device")})
-    asked["preset"] = load_preset(asked["preset"]) if isinstance(asked["preset"], str) else asked["preset"]
-    ahead = None if asked["verify"] == "none" else partial(begin_other_shapes, asked["preset"].certainty.probability)
+    config = load_preset(asked["preset"]) if isinstance(asked["preset"], str) else asked["preset"]
+    ahead = None if asked["verify"] == "none" else partial(begin_other_shapes, config.certainty.probability)
     about = {"settings": settings, "mass": mass, "friction": friction, "source": source, "ahead": ahead}
-    build = partial(_scene_among, views, surface=surface, solids=solids, about=about)
-    loose = [failure for failure in failures if failure.place is None]
-    search = _Search(build, hand, asked, until, loose)
+    stop = asked.get("stop") or (lambda: False)
     seen = [p for p in things_from_views(views, settings and settings.segmentation) if not _is_solid(p, solids or {})]
-    order = _in_order(seen, failures)
-    things = search.first([row for row in order if len(row[1]) < tries], known, enough, most)
-    things = search.further(things, [failed for _, failed in order], more)
-    things += [ThingPlan(points, reason=OUT_OF_TRIES, looked_at=False) for points, failed in order[len(things) :]]
+    for points, failed in _in_order(seen, failures):
+        if over or len(failed) >= tries:
+            reason = OUT_OF_TRIES if len(failed) >= tries else NOT_LOOKED_AT
+            things.append(ThingPlan(points, reason=reason, looked_at=False))
+            continue
+        scene = _scene_among(views, points, surface, solids, about)
+        left = None if deadline is None else max(deadline - (time.perf_counter() - began), 1e-3)
+        lost = [*failed, *(failure for failure in failures if failure.place is None)]
+        things.append(_thing_plan(points, scene, hand, lost, {**asked, "preset": config, "deadline": left}))
+        looked = sum(thing.looked_at for thing in things)
+        late = deadline is not None and time.perf_counter() - began > deadline
+        over = late or stop() or looked == most or things[-1].surety > 1.0
+        over = over or (looked >= enough and any(thing.is_likely for thing in things))
     return tuple(sorted(things, key=lambda thing: -thing.surety))
-
-
-@dataclass(frozen=True, eq=False)
-class _Search:
-    """Rounds of the planner for the objects of one request.
-
-    Attributes:
-        build: returns the scene of the object with the given points, or why there is none.
-        hand: hand that grasps.
-        plan: keyword arguments of `plan_grasps`.
-        until: end of the search, a `time.perf_counter()` value.
-        loose: failures at unknown places.
-    """
-
-    build: Callable[[Float[np.ndarray, "_ 3"]], Scene | str]
-    hand: HandModel
-    plan: dict[str, Any]
-    until: float
-    loose: Sequence[Failure]
-
-    def is_over(self, things: Sequence[ThingPlan], enough: int) -> bool:
-        """Return True if stopped, out of time, a grasp is verified, or one is likely after `enough` objects."""
-        stopped = (self.plan.get("stop") or bool)()
-        likely = any(thing.is_likely for thing in things) and sum(thing.searches > 0 for thing in things) >= enough
-        return stopped or time.perf_counter() > self.until or likely or any(thing.surety > 1.0 for thing in things)
-
-    def first(
-        self, order: Sequence[_Seen], known: Sequence[ThingPlan], enough: int, most: int | None
-    ) -> list[ThingPlan]:
-        """Return a plan for each object after its first round. See `plan_any_thing`."""
-        things = list[ThingPlan]()
-        for points, failed in order:
-            looked = sum(thing.looked_at for thing in things)
-            if kept := _kept(points, known, [*failed, *self.loose]):
-                things.append(kept)
-            elif looked == most or (looked and self.is_over(things, enough)):
-                things.append(ThingPlan(points, reason=NOT_LOOKED_AT, looked_at=False))
-            else:
-                things.append(self.once_more(ThingPlan(points, looked_at=False), failed))
-        return things
-
-    def further(self, things: Sequence[ThingPlan], failed: Sequence[Sequence[Failure]], most: int) -> list[ThingPlan]:
-        """Return the plans after up to `most` further rounds: objects with the fewest rounds first, then surest."""
-        found = list(things)
-        for _ in range(most):
-            doubtful = [row for row, thing in enumerate(found) if thing.result is not None]
-            if not doubtful or self.is_over(found, 1):
-                break
-            row = min(doubtful, key=lambda row: (found[row].searches, -found[row].surety))
-            found[row] = self.once_more(found[row], failed[row])
-        return found
-
-    def once_more(self, thing: ThingPlan, failed: Sequence[Failure]) -> ThingPlan:
-        """Return the plan after one more round, with the surest grasp. An object's first round has the usual effort."""
-        scene = thing.scene if thing.looked_at else None
-        scene = scene or self.build(thing.points)
-        thing = replace(thing, looked_at=True, searches=thing.searches + 1)
-        if isinstance(scene, str):
-            return replace(thing, reason=thing.reason or scene)
-        lost = [failure.grasp for failure in (*failed, *self.loose) if failure.grasp is not None]
-        config = self.plan["preset"]
-        config = config.at_budget(config.rounds.growth) if thing.searches > 1 else config
-        asked = {
-            "preset": replace(config, rounds=replace(config.rounds, most=1)),
-            "restrictions": (*((_Unlike(lost),) if lost else ()), *self.plan.get("restrictions", ())),
-            "seed": self.plan["seed"] + len(failed) + len(self.loose) + _SEED_STEP * (thing.searches - 1),
-            "deadline": None if self.until == math.inf else max(self.until - time.perf_counter(), 1e-3),
-        }
-        try:
-            result = plan_grasps(scene, self.hand, **{**self.plan, **asked})
-        except ConfigError as error:  # a restriction that this object cannot meet
-            return replace(thing, scene=thing.scene or scene, reason=str(error))
-        found = _with_result(replace(thing, scene=scene), result, lost)
-        return found if thing.grasp is None or found.surety > thing.surety else thing
 
 
 def result_of_things(things: Sequence[ThingPlan], seed: int = 0) -> GraspResult:
@@ -269,7 +183,9 @@ def _is_solid(points: Float[np.ndarray, "_ 3"], solids: Mapping[str, Sequence[Tr
     return any(float(np.quantile(one, _NEARLY_ALL)) < _STRAY for one in away)
 
 
-def _in_order(things: Sequence[Float[np.ndarray, "_ 3"]], failures: Sequence[Failure]) -> list[_Seen]:
+def _in_order(
+    things: Sequence[Float[np.ndarray, "_ 3"]], failures: Sequence[Failure]
+) -> list[tuple[Float[np.ndarray, "_ 3"], list[Failure]]]:
     rows = [
         (
             points,
@@ -301,44 +217,27 @@ def _scene_among(
     return with_neighbours(scene, solids, about["settings"]) if solids else scene
 
 
-def _kept(points: Float[np.ndarray, "_ 3"], known: Sequence[ThingPlan], failed: Sequence[Failure]) -> ThingPlan | None:
-    """Return the earlier plan for these points if it has no verified grasp. None without one."""
-    lost = [failure.grasp for failure in failed if failure.grasp is not None]
-    for thing in known:
-        if thing.result is not None and thing.surety <= 1.0 and _unchanged(points, thing.points):
-            return replace(_with_result(thing, thing.result, lost), looked_at=False)
-    return None
-
-
-def _unchanged(now: Float[np.ndarray, "_ 3"], before: Float[np.ndarray, "_ 3"]) -> bool:
-    apart = max(np.abs(now.mean(0) - before.mean(0)).max(), np.abs(now.std(0) - before.std(0)).max())
-    return bool(apart <= _MOVED and abs(len(now) - len(before)) <= _GAINED * len(before))
-
-
-def _with_result(thing: ThingPlan, result: GraspResult, lost: Sequence[Posture]) -> ThingPlan:
-    """Return the plan with this result and its surest grasp that is unlike every posture in `lost`."""
+def _thing_plan(
+    points: Float[np.ndarray, "_ 3"], scene: Scene | str, hand: HandModel, failed: Sequence[Failure], plan: Any
+) -> ThingPlan:
+    """Plan for one object. `plan` holds the keyword arguments of `plan_grasps`."""
+    if isinstance(scene, str):
+        return ThingPlan(points, reason=scene)
+    lost, config = [failure.grasp for failure in failed if failure.grasp is not None], plan["preset"]
+    if not failed:
+        config = replace(config, rounds=replace(config.rounds, most=1))
+    count, seed = plan["count"] + 2 * len(lost), plan["seed"] + len(failed)
+    try:
+        result = plan_grasps(scene, hand, **{**plan, "preset": config, "count": count, "seed": seed})
+    except ConfigError as error:  # a restriction that this object cannot meet
+        return ThingPlan(points, scene, reason=str(error))
     left = [grasp for grasp in unlike(result.tried, lost) if grasp.verdict is not Verdict.FAILED]
     if not left:
         reason = result.message or next((g.reason for g in result.tried if g.reason), "") or result.outcome.value
-        return replace(thing, result=result, grasp=None, reason=reason)
+        return ThingPlan(points, scene, result, None, reason)
     best = max(left, key=lambda grasp: (grasp.verdict is Verdict.VERIFIED, grasp.probability or 0.0))
     reason = "" if best.verdict is Verdict.VERIFIED else result.message or "no grasp passes the robustness checks"
-    return replace(thing, result=result, grasp=best, reason=reason)
-
-
-@dataclass(frozen=True, eq=False)
-class _Unlike(BoundRestriction):
-    """Restriction to grasps that are not like a failed one (`lost`). It is the same for every scene and hand."""
-
-    lost: Sequence[Posture]
-
-    def bind(self, scene: Scene, hand: HandModel) -> BoundRestriction:
-        """Return this restriction."""
-        return self
-
-    def admit(self, grasps: Sequence[Grasp]) -> Sequence[Grasp | Refusal]:
-        """Return each candidate, or a refusal if it is like a failed grasp."""
-        return [grasp if unlike([grasp], self.lost) else Refusal("like a lost grasp") for grasp in grasps]
+    return ThingPlan(points, scene, result, best, reason)
 
 
 def unlike(grasps: Sequence[Grasp], lost: Sequence[Posture]) -> list[Grasp]:

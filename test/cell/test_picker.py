@@ -99,17 +99,6 @@ def test_an_empty_bin_ends_it_as_empty_though_walls_stray(robot_of: RobotOf, see
     assert picker.why_ended == EMPTY
 
 
-def test_a_doubtful_plan_is_kept_for_the_next_image_of_a_thing_that_stays(robot_of: RobotOf):
-    """Without trials every grasp is doubtful. The two images differ by the camera's noise."""
-    robot = robot_of("ur5e_like", "parallel_gripper", THING, height=0.05)
-    robot.wait(1.0)
-    source = InProcessGrasps(robot.world.arm, robot.world.hand, robot.world.layout, preset="fast")
-    source._plan["verify"] = "none"
-    first, second = source.next(robot.look(), ()), source.next(robot.look(), ())
-    assert first.grasp is not None
-    assert second.grasp is first.grasp
-
-
 def test_a_thing_that_is_taken_away_is_noticed_while_lifting(robot: SimulatedRobot, monkeypatch: pytest.MonkeyPatch):
     """The referee's hand: the thing is gone in the moment of the lift."""
     follow, calls = robot.follow, 0

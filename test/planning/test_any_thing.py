@@ -1,7 +1,5 @@
 """Of all things seen, one with a grasp that is sure enough; what failed is not asked again in the same way."""
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
 
@@ -53,31 +51,6 @@ def test_without_a_verified_grasp_the_search_ends_after_some_objects(views, enou
     assert [thing.looked_at for thing in found].count(True) == enough
     assert found[0].grasp is not None
     assert found[0].grasp.verdict is Verdict.UNVERIFIED
-
-
-def test_objects_without_a_likely_grasp_get_further_rounds(views):
-    """No gripper lifts 30 kg, so that every round fails."""
-    heavy = {"mass": 30.0, "most": 1, **ASKED}
-    for more in (0, 2):
-        found = plan_any_thing(views, HAND, more=more, **heavy)
-        assert sorted((thing.looked_at, thing.searches) for thing in found) == [(False, 0), (True, 1 + more)]
-        assert not any(thing.grasp for thing in found)
-
-
-def test_doubtful_plans_are_kept_while_the_objects_stay_where_they_are(views):
-    asked = {"verify": "none", **ASKED}
-    known = plan_any_thing(views, HAND, **asked)
-    assert [thing.searches for thing in known] == [1, 1]
-    again = plan_any_thing(views, HAND, known=known, **asked)
-    assert [thing.looked_at for thing in again] == [False, False]
-    assert {id(thing.grasp) for thing in again} == {id(thing.grasp) for thing in known}
-    # A lost grasp is not given again. An object that was moved is planned for.
-    assert known[0].grasp is not None
-    lost = Failure(known[0].place, known[0].grasp.grasp)
-    left = plan_any_thing(views, HAND, known=known, failures=[lost], **asked)
-    assert all(thing.grasp is None or unlike([thing.grasp], [known[0].grasp.grasp]) for thing in left)
-    moved = [replace(known[0], points=known[0].points + 0.005), *known[1:]]
-    assert [thing.looked_at for thing in plan_any_thing(views, HAND, known=moved, **asked)].count(True) == 1
 
 
 def test_what_failed_comes_last_and_is_given_up_after_some_tries(views, first):
