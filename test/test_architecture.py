@@ -69,7 +69,7 @@ MAX_PACKAGE_LINES = {
     "graspd_dataset": 2_961,
     "graspd_viewer": 2_428,
     "graspd_cell": 3_777,
-    "test": 33_177,
+    "test": 33_184,
 }
 # Lines that a program reaches through its imports, those inside functions too.
 # The layout aims at 22,000 of the node.

@@ -70,7 +70,7 @@ class FlatPart:
         """Return the height up to which a point belongs to the plane [m], for its distance from the camera [m]."""
         return np.clip(INLIER_DEVIATIONS * self.noise * distance**2, self.least, self.most)
 
-    def below(self, distance: Float[np.ndarray, "n"]) -> Plane:
+    def as_support(self, distance: Float[np.ndarray, "n"]) -> Plane:
         """Return the plane as support of an object at these distances from the camera [m]. Noise sets its `margin`."""
         return replace(self.plane, margin=float(np.median(self.tolerance(distance))) / INLIER_DEVIATIONS)
 

@@ -99,7 +99,7 @@ def segment(
         raise CloudError(f"cloud: only {total} points show the object; at least {MIN_POINTS} are needed")
     obstacles = _obstacles(parted, chosen)
     doubts = _doubts(parted, chosen, bool(obstacles))
-    support = ground.support and ground.support.below(scene.mean_distance[chosen])
+    support = ground.support and ground.support.as_support(scene.mean_distance[chosen])
     cut = any("reaches the border" in doubt for doubt in doubts)
     told = (*doubts, *(() if marked else _touching(scene, chosen, parts)))
     beside = "" if target.point is None or len(views) > 1 else _beside(parted, chosen, target.point)
