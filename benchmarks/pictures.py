@@ -31,18 +31,18 @@ from PIL import Image
 from graspd_bench.rendering.depth_noise import DepthNoise
 from graspd_bench.rendering.render import camera_of_view, look_at, render_scene, render_shaded, save_png
 from graspd_bench.rendering.tabletop import ring_poses, tabletop, views_of
-from graspd_core import HandModel, PlanConfig, hand_names, load_hand, load_preset, load_scene, plan_grasps
+from graspd_core import HandModel, hand_names, load_hand, load_preset, load_scene, plan_grasps
 from graspd_core.perception.scene import Scene, object_parts
 from graspd_core.perception.scene_from_views import scene_from_views
 from graspd_core.se3 import perpendicular, rotation_from_quaternion
 from graspd_core.types import Grasp, Posture, TriangleMesh, Verdict
+from graspd_core.verify.prepared_grasp import make_metrics_context
 from graspd_core.verify.trial_registry import build_worlds
 from graspd_core.verify.world import PROTOCOLS
 from graspd_viewer.bench_page import bench_page
 from graspd_viewer.drawing import (
     SEEN,
     STAGES,
-    Mechanics,
     Part,
     contact_parts,
     force_parts,
@@ -50,9 +50,11 @@ from graspd_viewer.drawing import (
     placed_links,
     posture_at,
     scene_parts,
+    squeeze_parts,
     weakest_parts,
+    weakest_push,
 )
-from graspd_viewer.session import Session, make_session
+from graspd_viewer.session import make_session
 from graspd_viewer.trial_controls import record_trial
 from graspd_viewer.viewer import Viewer
 
@@ -78,7 +80,7 @@ def main() -> None:
     grasps = plan_grasps(mug, hand, count=8, preset=config, measure=False).grasps
     pictures = {
         "grasps": pairs(),
-        "view_hero": hero(mug, hand, config, grasps[0]),
+        "view_hero": hero(mug, hand, grasps[0]),
         "view_sequence": sequence(mug, hand, grasps[0]),
         "view_cloud": cloud(),
         "view_hands": hands(),
@@ -159,11 +161,10 @@ def pairs() -> np.ndarray:
     return np.hstack(found)
 
 
-def hero(scene: Scene, hand: HandModel, config: PlanConfig, grasp: Grasp) -> np.ndarray:
+def hero(scene: Scene, hand: HandModel, grasp: Grasp) -> np.ndarray:
     """A grasp with its contacts, squeeze forces and weakest push, beside it without the hand."""
-    mechanics = Mechanics(Session("", hand, (grasp,), scene, config))
-    pressing, push = mechanics.squeeze_forces(grasp), mechanics.weakest_push(grasp)
-    marks = [*contact_parts(grasp.contacts), *force_parts(pressing.positions, pressing.forces)]
+    push = weakest_push(make_metrics_context(scene.object, hand), grasp)
+    marks = [*contact_parts(grasp.contacts), *squeeze_parts(grasp.contacts)]
     marks += weakest_parts(push, scene.object) if push is not None else []
     drawn = scene_parts(scene)
     return np.hstack([shot(scene, drawn + at(hand, grasp.squeeze), near=1.2), shot(scene, drawn + marks, near=1.2)])

@@ -1,6 +1,6 @@
 """Meshes of everything drawn, shared by the browser (`scene_nodes`) and the docs (`benchmarks/pictures.py`).
 
-It also computes squeeze forces, the disturbance that a grasp resists least, and the hand's postures along its path.
+It also computes the disturbance that a grasp resists least, and the hand's postures along its path.
 """
 
 from __future__ import annotations
@@ -15,14 +15,10 @@ from jaxtyping import Float, UInt8
 from graspd_core.hands.kinematics import forward, link_poses, make_kinematics, primitive_mesh, retreat_posture
 from graspd_core.hands.model import HandModel
 from graspd_core.mesh.sdf import sample_sdf
-from graspd_core.optimize.grasp_postures import find_contacts, squeeze
-from graspd_core.optimize.loop import Poses
-from graspd_core.optimize.problem import build_problem
 from graspd_core.perception.scene import ObjectModel, Scene, sample_confidence
 from graspd_core.se3 import SE3, perpendicular, quaternion_from_rotation, rotation_from_quaternion
 from graspd_core.types import Contact, Grasp, Plane, Posture, Snapshot, TriangleMesh, Verdict, joined
-from graspd_core.verify.prepared_grasp import make_metrics_context, prepare_grasp
-from graspd_viewer.session import Session
+from graspd_core.verify.prepared_grasp import MetricsContext, prepare_grasp
 
 Colour = tuple[float, float, float]
 OBJECT, GUESSED, HAND = (0.85, 0.55, 0.25), (0.80, 0.45, 0.65), (0.40, 0.50, 0.68)
@@ -35,7 +31,7 @@ VERDICTS = {
     Verdict.FAILED: (0.85, 0.20, 0.20),
 }
 # Arrow lengths: contact normal [m], force [m/N], and disturbance [radii of the object] as offset and factor.
-NORMAL_LENGTH, FORCE_LENGTH, PUSH_LENGTH = 0.02, 0.008, (1.1, 0.7)
+NORMAL_LENGTH, FORCE_LENGTH, PUSH_LENGTH = 0.02, 0.004, (1.1, 0.7)
 _SHAFT, _SLICE = 0.0012, 96
 
 
@@ -82,6 +78,12 @@ def contact_parts(contacts: Sequence[Contact]) -> list[Part]:
     starts = np.array([contact.position for contact in contacts])
     ends = starts + NORMAL_LENGTH * np.array([contact.normal for contact in contacts])
     return [Part("contacts", arrows(starts, ends), NORMAL)]
+
+
+def squeeze_parts(contacts: Sequence[Contact]) -> list[Part]:
+    """Return a part with an arrow for the planned force on the object at each contact whose force is known."""
+    known = [(contact.position, contact.force) for contact in contacts if contact.force is not None]
+    return force_parts(*np.array(known).swapaxes(0, 1)) if known else []
 
 
 def force_parts(positions: Float[np.ndarray, "n 3"], forces: Float[np.ndarray, "n 3"]) -> list[Part]:
@@ -163,40 +165,12 @@ def _square(support: Plane, mesh: TriangleMesh) -> TriangleMesh:
     return TriangleMesh(corners, np.array([[0, 1, 2], [0, 2, 3]]))
 
 
-@dataclass(frozen=True)
-class SqueezeForces:
-    """Planned squeeze forces on the object [N] and their points of application [m]."""
+def weakest_push(context: MetricsContext, grasp: Grasp) -> Float[np.ndarray, "6"] | None:
+    """Return the unit disturbance (force, torque divided by the object's radius) that the contacts resist least.
 
-    positions: Float[np.ndarray, "contacts 3"]
-    forces: Float[np.ndarray, "contacts 3"]
-
-
-class Mechanics:
-    """Calculator of forces for the grasps of a session that has a scene. It prepares the shared data once."""
-
-    def __init__(self, session: Session) -> None:
-        assert session.scene is not None
-        self._hand, self._config = session.hand, session.config
-        self._problem = build_problem(session.scene, session.hand, session.config.problem, seed=0)
-        self._metrics = make_metrics_context(session.scene.object, session.hand)
-
-    def squeeze_forces(self, grasp: Grasp) -> SqueezeForces:
-        """Return the balanced contact forces from which the squeeze targets were computed."""
-        posture = grasp.grasp
-        rows = (posture.position, posture.quaternion_wxyz, posture.joint_positions)
-        poses = Poses(*(torch.as_tensor(row)[None].to(self._problem.hand.lower) for row in rows))
-        contacts = find_contacts(self._problem, poses, self._config.grasp_stages.touch_reach)
-        effort = torch.as_tensor(self._hand.effort).to(self._problem.hand.lower)
-        forces = squeeze(self._problem, poses, contacts, effort, self._config.grasp_stages).forces[0]
-        pressing = contacts.active[0] & (forces.norm(dim=-1) > 0)
-        return SqueezeForces(contacts.position[0][pressing].double().numpy(), forces[pressing].double().numpy())
-
-    def weakest_push(self, grasp: Grasp) -> Float[np.ndarray, "6"] | None:
-        """Return the unit disturbance (force, torque divided by the object's radius) that the contacts resist least.
-
-        None without force closure, because some disturbance is then not resisted at all.
-        """
-        return prepare_grasp(self._metrics, grasp.grasp).wrench_hull.weakest_push
+    None without force closure, because some disturbance is then not resisted at all.
+    """
+    return prepare_grasp(context, grasp.grasp).wrench_hull.weakest_push
 
 
 STAGES = ("retreat", "pregrasp", "grasp", "squeeze")

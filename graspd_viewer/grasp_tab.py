@@ -8,7 +8,8 @@ from typing import Any
 import numpy as np
 
 from graspd_core.types import Grasp
-from graspd_viewer.drawing import STAGES, Mechanics, contact_parts, force_parts, posture_at, weakest_parts
+from graspd_core.verify.prepared_grasp import MetricsContext, make_metrics_context
+from graspd_viewer.drawing import STAGES, contact_parts, posture_at, squeeze_parts, weakest_parts, weakest_push
 from graspd_viewer.grasp_list import ALL, FILTERS, ORDERS, figures_html, label, legend_html, listed, table_html
 from graspd_viewer.scene_nodes import SceneNodes
 from graspd_viewer.server import LatestJobs, name_tab
@@ -35,7 +36,7 @@ class GraspTab:
     def __init__(self, server: Any, jobs: LatestJobs, nodes: SceneNodes) -> None:
         self._server, self._jobs, self._nodes = server, jobs, nodes
         self._session: Session | None = None
-        self._mechanics: Mechanics | None = None
+        self._metrics: MetricsContext | None = None
         self._ranks: list[int] = []
         self._chosen: int | None = None
         self._at = 2.0
@@ -90,7 +91,7 @@ class GraspTab:
         """Show another session and select its first grasp. Call it in the drawing thread."""
         self._session = session
         # Created for the first selected grasp, because it takes as long as opening the file.
-        self._mechanics = None
+        self._metrics = None
         notes = "".join(f"\n\n*{_plain(note)}*" for note in session.notes[:6])
         self._title.content = f"**{_plain(session.title)}**, {_plain(session.hand.name)}{notes}"
         seen = session.title if session.scene is None else Path(session.scene.object.source).name or session.title
@@ -154,20 +155,20 @@ class GraspTab:
 
     def _draw_contacts(self) -> None:
         grasp = self._grasp()
-        self._nodes.draw("contacts", contact_parts(grasp.contacts) if grasp else ())
-        # Draw these after the pose, for which the visitor waits.
-        self._nodes.draw("forces", ())
+        contacts = grasp.contacts if grasp else ()
+        self._nodes.draw("contacts", contact_parts(contacts))
+        self._nodes.draw("forces", squeeze_parts(contacts))
+        # Draw this after the pose, for which the visitor waits.
         self._nodes.draw("weakest", ())
-        self._jobs.submit("mechanics", self._draw_mechanics, after=0.05)
+        self._jobs.submit("weakest", self._draw_weakest, after=0.05)
 
-    def _draw_mechanics(self) -> None:
+    def _draw_weakest(self) -> None:
         grasp, session = self._grasp(), self._session
         if grasp is None or session is None or session.scene is None:
             return
-        self._mechanics = self._mechanics or Mechanics(session)
-        pressing, push = self._mechanics.squeeze_forces(grasp), self._mechanics.weakest_push(grasp)
-        self._nodes.draw("forces", force_parts(pressing.positions, pressing.forces))
         target = session.scene.object
+        self._metrics = self._metrics or make_metrics_context(target, session.hand)
+        push = weakest_push(self._metrics, grasp)
         self._nodes.draw("weakest", weakest_parts(push, target) if push is not None else ())
 
     def _draw_slice(self) -> None:

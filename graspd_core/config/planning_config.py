@@ -40,7 +40,7 @@ class GraspStagesConfig:
 
     Attributes:
         touch_reach: links this near to the object count as touching [m].
-        grip_force: sum of the normal forces of the squeeze [N].
+        grip_force: least sum of the normal forces of the squeeze [N]. Heavy objects get more.
         link_force: greatest normal force of one link when the hand squeezes [N]. Lower it for delicate objects.
         stiffness: position gain of the controllers of the hand's revolute joints [N·m/rad].
         slide_stiffness: position gain of the controllers of the hand's prismatic joints [N/m].

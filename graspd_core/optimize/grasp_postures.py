@@ -47,6 +47,8 @@ _SETTLING = structs.Pregrasp(
 _CONE_EDGES = 8
 # Weights relative to force balance: of an even load on the contacts, and of normal forces that sum to one.
 _RIDGE, _SUM = 0.5, 10.0
+# Least sum of the normal forces per mass, times the friction [N/kg]: about six times what two opposing contacts need.
+_GRIP = 60.0
 # Newton's method ends at this squared slope. It takes at most ten steps, unless a value is NaN.
 _CONVERGED, _NEWTON_STEPS = 1e-22, 60
 
@@ -326,7 +328,7 @@ class Squeeze:
 
     Attributes:
         joints: position targets [rad] or [m].
-        forces: contact force on the object at each slot [N].
+        forces: contact force on the object at each slot [N], as if no joint were at its effort limit.
         imbalance: norm of the net wrench divided by the sum of the normal forces. 1 with fewer than two contacts.
     """
 
@@ -338,7 +340,10 @@ class Squeeze:
 def squeeze(
     problem: Problem, poses: Poses, contact_set: ContactSet, effort: Float[Tensor, "joints"], config: GraspStagesConfig
 ) -> Squeeze:
-    """Compute balanced contact forces F by non-negative least squares, and joint targets offset by JᵀF / kp."""
+    """Compute balanced contact forces F by non-negative least squares, and joint targets offset by JᵀF / kp.
+
+    The heavier the object, the larger the forces. A joint whose torque JᵀF exceeds its effort limit gives this limit.
+    """
     unit_forces, imbalance = balanced_forces(
         (contact_set.position - problem.object.center).double().cpu().numpy(),
         contact_set.normal.double().cpu().numpy(),
@@ -347,14 +352,14 @@ def squeeze(
         problem.friction,
     )
     forces = torch.as_tensor(unit_forces).to(problem.hand.lower)
-    torque = joint_torques(problem, poses, contact_set, forces)
-    limit = (effort * config.effort_share / torque.abs().clamp_min(1e-9)).amin(-1)
     pressed = by_link(contact_set, -(forces * contact_set.normal).sum(-1, keepdim=True)).amax((-2, -1))
-    limit = torch.minimum(limit, config.link_force / pressed.clamp_min(1e-9))
-    scale = limit.clamp(max=config.grip_force)[:, None]
+    grip = max(config.grip_force, _GRIP * problem.object.mass / problem.friction)
+    forces = (config.link_force / pressed.clamp_min(1e-9)).clamp(max=grip)[:, None, None] * forces
+    limit = effort * config.effort_share
+    torque = joint_torques(problem, poses, contact_set, forces).clamp(-limit, limit)
     stiffness = torch.where(problem.hand.joint_scale == 1.0, config.stiffness, config.slide_stiffness)
-    targets = (poses.joints + scale * torque / stiffness).clamp(problem.hand.lower, problem.hand.upper)
-    return Squeeze(targets, scale[..., None] * forces, torch.as_tensor(imbalance).to(problem.hand.lower))
+    targets = (poses.joints + torque / stiffness).clamp(problem.hand.lower, problem.hand.upper)
+    return Squeeze(targets, forces, torch.as_tensor(imbalance).to(problem.hand.lower))
 
 
 def by_link(contact_set: ContactSet, values: Float[Tensor, "batch slots n"]) -> Float[Tensor, "batch links n"]:

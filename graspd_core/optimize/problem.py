@@ -132,6 +132,7 @@ class ObjectTensors:
         surface: many points on the surface and its edges [m], to measure how deep a grasp penetrates.
         coarse_features: number of leading `features` used in the coarse steps, 0 if the object has no thin walls.
         center: centre of mass [m].
+        mass: mass [kg].
         length: characteristic length that torques are divided by [m].
         confidence: confidence in the surface near each node of `sdf`, at least a floor. None if no surface is guessed.
     """
@@ -141,6 +142,7 @@ class ObjectTensors:
     surface: Float[Tensor, "surface 3"]
     coarse_features: int
     center: Float[Tensor, "3"]
+    mass: float
     length: float
     confidence: Float[Tensor, "x y z"] | None
 
@@ -228,6 +230,7 @@ def make_object_tensors(scene: Scene, settings: ProblemConfig, device: str, dtyp
         surface=torch.as_tensor(surface, device=device, dtype=dtype),
         coarse_features=coarse,
         center=torch.as_tensor(scene.object.center_of_mass, device=device, dtype=dtype),
+        mass=scene.object.mass,
         length=scene.object.radius,
         confidence=confidence,
     )

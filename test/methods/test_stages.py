@@ -15,6 +15,8 @@ from graspd_core.hands.kinematics import link_poses, point_jacobian
 from graspd_core.mesh.shapes import SPHERE_RADIUS
 from graspd_core.optimize.candidates import PlannerInput, find_candidates, staged
 from graspd_core.optimize.grasp_postures import (
+    ContactSet,
+    Squeeze,
     _cone_edges,
     balanced_forces,
     by_link,
@@ -156,23 +158,44 @@ def test_torques_are_the_transposed_jacobian_times_forces(problem_of, hand, scen
 
 def test_the_squeeze_presses_within_effort_and_limits(problem_of, hand, scenes):
     problem, config = problem_of("cylinder"), GraspStagesConfig()
+    problem = replace(problem, object=replace(problem.object, mass=0.1))
     poses = closed_on(problem, hand, scenes["cylinder"], 4)
     contact_set = find_contacts(problem, poses, reach=0.02)
     effort = torch.as_tensor(hand.effort)
     pressed = squeeze(problem, poses, contact_set, effort, config)
     assert ((pressed.joints >= problem.hand.lower) & (pressed.joints <= problem.hand.upper)).all()
     assert not pressed.forces[~contact_set.active].any()
-    pressing = -(pressed.forces * contact_set.normal).sum((-1, -2))
-    assert (pressing > 0).any()
-    assert (pressing <= config.grip_force * (1 + 1e-9)).all()
-    torque = joint_torques(problem, poses, contact_set, pressed.forces)
-    assert (torque.abs() <= effort * config.effort_share * (1 + 1e-9)).all()
+    grip = normal_forces(contact_set, pressed).sum(-1)
+    assert grip[grip > 0].numpy() == pytest.approx(config.grip_force)
     weak = squeeze(problem, poses, contact_set, effort / 10, config)
-    assert (weak.forces.norm(dim=-1) <= pressed.forces.norm(dim=-1) + 1e-12).all()
-    most = float(by_link(contact_set, -(pressed.forces * contact_set.normal).sum(-1, keepdim=True)).max())
-    gentle = squeeze(problem, poses, contact_set, effort, replace(config, link_force=most / 2))
-    pressing = by_link(contact_set, -(gentle.forces * contact_set.normal).sum(-1, keepdim=True))
-    assert float(pressing.max()) == pytest.approx(most / 2)
+    assert (weak.forces == pressed.forces).all()
+    most = effort / 10 * config.effort_share / config.stiffness
+    assert ((weak.joints - poses.joints).abs() <= most * (1 + 1e-9)).all()
+    strongest = float(normal_forces(contact_set, pressed).max())
+    gentle = squeeze(problem, poses, contact_set, effort, replace(config, link_force=strongest / 2))
+    assert float(normal_forces(contact_set, gentle).max()) == pytest.approx(strongest / 2)
+
+
+def normal_forces(contact_set: ContactSet, pressed: Squeeze) -> torch.Tensor:
+    """Return the sum of the normal forces of each link [N]."""
+    return by_link(contact_set, -(pressed.forces * contact_set.normal).sum(-1, keepdim=True))[..., 0]
+
+
+def test_the_squeeze_of_a_heavy_or_slippery_object_is_stronger(problem_of, hand, scenes):
+    problem, config = problem_of("cylinder"), GraspStagesConfig(link_force=1000.0)
+    poses = closed_on(problem, hand, scenes["cylinder"], 4)
+    contact_set = find_contacts(problem, poses, reach=0.02)
+
+    def grip(mass: float, friction: float) -> float:
+        one = replace(problem, object=replace(problem.object, mass=mass), friction=friction)
+        pressed = squeeze(one, poses, contact_set, torch.as_tensor(hand.effort), config)
+        return float(normal_forces(contact_set, pressed).sum(-1).max())
+
+    assert grip(0.1, 0.6) == pytest.approx(config.grip_force)
+    # Two opposing contacts hold the weight m g with normal forces of m g / μ in all.
+    assert grip(1.0, 0.6) > 5 * 9.81 / 0.6
+    assert grip(1.0, 0.3) == pytest.approx(2 * grip(1.0, 0.6))
+    assert grip(2.0, 0.6) == pytest.approx(2 * grip(1.0, 0.6))
 
 
 def test_an_open_hand_is_clear_of_itself_and_crossed_fingers_are_not(problem_of, hand):

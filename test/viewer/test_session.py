@@ -8,13 +8,19 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-import torch
 
 from graspd_core.errors import FormatError, HandError, MeshError
-from graspd_core.optimize.grasp_postures import find_contacts
-from graspd_core.optimize.loop import Poses
 from graspd_core.types import ROBUSTNESS, Snapshot, TrialResult, Verdict
-from graspd_viewer.drawing import Mechanics, placed_links, posture_at, sdf_slice, skeletons, slice_axes
+from graspd_core.verify.prepared_grasp import make_metrics_context
+from graspd_viewer.drawing import (
+    placed_links,
+    posture_at,
+    sdf_slice,
+    skeletons,
+    slice_axes,
+    squeeze_parts,
+    weakest_push,
+)
 from graspd_viewer.grasp_list import figures_html, label, listed, table_html
 from graspd_viewer.live_view import LiveView
 from graspd_viewer.scene_nodes import SceneNodes
@@ -112,26 +118,19 @@ def test_the_way_goes_through_its_stages(result, grasps_file):
     assert bones[0, :, 1] == pytest.approx(positions[hand.link_parent >= 0], abs=1e-5)
 
 
-def test_squeeze_forces_press_inwards_and_balance(grasps_file):
+def test_the_arrows_of_a_squeeze_end_at_its_contacts_and_the_weakest_push_is_a_unit(grasps_file):
     session = open_grasps(grasps_file)
-    mechanics, grasp = Mechanics(session), session.grasps[0]
-    pressing = mechanics.squeeze_forces(grasp)
-    strength = np.linalg.norm(pressing.forces, axis=1).sum()
-    assert strength > 1.0
-    assert np.linalg.norm(pressing.forces.sum(0)) < 0.1 * strength
-    # On an edge the finger's own normal counts.
-    posture = vars(grasp.grasp).values()
-    poses = Poses(*(torch.as_tensor(value, dtype=torch.float32)[None] for value in posture))
-    touched = find_contacts(mechanics._problem, poses, session.config.grasp_stages.touch_reach)
-    gaps = torch.cdist(torch.as_tensor(pressing.positions, dtype=torch.float32), touched.position[0])
-    near = gaps.masked_fill(~touched.active[0], torch.inf) < 1e-6
-    assert near.any(1).all()
-    inward = [-(touched.normal[0][row].numpy() @ force) for row, force in zip(near, pressing.forces, strict=True)]
-    assert all(values.max() > 0 for values in inward)
-    push = mechanics.weakest_push(grasp)
+    grasp = session.grasps[0]
+    (arrows,) = squeeze_parts(grasp.contacts)
+    gaps = [np.linalg.norm(arrows.mesh.vertices - contact.position, axis=1).min() for contact in grasp.contacts]
+    assert max(gaps) < 1e-6
+    assert not squeeze_parts([replace(contact, force=None) for contact in grasp.contacts])
+    assert session.scene is not None
+    context = make_metrics_context(session.scene.object, session.hand)
+    push = weakest_push(context, grasp)
     assert push is not None
     assert np.linalg.norm(push) == pytest.approx(1.0)
-    assert mechanics.weakest_push(session.grasps[3]) is None  # that hand touches nothing
+    assert weakest_push(context, session.grasps[3]) is None  # that hand touches nothing
 
 
 @pytest.mark.parametrize("axis", [0, 1, 2])
