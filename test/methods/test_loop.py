@@ -191,6 +191,7 @@ def test_a_first_step_of_a_sliding_joint_is_its_share_of_a_radian(gripper: HandM
 
 def test_a_sliding_joint_is_told_to_go_on_by_force_over_stiffness(gripper: HandModel, scenes: dict[str, Scene]) -> None:
     problem = small_problem(scenes["sphere"], gripper)
+    problem = replace(problem, object=replace(problem.object, mass=0.05))
     # Jaws on either side of the ball of 35 mm, the palm 7 mm off.
     poses = Poses(
         torch.tensor([[0.0, 0.0, -0.132]], dtype=DOUBLE),
