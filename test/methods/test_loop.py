@@ -9,8 +9,8 @@ import pytest
 import torch
 from small_problem import small_problem
 
-from graspd_core import Scene, draw_starts, load_hand
-from graspd_core.config import GraspStagesConfig
+from graspd_core import Outcome, Scene, build_problem, draw_starts, load_hand, plan_grasps
+from graspd_core.config import GraspStagesConfig, ProblemConfig
 from graspd_core.hands.model import METRES_PER_RADIAN, HandModel
 from graspd_core.optimize import loop
 from graspd_core.optimize.closed_form.closed_form import ClosedForm, adam_step, weighted
@@ -208,3 +208,26 @@ def test_a_sliding_joint_is_told_to_go_on_by_force_over_stiffness(gripper: HandM
     assert float(poses.joints - pressed.joints) == pytest.approx(along / config.slide_stiffness, rel=1e-6)
     weak = squeeze(problem, poses, contact_set, torch.tensor([4.0], dtype=DOUBLE), config)
     assert float(poses.joints - weak.joints) == pytest.approx(4.0 / config.slide_stiffness, rel=1e-6)
+
+
+@pytest.mark.gpu
+def test_a_gpu_computes_what_the_cpu_computes(hand: HandModel, scenes: dict[str, Scene]) -> None:
+    found = []
+    for device in ("cpu", "cuda"):
+        # The compiled kernel computes in float32, so both use torch.
+        problem = build_problem(scenes["box"], hand, ProblemConfig(), seed=0, device=device, dtype=DOUBLE)
+        x = pack(draw_starts(scenes["box"], hand, STARTS, 0, "cpu", DOUBLE)).to(device)
+        radius = torch.full((STARTS,), 0.01, dtype=DOUBLE, device=device)
+        solver = ClosedForm(CONFIG, STARTS)
+        loss, gradient = solver.value_and_gradient(problem, x, radius, 0.01, fine=True, sharp=True)
+        contacts = find_contacts(problem, unpack(x), 0.02)
+        pressed = squeeze(problem, unpack(x), contacts, torch.as_tensor(hand.effort).to(x), GraspStagesConfig())
+        found.append([value.cpu().numpy() for value in (loss, gradient, pressed.joints, pressed.forces)])
+    for one, other in zip(*found, strict=True):
+        np.testing.assert_allclose(other, one, rtol=1e-6, atol=1e-6 * np.abs(one).max())
+
+
+@pytest.mark.gpu
+def test_grasps_planned_on_a_gpu_hold(hand: HandModel, scenes: dict[str, Scene]) -> None:
+    result = plan_grasps(scenes["box"], hand, count=4, device="cuda")
+    assert result.outcome is Outcome.SUCCEEDED
