@@ -141,6 +141,8 @@ class Picker:
         self._pace, self._cancelled = pace or Pace(), cancelled
         self._failures: list[Failure] = []
         self._picked = 0
+        # Joint values last sent to the hand. An object keeps a squeezing hand away from them.
+        self._sent: np.ndarray | None = None
         # Boxes of objects in the place bin, which the camera hardly sees.
         self._dropped: list[Box] = []
         self.offer: Offer | None = None
@@ -373,13 +375,16 @@ class Picker:
         """Move all fingers to joint values [rad] or [m], so that they arrive together."""
         hand, now = self._hand, self._hand_now()
         speed = np.minimum(np.where(hand.slides, 0.1, 1.5), 0.6 * hand.velocity)
-        seconds = max(0.3, 1.5 * float((np.abs(goal - now) / speed).max()))
+        way = np.abs(goal - now) if self._sent is None else np.maximum(np.abs(goal - now), np.abs(goal - self._sent))
+        seconds = max(0.3, 1.5 * float((way / speed).max()))
         if np.abs(goal - now).max() > 1e-3:
             goal = np.clip(goal, hand.lower, hand.upper)[None]
             self._follow(JointMotion(hand.joint_names, np.array([seconds]), goal, np.zeros_like(goal)))
 
     def _follow(self, motion: JointMotion, stop: Callable[[], bool] | None = None) -> JointReading:
         self._stop_if_cancelled()
+        if set(self._hand.joint_names) <= set(motion.names):
+            self._sent = motion.positions[-1, [motion.names.index(name) for name in self._hand.joint_names]]
         try:
             return self._robot.follow(motion, motion.duration + self._pace.patience, stop or self._cancelled)
         except MotionAborted:

@@ -53,7 +53,7 @@ class Segmentation:
         obstacles: downsampled points of each other object or surface nearby [m].
         warnings: warnings for the user.
         cut: whether the object reaches the border of an image or of the workspace.
-        beside: why the segment may be too large or the wrong object. Empty if there is no doubt.
+        beside: why the segment may be only a part of the object, or more than it. Empty if there is no doubt.
     """
 
     views: tuple[PointCloud, ...]
@@ -101,9 +101,12 @@ def segment(
     doubts = _doubts(parted, chosen, bool(obstacles))
     support = ground.support and ground.support.as_support(scene.mean_distance[chosen])
     cut = any("reaches the border" in doubt for doubt in doubts)
-    told = (*doubts, *(() if marked else _touching(scene, chosen, parts)))
+    touching = () if marked else _touching(scene, chosen, parts)
     beside = "" if target.point is None or len(views) > 1 else _beside(parted, chosen, target.point)
-    return Segmentation(found, support, obstacles, told, cut, beside)
+    if parted.settings.piled and named and touching:
+        # Seams within objects are as frequent in a pile as seams between them, because no part needs to stand.
+        touching, beside = (), "a seam divides the target from its neighbour, and both may be one object"
+    return Segmentation(found, support, obstacles, (*doubts, *touching), cut, beside)
 
 
 def find_things(
