@@ -142,7 +142,7 @@ class Picker:
         self._failures: list[Failure] = []
         self._picked = 0
         # Joint values last sent to the hand. An object keeps a squeezing hand away from them.
-        self._sent: np.ndarray | None = None
+        self._sent = hand.open_posture
         # Boxes of objects in the place bin, which the camera hardly sees.
         self._dropped: list[Box] = []
         self.offer: Offer | None = None
@@ -375,7 +375,7 @@ class Picker:
         """Move all fingers to joint values [rad] or [m], so that they arrive together."""
         hand, now = self._hand, self._hand_now()
         speed = np.minimum(np.where(hand.slides, 0.1, 1.5), 0.6 * hand.velocity)
-        way = np.abs(goal - now) if self._sent is None else np.maximum(np.abs(goal - now), np.abs(goal - self._sent))
+        way = np.maximum(np.abs(goal - now), np.abs(goal - self._sent))
         seconds = max(0.3, 1.5 * float((way / speed).max()))
         if np.abs(goal - now).max() > 1e-3:
             goal = np.clip(goal, hand.lower, hand.upper)[None]
@@ -384,7 +384,7 @@ class Picker:
     def _follow(self, motion: JointMotion, stop: Callable[[], bool] | None = None) -> JointReading:
         self._stop_if_cancelled()
         if set(self._hand.joint_names) <= set(motion.names):
-            self._sent = motion.positions[-1, [motion.names.index(name) for name in self._hand.joint_names]]
+            self._sent = motion.part(self._hand.joint_names).positions[-1]
         try:
             return self._robot.follow(motion, motion.duration + self._pace.patience, stop or self._cancelled)
         except MotionAborted:

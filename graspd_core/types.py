@@ -84,7 +84,8 @@ class Contact:
         link: name of the hand link.
         position: contact point on the object's surface, object frame [m].
         normal: outward unit normal of the object at the contact, object frame.
-        force: planned force of the link on the object when the hand squeezes, object frame [N]. None if unknown.
+        force: planned force of the link on the object when the hand squeezes, object frame [N]. Joints at their effort
+            limits give less. None if unknown.
     """
 
     link: str
@@ -181,7 +182,7 @@ class Grasp:
     Attributes:
         pregrasp: open posture, clear of the object.
         grasp: posture in which the fingers just touch the object.
-        squeeze: position targets that press the fingers on the object with balanced forces.
+        squeeze: position targets that press the fingers on the object.
         contacts: one contact per touching link.
         score: the optimiser's score, larger is better. It ranks grasps before any trial.
         metrics: static quality metrics. None until they are measured.

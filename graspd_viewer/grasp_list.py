@@ -25,7 +25,7 @@ _COLUMNS, _AROUND = ("payload", "penetration", "contact_area"), 2
 BLOCK = "<div style='font-size:0.8em;line-height:1.5;padding:0 0.8em'>"
 _LEGEND = (
     ("object", OBJECT, "■"), ("guessed part", GUESSED, "■"), ("hand", HAND, "■"), ("normal at a contact", NORMAL, "➔"),
-    ("force, 8 mm for a newton", FORCE, "➔"), ("weakest push", WEAKEST, "➔"), ("axis of its turn", TURN, "➔"),
+    ("force, 4 mm for a newton", FORCE, "➔"), ("weakest push", WEAKEST, "➔"), ("axis of its turn", TURN, "➔"),
 )  # fmt: skip
 _OTHER_FIGURES = {
     "score": "the optimiser's own measure, larger is better; it ranks grasps of one file before any trial",

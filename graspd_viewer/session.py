@@ -30,7 +30,6 @@ class Session:
         hand: the hand of the grasps.
         grasps: grasps in rank order.
         scene: scene of the object. None if the object is not available. The grasps are still shown.
-        config: settings of the run that found the grasps.
         seen: camera points in the object's frame [m]. Empty for a mesh.
         notes: warnings for visitors, one sentence each.
         origin: displayed origin in the file's frame [m]. Zero unless the object is far from the file's origin.
@@ -40,7 +39,6 @@ class Session:
     hand: HandModel
     grasps: tuple[Grasp, ...]
     scene: Scene | None = None
-    config: PlanConfig = field(default_factory=PlanConfig)
     seen: Float[np.ndarray, "points 3"] = field(default_factory=lambda: np.zeros((0, 3)))
     notes: tuple[str, ...] = ()
     origin: Float[np.ndarray, "3"] = field(default_factory=lambda: np.zeros(3))
@@ -67,7 +65,7 @@ def open_grasps(path: Path, *, object_source: str | None = None, hand: str | Non
     config = plan_config(document.get("config") or {}, f"{path}: config")
     scene, seen, notes = _object_of(document, path, object_source, config)
     if scene is None:
-        return Session(path.name, model, grasps, config=config, notes=notes)
+        return Session(path.name, model, grasps, notes=notes)
     return make_session(path.name, model, grasps, scene, config, seen, notes)
 
 
@@ -82,7 +80,7 @@ def make_session(
 ) -> Session:
     """Make a session with its origin near the object. Browsers use float32, which is too coarse far from the origin."""
     scene, far = planning_scene(scene, config.resolution)
-    return Session(title, hand, tuple(moved_grasp(g, -far) for g in grasps), scene, config, seen - far, notes, far)
+    return Session(title, hand, tuple(moved_grasp(g, -far) for g in grasps), scene, seen - far, notes, far)
 
 
 def seen_points(

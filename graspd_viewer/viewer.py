@@ -24,7 +24,7 @@ _KEYS = """
 wheel zooms.
 
 **Colours.** The object is orange; where a camera did not see it and its shape was guessed, mauve. Blue arrows are the
-object's normals at the contacts. Red arrows are forces on the object, 8 mm for a newton: as planned for the squeeze,
+object's normals at the contacts. Red arrows are forces on the object, 4 mm for a newton: as planned for the squeeze,
 and as MuJoCo measured them while a trial plays. Purple is the push that the grasp resists least, yellow the axis of the
 turn that goes with it. In a slice of the signed distance blue is inside.
 

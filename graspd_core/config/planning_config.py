@@ -40,8 +40,8 @@ class GraspStagesConfig:
 
     Attributes:
         touch_reach: links this near to the object count as touching [m].
-        grip_force: least sum of the normal forces of the squeeze [N]. Heavy objects get more.
-        link_force: greatest normal force of one link when the hand squeezes [N]. Lower it for delicate objects.
+        grip_force: sum of the normal forces of the squeeze, unless `link_force` limits it [N]. Heavy objects get more.
+        link_force: greatest planned normal force of one link [N]. Lower it for delicate objects, or give the mass.
         stiffness: position gain of the controllers of the hand's revolute joints [N·m/rad].
         slide_stiffness: position gain of the controllers of the hand's prismatic joints [N/m].
         effort_share: fraction of a joint's effort limit that the squeeze may use.

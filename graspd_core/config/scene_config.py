@@ -44,8 +44,8 @@ class SegmentationConfig:
         target_reach: a target point selects an object within this distance [m].
         target_share: a box or mask that covers this fraction of an object selects all of it.
         obstacle_range: other objects up to this distance from the object become obstacles [m].
-        piled: whether objects lie on each other. If so, parts divided by a seam are objects even above the support, but
-            their grasps are never verified. A heap of any size may stand on the support.
+        piled: whether objects lie on each other. If so, parts divided by a seam are objects even above the support. A
+            grasp of a part that a target point selects is never verified. A heap of any size may stand on the support.
     """
 
     roi_low: tuple[float, float, float] | None = None

@@ -1,7 +1,8 @@
 """Find the contacts of a grasp posture, and compute the pregrasp and the squeeze posture.
 
 From the pregrasp the hand closes without touching anything on its path. The squeeze has the joint targets that produce
-balanced contact forces. If the problem fits the compiled kernel, the kernel runs the same steps in place of torch.
+balanced contact forces, as far as the joints' efforts allow. If the problem fits the compiled kernel, the kernel runs
+the same steps in place of torch.
 """
 
 from __future__ import annotations
@@ -324,7 +325,7 @@ def hand_distance(problem: Problem, base: SE3, joints: Joints) -> Distances:
 
 @dataclass(frozen=True)
 class Squeeze:
-    """Balanced contact forces and the joint targets that produce them.
+    """Balanced contact forces and the joint targets that produce them, as far as the joints' efforts allow.
 
     Attributes:
         joints: position targets [rad] or [m].

@@ -39,7 +39,7 @@ def page(viewer, visit, grasps_file):
 
 def test_the_tab_names_what_is_shown_and_the_legend_every_arrow(page):
     page.until(lambda: page.tab.title() == "shape:box, parallel_gripper - graspd")
-    for arrow in ("normal at a contact", "force, 8 mm for a newton", "weakest push", "axis of its turn"):
+    for arrow in ("normal at a contact", "force, 4 mm for a newton", "weakest push", "axis of its turn"):
         page.text(arrow)
 
 

@@ -103,8 +103,8 @@ def segment(
     cut = any("reaches the border" in doubt for doubt in doubts)
     touching = () if marked else _touching(scene, chosen, parts)
     beside = "" if target.point is None or len(views) > 1 else _beside(parted, chosen, target.point)
-    if parted.settings.piled and named and touching:
-        # Seams within objects are as frequent in a pile as seams between them, because no part needs to stand.
+    if parted.settings.piled and target.point is not None and touching:
+        # In a pile no part needs to stand, so a seam may as well lie within an object.
         touching, beside = (), "a seam divides the target from its neighbour, and both may be one object"
     return Segmentation(found, support, obstacles, (*doubts, *touching), cut, beside)
 
