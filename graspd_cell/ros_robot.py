@@ -152,7 +152,7 @@ class RosRobot:
             refused = [handle for handle in handles if not handle.accepted]
             if refused:
                 raise MotionAborted("a controller rejected the motion; its log gives the reason")
-            results = [handle.get_result_async() for handle in handles]
+            results = [self._begun(handle.get_result_async) for handle in handles]
             for result in results:
                 self._wait_for(result, end, stop, watched=results)
         except MotionAborted:
@@ -182,7 +182,7 @@ class RosRobot:
         name = self._topics.controllers[self._clients.index(client)]
         if not client.wait_for_server(timeout_sec=self._topics.patience):
             raise RobotSilentError(f"no action server {name} within {self._topics.patience:g} s")
-        return client.send_goal_async(goal_of(motion))
+        return self._begun(client.send_goal_async, goal_of(motion))
 
     def _wait_for(self, future: Any, end: float, stop: Callable[[], bool], watched: Any = ()) -> None:
         """Wait for `future`. Raises MotionAborted: stopped, robot time over `end` [s], silence, `watched` failed."""
@@ -200,9 +200,18 @@ class RosRobot:
                 raise MotionAborted(f"nothing came on {self._topics.joint_states} for {self._topics.patience:g} s")
             time.sleep(_POLL)
 
+    def _begun(self, request: Callable[..., Any], *arguments: Any) -> Any:
+        """Return the future of a request to a controller. The thread that receives the answer sends the request.
+
+        If another thread sends it, rclpy 7.1 fails when the answer comes first.
+        """
+        task = self._executor.create_task(request, *arguments)
+        self._until(task.done, lambda: "the turn of a request to a controller")
+        return task.result()
+
     def _cancel(self, handles: list[Any]) -> None:
         """Cancel the accepted goals and wait for the confirmations, at most `patience` seconds."""
-        waiting = [handle.cancel_goal_async() for handle in handles if handle.accepted]
+        waiting = [self._begun(handle.cancel_goal_async) for handle in handles if handle.accepted]
         end = time.monotonic() + self._topics.patience
         while not all(one.done() for one in waiting) and time.monotonic() < end:
             time.sleep(_POLL)

@@ -68,7 +68,7 @@ MAX_PACKAGE_LINES = {
     "graspd_bench": 8_824,
     "graspd_dataset": 2_961,
     "graspd_viewer": 2_401,
-    "graspd_cell": 3_785,
+    "graspd_cell": 3_794,
     "test": 33_240,
 }
 # Lines that a program reaches through its imports, those inside functions too.
