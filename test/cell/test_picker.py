@@ -154,7 +154,6 @@ def test_jaws_that_close_further_as_a_thing_turns_between_them_still_hold_it(rob
 
     hold = after_squeeze(hand, grasp, reading(0.0))
     assert still_holds(hold, hand, reading(0.5)).held
-    # In the fingers of a hand, a turning object lets the median joint go further, at more than half of the effort.
     assert still_holds(hold, hand, replace(reading(0.7), efforts=0.6 * (target - touch))).held
     assert not still_holds(hold, hand, reading(0.95)).held
 

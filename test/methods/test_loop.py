@@ -218,8 +218,7 @@ def test_a_gpu_computes_what_the_cpu_computes(hand: HandModel, scenes: dict[str,
         problem = build_problem(scenes["box"], hand, ProblemConfig(), seed=0, device=device, dtype=DOUBLE)
         x = pack(draw_starts(scenes["box"], hand, STARTS, 0, "cpu", DOUBLE)).to(device)
         radius = torch.full((STARTS,), 0.01, dtype=DOUBLE, device=device)
-        solver = ClosedForm(CONFIG, STARTS)
-        loss, gradient = solver.value_and_gradient(problem, x, radius, 0.01, fine=True, sharp=True)
+        loss, gradient = ClosedForm(CONFIG, STARTS).value_and_gradient(problem, x, radius, 0.01, fine=True, sharp=True)
         contacts = find_contacts(problem, unpack(x), 0.02)
         pressed = squeeze(problem, unpack(x), contacts, torch.as_tensor(hand.effort).to(x), GraspStagesConfig())
         found.append([value.cpu().numpy() for value in (loss, gradient, pressed.joints, pressed.forces)])
@@ -229,5 +228,4 @@ def test_a_gpu_computes_what_the_cpu_computes(hand: HandModel, scenes: dict[str,
 
 @pytest.mark.gpu
 def test_grasps_planned_on_a_gpu_hold(hand: HandModel, scenes: dict[str, Scene]) -> None:
-    result = plan_grasps(scenes["box"], hand, count=4, device="cuda")
-    assert result.outcome is Outcome.SUCCEEDED
+    assert plan_grasps(scenes["box"], hand, count=4, device="cuda").outcome is Outcome.SUCCEEDED

@@ -121,6 +121,10 @@ def test_the_way_goes_through_its_stages(result, grasps_file):
 def test_the_arrows_of_a_squeeze_end_at_its_contacts_and_the_weakest_push_is_a_unit(grasps_file):
     session = open_grasps(grasps_file)
     grasp = session.grasps[0]
+    forces = np.array([contact.force for contact in grasp.contacts])
+    strength = np.linalg.norm(forces, axis=1).sum()
+    assert strength > max(1.0, 10 * np.linalg.norm(forces.sum(0)))
+    assert ((forces * [contact.normal for contact in grasp.contacts]).sum(1) < 0).all()
     (arrows,) = squeeze_parts(grasp.contacts)
     gaps = [np.linalg.norm(arrows.mesh.vertices - contact.position, axis=1).min() for contact in grasp.contacts]
     assert max(gaps) < 1e-6
