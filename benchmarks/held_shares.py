@@ -15,6 +15,7 @@ import json
 import time
 from collections.abc import Iterator
 from dataclasses import replace
+from itertools import islice
 from pathlib import Path
 from typing import Any
 
@@ -32,7 +33,7 @@ from graspd_core.planning.plan_grasps import plan_grasps
 from graspd_core.runtime import disk_cache
 from graspd_core.types import Verdict
 from graspd_core.verify.hold_trial import hold_trial, out_of_place
-from graspd_core.verify.robustness import begin_other_worlds, robustness_checks_of
+from graspd_core.verify.robustness import OTHER_SHAPES, begin_other_worlds, robustness_checks_of
 from graspd_core.verify.run_clock import Run
 from graspd_core.verify.trial_registry import build_worlds
 from graspd_core.verify.world import PROTOCOLS, build_world
@@ -69,12 +70,13 @@ def grasps_of_view(case: CameraView) -> list[dict[str, Any]]:
     assert asked is not None
     rows = []
     for grasp in (grasp for grasp in result.tried if grasp.verdict is Verdict.VERIFIED):
-        holds = [[item.hold(grasp, lambda: False) for item in stage.items] for stage in asked.stages]
+        holds = [(item.hold(grasp, lambda: False) for item in stage.items) for stage in asked.stages]
         *places, slippery = (hold is not None and hold.passed for hold in holds[0]) if holds else (False,)
-        shapes = [hold.passed for hold in holds[1] if hold is not None] if len(holds) > 1 else []
+        possible = (hold for hold in holds[1] if hold is not None) if len(holds) > 1 else iter(())
+        shapes = [hold.passed for hold in islice(possible, OTHER_SHAPES)]
         rows.append({
             "view": case.label, "way": case.way, "lowered": result.mass is not None, "places": sum(places),
-            "slippery": slippery, "shapes": sum(shapes), "of_shapes": len(shapes),
+            "slippery": slippery, "shapes": sum(shapes), "of_shapes": len(shapes), "doubted": bool(asked.doubts),
             "own": hold_trial(own, grasp, out_of_place(protocol)).passed,
         })  # fmt: skip
     return rows
@@ -115,8 +117,9 @@ def main() -> None:
                 lines.append({"view": case.label, "grasps": [], "refused": str(error)})
             file.write(json.dumps(lines[-1]) + "\n")
             file.flush()
-    rows = [row for line in lines for row in line["grasps"]]
-    two = lambda row: row["shapes"] >= min(2, row["of_shapes"])  # noqa: E731
+    rows = [row for line in lines for row in line["grasps"] if not row["doubted"]]
+    print(f"doubted scene: {share([row for line in lines for row in line['grasps'] if row['doubted']])}")
+    two = lambda row: row["shapes"] == row["of_shapes"]  # noqa: E731
     most = lambda row: row["places"] >= 2  # noqa: E731
     every = lambda row: row["places"] == 3 and row["slippery"]  # noqa: E731
     for name, placed, way, lowered in (

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+import numpy as np
+
 from graspd_core.errors import ConfigError
 
 
@@ -117,27 +119,27 @@ class HeldShares:
     fails_shapes: float
 
 
-# Measured on 714 grasps planned without a mass and 1,146 with the true mass, from 152 single views (docs/clouds.md).
+# Measured on 385 grasps planned without a mass and 544 with the true mass, from 152 single views (docs/clouds.md).
 # An assumed mass is the heavy end of what the volume allows, so trials lift more than most objects weigh.
-MASS_ASSUMED = HeldShares(0.84, 0.85, 0.90, 0.82, 0.74)
-MASS_KNOWN = HeldShares(0.76, 0.88, 0.91, 0.57, 0.57)
-# The fraction of objects that weigh at most x times the heavy end of their volume is about this times x. Of 325 drawn
-# household objects and ten scans it is 0.26 at x = 0.25, 0.64 at 0.5, 0.85 at 0.7.
-_LIGHT_GROWTH = 1.3
+MASS_ASSUMED = HeldShares(0.85, 0.88, 0.95, 0.77, 0.85)
+MASS_KNOWN = HeldShares(0.80, 0.89, 0.95, 0.61, 0.83)
+# Masses as fractions of the heavy end of the volume, and the fraction of 325 drawn household objects and ten scans that
+# weigh at most this.
+_MASSES, _LIGHTER = (0.0, 0.25, 0.5, 0.7, 1.0), (0.0, 0.26, 0.64, 0.85, 1.0)
 # With a payload below the heavy end, a grasp is verified only if at least this fraction of objects is lighter than it.
 LEAST_LIGHT = 0.8
-# Fraction of grasps that hold on a doubtful scene, e.g. with a doubtful camera position.
+# Fraction of grasps that hold on a doubtful scene, e.g. with a doubtful camera position. Each doubt multiplies by it.
 DOUBTED_SHARE = 0.6
 
 
 def share_as_light(mass: float, heavy: float) -> float:
     """Return the fraction of objects that weigh at most `mass` [kg], if their volume allows up to `heavy` [kg]."""
-    return min(1.0, _LIGHT_GROWTH * mass / heavy)
+    return float(np.interp(mass / heavy, _MASSES, _LIGHTER))
 
 
 def light_end(heavy: float) -> float:
     """Return the least mass [kg] that a verified grasp must lift, if the object's volume allows up to `heavy` [kg]."""
-    return LEAST_LIGHT / _LIGHT_GROWTH * heavy
+    return float(np.interp(LEAST_LIGHT, _LIGHTER, _MASSES)) * heavy
 
 
 @dataclass(frozen=True)
@@ -152,7 +154,7 @@ class CertaintyConfig:
         ConfigError: the probability is higher than any trials can ensure.
     """
 
-    probability: float = 0.9
+    probability: float = 0.95
 
     def __post_init__(self) -> None:
         most = min(MASS_ASSUMED.shapes, MASS_KNOWN.shapes)

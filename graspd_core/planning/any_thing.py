@@ -36,6 +36,8 @@ LIKE_DISTANCE, LIKE_TURN = 0.015, 0.26
 OUT_OF_TRIES, NOT_LOOKED_AT = "failed too often", "not planned for"
 # An object within this distance of an earlier failure's place is the same object [m].
 _SAME_PLACE = 0.04
+# Why an object is doubted.
+_FAILED = "an earlier grasp of this object failed"
 # Least probability of a likely grasp.
 _LIKELY = 0.5
 # Points are of a known solid if this fraction of them is within this distance of its surface [m].
@@ -120,7 +122,7 @@ def plan_any_thing(
         mass: mass of each object [kg]. None assumes the `heavy_mass` of each object's volume.
         friction: Coulomb friction coefficient between hand and objects.
         source: name of the views, for messages.
-        failures: failures of earlier requests. Grasps like the failed ones are left out.
+        failures: failures of earlier requests. Grasps like the failed ones are left out, and their objects are doubted.
         tries: number of failures after which an object is skipped.
         deadline: time after which the whole search ends [s]. None for no limit.
         enough: number of objects after which a likely grasp ends the search.
@@ -144,7 +146,7 @@ def plan_any_thing(
             reason = OUT_OF_TRIES if len(failed) >= tries else NOT_LOOKED_AT
             things.append(ThingPlan(points, reason=reason, looked_at=False))
             continue
-        scene = _scene_among(views, points, surface, solids, about)
+        scene = _scene_among(views, points, surface, solids, about, failed)
         left = None if deadline is None else max(deadline - (time.perf_counter() - began), 1e-3)
         lost = [*failed, *(failure for failure in failures if failure.place is None)]
         things.append(_thing_plan(points, scene, hand, lost, {**asked, "preset": config, "deadline": left}))
@@ -202,17 +204,21 @@ def _scene_among(
     surface: Plane | None,
     solids: Mapping[str, Sequence[TriangleMesh]] | None,
     about: dict[str, Any],
+    failed: Sequence[Failure],
 ) -> Scene | str:
     """Return the scene of the object with these points, or the message of the error.
 
-    `about` holds other arguments of `scene_from_views`.
+    `about` holds other arguments of `scene_from_views`. If a grasp of the object failed, the scene is doubted.
     """
+    again = any(failure.grasp is not None for failure in failed)
     # The target is a point on the object, because the middle of a ring is empty.
     middle = points[np.linalg.norm(points - points.mean(0), axis=1).argmin()]
     try:
-        scene = scene_from_views(views, target=Target(point=middle), **about)
+        scene = scene_from_views(views, target=Target(point=middle), **{**about, "ahead": None} if again else about)
     except (CloudError, MeshError) as error:
         return str(error)
+    if again and scene.evidence is not None:
+        scene = replace(scene, evidence=replace(scene.evidence, doubts=(*scene.evidence.doubts, _FAILED)))
     scene = scene if surface is None else replace(scene, support=surface)
     return with_neighbours(scene, solids, about["settings"]) if solids else scene
 

@@ -35,6 +35,7 @@ from graspd_core.verify.robustness import (
     RobustnessChecks,
     begin_in_thread,
     begin_other_worlds,
+    doubted_if_weak,
     less_sure,
     one_by_one,
     results_in_order,
@@ -142,8 +143,7 @@ def lighter(
     trials = replace(trials, alone=altered(trials.alone, mass=mass), around=around)
     known = replace(scene, object=replace(scene.object, mass_assumed=False))
     checks = robustness_checks_of(known, others, trials, certainty.probability)
-    if checks is not None and (doubted := less_sure(checks, most, scene.object.mass)).doubts:
-        checks = doubted
+    checks = checks and doubted_if_weak(checks, most, scene.object.mass)
     return replace(context, trials=trials, checks=checks, heavy=scene.object.mass)
 
 
@@ -219,8 +219,8 @@ def run_trials(
     others: list[Grasp] = []
     metrics: list[Future[GraspMetrics]] = []
     threads, doubted = torch.get_num_threads(), 0
-    # If the scene itself is doubtful, no grasp can be verified. Then `count` unverified grasps are enough.
-    hopeless = context.checks is not None and bool(context.checks.doubts)
+    # If the scene itself is doubtful, no grasp can be verified. Then `count` grasps that fail no check are enough.
+    doubts = context.checks.doubts[:1] if context.checks is not None else ()
     first = None
     seen = None if run.watch is None else candidates_seen(candidates)
     # The first answer comes sooner if the best candidate runs several robustness checks in parallel.
@@ -239,8 +239,8 @@ def run_trials(
             if seen is not None:
                 seen = replace(seen, verdicts=(*seen.verdicts[:index], tried.verdict, *seen.verdicts[index + 1 :]))
                 run.show(seen)
-            doubted += tried.verdict is Verdict.UNVERIFIED
-            enough = len(verified) + passed + (doubted if hopeless else 0) == count
+            doubted += tried.verdict is Verdict.UNVERIFIED and tried.reason in doubts
+            enough = len(verified) + passed + doubted == count
             if enough:
                 # Stop the trials that were started ahead, so that they do not slow down measuring.
                 trials.close()

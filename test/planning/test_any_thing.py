@@ -6,6 +6,7 @@ import pytest
 from graspd_bench.rendering.depth_noise import DEFAULT
 from graspd_bench.rendering.tabletop import CAMERA, ring_poses, tabletop, views_of
 from graspd_core import Grasp, Outcome, PointCloud, Posture, Sphere, Steering, Verdict, load_hand
+from graspd_core.config.planning_config import DOUBTED_SHARE
 from graspd_core.errors import CloudError, ConfigError, NoObjectError
 from graspd_core.planning.any_thing import (
     NOT_LOOKED_AT,
@@ -94,6 +95,11 @@ def test_a_grasp_like_one_that_was_lost_is_not_given_again(views: tuple[PointClo
     again = plan_any_thing(views, HAND, failures=[lost, *out], **ASKED)
     assert again[0].grasp is not None
     assert unlike([again[0].grasp], [first[0].grasp.grasp])
+    # A lost grasp speaks against the scene, so the object is doubted.
+    assert first[0].grasp.verdict is Verdict.VERIFIED
+    assert again[0].grasp.verdict is Verdict.UNVERIFIED
+    assert "an earlier grasp of this object failed" in again[0].reason
+    assert (again[0].grasp.probability or 0.0) <= DOUBTED_SHARE
 
 
 def test_nothing_on_the_table_is_no_thing_and_an_empty_cloud_is_told(views: tuple[PointCloud, ...]):

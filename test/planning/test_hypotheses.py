@@ -98,7 +98,8 @@ def under(*stages: Sequence[bool | None], least: int | None = None) -> Robustnes
 
     made = [tuple(hypothesis(f"{i}.{j}", held) for j, held in enumerate(stage)) for i, stage in enumerate(stages)]
     wanted = [len(items) if least is None else least for items in made]
-    return RobustnessChecks(tuple(map(CheckStage, made, wanted, FAILED)), PASSED)
+    may_fail = [len(items) - count for items, count in zip(made, wanted, strict=True)]
+    return RobustnessChecks(tuple(map(CheckStage, made, wanted, may_fail, FAILED)), PASSED)
 
 
 @pytest.mark.parametrize(
@@ -136,6 +137,28 @@ def test_where_some_must_hold_it_more_may_fail_and_what_there_is_not_counts_nowh
     assert try_robustness(asked, GRASP, lambda: False, partial(verification._at_once, 2))[0].passed == verified
 
 
+def test_every_other_shape_that_there_is_must_hold():
+    (stage,) = under((True, False, True), least=2).stages
+    for passed, verified in (((True, False, True), False), ((True, None, True), True), ((None, True, None), True)):
+        (items,) = under(passed).stages
+        asked = RobustnessChecks((replace(stage, items=items.items, may_fail=0),), PASSED)
+        assert try_robustness(asked, GRASP, lambda: False)[0].passed == verified
+    seen, hand = seen_from(), load_hand("allegro_right")
+    others = begin_other_worlds(Run(time.perf_counter(), 0.0, None, None), seen, hand, PROTOCOLS["standard"], SURE)
+    worlds = build_worlds(seen, hand, object_parts(seen.object), PROTOCOLS["standard"])
+    asked = robustness_checks_of(seen, others, worlds, SURE)
+    assert asked is not None
+    assert (asked.stages[1].least, asked.stages[1].may_fail) == (2, 0)
+
+
+def test_another_shape_may_turn_less_than_the_likeliest(monkeypatch):
+    monkeypatch.setattr(hypotheses, "_LESS_TURN", 1e-3)
+    reasons = [grasp.reason for grasp in plan(seen_from(), SURE, rounds=1).tried if grasp.trials[0].passed]
+    assert reasons
+    assert all(reason.startswith("fails under ") for reason in reasons)
+    assert any("other shape" in reason and "turned" in reason for reason in reasons)
+
+
 _STAGE = st.lists(st.sampled_from([True, True, True, False, None]), max_size=5)
 
 
@@ -165,7 +188,7 @@ def test_others_are_tried_once_the_best_waits_for_a_shape(monkeypatch):
         return held
 
     monkeypatch.setattr(verification, "grasp_trials", likeliest)
-    asked = RobustnessChecks((CheckStage((RobustnessCheck("a shape", waits),), 1, 0.5),), PASSED, waited_for)
+    asked = RobustnessChecks((CheckStage((RobustnessCheck("a shape", waits),), 1, 0, 0.5),), PASSED, waited_for)
     box = load_scene("shape:box")
     worlds = build_worlds(box, load_hand("allegro_right"), object_parts(box.object), PROTOCOLS["standard"])
     context = verification.VerificationContext(worlds, None, asked)
@@ -278,10 +301,15 @@ def test_at_less_than_the_assumed_mass_a_grasp_is_less_sure():
     # Most objects of this volume are heavier than a tenth of the heavy end: no grasp is verified.
     tenth = verification.lighter(seen, ahead, context, CertaintyConfig(), 0.08 * heavy, 0.1 * heavy)
     assert tenth.checks is not None
-    result, probability = try_robustness(tenth.checks, GRASP, lambda: False)
+    result, probability = try_robustness(less_sure(tenth.checks, 0.1 * heavy, heavy), GRASP, lambda: False)
     assert not result.passed
     assert "too many objects of this volume weigh more" in result.reason
     assert probability == pytest.approx(share_as_light(0.1, 1.0) * MASS_KNOWN.likeliest)
+    # On a doubted scene too, a grasp of little payload is less sure.
+    doubted = RobustnessChecks((), DOUBTED_SHARE, doubts=("are its numbers metres?",))
+    lighter = less_sure(doubted, 0.1 * heavy, heavy)
+    assert lighter.doubts == doubted.doubts
+    assert lighter.probability == pytest.approx(share_as_light(0.1, 1.0) * DOUBTED_SHARE)
 
 
 def test_a_grasp_is_as_sure_as_objects_are_lighter_than_its_own_payload():
@@ -373,6 +401,12 @@ def test_what_speaks_against_a_scene_leaves_no_grasp_verified(monkeypatch):
         assert not any(grasp.verdict is Verdict.VERIFIED for grasp in result.tried)
         assert all((grasp.probability, grasp.reason) == (DOUBTED_SHARE, "are its numbers metres?") for grasp in held)
         assert "none is robust enough: are its numbers metres?" in result.message
+    monkeypatch.setattr(hypotheses, "displaced", lambda grasp, *error: replace(grasp, pregrasp=grasp.squeeze))
+    held = [grasp for grasp in plan(doubted, SURE, rounds=1).tried if grasp.verdict is Verdict.UNVERIFIED]
+    assert held
+    for grasp in held:
+        assert grasp.reason.startswith("fails under displaced pose")
+        assert grasp.probability == pytest.approx(DOUBTED_SHARE * MASS_KNOWN.fails_places / MASS_KNOWN.places)
 
 
 def test_seen_all_round_only_place_and_friction_are_in_doubt(monkeypatch):
