@@ -28,7 +28,7 @@ from graspd_core.hands.model import HandModel, Primitive
 from graspd_core.hands.surface_points import kept_dense_samples
 from graspd_core.mesh.mesh_files import surface_samples
 from graspd_core.mesh.sharp_features import crease_points, farthest_points, neighbours_together
-from graspd_core.mesh.surface_queries import DistanceQuery, inside, unsigned_distance
+from graspd_core.mesh.surface_queries import DistanceQuery, is_inside, surface_distance
 from graspd_core.mesh.topology import packed_rows
 from graspd_core.optimize.kernel.builds import kernel
 from graspd_core.perception.scene import ObjectModel
@@ -284,8 +284,8 @@ def intersection_volume(context: MetricsContext, placed: PlacedHand) -> float:
             depths = deepest, -signed_distance(context.query, centers[first])
             in_hand, in_object = (np.clip(0.5 + depth / _CELL, 0.0, 1.0) for depth in depths)
             return float(np.maximum(in_hand + in_object - 1.0, 0.0).sum()) * _CELL**3
-        kept = unsigned_distance(context.query, centers[first]) < half_diagonal
-        kept[~kept] = inside(context.query, centers[first[~kept]])
+        kept = surface_distance(context.query.surface, centers[first]) < half_diagonal
+        kept[~kept] = is_inside(context.query.tree, centers[first[~kept]])
         kept = kept[same]
         size //= 2
         cells, which = _halve(cells[kept], size), np.repeat(which[kept], 8)
