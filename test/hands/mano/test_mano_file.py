@@ -24,7 +24,6 @@ from graspd_core.hands.mano.mano_hand import ManoHand, load_mano
 from graspd_core.hands.mano.mano_skin import (
     close_wrist,
     closed_faces,
-    make_skin,
     rest,
     rotation_from_vector,
     skin_vertices,
@@ -323,23 +322,20 @@ def draw(seed: int, shapes: int, batch: int = 2) -> tuple[torch.Tensor, torch.Te
 
 def test_forward_agrees_with_the_paper(data: ManoData) -> None:
     betas, pose, shift = draw(0, 10)
-    vertices, _ = skin_vertices(make_skin(data), betas, rotation_from_vector(pose), shift)
+    vertices, _ = skin_vertices(data, betas, rotation_from_vector(pose), shift)
     for row in range(2):
         expected = by_the_paper(data, betas[row].numpy(), pose[row].numpy(), shift[row].numpy())
         np.testing.assert_allclose(vertices[row], expected, atol=1e-12)
-    single, _ = skin_vertices(
-        make_skin(data, torch.float32), betas.float(), rotation_from_vector(pose.float()), shift.float()
-    )
+    single, _ = skin_vertices(data, betas.float(), rotation_from_vector(pose.float()), shift.float())
     np.testing.assert_allclose(single, vertices, atol=2e-6)  # float32 over four joints in a row
 
 
 def test_gradients_are_those_of_finite_differences(data: ManoData) -> None:
-    skin = make_skin(data)
     weights = torch.as_tensor(np.random.default_rng(1).normal(size=data.template.shape))
     betas, pose, shift = (x[:1].requires_grad_(True) for x in draw(2, 10))
 
     def value(betas: torch.Tensor, pose: torch.Tensor, shift: torch.Tensor) -> torch.Tensor:
-        return (skin_vertices(skin, betas, rotation_from_vector(pose), shift)[0] * weights).sum()
+        return (skin_vertices(data, betas, rotation_from_vector(pose), shift)[0] * weights).sum()
 
     assert torch.autograd.gradcheck(value, (betas, pose, shift), eps=1e-6, atol=1e-6)
     # At the zero rotation, where Rodrigues' formula divides nothing by nothing.
@@ -361,7 +357,7 @@ def test_the_wrist_is_closed(data: ManoData) -> None:
     betas, pose, shift = draw(6, 10, batch=1)
     for scale in (0.0, 0.3):
         rotations = rotation_from_vector(scale * pose)
-        vertices, _ = skin_vertices(make_skin(data), betas, rotations, shift)
+        vertices, _ = skin_vertices(data, betas, rotations, shift)
         mesh = trimesh.Trimesh(close_wrist(data, vertices)[0].numpy(), faces, process=False)
         assert mesh.is_watertight
         assert mesh.is_winding_consistent
@@ -393,10 +389,10 @@ def test_the_hands_links_are_the_skins_bodies(mano: ManoHand, seed: int) -> None
     hand = mano.model
     q = np.random.default_rng(seed).uniform(hand.lower, hand.upper)
     rotations, translations = link_poses(hand, q)
-    skin, betas = make_skin(mano.data), torch.as_tensor(mano.betas)[None]
+    betas = torch.as_tensor(mano.betas)[None]
     turned = mano_joints.rotations_from_joints(torch.as_tensor(mano.frames), torch.as_tensor(q)[None])
-    origin = rest(skin, betas)[1][:, 0]
-    _, joints = skin_vertices(skin, betas, turned, -origin)
+    origin = rest(mano.data, betas)[1][:, 0]
+    _, joints = skin_vertices(mano.data, betas, turned, -origin)
     links = [hand.link_index[name] for name in BODIES]
     np.testing.assert_allclose(translations[links], joints[0], atol=1e-12)
     whole = np.eye(3)
