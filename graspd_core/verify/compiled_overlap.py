@@ -29,9 +29,7 @@ _NODE = 15
 class CompiledQuery:
     """A mesh prepared for distance queries by the kernel, safe to use from several threads.
 
-    Attributes:
-        library: the kernel.
-        surface: addresses of `nodes` and `triangles`, as the kernel expects them.
+    `surface` holds the addresses of `nodes` and `triangles`, as the kernel expects them.
     """
 
     library: CDLL

@@ -298,13 +298,9 @@ def _near_box(query: DistanceQuery, points: Float[np.ndarray, "n 3"], margin: fl
 
 @dataclass(frozen=True, eq=False)
 class _PlacedSolids:
-    """The collision primitives of a hand at its grasp, hulls last.
+    """A hand's primitives at its grasp, hulls last, with their poses in the object frame [m].
 
-    Attributes:
-        primitives: the hand's primitives.
-        rotations: `R_object_primitive`.
-        translations: primitive origins, object frame [m].
-        smooth: the primitives that are not hulls, for distance queries.
+    `smooth` are those that are not hulls, for distance queries.
     """
 
     primitives: tuple[Primitive, ...]
@@ -447,23 +443,16 @@ def cone_wrenches(
     return np.concatenate([forces, torques], -1).reshape(-1, 6)
 
 
-# Greatest number of contacts in the wrench hull, in planning and in benchmarks. A hull of 32 contacts has some 22,000
-# facets, takes five times as long and raises ε by a tenth (docs/metrics.md).
-MAX_CONTACTS, PROTOCOL_CONTACTS = 16, 32
+# Greatest number of contacts in the wrench hull. A hull of 32 contacts has some 22,000 facets, takes five times as long
+# and raises ε by a tenth (docs/metrics.md).
+MAX_CONTACTS = 16
 # Half the distance of a central difference [m].
 _STEP = 2e-4
 
 
 @dataclass(frozen=True, eq=False)
 class PreparedGrasp:
-    """A hand at a grasp, with the quantities that metrics share.
-
-    Attributes:
-        context: the object and the hand.
-        posture: posture of the hand.
-        placed: the hand's samples, object frame.
-        max_contacts: greatest number of contacts in the wrench hull.
-    """
+    """A hand at a grasp, with the quantities that metrics share."""
 
     context: MetricsContext
     posture: Posture
