@@ -12,6 +12,7 @@ import pytest
 import torch
 import trimesh
 from hypothesis import given
+from inputs_made import Evil
 from scipy.sparse import csr_matrix
 
 from graspd_bench.studies.human_hand import measure_skin
@@ -83,16 +84,6 @@ def test_an_array_as_python_2_wrote_it(tmp_path: Path) -> None:
         b"K\x00tb\x89U" + bytes([len(raw)]) + raw + b"tbs."
     )
     np.testing.assert_array_equal(numbers(read_pickle(path)["x"]), values)
-
-
-class Evil:
-    """Pickles as a call of a function of one's choice."""
-
-    def __init__(self, function: Any, *arguments: Any) -> None:
-        self.call = function, arguments
-
-    def __reduce__(self) -> Any:
-        return self.call
 
 
 def test_a_malicious_file_is_refused_and_runs_nothing(model: dict[str, Any], tmp_path: Path) -> None:
