@@ -183,6 +183,7 @@ def _layout(path: Path) -> Any:
     ]
     sizes = {"width": width, "height": height, "point_step": point, "row_step": row, "is_bigendian": bool(big & 1)}
     points = points_from_message(SimpleNamespace(data=data[LAYOUT_HEAD.size :], fields=fields, **sizes))
+    assert 0 < len(points) <= width * height, f"{len(points)} points"
     finite(points)
     return points
 

@@ -23,7 +23,7 @@ from graspd_bench.stress.broken_meshes import thin_cup
 from graspd_bench.study import PROTOCOL_MASS, Case, Picture, Record, Request, Sections, raw_grasps
 from graspd_core.errors import ConfigError, GraspdError, choices
 from graspd_core.hands.fingers import find_fingers
-from graspd_core.hands.kinematics import make_kinematics, points_in_base
+from graspd_core.hands.kinematics import forward, make_kinematics, place_points, placement
 from graspd_core.hands.library import load_hand
 from graspd_core.hands.model import HandModel
 from graspd_core.mesh.sdf import build_sdf
@@ -175,10 +175,9 @@ def hand_span(hand: HandModel) -> float:
     shares = torch.rand(_POSTURES, hand.num_joints, generator=draw, dtype=torch.float64)
     # The greatest distances occur at joint limits, so half of the postures have every joint at a limit.
     shares[::2] = shares[::2].round()
-    kinematics = make_kinematics(hand, dtype=torch.float64)
-    tips = points_in_base(
-        kinematics, lower + shares * (upper - lower), torch.as_tensor(fingers.points), torch.as_tensor(fingers.links)
-    )
+    links = forward(make_kinematics(hand, dtype=torch.float64), lower + shares * (upper - lower))
+    matrix = placement(hand.num_links, torch.as_tensor(fingers.points), torch.as_tensor(fingers.links))
+    tips = place_points(matrix, links)
     return float(torch.cdist(tips, tips).max())
 
 

@@ -40,10 +40,10 @@ def straight(mover: Mover, q: Joints, way: Float[np.ndarray, "3"]) -> Float[np.n
     for k in range(1, count + 1):
         target = pose.copy()
         target[:3, 3] += k / count * way
-        found = solve(arm, _se3([target]), torch.as_tensor(rows[-1])[None], _STEPS)
-        after = found.q[0].double().numpy()
+        found, reached = solve(arm, _se3([target]), torch.as_tensor(rows[-1])[None], _STEPS)
+        after = found[0].double().numpy()
         far = np.abs(after - rows[-1]).max() > _JUMP
-        if not bool(found.reached[0]) or far or not mover.clear(np.stack([rows[-1], after]), allowed):
+        if not bool(reached[0]) or far or not mover.clear(np.stack([rows[-1], after]), allowed):
             break
         rows.append(after)
     return np.stack(rows)
@@ -110,8 +110,8 @@ def _clear_postures(mover: Mover, arm: Arm, q: Joints, targets: Sequence[Pose]) 
     starts = torch.cat([torch.as_tensor(q).expand(len(targets), 1, -1), nearest_postures(start_table(arm), goal, 2)], 1)
     count = starts.shape[1]
     rows = torch.arange(len(targets)).repeat_interleave(count)
-    found = solve(arm, goal[rows], starts.flatten(0, 1), _STEPS)
-    reached = found.q[found.reached].double().numpy()
+    found, there = solve(arm, goal[rows], starts.flatten(0, 1), _STEPS)
+    reached = found[there].double().numpy()
     # Choose the equivalent angle (modulo 2π) that is nearest to the current joint value.
     turned = reached + 2 * np.pi * np.round((q - reached) / (2 * np.pi))
     inside = (turned >= arm.lower) & (turned <= arm.upper)

@@ -77,14 +77,9 @@ print(", ".join(f"{name} ({len(load_hand(name).joint_names)} joints)" for name i
 
 @dataclass(frozen=True)
 class Check:
-    """The result of one check.
+    """The result of one check of a library or part, and whether graspd needs it.
 
-    Attributes:
-        name: name of the checked library or part.
-        ok: whether the check passed.
-        detail: a version or a number if the check passed, else the error in one line.
-        hint: what to do if the check failed.
-        needed: whether graspd needs this library or part.
+    `detail` is a version or a number, after a failure the error in one line. `hint` says what to do after a failure.
     """
 
     name: str

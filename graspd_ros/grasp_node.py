@@ -36,7 +36,7 @@ from graspd_core.hands.model import all_joint_names
 from graspd_core.runtime.worker_process import trim_heap
 from graspd_core.transforms import TransformBuffer
 from graspd_ros.convert import nanoseconds
-from graspd_ros.error_codes import RequestError, sentence_of
+from graspd_ros.error_codes import ErrorCode, RequestError, code_of, sentence_of
 from graspd_ros.inputs.request_builder import SOURCES, RequestBuilder
 from graspd_ros.inputs.sensor_frames import (
     DepthMessage,
@@ -199,7 +199,7 @@ class GraspNode(Node):
         try:
             self._collision_objects = updated_objects(self._collision_objects, message)
         except Exception as error:  # whatever the message holds, the executor goes on
-            self._responses.collision_object_not_taken(error)
+            self._responses.refused("", "collision_objects", code_of(error), sentence_of(error))
 
     def _on_cancel(self, message: String) -> None:
         if not self._worker.cancel(message.data) and message.data:
@@ -240,7 +240,7 @@ class GraspNode(Node):
         if reason := self._pairs.unpaired():
             missing[IMAGES] = reason
             if IMAGES not in before:
-                self._responses.images_not_taken(reason)
+                self._responses.refused("", "sensors", ErrorCode.NO_CLOUD, reason)
         self._request_builder.missing = missing
 
     def _on_diagnostics_due(self) -> None:

@@ -20,7 +20,7 @@ from graspd_core.types import joined
 from graspd_ros.convert import array_of
 from graspd_ros.error_codes import ErrorCode, RequestError
 from graspd_ros.inputs.request_builder import RequestBuilder
-from graspd_ros.inputs.solids import bad_message, mesh_shapes, plane_of, primitive_shapes, with_support
+from graspd_ros.inputs.solids import bad_message, placed_shapes, plane_of, with_support
 from graspd_ros.outputs.moveit import moveit_grasp
 from graspd_ros.parameters import Settings
 from graspd_ros.request import Listener, Request
@@ -105,5 +105,5 @@ def _load(mesh: TriangleMesh, settings: Settings) -> Scene:
 
 def _solid(target: Object) -> TriangleMesh:
     if target.meshes:
-        return joined(*mesh_shapes(target.meshes, target.mesh_poses, "object"))
-    return joined(*primitive_shapes(target.primitives, target.primitive_poses, "object"))
+        return joined(*placed_shapes("mesh", target.meshes, target.mesh_poses, "object"))
+    return joined(*placed_shapes("primitive", target.primitives, target.primitive_poses, "object"))

@@ -24,6 +24,7 @@ from graspd_core import HandModel, Scene, load_preset, plan_grasps, save_result
 from graspd_core.config import load_scene_config
 from graspd_core.perception.obstacles import held_hull
 from graspd_core.planning.any_thing import Failure, plan_any_thing, result_of_things
+from graspd_core.planning.any_thing import unlike as unlike_postures
 from graspd_core.types import (
     Grasp,
     GraspResult,
@@ -61,8 +62,6 @@ if TYPE_CHECKING:
 PATIENCE = 0.15  # seconds for a run to end by itself after its request has ended
 _POLL = 0.02  # seconds between two checks of stop and deadline
 MOST_RUNS = 16
-# Two grasps are similar if their bases are within this distance [m] and this angle [rad].
-LIKE_DISTANCE, LIKE_TURN = 0.015, 0.26
 
 # Returns `T_target_source` at a time (0 for the newest). It waits for late transforms until the stop hook returns True,
 # and may raise a TransformError.
@@ -144,7 +143,7 @@ class RecentRuns:
             run = self._grasp(name)[0]
             for place, _ in run.planned.objects[:1]:
                 places[row] = request.to_object(run.frame, matrix_of(place, (1.0, 0.0, 0.0, 0.0)), lookup)[:3, 3]
-        grasps = [Posture(pose[:3, 3], wxyz_of_matrix(pose), np.zeros(0)) for pose in excluded]
+        grasps = _postures(excluded)
         return [Failure(place, grasp) for place, grasp in zip(places, grasps, strict=True)]
 
     def _grasp(self, name: str) -> tuple[_Run, Grasp]:
@@ -172,7 +171,7 @@ class RecentRuns:
 
 def unlike(grasps: Iterable[Grasp], excluded: Sequence[Matrix]) -> list[Grasp]:
     """Return the grasps that are not similar to any of the `excluded` base-link poses."""
-    return [grasp for grasp in grasps if not any(_alike(matrix_of_posture(grasp.grasp), pose) for pose in excluded)]
+    return unlike_postures(list(grasps), _postures(excluded))
 
 
 def without(result: GraspResult, excluded: Sequence[Matrix], count: int) -> GraspResult:
@@ -186,10 +185,8 @@ def without(result: GraspResult, excluded: Sequence[Matrix], count: int) -> Gras
     return replace(result, outcome=outcome, tried=(*good[:count], *failed))
 
 
-def _alike(a: Matrix, b: Matrix) -> bool:
-    cosine = (np.trace(a[:3, :3].T @ b[:3, :3]) - 1) / 2
-    near = np.linalg.norm(a[:3, 3] - b[:3, 3]) < LIKE_DISTANCE
-    return bool(near and np.arccos(np.clip(cosine, -1.0, 1.0)) < LIKE_TURN)
+def _postures(poses: Sequence[Matrix]) -> list[Posture]:
+    return [Posture(pose[:3, 3], wxyz_of_matrix(pose), np.zeros(0)) for pose in poses]
 
 
 class Planner:

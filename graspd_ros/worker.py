@@ -12,6 +12,8 @@ from dataclasses import dataclass
 from enum import StrEnum
 from typing import Generic, Protocol, TypeVar
 
+from graspd_ros.error_codes import ErrorCode
+
 
 class BusyPolicy(StrEnum):
     """What happens to a request that arrives while another one is running."""
@@ -28,14 +30,6 @@ class WorkerEnding(StrEnum):
     FAILED = "failed"
     CANCELLED = "cancelled"
     SUPERSEDED = "superseded"
-
-
-class Refusal(StrEnum):
-    """Reason why `submit` did not accept a request."""
-
-    BUSY = "busy"
-    DUPLICATE = "duplicate"
-    STOPPING = "stopping"
 
 
 class WorkerRequest(Protocol):
@@ -59,7 +53,7 @@ StopHook = Callable[[], bool]
 class Admission:
     """Answer of `submit`. Without `refusal` the request is accepted, and `ahead` requests are before it."""
 
-    refusal: Refusal | None = None
+    refusal: ErrorCode | None = None
     reason: str = ""
     ahead: int = 0
 
@@ -134,16 +128,16 @@ class Worker(Generic[R, V]):
 
     def _refusal(self, request: R, policy: BusyPolicy, ahead: int) -> Admission | None:
         if self._stopping:
-            return Admission(Refusal.STOPPING, "the node is shutting down")
+            return Admission(ErrorCode.SHUTTING_DOWN, "the node is shutting down")
         if request.id in self._live:
-            return Admission(Refusal.DUPLICATE, f"a request {request.id!r} is already waiting or running")
+            return Admission(ErrorCode.DUPLICATE_ID, f"a request {request.id!r} is already waiting or running")
         if request.only_newest or policy is BusyPolicy.REPLACE:
             return None
         if policy is BusyPolicy.REJECT and ahead:
-            return Admission(Refusal.BUSY, "the node is busy, and busy_policy is reject")
+            return Admission(ErrorCode.BUSY, "the node is busy, and busy_policy is reject")
         if policy is BusyPolicy.QUEUE and ahead > self.queue_size:
             full = f"the queue is full: one runs, {ahead - 1} of queue_size={self.queue_size} wait"
-            return Admission(Refusal.BUSY, full)
+            return Admission(ErrorCode.BUSY, full)
         return None
 
     def cancel(self, request_id: str) -> int:

@@ -18,6 +18,7 @@ from graspd_core.mesh.sdf import sample_sdf
 from graspd_core.perception.scene import ObjectModel, Scene, sample_confidence
 from graspd_core.se3 import SE3, perpendicular, quaternion_from_rotation, rotation_from_quaternion
 from graspd_core.types import Contact, Grasp, Plane, Posture, Snapshot, TriangleMesh, Verdict, joined
+from graspd_core.verify.hold_trial import straight_path
 from graspd_core.verify.prepared_grasp import MetricsContext, prepare_grasp
 
 Colour = tuple[float, float, float]
@@ -181,15 +182,7 @@ def posture_at(hand: HandModel, grasp: Grasp, at: float) -> Posture:
     stages = (retreat_posture(hand, grasp.pregrasp), grasp.pregrasp, grasp.grasp, grasp.squeeze)
     first = min(max(int(at), 0), len(stages) - 2)
     share = min(max(at - first, 0.0), 1.0)
-    start, end = stages[first], stages[first + 1]
-    # q and -q are the same rotation. Interpolate over the smaller angle.
-    sign = 1.0 if start.quaternion_wxyz @ end.quaternion_wxyz >= 0 else -1.0
-    quaternion = (1 - share) * start.quaternion_wxyz + share * sign * end.quaternion_wxyz
-    return Posture(
-        (1 - share) * start.position + share * end.position,
-        quaternion / np.linalg.norm(quaternion),
-        (1 - share) * start.joint_positions + share * end.joint_positions,
-    )
+    return straight_path(stages[first], stages[first + 1], np.array([share]))[0]
 
 
 def placed_links(

@@ -255,7 +255,7 @@ def _own(arm: Arm, target: SE3) -> Bool[Tensor, "batch"]:
         rows = torch.nonzero(~reached).flatten()
         if not len(rows):
             break
-        reached[rows] = solve(arm, target[rows], starts[rows], _STEPS).reached
+        reached[rows] = solve(arm, target[rows], starts[rows], _STEPS)[1]
     return reached
 
 

@@ -24,7 +24,7 @@ from graspd_core.errors import ConfigError
 from graspd_core.hands.mano.mano_hand import load_mano
 from graspd_core.mesh.mesh_files import surface_samples
 from graspd_core.mesh.shapes import object_hash
-from graspd_core.mesh.surface_queries import DistanceQuery, inside, make_distance_query, signed_distance
+from graspd_core.mesh.surface_queries import DistanceQuery, is_inside, make_distance_query, signed_distance
 from graspd_core.optimize.plan_config import PlanConfig, load_preset, override, to_mapping
 from graspd_core.perception.load_scene import load_scene
 from graspd_core.perception.scene import object_parts
@@ -77,10 +77,10 @@ def _shared_volume(query: DistanceQuery, skin: TriangleMesh) -> float:
         return 0.0
     axes = [_middles(a, b) for a, b in zip(low, high, strict=True)]
     cells = np.stack(np.meshgrid(*axes, indexing="ij"), -1).reshape(-1, 3)
-    cells = cells[inside(query, cells)]
+    cells = cells[is_inside(query.tree, cells)]
     if len(cells) == 0:
         return 0.0
-    return float(inside(make_distance_query(skin), cells).sum()) * VOXEL**3
+    return float(is_inside(make_distance_query(skin).tree, cells).sum()) * VOXEL**3
 
 
 def _middles(low: float, high: float) -> Float[np.ndarray, "n"]:

@@ -176,8 +176,8 @@ def _postures(task: ArmTask, target: SE3) -> tuple[Float[Tensor, "postures joint
     starts = nearest_postures(table, target, _STARTS, task.usable)
     count = starts.shape[1]
     owner = torch.arange(len(starts)).repeat_interleave(count)
-    solved = solve(arm, target[owner], starts.flatten(0, 1), _STEPS)
-    q, owner = _nearest_turn(arm, solved.q[solved.reached]), owner[solved.reached]
+    q, reached = solve(arm, target[owner], starts.flatten(0, 1), _STEPS)
+    q, owner = _nearest_turn(arm, q[reached]), owner[reached]
     if not len(q):
         return q, owner
     hits = hits_of_support(arm, task.scene, task.base, placed(arm.capsules, arm_links(arm, q))[:2])
@@ -228,7 +228,7 @@ def _followed(
         return _Followed(q.new_zeros(0, length, q.shape[1]), [], [])
     target = SE3(paths.rotation.flatten(0, 1), paths.translation.flatten(0, 1))
     solved = solve(task.arm, target, q.repeat_interleave(length, 0), _PATH_STEPS)
-    path, reached = solved.q.unflatten(0, (count, length)), solved.reached.unflatten(0, (count, length))
+    path, reached = (values.unflatten(0, (count, length)) for values in solved)
     off = torch.where(reached, length, (torch.arange(length) - STAGE_ROWS[2]).abs())
     lost = torch.where(reached.all(1), -1, off.argmin(1)).tolist()
     jumps, hits = path.diff(dim=1).abs().amax(1), _hits_on_path(task, path, joints)

@@ -42,14 +42,6 @@ def tip_chain(arm: Arm, dtype: torch.dtype = torch.float32) -> SerialChain:
     return SerialChain(kinematic_chain(arm), tip, dtype=torch.float64).to(dtype=dtype)
 
 
-def tip_and_jacobian(
-    chain: SerialChain, q: Float[Tensor, "batch joints"]
-) -> tuple[SE3, Float[Tensor, "batch 6 joints"]]:
-    """Return `T_base_tip` at joint values q [rad] or [m], and the Jacobian, base frame: linear, then angular rows."""
-    jacobian, tip = chain.jacobian_tensor(q, ret_eef_pose=True)
-    return SE3(tip[:, :3, :3], tip[:, :3, 3]), jacobian
-
-
 # A pose counts as reached within these tolerances [m], [rad].
 POSITION_TOLERANCE, ROTATION_TOLERANCE = 1e-4, 1e-3
 # Length that counts as much as one radian [m].
@@ -62,19 +54,6 @@ _LONGEST_STEP = 0.6
 # Indices of the rotation matrix entries whose differences give the axis, and a sine that may be a rounding error.
 _ROWS, _COLUMNS, _TINY = [2, 0, 1], [1, 2, 0], 1e-7
 _HALF_TURN = (torch.pi, 0.0, 0.0)
-
-
-@dataclass(frozen=True)
-class Solutions:
-    """Joint values, and which of them reach their targets.
-
-    Attributes:
-        q: joint values at the last step [rad] or [m].
-        reached: True if the tip is within the tolerances of its target.
-    """
-
-    q: Float[Tensor, "batch joints"]
-    reached: Bool[Tensor, "batch"]
 
 
 def pose_error(target: SE3, tip: SE3) -> Float[Tensor, "batch 6"]:
@@ -98,9 +77,10 @@ def rotation_vector(
 @torch.no_grad()
 def solve(
     arm: Arm, target: SE3, start: Float[Tensor, "batch joints"], steps: int, *, limited: bool = True
-) -> Solutions:
+) -> tuple[Float[Tensor, "batch joints"], Bool[Tensor, "batch"]]:
     """Iterate from each start towards its target `T_base_tip`.
 
+    Return the joint values at the last step [rad] or [m], and whether the tip is within the tolerances of its target.
     Rows that have reached their target are no longer computed. The solver uses float32. It is a hundred times finer
     than the tolerances, and takes two thirds of the time of float64.
 
@@ -113,8 +93,9 @@ def solve(
     q, reached = torch.empty(now.shape), torch.zeros(len(now), dtype=torch.bool)
     rows = torch.arange(len(now))
     for step in range(steps + 1):
-        tip, jacobian = tip_and_jacobian(chain, now)
-        wrong = pose_error(target, tip)
+        # The rows of the Jacobian are linear, then angular, in the base frame.
+        jacobian, tip = chain.jacobian_tensor(now, ret_eef_pose=True)
+        wrong = pose_error(target, SE3(tip[:, :3, :3], tip[:, :3, 3]))
         away, turned = wrong[:, :3].norm(dim=-1), wrong[:, 3:].norm(dim=-1)
         there = (away < POSITION_TOLERANCE) & (turned < ROTATION_TOLERANCE)
         if step == steps or there.any():
@@ -129,7 +110,7 @@ def solve(
     q = q.to(start)
     # Rounding may exceed a limit.
     q = q.clamp(*map(torch.as_tensor, (arm.lower, arm.upper))) if limited else q
-    return Solutions(q, reached)
+    return q, reached
 
 
 def _step(
@@ -254,11 +235,11 @@ def why_unreached(arm: Arm, target: SE3, start: Float[Tensor, "batch joints"]) -
     table = start_table(arm)
     starts = torch.cat([start[:, None], nearest_postures(table, target, _STARTS - 1)], 1)
     count = starts.shape[1]
-    solved = solve(
+    q, reached = solve(
         arm, target[torch.arange(len(start)).repeat_interleave(count)], starts.flatten(0, 1), _STEPS, limited=False
     )
-    beyond = _beyond(arm, solved.q).unflatten(0, (-1, count))
-    total = torch.where(solved.reached.unflatten(0, (-1, count)), beyond.sum(-1), torch.inf)
+    beyond = _beyond(arm, q).unflatten(0, (-1, count))
+    total = torch.where(reached.unflatten(0, (-1, count)), beyond.sum(-1), torch.inf)
     longest = table.features[:, :3].norm(dim=-1).max()
     reasons: list[str] = []
     for row, which in enumerate(total.argmin(1).tolist()):

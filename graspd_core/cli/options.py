@@ -90,15 +90,14 @@ def planning_options(options: argparse.Namespace) -> tuple[PlanConfig, dict[str,
     return config, request
 
 
-def not_loaded(options: argparse.Namespace, config: PlanConfig, began: float) -> GraspResult:
-    """Return the result of a run whose deadline passed while loading. `began` is its start by `time.perf_counter()`."""
+def not_loaded(options: argparse.Namespace, config: PlanConfig, began: float) -> tuple[GraspResult, dict[str, Any]]:
+    """Return the result of a run whose deadline passed while loading, and its JSON document.
+
+    `began` is the start of the run by `time.perf_counter()`.
+    """
     taken = time.perf_counter() - began
-    return GraspResult(Outcome.DEADLINE, (), Timing(load=taken, total=taken), options.seed, config.method)
-
-
-def not_loaded_document(result: GraspResult) -> dict[str, Any]:
-    """Return the JSON document of a run whose object was not loaded: its outcome and no grasps."""
-    return {"outcome": {"name": result.outcome.name, "message": result.outcome.value}, "grasps": []}
+    result = GraspResult(Outcome.DEADLINE, (), Timing(load=taken, total=taken), options.seed, config.method)
+    return result, {"outcome": {"name": result.outcome.name, "message": result.outcome.value}, "grasps": []}
 
 
 def summary(result: GraspResult, wanted: int, different: int) -> str:

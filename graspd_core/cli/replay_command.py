@@ -19,7 +19,6 @@ from graspd_core.cli.options import (
     good_grasps,
     merged_views,
     not_loaded,
-    not_loaded_document,
     plan_any_object,
     planning_options,
     scene_config_of,
@@ -146,8 +145,7 @@ def _planned(
             with deadline.cuts_short(), busy("load"):
                 scene = _scene_of(job, options, settings)
         except DeadlinePassed:
-            result = not_loaded(options, config, began)
-            return result, not_loaded_document(result)
+            return not_loaded(options, config, began)
         for warning in scene.object.warnings:
             print_note(f"{job.label}: {warning}")
         with Reporter() as reporter:

@@ -129,13 +129,7 @@ def process_began() -> float:
 
 @dataclass(frozen=True)
 class Watched:
-    """Hooks that show a run in a browser. By default they do nothing.
-
-    Attributes:
-        watch: watch hook for `plan_grasps`.
-        progress_hook: additional progress hook for `plan_grasps`.
-        show: function that shows the result until Ctrl-C.
-    """
+    """Hooks that show a run in a browser, the result until Ctrl-C. By default they do nothing."""
 
     watch: WatchHook | None = None
     progress_hook: ProgressHook | None = None

@@ -17,7 +17,6 @@ from graspd_core.cli.options import (
     exit_status,
     good_grasps,
     not_loaded,
-    not_loaded_document,
     plan_any_object,
     planning_options,
     restrictions_of,
@@ -91,9 +90,9 @@ def run(options: argparse.Namespace) -> int:
             hand = load_hand(options.hand)
     except DeadlinePassed:
         # No file is written, because a result file needs an object.
-        result = not_loaded(options, config, options.began)
+        result, document = not_loaded(options, config, options.began)
         print(summary(result, options.count, 0))
-        answer(not_loaded_document(result))
+        answer(document)
         return exit_status(result)
     known = (*scene.object.warnings, *hand.named_warnings)
     for warning in known:

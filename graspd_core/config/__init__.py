@@ -5,36 +5,17 @@ from __future__ import annotations
 import typing
 from typing import Literal
 
-from graspd_core.config.mapping import from_mapping
-from graspd_core.config.planning_config import (
-    CertaintyConfig,
-    GraspStagesConfig,
-    ProblemConfig,
-    RobustConfig,
-    RoundsConfig,
-)
-from graspd_core.config.scene_config import (
-    ObstacleConfig,
-    ReconstructionConfig,
-    SceneConfig,
-    SegmentationConfig,
-    load_scene_config,
-)
-
-__all__ = [
-    "VERIFICATIONS",
-    "CertaintyConfig",
-    "GraspStagesConfig",
-    "ObstacleConfig",
-    "ProblemConfig",
-    "ReconstructionConfig",
-    "RobustConfig",
-    "RoundsConfig",
-    "SceneConfig",
-    "SegmentationConfig",
-    "from_mapping",
-    "load_scene_config",
-]
+from graspd_core.config.mapping import from_mapping as from_mapping
+from graspd_core.config.planning_config import CertaintyConfig as CertaintyConfig
+from graspd_core.config.planning_config import GraspStagesConfig as GraspStagesConfig
+from graspd_core.config.planning_config import ProblemConfig as ProblemConfig
+from graspd_core.config.planning_config import RobustConfig as RobustConfig
+from graspd_core.config.planning_config import RoundsConfig as RoundsConfig
+from graspd_core.config.scene_config import ObstacleConfig as ObstacleConfig
+from graspd_core.config.scene_config import ReconstructionConfig as ReconstructionConfig
+from graspd_core.config.scene_config import SceneConfig as SceneConfig
+from graspd_core.config.scene_config import SegmentationConfig as SegmentationConfig
+from graspd_core.config.scene_config import load_scene_config as load_scene_config
 
 Verify = Literal["standard", "hard", "full", "hard_full", "none"]
 VERIFICATIONS: tuple[str, ...] = typing.get_args(Verify)

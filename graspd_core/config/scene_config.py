@@ -132,13 +132,7 @@ class ObstacleConfig:
 
 @dataclass(frozen=True)
 class SceneConfig:
-    """Settings for building a scene from point clouds.
-
-    Attributes:
-        segmentation: settings for cutting the object out of the cloud.
-        reconstruction: settings for making a closed mesh of the object's points.
-        obstacles: settings for making hulls of the neighbouring objects.
-    """
+    """Settings for building a scene from point clouds."""
 
     segmentation: SegmentationConfig = field(default_factory=SegmentationConfig)
     reconstruction: ReconstructionConfig = field(default_factory=ReconstructionConfig)

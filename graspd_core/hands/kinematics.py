@@ -144,17 +144,6 @@ def placed_points(matrix: Float[Tensor, "points columns"]) -> tuple[Float[Tensor
     return columns[torch.arange(len(links), device=links.device), links, :3], links
 
 
-def points_in_base(
-    kinematics: Kinematics,
-    q: Float[Tensor, "batch joints"],
-    points: Float[Tensor, "points 3"],
-    links: Int[Tensor, "points"],
-) -> Float[Tensor, "batch points 3"]:
-    """Return link-frame points at joint values q in the base frame [m]. To repeat this, build the `placement` once."""
-    poses = forward(kinematics, q)
-    return place_points(placement(poses.translation.shape[1], points, links), poses)
-
-
 def point_jacobian(
     hand: HandModel, q: JointValues, points: LinkPoints, links: LinkNumbers
 ) -> Float[np.ndarray, "points 3 joints"]:

@@ -37,16 +37,18 @@ def primitive_sdf(primitive: Primitive, points: _Places) -> _Distances:
     if primitive.kind == "hull":
         normals, offsets = (torch.as_tensor(a).to(points) for a in hull_planes(primitive))
         return (local @ normals.T - offsets).amax(-1)
-    core, radius = _core_of(primitive)
+    core, radius = core_of(primitive)
     reach = local.abs()
     if primitive.kind == "cylinder":
         reach, core = torch.stack([safe_norm(reach[..., :2]), reach[..., 2]], -1), core[1:]
     return corner_sdf(reach - reach.new_tensor(core)) - radius
 
 
-def _core_of(primitive: Primitive) -> tuple[tuple[float, ...], float]:
-    """Return a primitive other than a hull as a core and the radius that grows it (see `CollisionTensors`) [m]."""
+def core_of(primitive: Primitive) -> tuple[tuple[float, ...], float]:
+    """Return a primitive as a core and the radius that grows it (see `CollisionTensors`) [m]. Zeros for a hull."""
     size = primitive.size
+    if primitive.kind == "hull":
+        return (0.0, 0.0, 0.0), 0.0
     if primitive.kind == "box":
         return size, 0.0
     if primitive.kind == "cylinder":
@@ -87,7 +89,7 @@ def bounds(primitive: Primitive) -> tuple[Float[np.ndarray, "3"], Float[np.ndarr
     if primitive.kind == "hull":
         corners = primitive.vertices @ primitive.rotation.T + primitive.translation
         return corners.min(0), corners.max(0)
-    core, radius = _core_of(primitive)
+    core, radius = core_of(primitive)
     reach = np.abs(primitive.rotation) @ (np.array(core) + radius)
     return primitive.translation - reach, primitive.translation + reach
 
@@ -143,7 +145,7 @@ def make_collision_tensors(hand: HandModel, device: torch.device | str, dtype: t
 @lru_cache(maxsize=8)
 def _make_collision_tensors(hand: HandModel, device: torch.device, dtype: torch.dtype) -> CollisionTensors:
     solids = [p for p in hand.primitives if p.kind != "hull"]
-    cores = [_core_of(p) for p in solids]
+    cores = [core_of(p) for p in solids]
 
     def tensor(values: object, shape: tuple[int, ...]) -> Tensor:
         return torch.as_tensor(np.asarray(values, dtype=float).reshape(shape), device=device, dtype=dtype)
@@ -163,31 +165,27 @@ def solid_distance(
     solids: CollisionTensors, links: SE3, points: Float[Tensor, "batch points 3"]
 ) -> Float[Tensor, "batch points solids"]:
     """Return the signed distance [m] of base-frame points to every primitive. `links` are the poses of `forward`."""
-
-    def whole(links: SE3, points: Tensor) -> Tensor:
-        return _distance(_to_solids(solids, links, points), solids.core, solids.radius, solids.is_round)
-
-    return _in_parts(whole, len(solids.link), links, points)
+    return _in_parts(solids, links, points, lambda local: _distance(local, solids.core, solids.radius, solids.is_round))
 
 
 def solid_bound(
     solids: CollisionTensors, links: SE3, points: Float[Tensor, "batch points 3"]
 ) -> Float[Tensor, "batch points solids"]:
     """Return a cheap lower bound of `solid_distance` [m]: the largest offset from the solid's box along its axes."""
-
-    def whole(links: SE3, points: Tensor) -> Tensor:
-        return (_to_solids(solids, links, points).abs() - (solids.core + solids.radius[:, None])).amax(-1)
-
-    return _in_parts(whole, len(solids.link), links, points)
+    box = solids.core + solids.radius[:, None]
+    return _in_parts(solids, links, points, lambda local: (local.abs() - box).amax(-1))
 
 
-def _in_parts(whole: Callable[[SE3, Tensor], Tensor], solids: int, links: SE3, points: Tensor) -> Tensor:
+def _in_parts(
+    solids: CollisionTensors, links: SE3, points: Tensor, measure: Callable[[Tensor], Tensor]
+) -> Float[Tensor, "batch points solids"]:
+    """Return a measure of the points in the frame of every primitive, for a part of the batch at a time."""
     at_once = _AT_ONCE if points.device.type == "cpu" else _AT_ONCE_ELSEWHERE
-    most = max(1, at_once // max(1, solids * points.shape[1]))
+    most = max(1, at_once // max(1, len(solids.link) * points.shape[1]))
     if len(points) <= most:
-        return whole(links, points)
+        return measure(_to_solids(solids, links, points))
     parts = [slice(i, i + most) for i in range(0, len(points), most)]
-    return torch.cat([whole(links[part], points[part]) for part in parts])
+    return torch.cat([measure(_to_solids(solids, links[part], points[part])) for part in parts])
 
 
 def _to_solids(

@@ -145,9 +145,9 @@ class HandModel:
     link_inertia: Float[np.ndarray, "links 3 3"]
     primitives: tuple[Primitive, ...]
     adjacent: Bool[np.ndarray, "links links"]
-    candidate_points: Float[np.ndarray, "candidates 3"]
-    candidate_normals: Float[np.ndarray, "candidates 3"]
-    candidate_link: Int[np.ndarray, "candidates"]
+    candidate_points: Float[np.ndarray, "candidates 3"] = field(default_factory=lambda: np.zeros((0, 3)))
+    candidate_normals: Float[np.ndarray, "candidates 3"] = field(default_factory=lambda: np.zeros((0, 3)))
+    candidate_link: Int[np.ndarray, "candidates"] = field(default_factory=lambda: np.zeros(0, dtype=np.int64))
     warnings: tuple[str, ...] = ()
     base_place: tuple[tuple[float, float, float], tuple[float, float, float, float]] = AT_ORIGIN
     mimics: tuple[Mimic, ...] = ()

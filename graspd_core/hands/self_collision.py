@@ -156,8 +156,8 @@ def adjacent_links(hand: HandModel) -> Bool[np.ndarray, "links links"]:
     These are links of one rigid group, links one joint apart, and links two joints apart that never overlap by much.
     Pairs that overlap in the open posture or in every sampled posture are adjacent too.
     """
-    build = lambda: {"adjacent": _adjacent_links(hand)}  # noqa: E731
-    return kept(hand, "adjacent", hand.num_links, {"adjacent": (hand.num_links,)}, build)["adjacent"]
+    shapes = {"adjacent": (hand.num_links,)}
+    return kept(hand, "adjacent", hand.num_links, shapes, lambda: (_adjacent_links(hand),))["adjacent"]
 
 
 def _adjacent_links(hand: HandModel) -> Bool[np.ndarray, "links links"]:

@@ -190,13 +190,8 @@ def with_candidates(hand: HandModel, count: int) -> HandModel:
         raise HandError(f"candidates: {count}; valid: 1 or more")
     if count == len(hand.candidate_link):
         return hand
-
-    def build() -> dict[str, np.ndarray]:
-        points, normals, links = candidates(hand, count, seed=0)
-        return {"candidate_points": points, "candidate_normals": normals, "candidate_link": links}
-
     shapes = {"candidate_points": (3,), "candidate_normals": (3,), "candidate_link": ()}
-    return replace(hand, **kept(hand, f"candidates-{count}", 1, shapes, build))
+    return replace(hand, **kept(hand, f"candidates-{count}", 1, shapes, lambda: candidates(hand, count, seed=0)))
 
 
 def candidates(hand: HandModel, count: int, seed: int) -> tuple[Points, Points, LinkNumbers]:
@@ -246,24 +241,24 @@ def dense_samples(hand: HandModel, *, count: int = 4000, seed: int = 1) -> Sampl
 
 def kept_dense_samples(hand: HandModel, *, count: int, seed: int) -> Samples:
     """Return `dense_samples`, cached on disk by the content of the hand."""
-
-    def build() -> dict[str, np.ndarray]:
-        points, links, areas = dense_samples(hand, count=count, seed=seed)
-        return {"points": points, "links": links, "areas": areas}
-
+    build = lambda: dense_samples(hand, count=count, seed=seed)  # noqa: E731
     found = kept(hand, f"samples-{count}-{seed}", count, {"points": (3,), "links": (), "areas": ()}, build)
     return found["points"], found["links"], found["areas"]
 
 
 def kept(
-    hand: HandModel, what: str, rows: int, shapes: Mapping[str, tuple[int, ...]], build: Callable[[], cache.Arrays]
+    hand: HandModel,
+    what: str,
+    rows: int,
+    shapes: Mapping[str, tuple[int, ...]],
+    build: Callable[[], tuple[np.ndarray, ...]],
 ) -> cache.Arrays:
     """Return the arrays that `build` computes, cached on disk by the content of the hand.
 
     Args:
         what: name of the arrays, with all settings that they depend on.
         rows: least number of rows of each array.
-        shapes: name of each array, and the shape of its rows.
+        shapes: name of each array, in the order of `build`, and the shape of its rows.
     """
 
     def valid(arrays: cache.Arrays) -> bool:
@@ -273,7 +268,7 @@ def kept(
         return len(counts) == 1 and min(counts) >= rows
 
     content = cache.digest(value for name, value in sorted(vars(hand).items()) if name in _CONTENT)
-    return cache.remember(f"hand-{content}-{what}", build, valid)
+    return cache.remember(f"hand-{content}-{what}", lambda: dict(zip(shapes, build(), strict=True)), valid)
 
 
 def _pool(

@@ -200,17 +200,10 @@ class GraspLibrary:
     def add(
         self, entry: LibraryEntry, target: ObjectModel, hand: HandModel, config: PlanConfig, grasps: Sequence[Grasp]
     ) -> int:
-        """Append verified grasps to an entry. Return the new number of grasps of the entry.
+        """Append grasps, found with `config` and in the object frame, to an entry of `target` and `hand`.
 
-        Args:
-            entry: entry of `target` and `hand`.
-            target: grasped object.
-            hand: grasping hand.
-            config: settings with which the grasps were found.
-            grasps: grasps in the object frame. Grasps that are not verified are ignored.
-
-        Raises:
-            FormatError: the library cannot be read or written.
+        Grasps that are not verified are ignored. Return the new number of grasps of the entry. Raises FormatError: the
+        library cannot be read or written.
         """
         new = [replace(grasp, arm=None) for grasp in grasps if grasp.verdict is Verdict.VERIFIED]
         with self._reading(write=True) as base:

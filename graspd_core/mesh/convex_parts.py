@@ -8,7 +8,6 @@ bulges are within tolerance or there are enough parts. Then touching clusters ar
 from __future__ import annotations
 
 import heapq
-from dataclasses import dataclass
 from itertools import count
 
 import numpy as np
@@ -48,12 +47,8 @@ CHOICE = 12
 Points = Float[np.ndarray, "_ 3"]
 
 
-@dataclass(frozen=True)
-class _Cut:
-    """A plane that splits points by whether `points @ direction` is below or above `offset`."""
-
-    direction: Float[np.ndarray, "3"]
-    offset: float
+# The direction and offset of a plane. It splits points by whether `points @ direction` is below or above the offset.
+_Cut = tuple[Float[np.ndarray, "3"], float]
 
 
 def convex_parts(
@@ -102,9 +97,10 @@ def _cut_up(sdf: GridSDF, points: Points, tolerance: float, most: int) -> list[P
         if cut is None:
             done.append(cluster)
             continue
-        along = cluster @ cut.direction
-        sort(cluster[along <= cut.offset + OVERLAP])
-        sort(cluster[along >= cut.offset - OVERLAP])
+        direction, offset = cut
+        along = cluster @ direction
+        sort(cluster[along <= offset + OVERLAP])
+        sort(cluster[along >= offset - OVERLAP])
     return done + [cluster for _, _, cluster in heap]
 
 
@@ -140,7 +136,7 @@ def _promising_cuts(sdf: GridSDF, cluster: Points) -> list[_Cut]:
     left[(below < 4) | (above < 4) | thin] = np.inf
     best = left.argmin(1)
     order = [k for k in np.argsort(left.min(1)) if np.isfinite(left[k, best[k]])]
-    return [_Cut(directions[k], float(low[k] + share[best[k]] * span[k])) for k in order[:SHORTLIST]]
+    return [(directions[k], float(low[k] + share[best[k]] * span[k])) for k in order[:SHORTLIST]]
 
 
 def _sums_below(
@@ -154,7 +150,8 @@ def _sums_below(
 
 
 def _bulge_left(sdf: GridSDF, points: Points, cut: _Cut) -> float:
-    below = points @ cut.direction <= cut.offset
+    direction, offset = cut
+    below = points @ direction <= offset
     hulls = [hull for hull in (_hull(points[below]), _hull(points[~below])) if hull is not None]
     return float(sum(hull.area * _outside(sdf, _hull_samples(hull)).mean() for hull in hulls))
 

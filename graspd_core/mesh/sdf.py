@@ -59,28 +59,8 @@ class GridSDF:
         return GridSDF(*(x.to(device=device, dtype=dtype) for x in vars(self).values()))
 
 
-@dataclass(frozen=True)
-class GridLayout:
-    """Positions of the nodes of a grid, in the object frame.
-
-    Attributes:
-        counts: number of nodes along each axis.
-        origin: position of the first node [m].
-        spacing: side of a cubic cell [m].
-    """
-
-    counts: tuple[int, int, int]
-    origin: Float[np.ndarray, "3"]
-    spacing: float
-
-
 def build_sdf(
-    mesh: TriangleMesh,
-    *,
-    resolution: int = 48,
-    padding: float = PADDING,
-    device: torch.device | str = "cpu",
-    dtype: torch.dtype = torch.float32,
+    mesh: TriangleMesh, *, resolution: int = 48, padding: float = PADDING, dtype: torch.dtype = torch.float32
 ) -> GridSDF:
     """Sample a mesh's signed distance on at most `resolution`³ nodes, laid out by `grid_layout`.
 
@@ -93,24 +73,27 @@ def build_sdf(
         resolution: nodes per side for a cubic object. Other objects get as many nodes in all, and finer cells.
         padding: free space around the bounding box [m], limited to half the object's extent.
     """
-    layout = grid_layout(mesh, resolution, padding)
+    counts, origin, spacing = grid_layout(mesh, resolution, padding)
     centre = (mesh.vertices.min(0) + mesh.vertices.max(0)) / 2
     # About the centre: far from the origin, differences lose digits.
     centred = TriangleMesh(mesh.vertices - centre, mesh.faces)
-    axes = [x + layout.spacing * np.arange(n) for x, n in zip(layout.origin - centre, layout.counts, strict=True)]
+    axes = [x + spacing * np.arange(n) for x, n in zip(origin - centre, counts, strict=True)]
     nodes = np.stack(np.meshgrid(*axes, indexing="ij"))
-    closest, normals = _closest_to_nodes(make_surface(centred), nodes, layout.spacing)
+    closest, normals = _closest_to_nodes(make_surface(centred), nodes, spacing)
     offset = nodes - closest
-    inside = _inside(centred, nodes, _length(offset), layout.spacing)
-    field = _field(offset, normals, inside, layout.spacing)
-    half = (np.array(layout.counts) - 1) * layout.spacing / 2
-    return GridSDF(
-        *(torch.as_tensor(x, dtype=dtype, device=device) for x in (field, layout.origin, layout.spacing, half))
-    )
+    inside = _inside(centred, nodes, _length(offset), spacing)
+    field = _field(offset, normals, inside, spacing)
+    half = (np.array(counts) - 1) * spacing / 2
+    return GridSDF(*(torch.as_tensor(x, dtype=dtype) for x in (field, origin, spacing, half)))
 
 
-def grid_layout(mesh: TriangleMesh, resolution: int, padding: float = PADDING) -> GridLayout:
-    """Return the grid of finest cubic cells that covers the padded bounding box with at most `resolution`³ nodes."""
+def grid_layout(
+    mesh: TriangleMesh, resolution: int, padding: float = PADDING
+) -> tuple[tuple[int, int, int], Float[np.ndarray, "3"], float]:
+    """Return the grid of finest cubic cells that covers the padded bounding box with at most `resolution`³ nodes.
+
+    The grid is given by its number of nodes along each axis, its first node and the side of a cell [m].
+    """
     low, high = mesh.vertices.min(0), mesh.vertices.max(0)
     extent = float((high - low).max())
     sides = high - low + 2 * min(padding, extent / 2)
@@ -122,7 +105,7 @@ def grid_layout(mesh: TriangleMesh, resolution: int, padding: float = PADDING) -
         fine, spacing = (fine, middle) if count(middle).prod() <= resolution**3 else (middle, spacing)
     counts = count(spacing)
     x, y, z = counts.tolist()
-    return GridLayout((x, y, z), (low + high - (counts - 1) * spacing) / 2, spacing)
+    return (x, y, z), (low + high - (counts - 1) * spacing) / 2, spacing
 
 
 def sample_sdf(

@@ -42,17 +42,7 @@ def signed_distance(
     distance = np.linalg.norm(np.maximum(0.0, np.maximum(tree.low - points, points - tree.high)), axis=1)
     near = distance <= reach
     distance[near] = surface_distance(query.surface, points[near])
-    return np.where(inside(query, points), -distance, distance)
-
-
-def inside(query: DistanceQuery, points: Float[np.ndarray, "n 3"]) -> Bool[np.ndarray, "n"]:
-    """Return which points are inside by the winding number, without computing distances."""
-    return is_inside(query.tree, points)
-
-
-def unsigned_distance(query: DistanceQuery, points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n"]:
-    """Return the unsigned distance [m] to the nearest triangle, without computing the winding number."""
-    return surface_distance(query.surface, points)
+    return np.where(is_inside(tree, points), -distance, distance)
 
 
 # Points per call. libigl holds Python's global lock during a call, so this limits the wait of other threads (to 2 ms).

@@ -15,7 +15,7 @@ from scipy.spatial import QhullError
 from torch import Tensor
 
 from graspd_core.hands.fingers import find_fingers, placed_tips
-from graspd_core.hands.kinematics import drawn_back, forward, link_poses, make_kinematics, points_in_base
+from graspd_core.hands.kinematics import drawn_back, forward, link_poses, make_kinematics, place_points, placement
 from graspd_core.hands.model import HandModel
 from graspd_core.mesh.convex_parts import hull_surface
 from graspd_core.mesh.mesh_files import surface_samples
@@ -258,8 +258,8 @@ def between_fingertips(hand: HandModel, joints: Joints) -> Positions:
     fingers = find_fingers(hand)
     travel = placed_tips(hand, fingers, hand.closed_posture) - placed_tips(hand, fingers, hand.open_posture)
     along = torch.as_tensor(travel @ closing_axis(hand))
-    kinematics = make_kinematics(hand, dtype=torch.float64)
-    tips = points_in_base(kinematics, joints, torch.as_tensor(fingers.points), torch.as_tensor(fingers.links))
+    matrix = placement(hand.num_links, torch.as_tensor(fingers.points), torch.as_tensor(fingers.links))
+    tips = place_points(matrix, forward(make_kinematics(hand, dtype=torch.float64), joints))
     sides = [tips[:, side].mean(1) for side in (along > 0, along <= 0) if side.any()]
     return torch.stack(sides).mean(0)
 

@@ -242,7 +242,7 @@ def object_sdf(model: ObjectModel, resolution: int = 48) -> GridSDF:
         return {name: tensor.numpy() for name, tensor in vars(sdf).items()}
 
     def valid(arrays: cache.Arrays) -> bool:
-        counts = grid_layout(model.mesh, resolution).counts
+        counts, _, _ = grid_layout(model.mesh, resolution)
         shapes = {"field": (4, *counts), "origin": (3,), "spacing": (), "half": (3,)}
         return {name: array.shape for name, array in arrays.items()} == shapes
 

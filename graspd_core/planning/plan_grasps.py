@@ -53,7 +53,8 @@ def planning_scene(scene: Scene, resolution: int) -> tuple[Scene, Float[np.ndarr
     if not 8 <= resolution <= 256:
         raise ConfigError(f"resolution: {resolution} nodes; valid: 8 to 256")
     scene, far = near_scene(scene)
-    same_grid = tuple(scene.sdf.field.shape[1:]) == grid_layout(scene.object.mesh, resolution).counts
+    counts, _, _ = grid_layout(scene.object.mesh, resolution)
+    same_grid = tuple(scene.sdf.field.shape[1:]) == counts
     if same_grid and not far.any():
         return scene, far
     sdf = object_sdf(scene.object, resolution).to(scene.sdf.field.device, scene.sdf.field.dtype)

@@ -49,10 +49,7 @@ def remember(key: str, build: Callable[[], Arrays], valid: Callable[[Arrays], bo
         arrays = build()
         if path:
             _write(path, arrays)
-    with _lock:
-        _memory[key] = arrays
-        while len(_memory) > CAPACITY:
-            _memory.popitem(last=False)
+    supply({key: arrays})
     return arrays
 
 
@@ -63,7 +60,7 @@ def contents() -> dict[str, Arrays]:
 
 
 def supply(arrays: dict[str, Arrays]) -> None:
-    """Add arrays that another process built to the memory of this process."""
+    """Add arrays, which another process may have built, to the memory of this process."""
     with _lock:
         _memory.update(arrays)
         while len(_memory) > CAPACITY:

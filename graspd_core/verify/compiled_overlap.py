@@ -13,7 +13,7 @@ from functools import lru_cache
 import numpy as np
 from jaxtyping import Float, Int, UInt8
 
-from graspd_core.hands.link_distance import hull_planes
+from graspd_core.hands.link_distance import core_of, hull_planes
 from graspd_core.hands.model import HandModel, Primitive
 from graspd_core.mesh.surface_queries import DistanceQuery, make_distance_query
 from graspd_core.mesh.surface_queries import signed_distance as python_distance
@@ -29,9 +29,7 @@ _NODE = 15
 class CompiledQuery:
     """A mesh prepared for distance queries by the kernel, safe to use from several threads.
 
-    Attributes:
-        library: the kernel.
-        surface: addresses of `nodes` and `triangles`, as the kernel expects them.
+    `surface` holds the addresses of `nodes` and `triangles`, as the kernel expects them.
     """
 
     library: CDLL
@@ -95,10 +93,12 @@ def compiled_hand(hand: HandModel) -> CompiledHand:
     poses = [np.column_stack([solid.rotation, solid.translation]).ravel() for solid in solids]
     planes = [np.column_stack(hull_planes(solid)) if solid.kind == "hull" else np.zeros((0, 4)) for solid in solids]
     starts = np.cumsum([0, *(len(some) for some in planes)])
-    cores = [_core(solid) for solid in solids]
+    cores = [core_of(solid) for solid in solids]
     arrays = (
-        *(_doubles(values) for values in (poses, [_ball(solid) for solid in solids], cores)),
-        _doubles([solid.size[0] if solid.kind in ("sphere", "capsule") else 0.0 for solid in solids]),
+        _doubles(poses),
+        _doubles([_ball(solid) for solid in solids]),
+        _doubles([core for core, _ in cores]),
+        _doubles([radius for _, radius in cores]),
         *(
             np.array(values, dtype=np.int32)
             for values in ([solid.kind == "cylinder" for solid in solids], [solid.link for solid in solids], starts)
@@ -111,15 +111,6 @@ def compiled_hand(hand: HandModel) -> CompiledHand:
 
 def _doubles(values: object) -> np.ndarray:
     return np.ascontiguousarray(values, dtype=float)
-
-
-def _core(solid: Primitive) -> tuple[float, ...]:
-    """Return a primitive's half extents along its own axes [m], of a sphere or capsule without the radius."""
-    if solid.kind == "box":
-        return solid.size
-    if solid.kind == "cylinder":
-        return (solid.size[0], *solid.size)
-    return (0.0, 0.0, solid.size[1] if solid.kind == "capsule" else 0.0)
 
 
 def _ball(solid: Primitive) -> tuple[float, ...]:

@@ -12,7 +12,7 @@ from __future__ import annotations
 import math
 from collections import deque
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -207,9 +207,7 @@ def axis_name(direction: np.ndarray) -> str:
 def set_hand_pose(world: World, data: Any, posture: Posture) -> None:
     """Set base pose, joint values and joint targets to a posture. The caller must run `mj_forward`."""
     set_joints(world, data, posture.joint_positions)
-    data.mocap_pos[0] = posture.position
-    data.mocap_quat[0] = posture.quaternion_wxyz
-    data.ctrl[:] = posture.joint_positions
+    set_targets(data, posture)
 
 
 def place_hand(world: World, data: Any, posture: Posture) -> None:
@@ -231,9 +229,8 @@ def set_joints(world: World, data: Any, values: np.ndarray) -> None:
 def _move(world: World, data: Any, start: Posture, end: Posture, protocol: Protocol, worst: np.ndarray) -> str:
     """Move the hand's targets linearly from start to end. Return why the trial failed, empty if it did not."""
     steps = round(protocol.stage_time / protocol.timestep)
-    path = straight_path(start, end, np.arange(1, steps + 1) / steps)
-    for step in range(1, steps + 1):
-        set_targets(data, path, step - 1)
+    for step, posture in enumerate(straight_path(start, end, np.arange(1, steps + 1) / steps), 1):
+        set_targets(data, posture)
         advance(world, data)
         if step % CHECK_EVERY == 0:
             reason = breach(world, data, protocol, worst)
@@ -242,33 +239,23 @@ def _move(world: World, data: Any, start: Posture, end: Posture, protocol: Proto
     return ""
 
 
-@dataclass(frozen=True, eq=False)
-class PosturePath:
-    """Base poses (wxyz, [m]) and joint targets [rad] or [m] along the path between two postures."""
-
-    positions: Float[np.ndarray, "n 3"]
-    quaternions: Float[np.ndarray, "n 4"]
-    joints: Float[np.ndarray, "n joints"]
-
-
-def straight_path(start: Posture, end: Posture, shares: Float[np.ndarray, "n"]) -> PosturePath:
+def straight_path(start: Posture, end: Posture, shares: Float[np.ndarray, "n"]) -> list[Posture]:
     """Return the postures at the fractions `shares` of the straight path from start to end."""
     a = shares[:, None]
     # Take the shorter rotation of the base. A quaternion and its negative are the same rotation.
     sign = 1.0 if start.quaternion_wxyz @ end.quaternion_wxyz >= 0 else -1.0
+    positions = (1 - a) * start.position + a * end.position
     quaternions = (1 - a) * start.quaternion_wxyz + a * sign * end.quaternion_wxyz
-    return PosturePath(
-        (1 - a) * start.position + a * end.position,
-        quaternions / np.linalg.norm(quaternions, axis=1, keepdims=True),
-        (1 - a) * start.joint_positions + a * end.joint_positions,
-    )
+    quaternions /= np.linalg.norm(quaternions, axis=1, keepdims=True)
+    joints = (1 - a) * start.joint_positions + a * end.joint_positions
+    return [Posture(*at) for at in zip(positions, quaternions, joints, strict=True)]
 
 
-def set_targets(data: Any, path: PosturePath, index: int) -> None:
-    """Set base pose and joint targets to point `index` of the path."""
-    data.mocap_pos[0] = path.positions[index]
-    data.mocap_quat[0] = path.quaternions[index]
-    data.ctrl[:] = path.joints[index]
+def set_targets(data: Any, posture: Posture) -> None:
+    """Set base pose and joint targets to a posture."""
+    data.mocap_pos[0] = posture.position
+    data.mocap_quat[0] = posture.quaternion_wxyz
+    data.ctrl[:] = posture.joint_positions
 
 
 def diverged(data: Any) -> bool:

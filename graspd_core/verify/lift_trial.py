@@ -29,7 +29,6 @@ from graspd_core.verify.hold_trial import (
     posture_fault,
     self_fault,
     set_hand_pose,
-    set_joints,
     set_targets,
     step_until_known,
     straight_path,
@@ -120,11 +119,16 @@ def _raise(
 ) -> str:
     """Approach, close, squeeze and lift. Return why the trial failed, empty if it did not. Update `worst`."""
     away, touched = (begin.position - grasp.pregrasp.position) / settings.retreat, False
-    for name, start, end, duration in _stages(begin, grasp, protocol, settings):
+    stages = (
+        (_COMING, begin, grasp.pregrasp, settings.approach_time),
+        (_CLOSING, grasp.pregrasp, grasp.grasp, protocol.stage_time),
+        (_SQUEEZING, grasp.grasp, grasp.squeeze, protocol.stage_time),
+        (_LIFTING, grasp.squeeze, grasp.squeeze, settings.lift_time),
+    )
+    for name, start, end, duration in stages:
         steps = round(duration / protocol.timestep)
-        path = straight_path(start, end, np.arange(1, steps + 1) / steps)
-        for step in range(1, steps + 1):
-            set_targets(data, path, step - 1)
+        for step, posture in enumerate(straight_path(start, end, np.arange(1, steps + 1) / steps), 1):
+            set_targets(data, posture)
             if name == _LIFTING:
                 _sink(world, data, away if world.up is None else world.up, step / steps, settings)
             advance(world, data)
@@ -142,18 +146,6 @@ def _raise(
 
 def _said(reason: str, stage: str) -> str:
     return f"{reason} {stage}" if reason and reason != STOPPED else reason
-
-
-def _stages(
-    begin: Posture, grasp: Grasp, protocol: Protocol, settings: LiftSettings
-) -> tuple[tuple[str, Posture, Posture, float], ...]:
-    """Return name, start, end and duration [s] of each stage before the final hold."""
-    return (
-        (_COMING, begin, grasp.pregrasp, settings.approach_time),
-        (_CLOSING, grasp.pregrasp, grasp.grasp, protocol.stage_time),
-        (_SQUEEZING, grasp.grasp, grasp.squeeze, protocol.stage_time),
-        (_LIFTING, grasp.squeeze, grasp.squeeze, settings.lift_time),
-    )
 
 
 def _touches(world: World, data: Any) -> bool:
@@ -181,10 +173,8 @@ def reach_through(world: World, data: Any, postures: tuple[Posture, ...], limit:
 
     worst, reason = 0.0, ""
     for (start, end), name in zip(pairwise(postures), (_COMING, _CLOSING), strict=True):
-        path = straight_path(start, end, np.array([*_SHARES, 1.0]))
-        for index in range(len(path.positions)):
-            set_targets(data, path, index)
-            set_joints(world, data, data.ctrl)
+        for posture in straight_path(start, end, np.array([*_SHARES, 1.0])):
+            set_hand_pose(world, data, posture)
             mujoco.mj_kinematics(world.model, data)
             for geom, said in world.obstacles:
                 depth = max(-mujoco.mj_geomDistance(world.model, data, geom, g, 0.0, None) for g in world.hand_geoms)

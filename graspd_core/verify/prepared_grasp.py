@@ -28,7 +28,7 @@ from graspd_core.hands.model import HandModel, Primitive
 from graspd_core.hands.surface_points import kept_dense_samples
 from graspd_core.mesh.mesh_files import surface_samples
 from graspd_core.mesh.sharp_features import crease_points, farthest_points, neighbours_together
-from graspd_core.mesh.surface_queries import DistanceQuery, inside, unsigned_distance
+from graspd_core.mesh.surface_queries import DistanceQuery, is_inside, surface_distance
 from graspd_core.mesh.topology import packed_rows
 from graspd_core.optimize.kernel.builds import kernel
 from graspd_core.perception.scene import ObjectModel
@@ -284,8 +284,8 @@ def intersection_volume(context: MetricsContext, placed: PlacedHand) -> float:
             depths = deepest, -signed_distance(context.query, centers[first])
             in_hand, in_object = (np.clip(0.5 + depth / _CELL, 0.0, 1.0) for depth in depths)
             return float(np.maximum(in_hand + in_object - 1.0, 0.0).sum()) * _CELL**3
-        kept = unsigned_distance(context.query, centers[first]) < half_diagonal
-        kept[~kept] = inside(context.query, centers[first[~kept]])
+        kept = surface_distance(context.query.surface, centers[first]) < half_diagonal
+        kept[~kept] = is_inside(context.query.tree, centers[first[~kept]])
         kept = kept[same]
         size //= 2
         cells, which = _halve(cells[kept], size), np.repeat(which[kept], 8)
@@ -298,13 +298,9 @@ def _near_box(query: DistanceQuery, points: Float[np.ndarray, "n 3"], margin: fl
 
 @dataclass(frozen=True, eq=False)
 class _PlacedSolids:
-    """The collision primitives of a hand at its grasp, hulls last.
+    """A hand's primitives at its grasp, hulls last, with their poses in the object frame [m].
 
-    Attributes:
-        primitives: the hand's primitives.
-        rotations: `R_object_primitive`.
-        translations: primitive origins, object frame [m].
-        smooth: the primitives that are not hulls, for distance queries.
+    `smooth` are those that are not hulls, for distance queries.
     """
 
     primitives: tuple[Primitive, ...]
@@ -447,23 +443,16 @@ def cone_wrenches(
     return np.concatenate([forces, torques], -1).reshape(-1, 6)
 
 
-# Greatest number of contacts in the wrench hull, in planning and in benchmarks. A hull of 32 contacts has some 22,000
-# facets, takes five times as long and raises ε by a tenth (docs/metrics.md).
-MAX_CONTACTS, PROTOCOL_CONTACTS = 16, 32
+# Greatest number of contacts in the wrench hull. A hull of 32 contacts has some 22,000 facets, takes five times as long
+# and raises ε by a tenth (docs/metrics.md).
+MAX_CONTACTS = 16
 # Half the distance of a central difference [m].
 _STEP = 2e-4
 
 
 @dataclass(frozen=True, eq=False)
 class PreparedGrasp:
-    """A hand at a grasp, with the quantities that metrics share.
-
-    Attributes:
-        context: the object and the hand.
-        posture: posture of the hand.
-        placed: the hand's samples, object frame.
-        max_contacts: greatest number of contacts in the wrench hull.
-    """
+    """A hand at a grasp, with the quantities that metrics share."""
 
     context: MetricsContext
     posture: Posture

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Collection, Mapping
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 from geometry_msgs.msg import Pose
@@ -27,19 +27,14 @@ MOST_OBJECTS = 1000
 _SIZES = {SolidPrimitive.BOX: 3, SolidPrimitive.SPHERE: 1, SolidPrimitive.CYLINDER: 2, SolidPrimitive.CONE: 2}
 
 
-def mesh_shapes(shapes: Collection[Mesh], poses: Collection[Pose], owner: str) -> list[TriangleMesh]:
-    """Return meshes at their poses, or at the origin without. Raises RequestError about `owner`: one is invalid."""
-    return _placed("mesh", _mesh, shapes, poses, owner)
-
-
-def primitive_shapes(shapes: Collection[SolidPrimitive], poses: Collection[Pose], owner: str) -> list[TriangleMesh]:
-    """Return the meshes of primitives at their poses. Raises RequestError about `owner`: one is invalid."""
-    return _placed("primitive", _primitive, shapes, poses, owner)
-
-
-def _placed(
-    kind: str, make: Callable[[Any, str], TriangleMesh], shapes: Collection[Any], poses: Collection[Pose], owner: str
+def placed_shapes(
+    kind: Literal["mesh", "primitive"], shapes: Collection[Any], poses: Collection[Pose], owner: str
 ) -> list[TriangleMesh]:
+    """Return the meshes of shapes at their poses, or at the origin without.
+
+    Raises RequestError about `owner`: a shape or pose is invalid, or their numbers differ.
+    """
+    make = _mesh if kind == "mesh" else _primitive
     if len(poses) not in (0, len(shapes)):
         raise bad_message(owner, f"{kind}_poses: {len(poses)} poses for {len(shapes)} shapes; give one for each shape")
     parts = [make(shape, owner) for shape in shapes]
@@ -120,13 +115,7 @@ def with_support(load: Callable[[], Scene], plane: Plane | None) -> Callable[[],
 
 @dataclass(frozen=True, eq=False)
 class SceneObject:
-    """Collision object of the planning scene.
-
-    Attributes:
-        frame: frame of the pose.
-        T_frame_object: pose of the object in `frame` [m].
-        shapes: meshes in the object's own frame [m].
-    """
+    """Collision object of the planning scene. Its shapes are in its own frame [m]."""
 
     frame: str
     T_frame_object: Matrix
@@ -159,8 +148,8 @@ def updated_objects(objects: Mapping[str, SceneObject], message: Any) -> Mapping
 def _changed(there: SceneObject | None, message: Any, owner: str) -> SceneObject:
     if message.planes:
         raise bad_message(owner, "planes: infinite planes are not supported; give a box, or the request's surface")
-    solids = primitive_shapes(message.primitives, message.primitive_poses, owner)
-    shapes = (*solids, *mesh_shapes(message.meshes, message.mesh_poses, owner))
+    solids = placed_shapes("primitive", message.primitives, message.primitive_poses, owner)
+    shapes = (*solids, *placed_shapes("mesh", message.meshes, message.mesh_poses, owner))
     # As in MoveIt, appended shapes are relative to the object's existing pose.
     if message.operation == message.APPEND and there is not None:
         return replace(there, shapes=(*there.shapes, *shapes))

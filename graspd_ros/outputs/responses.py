@@ -46,7 +46,7 @@ from graspd_ros.outputs.moveit import attached_kind, attached_object
 from graspd_ros.parameters import Settings
 from graspd_ros.request import MOST_ID, Listener, Request
 from graspd_ros.request_planner import Planned
-from graspd_ros.worker import Admission, Refusal, Report, WorkerEnding
+from graspd_ros.worker import Admission, Report, WorkerEnding
 
 _ENDS = {
     GraspArray.SUCCEEDED: "requests succeeded",
@@ -60,11 +60,6 @@ _ENDS = {
 ACCEPTED, RECEIVED, SUPERSEDED = "requests accepted", "clouds received", "clouds superseded"
 VERIFIED, FAILED = "grasps verified", "grasps failed"
 COUNT_PERIOD = 1.0  # seconds between two reports of superseded clouds, or of unusable clouds
-_REFUSALS = {
-    Refusal.BUSY: ErrorCode.BUSY,
-    Refusal.DUPLICATE: ErrorCode.DUPLICATE_ID,
-    Refusal.STOPPING: ErrorCode.SHUTTING_DOWN,
-}
 _NEWER = "a newer request took its place"
 _ENDINGS = {
     WorkerEnding.CANCELLED: messages.AnswerEnding(GraspArray.CANCELLED, ErrorCode.CANCELLED, "cancelled"),
@@ -296,8 +291,8 @@ class Responses:
 
     def admitted(self, request: Request, admission: Admission) -> None:
         if admission.refusal is not None:
-            code, message = _REFUSALS[admission.refusal], admission.reason
-            self._refused(request.id, request.source, code, message)
+            code, message = admission.refusal, admission.reason
+            self.refused(request.id, request.source, code, message)
             ending = messages.AnswerEnding(GraspArray.REFUSED, code, message)
             self._publish(self._answer(request, ending), request.listener)
         elif not request.only_newest:
@@ -309,7 +304,7 @@ class Responses:
         if code is ErrorCode.INTERNAL:
             self.report_error(request_id[:MOST_ID], source, error)
         else:
-            self._refused(request_id[:MOST_ID], source, code, message)
+            self.refused(request_id[:MOST_ID], source, code, message)
         ending = messages.AnswerEnding(GraspArray.REFUSED, code, message)
         header = Header(stamp=self._now())
         self._publish(messages.array_message(ending, request_id[:MOST_ID], header, 0.0, self._hand, Pace()), listener)
@@ -320,15 +315,8 @@ class Responses:
             self._complained = time.monotonic()
             self.not_made(request_id, "cloud", error)
 
-    def collision_object_not_taken(self, error: Exception) -> None:
-        """Report an invalid collision-object message. The planning scene stays unchanged."""
-        self._refused("", "collision_objects", code_of(error), sentence_of(error))
-
-    def images_not_taken(self, reason: str) -> None:
-        """Report why no incoming depth image is used."""
-        self._refused("", "sensors", ErrorCode.NO_CLOUD, reason)
-
-    def _refused(self, request_id: str, source: str, code: ErrorCode, message: str) -> None:
+    def refused(self, request_id: str, source: str, code: ErrorCode, message: str) -> None:
+        """Report on `~/status` and in the log why a message is not used. The id is empty if it is no request."""
         self.publishers.emit("refused", request_id, source, code=code, message=message)
         self._log().warning(f"{request_id or source}: refused: {message}")
 

@@ -81,8 +81,8 @@ def arm_at() -> Callable[[SimulatedRobot, np.ndarray, np.ndarray], np.ndarray]:
     def find(robot: SimulatedRobot, place: np.ndarray, start: np.ndarray) -> np.ndarray:
         down = torch.tensor([[1.0, 0.0, 0.0], [0.0, -1.0, 0.0], [0.0, 0.0, -1.0]], dtype=torch.float64)
         target = SE3(down[None], torch.as_tensor(place)[None])
-        found = solve(robot.world.arm, target, torch.as_tensor(start)[None], 200)
-        assert bool(found.reached[0])
-        return found.q[0].double().numpy()
+        found, reached = solve(robot.world.arm, target, torch.as_tensor(start)[None], 200)
+        assert bool(reached[0])
+        return found[0].double().numpy()
 
     return find

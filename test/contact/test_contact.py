@@ -3,6 +3,8 @@
 Each is worked by hand and against finite differences; the support also against brute force over sampled cone forces.
 """
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import torch
@@ -20,11 +22,12 @@ from graspd_core.optimize.graspd2022.graspd2022 import (
     net_wrench,
     speed_left,
 )
+from graspd_core.optimize.graspd2022.graspd2022_config import ContactConfig
 from graspd_core.optimize.losses import disturbance_directions, wrench_support
 from graspd_core.se3 import random_rotations
 
-PUBLISHED = {"stiffness": 1e6, "friction_stiffness": 1e8, "friction": 0.8}
-SOFT = {"stiffness": 1e3, "friction_stiffness": 30.0, "friction": 0.8}
+PUBLISHED = ContactConfig(stiffness=1e6, friction_stiffness=1e8, friction=0.8, leak=0.1)
+SOFT = replace(PUBLISHED, stiffness=1e3, friction_stiffness=30.0)
 
 
 def draw(seed: int, points: int = 6) -> tuple[Tensor, Tensor, Tensor]:
@@ -43,8 +46,7 @@ def one_point(height: float, velocity: list[float], **constants: float) -> list[
         torch.tensor([[height]], dtype=torch.float64),
         torch.tensor([[[0.0, 0.0, 1.0]]], dtype=torch.float64),
         torch.tensor([velocity], dtype=torch.float64),
-        **{**PUBLISHED, **constants},
-        leak=0.1,
+        replace(PUBLISHED, **constants),
     )
     return force[0, 0, 0].tolist()
 
@@ -64,7 +66,7 @@ def test_one_point_by_hand():
 @given(seed=st.integers(0, 2**31))
 def test_forces_only_push_stay_in_the_cone_and_oppose_the_motion(seed):
     height, normals, velocities = draw(seed)
-    forces = contact_forces(height, normals, velocities, **PUBLISHED, leak=0.1)
+    forces = contact_forces(height, normals, velocities, PUBLISHED)
     along = (forces * normals[:, :, None]).sum(-1)
     side = (forces - along[..., None] * normals[:, :, None]).norm(dim=-1)
     # Forces up to 1e4 N round to 1e-12, more where the motion is nearly along the normal: the square of the slip is
@@ -81,20 +83,20 @@ def test_forces_only_push_stay_in_the_cone_and_oppose_the_motion(seed):
 def test_turning_everything_turns_the_forces(seed):
     height, normals, velocities = draw(seed)
     turn = random_rotations(1, torch.Generator().manual_seed(seed), torch.float64)[0]
-    here = contact_forces(height, normals, velocities, **SOFT, leak=0.1) @ turn.T
-    there = contact_forces(height, normals @ turn.T, velocities @ turn.T, **SOFT, leak=0.1)
+    here = contact_forces(height, normals, velocities, SOFT) @ turn.T
+    there = contact_forces(height, normals @ turn.T, velocities @ turn.T, SOFT)
     assert there.numpy() == pytest.approx(here.numpy(), abs=1e-12)
 
 
-@pytest.mark.parametrize("constants", [PUBLISHED, SOFT], ids=["published", "soft"])
+@pytest.mark.parametrize("contact", [PUBLISHED, SOFT], ids=["published", "soft"])
 @pytest.mark.parametrize("seed", range(3))
-def test_gradients_of_the_forces(constants, seed):
+def test_gradients_of_the_forces(contact, seed):
     height, normals, velocities = draw(seed)
     # Without a leak the gradient is that of the forward pass; 0.1 mm from the surface no difference crosses it.
     height = torch.where(height.abs() < 1e-4, 1e-3, height).requires_grad_(True)
     inputs = height, normals.requires_grad_(True), velocities[1:].requires_grad_(True)
-    scale = 1 / constants["stiffness"]
-    assert gradcheck(lambda h, n, v: scale * contact_forces(h, n, v, **constants, leak=0.0), inputs, eps=1e-8)
+    scale, exact = 1 / contact.stiffness, replace(contact, leak=0.0)
+    assert gradcheck(lambda h, n, v: scale * contact_forces(h, n, v, exact), inputs, eps=1e-8)
 
 
 @given(leak=st.floats(0.0, 1.0), seed=st.integers(0, 2**31))
@@ -115,7 +117,7 @@ def test_the_leak_reaches_normal_force_and_friction():
     slopes = []
     for height in (-0.001, 0.001):
         at = torch.tensor([[height]], dtype=torch.float64, requires_grad=True)
-        forces = contact_forces(at, up, velocities, **PUBLISHED, leak=0.1)[0, 0, 0]
+        forces = contact_forces(at, up, velocities, PUBLISHED)[0, 0, 0]
         slopes.append([torch.autograd.grad(f, at, retain_graph=True)[0].item() for f in forces])
     assert slopes[0] == pytest.approx([0.8e6, 0.0, 1e6])
     assert slopes[1] == pytest.approx([0.08e6, 0.0, 0.1e6])
@@ -128,7 +130,7 @@ def test_nothing_is_not_a_number_without_motion_or_normal():
     normals.requires_grad_(True)
     # No motion at all, and motion along the normal: nothing slides.
     velocities = torch.tensor([[0.0, 0.0, 0.0], [0.01, 0.0, 0.0]], dtype=torch.float64, requires_grad=True)
-    forces = contact_forces(height, normals, velocities, **PUBLISHED, leak=0.1)
+    forces = contact_forces(height, normals, velocities, PUBLISHED)
     gradients = torch.autograd.grad(forces.sum(), (height, normals, velocities))
     assert forces.isfinite().all()
     assert all(gradient.isfinite().all() for gradient in gradients)
@@ -136,8 +138,8 @@ def test_nothing_is_not_a_number_without_motion_or_normal():
 
 def test_single_and_double_precision_of_the_forces_agree():
     height, normals, velocities = draw(1, points=60)
-    double = contact_forces(height, normals, velocities, **PUBLISHED, leak=0.1)
-    single = contact_forces(height.float(), normals.float(), velocities.float(), **PUBLISHED, leak=0.1)
+    double = contact_forces(height, normals, velocities, PUBLISHED)
+    single = contact_forces(height.float(), normals.float(), velocities.float(), PUBLISHED)
     # Forces up to 1e4 N; the tangential speed loses half the digits where the motion is along the normal.
     assert single.double().numpy() == pytest.approx(double.numpy(), rel=2e-4, abs=1e-2)
 
@@ -158,10 +160,7 @@ def pushed(velocity: list[float], contact: list[float]) -> tuple[list[float], li
     """Velocities of the ball after a step in which a point 1 mm below its surface, towards `contact`, pushes it."""
     normal = torch.tensor([[contact]], dtype=torch.float64)
     velocities = torch.tensor([velocity], dtype=torch.float64)
-    forces = contact_forces(
-        torch.tensor([[-0.001]], dtype=torch.float64),
-        normal, velocities, stiffness=1e6, friction_stiffness=1e8, friction=0.8, leak=0.1,
-    )  # fmt: skip
+    forces = contact_forces(torch.tensor([[-0.001]], dtype=torch.float64), normal, velocities, PUBLISHED)
     force, torque = net_wrench(forces, (RADIUS - 0.001) * normal)
     linear, angular = euler_step(ball(), velocities, torch.zeros_like(velocities), force, torque, STEP)
     return linear[0, 0].tolist(), angular[0, 0].tolist()

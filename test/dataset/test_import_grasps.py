@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 import pytest
 import yaml
+from inputs_made import Evil
 from scipy.spatial.transform import Rotation
 
 from graspd_core import Posture, Verdict, load_grasps, load_hand, load_scene, plan_grasps
@@ -190,16 +191,6 @@ def test_a_frame_in_doubt_is_named_and_no_share_is_printed_for_it(shifted: Path,
     (line,) = [line for line in printed.splitlines() if "| imported, frame in doubt |" in line]
     assert "%" not in line
     assert told in printed
-
-
-class Evil:
-    """Pickles as a call of a function of one's choice."""
-
-    def __init__(self, function: Any, *arguments: Any) -> None:
-        self.call = function, arguments
-
-    def __reduce__(self) -> Any:
-        return self.call
 
 
 def test_a_file_that_runs_code_is_refused_and_runs_nothing(exported, tmp_path: Path):

@@ -20,7 +20,6 @@ from graspd_core.hands.kinematics import (
     place_points,
     placement,
     point_jacobian,
-    points_in_base,
 )
 from graspd_core.hands.library import load_hand
 from graspd_core.hands.link_distance import (
@@ -237,12 +236,10 @@ def test_link_poses_are_rigid_and_placing_agrees_with_them(allegro: HandModel, s
     eye = torch.eye(3, dtype=torch.float64).expand_as(rotations)
     torch.testing.assert_close(rotations @ rotations.mT, eye, atol=1e-12, rtol=0)
     expected = (rotations[:, links] @ torch.as_tensor(points)[None, :, :, None]).squeeze(-1)
-    turned = place_points(
-        placement(allegro.num_links, torch.as_tensor(points), torch.as_tensor(links), directions=True),
-        poses,
-    )
+    given = allegro.num_links, torch.as_tensor(points), torch.as_tensor(links)
+    turned = place_points(placement(*given, directions=True), poses)
     torch.testing.assert_close(turned, expected, atol=1e-12, rtol=0)
-    moved = points_in_base(kinematics, torch.as_tensor(q), torch.as_tensor(points), torch.as_tensor(links))
+    moved = place_points(placement(*given), poses)
     torch.testing.assert_close(moved, expected + translations[:, links], atol=1e-12, rtol=0)
 
 
@@ -251,9 +248,10 @@ def test_point_jacobian_is_the_derivative(moving: HandModel) -> None:
     q = _random_q(moving, 1, 3)[0]
     points, links = rng.normal(size=(25, 3)) * 0.05, rng.integers(0, moving.num_links, 25)
     kinematics = make_kinematics(moving, dtype=torch.float64)
+    matrix = placement(moving.num_links, torch.as_tensor(points), torch.as_tensor(links))
 
     def positions(x: torch.Tensor) -> torch.Tensor:
-        return points_in_base(kinematics, x[None], torch.as_tensor(points), torch.as_tensor(links))[0]
+        return place_points(matrix, forward(kinematics, x[None]))[0]
 
     expected = torch.autograd.functional.jacobian(positions, torch.as_tensor(q))
     np.testing.assert_allclose(point_jacobian(moving, q, points, links), np.asarray(expected), atol=1e-12)

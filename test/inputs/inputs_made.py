@@ -25,6 +25,16 @@ GITHUB = "https://github.com/"
 FRAME, OTHER_FRAME, STAMP = "camera_optical_frame", "other_optical_frame", 1_700_000_000 * SECOND
 
 
+class Evil:
+    """Pickles as a call of a function of one's choice."""
+
+    def __init__(self, function: Any, *arguments: Any) -> None:
+        self.call = function, arguments
+
+    def __reduce__(self) -> Any:
+        return self.call
+
+
 @dataclass(frozen=True)
 class Situation:
     """An input and what a person would expect of it.

@@ -146,7 +146,7 @@ CLOUDS = (
     Situation(
         "another array",
         array_file("a.npz", lambda: {"xyz": rows_of()}),
-        "no array called 'points', 'depth' or 'depths'",
+        "no array called 'points', 'depth' or 'depths'; it has: xyz",
         "NVlabs/6dof-graspnet/issues/7",
     ),
     Situation(
@@ -367,7 +367,7 @@ DRIVERS = (
     Situation(
         "points with colours, n by 6",
         array_file("a.npy", lambda: np.hstack([rows_of(), np.full((76800, 3), 128.0)])),
-        "colours or normals beside x, y, z",
+        r"colours or normals beside x, y, z\? .*points\[:, :3\]",
         "YanjieZe/Improved-3D-Diffusion-Policy/issues/24",
     ),
     Situation(

@@ -221,14 +221,14 @@ def test_a_sheet_has_no_inside():
 def test_cells_are_the_finest_that_cover_any_box(sides, resolution):
     corners = np.array([(0, 0, 0), sides]) + 5.0
     mesh = TriangleMesh(np.vstack([corners, corners[:1]]), np.array([[0, 1, 2]]))
-    layout = grid_layout(mesh, resolution)
+    counts, origin, spacing = grid_layout(mesh, resolution)
     padding = min(PADDING, max(sides) / 2)
-    reach = (np.array(layout.counts) - 1) * layout.spacing
-    assert np.prod(layout.counts) <= resolution**3
-    assert (layout.origin <= corners[0] - padding + 1e-6).all()
-    assert (layout.origin + reach >= corners[1] + padding - 1e-6).all()
-    assert layout.origin + reach / 2 == pytest.approx(corners.mean(0))
-    finer = np.ceil((np.array(sides) + 2 * padding) / (layout.spacing * (1 - 1e-6))) + 1
+    reach = (np.array(counts) - 1) * spacing
+    assert np.prod(counts) <= resolution**3
+    assert (origin <= corners[0] - padding + 1e-6).all()
+    assert (origin + reach >= corners[1] + padding - 1e-6).all()
+    assert origin + reach / 2 == pytest.approx(corners.mean(0))
+    finer = np.ceil((np.array(sides) + 2 * padding) / (spacing * (1 - 1e-6))) + 1
     assert finer.prod() > resolution**3
 
 

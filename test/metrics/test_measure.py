@@ -24,7 +24,6 @@ from graspd_core.types import Grasp, GraspMetrics, Posture, TriangleMesh
 from graspd_core.verify.compiled_overlap import CompiledQuery
 from graspd_core.verify.metrics import distinct, measure
 from graspd_core.verify.prepared_grasp import (
-    PROTOCOL_CONTACTS,
     compiled_hull,
     cone_wrenches,
     contact_area,
@@ -368,7 +367,7 @@ def test_area_over_volume_of_a_block_sunk_into_a_face(block, box, at):
 
 def test_more_contacts_only_widen_the_wrench_hull(gripper, box, at):
     context, posture = make_metrics_context(as_object(box), gripper), at((0, 0, -0.05), (0.0145, 0.0145))
-    few, many = (measure(context, posture, max_contacts=count) for count in (8, PROTOCOL_CONTACTS))
+    few, many = (measure(context, posture, max_contacts=count) for count in (8, 32))
     # Farthest points are nested: the first eight are among the first 32. Joggled by 1e-10.
     assert some(many["epsilon"]) >= some(few["epsilon"]) - 1e-8
     assert some(many["volume"]) > some(few["volume"])
@@ -449,7 +448,7 @@ def test_a_hull_that_rounding_spoils_is_refused_or_right(joggle):
         assert found[8] > 1e-9 or found[7] == pytest.approx(ConvexHull(points).volume, rel=1e-6)
 
 
-@given(seed=st.integers(0, 2**31), contacts=st.integers(3, PROTOCOL_CONTACTS))
+@given(seed=st.integers(0, 2**31), contacts=st.integers(3, 32))
 @settings(max_examples=20)
 def test_the_compiled_hull_is_qhull_s(seed, contacts):
     rng = np.random.default_rng(seed)

@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from graspd_core import load_hand, load_preset, load_scene, override, plan_grasps
+from graspd_core import load_preset, load_scene, override, plan_grasps
 from graspd_core.errors import ConfigError
 from graspd_core.runtime import disk_cache as cache
 from graspd_core.types import Grasp, GraspResult, Outcome, Plane, Progress, Stage, Verdict
@@ -15,11 +15,6 @@ from graspd_core.verify import verification
 
 # A search that nobody waits for.
 ENDLESS = replace(load_preset("fast"), settings=replace(load_preset("fast").settings, refine_steps=10**7))
-
-
-@pytest.fixture(scope="module")
-def hand():
-    return load_hand("allegro_right", candidates=load_preset("fast").problem.fine_candidates)
 
 
 @pytest.fixture(scope="module")

@@ -133,7 +133,7 @@ def as_bytes(pixels: np.ndarray, order: str, padding: int) -> tuple[memoryview, 
 
 
 @given(
-    st.sampled_from(["16UC1", "mono16", "32FC1"]),
+    st.sampled_from(["16UC1", "mono16", "32FC1", "64FC1"]),
     st.sampled_from("<>"),
     st.integers(0, 9),
     st.integers(1, 5),
@@ -142,7 +142,8 @@ def as_bytes(pixels: np.ndarray, order: str, padding: int) -> tuple[memoryview, 
 )
 def test_any_layout_comes_back_in_metres(encoding, order, padding, height, width, seed):
     millimetres = np.random.default_rng(seed).integers(0, 2**16, (height, width))
-    pixels = millimetres.astype("u2") if encoding != "32FC1" else (millimetres / 1000).astype("f4")
+    kind = {"32FC1": "f4", "64FC1": "f8"}.get(encoding)
+    pixels = (millimetres / 1000).astype(kind) if kind else millimetres.astype("u2")
     data, step = as_bytes(pixels, order, padding)
     sizes = {"width": width, "height": height, "step": step}
     depth = depth_from_message(SimpleNamespace(data=data, encoding=encoding, is_bigendian=order == ">", **sizes))

@@ -1,5 +1,6 @@
 """Clouds are refused, cleaned and moved, in messages of any layout. More: test/ros/inputs/test_sensor_frames.py."""
 
+from collections.abc import Sequence
 from types import SimpleNamespace
 
 import numpy as np
@@ -88,21 +89,25 @@ def fields_of(places: dict[str, tuple[int, int]]) -> list[SimpleNamespace]:
     return [SimpleNamespace(name=name, offset=offset, datatype=kind) for name, (offset, kind) in places.items()]
 
 
-def message_of(points: np.ndarray, code: str, step: int, row_padding: int) -> SimpleNamespace:
-    """Return a PointCloud2 with the coordinates at the end of each point. All other bytes are junk."""
+def message_of(
+    points: np.ndarray, codes: Sequence[str], step: int, row_padding: int, axes: Sequence[int] = (0, 1, 2)
+) -> SimpleNamespace:
+    """Return a PointCloud2 with the coordinates at the end of each point, in the order of `axes`, else junk."""
     height, width, _ = points.shape
-    size, row_step = int(code[2]), width * step + row_padding
+    row_step = width * step + row_padding
     data = np.random.default_rng(1).integers(0, 256, height * row_step, dtype=np.uint8)
-    first = step - 3 * size
-    for axis in range(3):
-        np.ndarray((height, width), code, data, first + axis * size, (row_step, step))[...] = points[..., axis]
-    number = {4: 7, 8: 8}[size]
-    fields = {"rgb": (0, 6), **{name: (first + axis * size, number) for axis, name in enumerate("xyz")}}
+    fields, first = {"rgb": (0, 6)}, step - sum(int(code[2]) for code in codes)
+    for axis in axes:
+        size = int(codes[axis][2])
+        np.ndarray((height, width), codes[axis], data, first, (row_step, step))[...] = points[..., axis]
+        fields["xyz"[axis]] = (first, {4: 7, 8: 8}[size])
+        first += size
     sizes = {"width": width, "height": height, "point_step": step, "row_step": row_step}
-    return SimpleNamespace(is_bigendian=code[0] == ">", fields=fields_of(fields), data=data.tobytes(), **sizes)
+    return SimpleNamespace(is_bigendian=codes[0][0] == ">", fields=fields_of(fields), data=data.tobytes(), **sizes)
 
 
-layouts = st.tuples(st.sampled_from(["<f4", ">f4", "<f8", ">f8"]), st.integers(24, 40), st.integers(0, 9))
+types = st.sampled_from("<>").flatmap(lambda order: st.tuples(*[st.sampled_from([f"{order}f4", f"{order}f8"])] * 3))
+layouts = st.tuples(types, st.integers(24, 40), st.integers(0, 9), st.permutations(range(3)))
 
 
 @given(layouts, st.integers(1, 4), st.integers(1, 5), st.integers(0, 2**32 - 1))
@@ -128,7 +133,7 @@ def test_one_coordinate_that_is_not_finite_drops_the_point():
     points[0, 3] = np.inf, -np.inf, 0
     # The largest of finite numbers are finite.
     points[0, 4] = np.finfo(np.float64).max
-    kept = points_from_message(message_of(points, "<f8", 24, 0))
+    kept = points_from_message(message_of(points, ["<f8"] * 3, 24, 0))
     np.testing.assert_array_equal(kept, points[0, 4:])
 
 
@@ -148,7 +153,7 @@ def test_one_coordinate_that_is_not_finite_drops_the_point():
     ],
 )
 def test_contradictions_are_named(change, culprit):
-    good = message_of(np.ones((2, 3, 3)), "<f4", 24, 0)
+    good = message_of(np.ones((2, 3, 3)), ["<f4"] * 3, 24, 0)
     made = {key: fields_of(value) if key == "fields" else value for key, value in change.items()}
     with pytest.raises(CloudError) as refused:
         points_from_message(SimpleNamespace(**{**vars(good), **made}))
@@ -160,5 +165,5 @@ def test_contradictions_are_named(change, culprit):
 def test_a_camera_image_is_converted_without_looking_at_each_point(bytecodes, code, step):
     points = np.random.default_rng(0).normal(size=(480, 640, 3))
     points[::3, ::2] = np.nan
-    message = message_of(points, code, step, 0)
+    message = message_of(points, [code] * 3, step, 0)
     assert bytecodes(lambda: points_from_message(message)) < 480 * 640 / 10

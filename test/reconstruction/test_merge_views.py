@@ -9,13 +9,7 @@ from graspd_bench.rendering.tabletop import depth_views, ring_poses, tabletop
 from graspd_core import PinholeCamera, PointCloud, cloud_from_depth, make_shape
 from graspd_core.errors import CloudError
 from graspd_core.mesh.mesh_files import surface_samples
-from graspd_core.mesh.surface_queries import (
-    make_distance_query,
-    make_surface,
-    surface_distance,
-    unsigned_distance,
-    winding_inside,
-)
+from graspd_core.mesh.surface_queries import make_surface, surface_distance, winding_inside
 from graspd_core.perception.reconstruct.merge_views import Surfels, merge_views, point_step, thin
 from graspd_core.perception.reconstruct.poisson import BAND_CELLS, grid_poisson_field, march
 
@@ -28,7 +22,7 @@ VIEWS = [cloud_from_depth(depth, CAMERA, pose) for depth, pose in zip(DEPTHS, PO
 
 def test_merged_points_lie_on_the_surface_and_face_a_camera():
     merged = merge_views(VIEWS)
-    assert unsigned_distance(make_distance_query(SCENE.truth), merged.points).mean() < 0.0006
+    assert surface_distance(make_surface(SCENE.truth), merged.points).mean() < 0.0006
     assert np.linalg.norm(merged.normals, axis=1) == pytest.approx(np.ones(len(merged.points)))
     eyes = np.array([view.viewpoint for view in VIEWS])
     facing = ((eyes[None] - merged.points[:, None]) * merged.normals[:, None]).sum(-1)
@@ -48,9 +42,9 @@ def test_noise_along_the_line_of_sight_is_smoothed():
         ray = view.points - view.viewpoint
         ray /= np.linalg.norm(ray, axis=1, keepdims=True)
         noisy.append(PointCloud(view.points + rng.normal(0, 0.0015, (len(ray), 1)) * ray, view.viewpoint))
-    query = make_distance_query(SCENE.truth)
-    before = unsigned_distance(query, np.concatenate([view.points for view in noisy])).mean()
-    assert unsigned_distance(query, merge_views(noisy).points).mean() < 0.6 * before
+    surface = make_surface(SCENE.truth)
+    before = surface_distance(surface, np.concatenate([view.points for view in noisy])).mean()
+    assert surface_distance(surface, merge_views(noisy).points).mean() < 0.6 * before
 
 
 def test_flying_pixels_are_dropped():
@@ -60,7 +54,7 @@ def test_flying_pixels_are_dropped():
     few = rng.choice(len(ray), 60, replace=False)
     flying = view.viewpoint + ray[few] * rng.uniform(0.7, 0.93, (60, 1))
     merged = merge_views([PointCloud(np.vstack([view.points, flying]), view.viewpoint)], point_step([view]))
-    assert unsigned_distance(make_distance_query(SCENE.truth), merged.points).max() < 0.008
+    assert surface_distance(make_surface(SCENE.truth), merged.points).max() < 0.008
 
 
 def test_thinning_is_even_and_keeps_both_sides():

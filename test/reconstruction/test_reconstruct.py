@@ -17,7 +17,7 @@ from graspd_core.config import ReconstructionConfig
 from graspd_core.errors import CloudError
 from graspd_core.mesh.mesh_files import mass_properties, surface_samples
 from graspd_core.mesh.shapes import SHAPES, make_shape
-from graspd_core.mesh.surface_queries import inside, make_distance_query, unsigned_distance
+from graspd_core.mesh.surface_queries import make_surface, surface_distance, winding_inside
 from graspd_core.mesh.topology import is_closed
 from graspd_core.perception.cloud.free_space import FreeSpace, empty_depth, make_view_depths
 from graspd_core.perception.reconstruct.reconstruct import Reconstruction, reconstruct
@@ -51,7 +51,7 @@ def made(name: str, count: int = 1) -> Reconstruction:
 
 def distances(surface: TriangleMesh, other: TriangleMesh) -> np.ndarray:
     """From points of one surface to the other [m]."""
-    return unsigned_distance(make_distance_query(other), surface_samples(surface, 3000, 0)[0])
+    return surface_distance(make_surface(other), surface_samples(surface, 3000, 0)[0])
 
 
 @pytest.mark.parametrize("name", sorted(SHAPES))
@@ -65,7 +65,7 @@ def test_one_view_gives_a_closed_sane_solid(name):
     # Plain Poisson of depth 7 leaves two thirds of its surface beyond 10 mm, of such views.
     assert (distances(whole.mesh, scene.truth) > 0.01).mean() < 0.1
     assert (distances(scene.truth, whole.mesh) > 0.01).mean() < 0.1
-    assert unsigned_distance(make_distance_query(whole.mesh), views[0].points).mean() < 0.0015
+    assert surface_distance(make_surface(whole.mesh), views[0].points).mean() < 0.0015
 
 
 @pytest.mark.parametrize(
@@ -137,12 +137,11 @@ def test_many_views_keep_a_mug_hollow():
     scene, views = seen("mug", 15)
     whole = reconstruct(views, support=scene.support)
     assert is_closed(whole.mesh)
-    query = make_distance_query(whole.mesh)
     # On the axis from a third of the height up; the foot is 4 mm thick.
     heights = np.linspace(0.03, 0.09, 12)
     bottom = scene.truth.vertices[scene.truth.vertices[:, 2] < 1e-6].mean(0)
     axis = bottom + np.outer(heights, [0.0, 0.0, 1.0])
-    assert not inside(query, axis).any()
+    assert not winding_inside(whole.mesh, axis).any()
     assert distances(scene.truth, whole.mesh).mean() < 0.002
     assert distances(whole.mesh, scene.truth).mean() < 0.0015
 
@@ -320,4 +319,4 @@ def test_an_all_round_cloud_keeps_the_thin_walls_of_what_is_hollow(name, noise):
     assert 0.85 * shape_volume(name) < volume < 1.55 * shape_volume(name)
     tall = mesh.vertices[:, 2]
     cavity = np.array([[0.0, 0.0, tall.min() + share * np.ptp(tall)] for share in (0.5, 0.8)])
-    assert not inside(make_distance_query(whole.mesh), cavity).any()
+    assert not winding_inside(whole.mesh, cavity).any()

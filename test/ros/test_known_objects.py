@@ -1,8 +1,6 @@
 """Requests for objects that a library knows: what answers them, what is planned for them, and what is refused."""
 
 import shutil
-import subprocess
-import sys
 from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
@@ -17,7 +15,7 @@ from shape_msgs.msg import Plane
 from std_msgs.msg import Header
 
 from graspd_core import GraspResult, HandModel, Outcome, TriangleMesh, hand_mesh, load_scene, make_shape
-from graspd_core.errors import ConfigError, GraspdError, MeshError
+from graspd_core.errors import ConfigError, GraspdError
 from graspd_core.library.grasp_library import GraspLibrary
 from graspd_core.library.known_grasps import known_or_planned
 from graspd_core.mesh.mesh_files import save_mesh
@@ -150,16 +148,9 @@ def test_a_direction_and_a_surface_are_kept(folder: Path, hand: HandModel):
 @pytest.mark.parametrize(
     ("fields", "settings", "error", "told"),
     [
-        (known(known_object="bell"), {}, ConfigError, "'bell' is not in the library known.grasps; it has ball"),
         (known(), {"grasp_library": ""}, GraspdError, "KNOWN=4 needs a library; set the parameter grasp_library"),
         (known(), {"verify": "hard"}, ConfigError, "does not have it with any mass, friction 0.6, hard trials"),
         (known(mesh_uri="ball.obj"), {}, GraspdError, "known_object: 'ball' with mesh_uri too; valid with KNOWN=4"),
-        (
-            {"source": GraspRequest.KNOWN, "mesh_uri": "ball.obj", "mesh_scale": 0.5},
-            {},
-            ConfigError,
-            "ball.obj: scale 0.5 is not in the library known.grasps; valid: 1",
-        ),
         (
             {"source": GraspRequest.LATEST_CLOUD, "surface": Plane(coef=[0.0, 0.0, 1.0, 0.0])},
             {},
@@ -175,24 +166,11 @@ def test_what_cannot_be_answered_is_named(folder: Path, hand: HandModel, fields,
     assert code_of(refused.value) is ErrorCode.BAD_REQUEST
 
 
-def test_a_mesh_that_changed_and_a_library_that_was_torn_are_told(built: Path, folder: Path, hand: HandModel):
-    mesh, node = make_shape("sphere"), Node(hand)
-    save_mesh(built / "ball.obj", TriangleMesh(mesh.vertices * 1.1, mesh.faces))
-    try:
-        with pytest.raises(MeshError, match=r"ball\.obj: the mesh has changed since ball was added to the library"):
-            node.answer(**known())
-    finally:
-        save_mesh(built / "ball.obj", mesh)
+def test_a_library_that_was_torn_is_told(folder: Path, hand: HandModel):
     Path("known.grasps").write_bytes(b"no library" * 1000)
     with pytest.raises(GraspdError, match=r"known\.grasps: damaged or not a library") as refused:
-        node.answer(**known())
+        Node(hand).answer(**known())
     assert code_of(refused.value) is ErrorCode.BAD_LIBRARY
-
-
-def test_a_node_without_a_library_imports_none_of_it():
-    code = "import sys, graspd_ros.grasp_node; print([m for m in sys.modules if 'sqlite3' in m or 'core.library' in m])"
-    told = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
-    assert told.stdout.strip() == "[]"
 
 
 @pytest.mark.timeout(300)

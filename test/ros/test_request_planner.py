@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from builtin_interfaces.msg import Time
 
-from graspd_core import Steering, load_hand, load_scene
+from graspd_core import Steering, load_scene
 from graspd_core.errors import MeshError, TransformError
 from graspd_core.types import GraspResult, Outcome, Progress, Stage, Verdict
 from graspd_ros.convert import matrix_of_posture
@@ -17,11 +17,6 @@ from graspd_ros.request import Request
 from graspd_ros.request_planner import Planner, unlike
 
 SETTINGS = Settings(num_grasps=1, preset="fast", deadline=100.0)
-
-
-@pytest.fixture(scope="module")
-def hand():
-    return load_hand("allegro_right", candidates=600)
 
 
 def request(load, settings: Settings = SETTINGS, pose: np.ndarray | None = None) -> Request:

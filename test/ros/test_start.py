@@ -84,12 +84,10 @@ def test_a_hand_is_taken_out_of_a_robots_description(tmp_path):
         load_hand(tmp_path / "hand.yaml")
 
 
-def description(folder: Path, **keys: str) -> Path:
+def description(folder: Path) -> Path:
     """The shipped arm of seven axes, its URDF left to the topic."""
     text = (config_dir() / "arms" / "panda_like.yaml").read_text().replace("urdf: panda_like.urdf", "")
     path = folder / "arm.yaml"
-    for key, value in keys.items():
-        text = "\n".join(line for line in text.splitlines() if not line.startswith(f"{key}:")) + f"\n{key}: {value}\n"
     path.write_text(f"{text}\nurdf: robot_description\n")
     return path
 
@@ -121,13 +119,6 @@ def test_grasps_come_with_the_joints_of_an_arm_that_was_heard(client, robot, sta
     answer = client.answer("r")
     assert answer.status == GraspArray.SUCCEEDED, answer.message
     assert list(answer.grasps[0].arm_trajectory.joint_names) == [f"joint_{number}" for number in range(1, 8)]
-
-
-def test_a_link_that_the_robot_does_not_have_ends_the_start_with_the_choices(robot, start_node, tmp_path):
-    (told,) = told_at_the_start(start_node, description(tmp_path, tip="tool"))
-    assert "arm.yaml.tip: no link 'tool' in the URDF; links: base_link, " in told
-    (told,) = told_at_the_start(start_node, description(tmp_path, base="torso"))
-    assert "arm.yaml.base: no link 'torso' in the URDF; links: base_link, " in told
 
 
 def test_a_robot_that_never_comes_is_waited_for_so_long(start_node, tmp_path):

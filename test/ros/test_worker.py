@@ -9,7 +9,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from graspd_ros.worker import BusyPolicy, Refusal, Report, Worker, WorkerEnding
+from graspd_ros.error_codes import ErrorCode
+from graspd_ros.worker import BusyPolicy, Report, Worker, WorkerEnding
 
 TIMEOUT = 100.0  # seconds; what is waited for takes milliseconds
 
@@ -136,7 +137,7 @@ def test_what_was_done_before_a_cancel_is_not_lost(bench: Bench):
 def test_an_id_is_taken_once_at_a_time(bench: Bench, policy: BusyPolicy):
     bench.run(Job("same"))
     again = bench.worker.submit(Job("same"), policy)
-    assert (again.refusal, again.reason) == (Refusal.DUPLICATE, "a request 'same' is already waiting or running")
+    assert (again.refusal, again.reason) == (ErrorCode.DUPLICATE_ID, "a request 'same' is already waiting or running")
     bench.release.set()
     assert bench.wait(1) == {"same": WorkerEnding.DONE}
     assert bench.worker.submit(Job("same"), BusyPolicy.REJECT).refusal is None
@@ -165,7 +166,7 @@ def test_after_stop_nothing_is_taken(bench: Bench):
     assert bench.worker.stop(TIMEOUT)
     assert bench.wait(2) == {"0": WorkerEnding.CANCELLED, "1": WorkerEnding.CANCELLED}
     refused = bench.worker.submit(Job("2"), BusyPolicy.QUEUE)
-    assert (refused.refusal, refused.reason) == (Refusal.STOPPING, "the node is shutting down")
+    assert (refused.refusal, refused.reason) == (ErrorCode.SHUTTING_DOWN, "the node is shutting down")
 
 
 ACTIONS = st.lists(

@@ -33,11 +33,6 @@ def test_file_scale_and_value_agree(tmp_path):
     assert torch.allclose(from_file.sdf.field[0], from_value.sdf.field[0], atol=1e-6)
 
 
-def test_a_target_on_a_mesh_is_refused_by_name():
-    with pytest.raises(MeshError, match="target: given with shape:box, a mesh; valid with clouds"):
-        load_scene("shape:box", target=Target(point=np.zeros(3)))
-
-
 def test_a_cloud_becomes_a_scene_in_its_own_frame():
     """The side of a sphere that a camera at the origin sees, a third of a metre ahead."""
     ball, normals = surface_samples(make_shape("sphere"), 6000, 0)
@@ -59,26 +54,6 @@ def test_a_cloud_that_shows_nothing_is_refused_and_so_is_a_bad_mass():
         scene_from_views([PointCloud(np.zeros((0, 3)), np.zeros(3))])
     with pytest.raises(MeshError, match="mass"):
         scene_from_views([PointCloud(np.random.default_rng(0).random((100, 3)), np.zeros(3))], mass=-1.0)
-
-
-def test_a_cloud_file_is_reconstructed(tmp_path):
-    points, _ = surface_samples(make_shape("sphere"), 3000, 0)
-    np.savez(tmp_path / "ball.npz", points=points, viewpoint=np.array([0.0, 0.0, 1.0]))
-    scene = load_scene(tmp_path / "ball.npz", resolution=16)
-    assert scene.object.volume == pytest.approx(shape_volume("sphere"), rel=0.05)
-
-
-@pytest.mark.parametrize(
-    ("source", "error", "complaint"),
-    [
-        ("shape:teapot", MeshError, "unknown shape 'teapot'"),
-        ("nothing.obj", MeshError, "nothing.obj: no such mesh file"),
-        ("nothing.npy", CloudError, "nothing.npy: no such cloud file"),
-    ],
-)
-def test_bad_sources_are_named(source, error, complaint):
-    with pytest.raises(error, match=complaint):
-        load_scene(source)
 
 
 def test_unknown_endings_list_meshes_and_clouds(tmp_path):

@@ -8,7 +8,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from graspd_core import HandModel, PlanConfig, Scene, draw_starts, load_hand, load_scene
+from graspd_core import HandModel, PlanConfig, Scene, draw_starts, load_scene
 from graspd_core.mesh.sdf import sample_sdf
 from graspd_core.optimize.candidates import PlannerInput, assemble
 from graspd_core.optimize.closed_form.closed_form import ClosedForm
@@ -20,11 +20,6 @@ PLAN = PlanConfig()
 # The preset's method in a tenth of its steps.
 SHORT = replace(PLAN.settings, explore_steps=6, refine_steps=6, polish_steps=6)
 BATCH = 16
-
-
-@pytest.fixture(scope="module")
-def hand() -> HandModel:
-    return load_hand("allegro_right", candidates=PLAN.problem.fine_candidates)
 
 
 @pytest.fixture(scope="module")

@@ -32,7 +32,6 @@ from graspd_core.hands.mano.mano_file import BODIES, PARENTS, ManoData, read_man
 from graspd_core.hands.mano.mano_skin import (
     close_wrist,
     closed_faces,
-    make_skin,
     rest,
     rotation_from_vector,
     skin_vertices,
@@ -102,12 +101,11 @@ def palm_normal(data: ManoData, joints: Float[np.ndarray, "16 3"]) -> Float[np.n
     wrist, index, little = joints[0], joints[1], joints[7]
     normal = np.cross(index - wrist, little - wrist)
     normal /= np.linalg.norm(normal)
-    skin = make_skin(data)
     zero = torch.zeros(1, data.shape_directions.shape[-1], dtype=torch.float64)
     mean = torch.as_tensor(data.mean).reshape(1, 15, 3)
     turned = torch.cat([torch.eye(3).to(zero).expand(1, 1, 3, 3), rotation_from_vector(mean)], 1)
     flat = torch.eye(3).to(zero).expand(1, 16, 3, 3)
-    bent, straight = (skin_vertices(skin, zero, r, zero.new_zeros(1, 3))[1][0].numpy() for r in (turned, flat))
+    bent, straight = (skin_vertices(data, zero, r, zero.new_zeros(1, 3))[1][0].numpy() for r in (turned, flat))
     ends = [3, 6, 9, 12]
     # A flat mean pose does not show the side. Then a right hand is assumed.
     return -normal if float(((bent - straight)[ends] @ normal).mean()) < -1e-4 else normal
@@ -191,10 +189,10 @@ class ManoHand:
 
     def skinned_mesh(self, posture: Posture) -> TriangleMesh:
         """Return MANO's own surface at a posture [m], in the frame of the posture's position. The wrist is closed."""
-        skin, betas = make_skin(self.data), torch.as_tensor(self.betas)[None]
+        betas = torch.as_tensor(self.betas)[None]
         rotations = rotations_from_joints(torch.as_tensor(self.frames), torch.as_tensor(posture.joint_positions)[None])
-        origin = rest(skin, betas)[1][:, 0]
-        vertices, _ = skin_vertices(skin, betas, rotations, -origin)
+        origin = rest(self.data, betas)[1][:, 0]
+        vertices, _ = skin_vertices(self.data, betas, rotations, -origin)
         turn = rotation_from_quaternion(torch.as_tensor(posture.quaternion_wxyz, dtype=torch.float64))
         placed = close_wrist(self.data, vertices)[0] @ turn.T + torch.as_tensor(posture.position)
         return TriangleMesh(placed.numpy(), closed_faces(self.data))
@@ -210,7 +208,7 @@ def load_mano(path: str | Path, betas: Sequence[float] = (), *, candidates: int 
     if len(betas) > len(shape) or not np.isfinite(list(betas)).all():
         raise HandError(f"{path}: betas has {len(betas)} numbers; valid: at most {len(shape)} finite numbers")
     shape[: len(betas)] = betas
-    vertices, joints = (t[0].numpy() for t in rest(make_skin(data), torch.as_tensor(shape)[None]))
+    vertices, joints = (t[0].numpy() for t in rest(data, torch.as_tensor(shape)[None]))
     closed_faces(data)  # This refuses a mesh that cannot be closed before any planning.
     owner = data.weights.argmax(1)
     tips = _fingertips(vertices, joints, owner)
@@ -266,9 +264,6 @@ def _bare_hand(still: _Rest) -> HandModel:
         link_inertia=inertia,
         primitives=tuple(hulls.values()),
         adjacent=np.eye(count, dtype=bool),
-        candidate_points=np.zeros((0, 3)),
-        candidate_normals=np.zeros((0, 3)),
-        candidate_link=np.zeros(0, dtype=np.int64),
     )
 
 

@@ -6,8 +6,6 @@ shape, the pose and the translation, also at zero rotation.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import numpy as np
 import torch
 from jaxtyping import Float, Int
@@ -19,32 +17,18 @@ from graspd_core.mesh.topology import face_edges
 from graspd_core.se3 import rotation_from_quaternion, safe_norm
 
 
-@dataclass(frozen=True, eq=False)
-class Skin:
-    """A MANO model as tensors. `ManoData` describes the fields."""
-
-    template: Float[Tensor, "vertices 3"]
-    shape_directions: Float[Tensor, "vertices 3 shapes"]
-    pose_directions: Float[Tensor, "vertices 3 135"]
-    joint_regressor: Float[Tensor, "16 vertices"]
-    weights: Float[Tensor, "vertices 16"]
-
-
-def make_skin(data: ManoData, dtype: torch.dtype = torch.float64) -> Skin:
-    fields = (data.template, data.shape_directions, data.pose_directions, data.joint_regressor, data.weights)
-    return Skin(*(torch.as_tensor(array, dtype=dtype) for array in fields))
-
-
 def rest(
-    skin: Skin, betas: Float[Tensor, "batch shapes"]
+    data: ManoData, betas: Float[Tensor, "batch shapes"]
 ) -> tuple[Float[Tensor, "batch vertices 3"], Float[Tensor, "batch 16 3"]]:
     """Return vertices and joints of a shape at rest [m]. Missing betas are zero."""
-    shaped = skin.template + torch.einsum("vcs,bs->bvc", skin.shape_directions[..., : betas.shape[-1]], betas)
-    return shaped, skin.joint_regressor @ shaped
+    arrays = data.template, data.shape_directions[..., : betas.shape[-1]], data.joint_regressor
+    template, directions, regressor = (torch.as_tensor(array).to(betas) for array in arrays)
+    shaped = template + torch.einsum("vcs,bs->bvc", directions, betas)
+    return shaped, regressor @ shaped
 
 
 def skin_vertices(
-    skin: Skin,
+    data: ManoData,
     betas: Float[Tensor, "batch shapes"],
     rotations: Float[Tensor, "batch 16 3 3"],
     translation: Float[Tensor, "batch 3"],
@@ -52,14 +36,14 @@ def skin_vertices(
     """Return posed vertices and joints [m].
 
     Args:
-        skin: the model.
+        data: the model.
         betas: shape coefficients.
         rotations: rotation of every body relative to its parent, in model axes. The first turns the whole hand.
         translation: added to all vertices and joints [m].
     """
-    shaped, joints = rest(skin, betas)
+    shaped, joints = rest(data, betas)
     feature = (rotations[:, 1:] - torch.eye(3, dtype=rotations.dtype, device=rotations.device)).flatten(1)
-    posed = shaped + torch.einsum("vcp,bp->bvc", skin.pose_directions, feature)
+    posed = shaped + torch.einsum("vcp,bp->bvc", torch.as_tensor(data.pose_directions).to(betas), feature)
     turns, places = [rotations[:, 0]], [joints[:, 0]]
     for body in range(1, len(PARENTS)):
         parent = PARENTS[body]
@@ -68,7 +52,8 @@ def skin_vertices(
         turns.append(turns[parent] @ rotations[:, body])
     turn, place = torch.stack(turns, 1), torch.stack(places, 1)
     shift = place - (turn @ joints[..., None]).squeeze(-1)
-    mixed = torch.einsum("vj,bjrc->bvrc", skin.weights, torch.cat([turn, shift[..., None]], -1))
+    weights = torch.as_tensor(data.weights).to(betas)
+    mixed = torch.einsum("vj,bjrc->bvrc", weights, torch.cat([turn, shift[..., None]], -1))
     vertices = (mixed[..., :3] @ posed[..., None]).squeeze(-1) + mixed[..., 3]
     return vertices + translation[:, None], place + translation[:, None]
 

@@ -134,9 +134,6 @@ def assemble(
         link_inertia=np.stack([spec.inertia for spec in specs]),
         primitives=tuple(replace(p, link=i) for i, spec in enumerate(specs) for p in spec.primitives),
         adjacent=np.eye(len(order), dtype=bool),
-        candidate_points=np.zeros((0, 3)),
-        candidate_normals=np.zeros((0, 3)),
-        candidate_link=np.zeros(0, dtype=np.int64),
         warnings=(*warnings, *mended),
     )
 

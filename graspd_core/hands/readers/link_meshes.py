@@ -44,7 +44,8 @@ def resolve_mesh(urdf: Path, shape: ET.Element, filename: str) -> Path:
     else:
         folders = list(parents)
     for folder in folders:
-        if inside_exists(folder / rest):
+        # Of an invalid name, `Path.is_file` may raise.
+        if os.path.isfile(folder / rest):
             return folder / rest
     where = "in any package path, nor " if scheme in ("package", "model") else ""
     raise wrong(urdf, shape, f"mesh {filename!r} was not found {where}beside the file or above it")
@@ -63,23 +64,8 @@ def missing_packages(urdf: Path, meshes: Iterable[ET.Element]) -> tuple[str, ...
     addresses = (_address(mesh.get("filename") or "") for mesh in meshes)
     named = {rest.partition("/")[0] for scheme, rest in addresses if scheme in ("package", "model")}
     parents = urdf.resolve().parents
-    lost = sorted(name for name in named if not any(map(_folder_exists, _package_folders(name, parents))))
+    lost = sorted(name for name in named if not any(map(os.path.isdir, _package_folders(name, parents))))
     return tuple(f"package {name!r} was not found; meshes are searched beside the file and above it" for name in lost)
-
-
-def _folder_exists(path: Path) -> bool:
-    try:
-        return path.is_dir()
-    except (OSError, ValueError):
-        return False
-
-
-def inside_exists(path: Path) -> bool:
-    """Return True if a file exists. An invalid file name gives False."""
-    try:
-        return path.is_file()
-    except (OSError, ValueError):
-        return False
 
 
 def corners_each(meshes: int) -> int:

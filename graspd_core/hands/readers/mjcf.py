@@ -7,6 +7,7 @@ graspd itself reads the meshes as convex hulls, in more formats. Unsupported ele
 from __future__ import annotations
 
 import importlib
+import os
 import re
 import xml.etree.ElementTree as ET
 from collections.abc import Mapping
@@ -28,7 +29,7 @@ from graspd_core.hands.readers.build_model import (
     refuse_crowds,
     resolved_couplings,
 )
-from graspd_core.hands.readers.link_meshes import LARGEST_SIZE, corners_each, inside_exists, mesh_hull
+from graspd_core.hands.readers.link_meshes import LARGEST_SIZE, corners_each, mesh_hull
 from graspd_core.hands.readers.xml_io import DEEPEST, FARTHEST, Element, as_text, read_xml, wrong
 from graspd_core.mesh.convex_parts import limited_hull
 from graspd_core.se3 import axis_rotation, rotation_from_quaternion
@@ -229,7 +230,7 @@ def _read_included(path: Path, holder: Path, place: ET.Element, seen: set[Path])
     """Read an included file, which lies beside the main file or beside `holder`. Return its path and root."""
     name = place.get("file") or ""
     told = f"<include file={short_repr(name)}>"
-    found = next((folder / name for folder in (path.parent, holder.parent) if inside_exists(folder / name)), None)
+    found = next((folder / name for folder in (path.parent, holder.parent) if os.path.isfile(folder / name)), None)
     if found is None:
         raise wrong(path, place, f"{told}: no such file beside {path.name}")
     if found.resolve() in seen:

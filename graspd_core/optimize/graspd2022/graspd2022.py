@@ -40,7 +40,7 @@ from graspd_core.mesh.mesh_files import surface_samples
 from graspd_core.mesh.sdf import sample_sdf
 from graspd_core.optimize import losses
 from graspd_core.optimize.candidates import PlannerInput, PlannerOutput
-from graspd_core.optimize.graspd2022.graspd2022_config import Graspd2022Config, PoseStepsConfig
+from graspd_core.optimize.graspd2022.graspd2022_config import ContactConfig, Graspd2022Config, PoseStepsConfig
 from graspd_core.optimize.initial_poses import draw_starts
 from graspd_core.optimize.loop import Distances, Points, Poses, Rows, Values, minimise, pack, unpack
 from graspd_core.optimize.problem import PointSet, Problem, hand_forward, least_distance, obstacle_depth, self_collision
@@ -81,14 +81,7 @@ def leaky_min(x: Float[Tensor, "*shape"], leak: float) -> Float[Tensor, "*shape"
 
 
 def contact_forces(
-    height: Distances,
-    normals: Points,
-    velocities: Float[Tensor, "simulations 3"],
-    *,
-    stiffness: float,
-    friction_stiffness: float,
-    friction: float,
-    leak: float,
+    height: Distances, normals: Points, velocities: Float[Tensor, "simulations 3"], contact: ContactConfig
 ) -> Float[Tensor, "batch points simulations 3"]:
     """Compute forces on the object at every hand point, once for each velocity of the object [N].
 
@@ -96,16 +89,13 @@ def contact_forces(
         height: height of the hand's points above the level set, φ − r [m].
         normals: ∇φ at these points. A zero vector gives no normal force.
         velocities: linear velocities of the object relative to the hand [m/s].
-        stiffness: k_n [N/m].
-        friction_stiffness: k_f [N·s/m].
-        friction: Coulomb coefficient μ.
-        leak: slope of the depth out of contact.
+        contact: k_n, k_f, μ and the leak.
     """
-    push = stiffness * leaky_min(height, leak)
+    push = contact.stiffness * leaky_min(height, contact.leak)
     along = normals @ velocities.T
     slip = ((velocities * velocities).sum(-1) - along * along).clamp_min(_SLIP_FLOOR).sqrt()
     # Friction force per tangential speed. The last line adds v_t = v − (n·v) n together with the normal force.
-    drag = (-friction * push[..., None] / slip).clamp(max=friction_stiffness)
+    drag = (-contact.friction * push[..., None] / slip).clamp(max=contact.friction_stiffness)
     return (push[..., None] + drag * along)[..., None] * normals[:, :, None] - drag[..., None] * velocities
 
 
@@ -479,15 +469,7 @@ class Graspd2022:
         placed = hand_forward(problem, self.points(problem), poses)
         distance, normals = sample_sdf(problem.object.sdf, placed.points)
         arms = placed.points - body.center
-        supplied = contact_forces(
-            distance - radius[:, None],
-            normals,
-            velocities,
-            stiffness=config.contact.stiffness,
-            friction_stiffness=config.contact.friction_stiffness,
-            friction=config.contact.friction,
-            leak=config.contact.leak,
-        )
+        supplied = contact_forces(distance - radius[:, None], normals, velocities, config.contact)
         none = torch.zeros_like(radius)
         if config.relaxation.enabled:
             difference = physics(desired, actual(supplied, arms, body.length, desired.shape[-1]))

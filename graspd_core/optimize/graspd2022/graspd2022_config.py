@@ -145,14 +145,6 @@ class Graspd2022Config:
     """Grasp'D as published (docs/method.md, §1). Where paper and released code differ, a setting selects one of them.
 
     Attributes:
-        initial: starts of the optimiser.
-        level_set: coarse-to-fine search.
-        contact: penalty contact.
-        simulation: single simulation step of the object.
-        relaxation: desired forces as variables.
-        pose_steps: steps of the pose.
-        constraints: bounds on L_task and L_limit, and their multipliers.
-        weights: weights of the minimised terms.
         steps: number of optimiser steps.
         pose_rate: step size of position [m], quaternion [half rad] and joints [rad].
         beta2: decay rate of the gradient's infinity norm (Adamax) or of its square (Adam).

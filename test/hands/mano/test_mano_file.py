@@ -12,6 +12,7 @@ import pytest
 import torch
 import trimesh
 from hypothesis import given
+from inputs_made import Evil
 from scipy.sparse import csr_matrix
 
 from graspd_bench.studies.human_hand import measure_skin
@@ -24,7 +25,6 @@ from graspd_core.hands.mano.mano_hand import ManoHand, load_mano
 from graspd_core.hands.mano.mano_skin import (
     close_wrist,
     closed_faces,
-    make_skin,
     rest,
     rotation_from_vector,
     skin_vertices,
@@ -84,16 +84,6 @@ def test_an_array_as_python_2_wrote_it(tmp_path: Path) -> None:
         b"K\x00tb\x89U" + bytes([len(raw)]) + raw + b"tbs."
     )
     np.testing.assert_array_equal(numbers(read_pickle(path)["x"]), values)
-
-
-class Evil:
-    """Pickles as a call of a function of one's choice."""
-
-    def __init__(self, function: Any, *arguments: Any) -> None:
-        self.call = function, arguments
-
-    def __reduce__(self) -> Any:
-        return self.call
 
 
 def test_a_malicious_file_is_refused_and_runs_nothing(model: dict[str, Any], tmp_path: Path) -> None:
@@ -323,23 +313,20 @@ def draw(seed: int, shapes: int, batch: int = 2) -> tuple[torch.Tensor, torch.Te
 
 def test_forward_agrees_with_the_paper(data: ManoData) -> None:
     betas, pose, shift = draw(0, 10)
-    vertices, _ = skin_vertices(make_skin(data), betas, rotation_from_vector(pose), shift)
+    vertices, _ = skin_vertices(data, betas, rotation_from_vector(pose), shift)
     for row in range(2):
         expected = by_the_paper(data, betas[row].numpy(), pose[row].numpy(), shift[row].numpy())
         np.testing.assert_allclose(vertices[row], expected, atol=1e-12)
-    single, _ = skin_vertices(
-        make_skin(data, torch.float32), betas.float(), rotation_from_vector(pose.float()), shift.float()
-    )
+    single, _ = skin_vertices(data, betas.float(), rotation_from_vector(pose.float()), shift.float())
     np.testing.assert_allclose(single, vertices, atol=2e-6)  # float32 over four joints in a row
 
 
 def test_gradients_are_those_of_finite_differences(data: ManoData) -> None:
-    skin = make_skin(data)
     weights = torch.as_tensor(np.random.default_rng(1).normal(size=data.template.shape))
     betas, pose, shift = (x[:1].requires_grad_(True) for x in draw(2, 10))
 
     def value(betas: torch.Tensor, pose: torch.Tensor, shift: torch.Tensor) -> torch.Tensor:
-        return (skin_vertices(skin, betas, rotation_from_vector(pose), shift)[0] * weights).sum()
+        return (skin_vertices(data, betas, rotation_from_vector(pose), shift)[0] * weights).sum()
 
     assert torch.autograd.gradcheck(value, (betas, pose, shift), eps=1e-6, atol=1e-6)
     # At the zero rotation, where Rodrigues' formula divides nothing by nothing.
@@ -361,7 +348,7 @@ def test_the_wrist_is_closed(data: ManoData) -> None:
     betas, pose, shift = draw(6, 10, batch=1)
     for scale in (0.0, 0.3):
         rotations = rotation_from_vector(scale * pose)
-        vertices, _ = skin_vertices(make_skin(data), betas, rotations, shift)
+        vertices, _ = skin_vertices(data, betas, rotations, shift)
         mesh = trimesh.Trimesh(close_wrist(data, vertices)[0].numpy(), faces, process=False)
         assert mesh.is_watertight
         assert mesh.is_winding_consistent
@@ -393,10 +380,10 @@ def test_the_hands_links_are_the_skins_bodies(mano: ManoHand, seed: int) -> None
     hand = mano.model
     q = np.random.default_rng(seed).uniform(hand.lower, hand.upper)
     rotations, translations = link_poses(hand, q)
-    skin, betas = make_skin(mano.data), torch.as_tensor(mano.betas)[None]
+    betas = torch.as_tensor(mano.betas)[None]
     turned = mano_joints.rotations_from_joints(torch.as_tensor(mano.frames), torch.as_tensor(q)[None])
-    origin = rest(skin, betas)[1][:, 0]
-    _, joints = skin_vertices(skin, betas, turned, -origin)
+    origin = rest(mano.data, betas)[1][:, 0]
+    _, joints = skin_vertices(mano.data, betas, turned, -origin)
     links = [hand.link_index[name] for name in BODIES]
     np.testing.assert_allclose(translations[links], joints[0], atol=1e-12)
     whole = np.eye(3)

@@ -93,6 +93,13 @@ def refusal(**fields) -> RequestError:
         ({"mesh_scale": math.nan}, "mesh_scale: nan"),
         ({"use_target_point": True, "target_point": Point(x=math.nan)}, "target_point: [nan"),
         ({"use_target_point": True, "target_point": Point(z=1e9)}, "within 1000 m"),
+        ({"use_view_point": True, "view_point": Point(x=math.nan)}, "view_point: [nan"),
+        ({"target_mask": Image(height=1), "alone": True}, "target_mask: cannot be combined with alone"),
+        (
+            {"target_mask": Image(height=1), "use_target_point": True},
+            "target_mask: cannot be combined with target_point",
+        ),
+        ({"target_mask": Image(height=1), "source": GraspRequest.MESH}, "target_mask: given with source 1"),
         ({"any_object": True, "alone": True}, "any_object: alone is given too"),
         ({"any_object": True, "target_mask": Image(height=1)}, "any_object: target_mask is given too"),
         ({"any_object": True, "source": GraspRequest.MESH}, "any_object: given with source 1; valid: CLOUD=0"),
@@ -284,6 +291,7 @@ def test_every_trouble_has_its_code():
     cases = {
         NoObjectError("x"): ErrorCode.NO_OBJECT,
         CloudError("x"): ErrorCode.BAD_CLOUD,
+        MeshError("x"): ErrorCode.BAD_MESH,
         TransformError("x"): ErrorCode.NO_TRANSFORM,
         ResourceError("x"): ErrorCode.OUT_OF_MEMORY,
         MemoryError(): ErrorCode.OUT_OF_MEMORY,

@@ -111,30 +111,6 @@ def test_with_an_arm_every_grasp_has_its_joints_and_what_is_out_of_reach_is_told
     assert "m from the base of panda_like, whose reach with allegro_right" in answer.message
 
 
-def test_whatever_cannot_be_served_is_refused_by_name(client, node):
-    cases = [
-        ({"source": 9}, "BAD_REQUEST", "source: 9"),
-        ({**SPHERE, "hand": "no_such_hand"}, "WRONG_HAND", "'no_such_hand' is not loaded"),
-        ({**SPHERE, "object_pose": Pose(position=Point(x=float("nan")))}, "BAD_REQUEST", "object_pose"),
-        ({"source": GraspRequest.MESH, "mesh_uri": "/etc/passwd"}, "BAD_MESH", "outside mesh_roots"),
-        ({"source": GraspRequest.LATEST_CLOUD}, "NO_CLOUD", "no cloud or depth image"),
-    ]
-    for number, (fields, _, _) in enumerate(cases):
-        client.send_request(id=f"bad-{number}", **fields)
-    client.send_request(id="../escape", **SPHERE)
-    for number, (_, code, culprit) in enumerate(cases):
-        answer = client.answer(f"bad-{number}")
-        assert (answer.status, answer.error_code) == (GraspArray.REFUSED, code)
-        assert culprit in answer.message
-        assert "\n" not in answer.message
-    assert client.answer("../escape").error_code == "BAD_REQUEST"
-    assert len(client.answers) == len(cases) + 1
-    client.send_request(id="empty-cloud")
-    answer = client.answer("empty-cloud")
-    assert (answer.status, answer.error_code) == (GraspArray.FAILED, "BAD_CLOUD")
-    assert node.alive()
-
-
 def test_a_live_id_is_not_taken_twice_and_a_queued_request_can_be_cancelled(client, node):
     client.send_request(id="a", **SPHERE, **LONG)
     client.event(event="progress", request="a")
