@@ -44,7 +44,7 @@ def resolve_mesh(urdf: Path, shape: ET.Element, filename: str) -> Path:
     else:
         folders = list(parents)
     for folder in folders:
-        # Of an invalid name, `Path.is_file` may raise.
+        # For an invalid name this is False, where pathlib may raise.
         if os.path.isfile(folder / rest):
             return folder / rest
     where = "in any package path, nor " if scheme in ("package", "model") else ""
