@@ -38,7 +38,7 @@ def add_command(commands: Any) -> None:
         nargs="+",
         default=(),
         metavar="CASE",
-        help="of stress: names, families; maps: names; piles: sizes; cell: sizes, ARM+HAND",
+        help="of stress: names, families; maps: names; cell: sizes, ARM+HAND",
     )
     parser.add_argument("--seeds", nargs="+", type=int, default=(), metavar="N", help="default: by study")
     parser.add_argument("--count", type=int, default=None, help="grasps of a case (default: by study and method)")

@@ -1,4 +1,4 @@
-"""More trials in MuJoCo: displacement under gravity with a frozen and with a driven hand, and lifts out of a pile.
+"""More trials in MuJoCo: displacement under gravity with a frozen and with a driven hand, and falling objects.
 
 `displacement_trial` repeats PyBullet's displacement trial in MuJoCo, to show how much its result depends on the engine.
 Hand, mass and steps are the same: a frozen hand, 1 kg, 35 steps of 1/240 s, 9.8 m/s². The friction of a pair is the
@@ -8,14 +8,12 @@ product of Bullet's two coefficients, 3 times 3. Nothing bounces. In Bullet the 
 of the papers has a frozen hand, without motors and effort limits. Its 0.15 s are too short to show a slow slip. Hand,
 object and physics of `gravity_trial` are those of the hold trial.
 
-`dropped` and `settle` let objects come to rest on a table. `lift_out` is the lift trial with one of these objects. The
-other objects are free bodies. All final poses are kept, so that the next lift can continue from them.
+`dropped` lets objects come to rest on a table.
 """
 
 from __future__ import annotations
 
 import math
-from collections import deque
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
@@ -28,21 +26,16 @@ from graspd_core.hands.kinematics import forward, make_kinematics
 from graspd_core.hands.model import HandModel
 from graspd_core.perception.scene import ObjectModel, object_parts
 from graspd_core.se3 import SE3, quaternion_from_rotation, random_rotations, rotation_from_quaternion
-from graspd_core.types import Grasp, Plane, Posture, TrialResult, TriangleMesh
+from graspd_core.types import Grasp, Plane, Posture, TriangleMesh
 from graspd_core.verify.early_stop import CHECK_EVERY, CREEPING, ObjectState
 from graspd_core.verify.hold_trial import DIRECTIONS, close_hand, diverged, moved, object_state
-from graspd_core.verify.lift_trial import LiftSettings, lift_trial
 from graspd_core.verify.world import (
-    OBJECT,
     PROTOCOLS,
-    FreeBody,
     Protocol,
     World,
     add_object,
-    add_others,
     add_plane,
     add_primitive,
-    build_world,
     set_physics,
     trial_data,
 )
@@ -203,19 +196,19 @@ _SPEED, _SPIN, _STILL = 0.002, 0.05, 50
 Pose = Float[np.ndarray, "4 4"]
 
 
-@dataclass(frozen=True)
-class Lifted:
-    """Result of lifting one of several objects.
+@dataclass(frozen=True, eq=False)
+class FreeBody:
+    """A free body of the scene.
 
     Attributes:
-        result: result of the lift trial.
-        poses: final poses of all objects in the table frame, in the order of the input.
-        hand: final posture of the hand in the table frame. None if the hand never moved.
+        model: the body's object model, in the body's own frame.
+        parts: the body's convex parts, in the body's own frame [m].
+        pose: `T_world_body` [m].
     """
 
-    result: TrialResult
-    poses: tuple[Pose, ...]
-    hand: Posture | None
+    model: ObjectModel
+    parts: tuple[TriangleMesh, ...]
+    pose: Float[np.ndarray, "4 4"]
 
 
 def settle(
@@ -246,7 +239,9 @@ def settle(
     add_plane(spec, _FLOOR, Plane(np.eye(3)[2], 0.0), protocol.friction)
     for index, normal in enumerate(np.vstack([np.eye(3)[:2], -np.eye(3)[:2]]) if wall is not None else ()):
         add_plane(spec, f"{_WALL} {index}", Plane(normal, -float(wall or 0.0)), protocol.friction)
-    names = add_others(spec, bodies, protocol.friction)
+    names = [f"body {index}" for index in range(len(bodies))]
+    for name, body in zip(names, bodies, strict=True):
+        add_object(spec, body.model, body.parts, protocol.friction, name=name, pose=body.pose)
     model = spec.compile()
     data = mujoco.MjData(model)
     _damp(model, names, *(_RESTING if wall is None else _FALLING))
@@ -293,60 +288,6 @@ def dropped(models: Sequence[ObjectModel], seed: int, wall: float, *, stays: boo
 
 def posed(bodies: Sequence[FreeBody], poses: Sequence[Pose]) -> tuple[FreeBody, ...]:
     return tuple(replace(body, pose=pose) for body, pose in zip(bodies, poses, strict=True))
-
-
-def lift_out(
-    hand: HandModel, bodies: Sequence[FreeBody], index: int, grasp: Grasp, protocol: Protocol, settings: LiftSettings
-) -> Lifted:
-    """Close the hand on the object `bodies[index]` among others on the table z = 0, and lift it.
-
-    Args:
-        grasp: the grasp, in the table frame.
-        protocol: physics settings, and how far the object may slip in the hand.
-    """
-    target, others = bodies[index], [body for k, body in enumerate(bodies) if k != index]
-    model, parts = placed(target)
-    world = build_world(hand, model, parts, protocol, Plane(np.eye(3)[2], 0.0), others=others)
-    watch = _Watch(world)
-    result = lift_trial(replace(world, watch=watch, spare=deque()), hand, grasp, protocol, settings=settings)
-    if watch.end is None:
-        return Lifted(result, tuple(body.pose for body in bodies), None)
-    moved, rest, posture = watch.end
-    poses = [*rest[:index], moved @ target.pose, *rest[index:]]
-    return Lifted(result, tuple(poses), posture)
-
-
-class _Watch:
-    """Hook that keeps the poses of the last step, in the table frame. A lift lowers the table (lift_trial.py)."""
-
-    def __init__(self, world: World) -> None:
-        self._world = world
-        self.end: tuple[Pose, list[Pose], Posture] | None = None
-
-    def __call__(self, data: Any) -> None:
-        world, up = self._world, -data.mocap_pos[1]
-        body = int(world.model.body(OBJECT).id)
-        object_pose, rest = _pose(data, body), [_pose(data, other) for other in world.others]
-        for pose in (object_pose, *rest):
-            pose[:3, 3] += up
-        posture = Posture(data.mocap_pos[0] + up, data.mocap_quat[0].copy(), data.qpos[world.joint_addresses])
-        self.end = object_pose, rest, posture
-
-
-def placed(body: FreeBody) -> tuple[ObjectModel, tuple[TriangleMesh, ...]]:
-    """Return the object and its convex parts, transformed to the world frame."""
-    turn, place = body.pose[:3, :3], body.pose[:3, 3]
-
-    def there(mesh: TriangleMesh) -> TriangleMesh:
-        return TriangleMesh(mesh.vertices @ turn.T + place, mesh.faces)
-
-    model = replace(
-        body.model,
-        mesh=there(body.model.mesh),
-        center_of_mass=turn @ body.model.center_of_mass + place,
-        inertia=turn @ body.model.inertia @ turn.T,
-    )
-    return model, tuple(there(part) for part in body.parts)
 
 
 def _pose(data: Any, body: int) -> Pose:

@@ -163,8 +163,8 @@ def _rest(world: World, data: Any) -> None:
 def _sink(world: World, data: Any, up: Float[np.ndarray, "3"], a: float, settings: LiftSettings) -> None:
     data.mocap_pos[1:] = -settings.lift_height * a * a * (3 - 2 * a) * up
     acceleration = settings.lift_height * (6 - 12 * a) / settings.lift_time**2 if a < 1 else 0.0
-    for body in (world.object_body, *world.others):
-        data.xfrc_applied[body, :3] = -acceleration * world.model.body_mass[body] * up
+    body = world.object_body
+    data.xfrc_applied[body, :3] = -acceleration * world.model.body_mass[body] * up
 
 
 def reach_through(world: World, data: Any, postures: tuple[Posture, ...], limit: float) -> str:

@@ -40,21 +40,6 @@ _GRAVITY = 9.81
 Friction = tuple[float, float, float]
 
 
-@dataclass(frozen=True, eq=False)
-class FreeBody:
-    """A free body of the scene.
-
-    Attributes:
-        model: the body's object model, in the body's own frame.
-        parts: the body's convex parts, in the body's own frame [m].
-        pose: `T_world_body` [m].
-    """
-
-    model: ObjectModel
-    parts: tuple[TriangleMesh, ...]
-    pose: Float[np.ndarray, "4 4"]
-
-
 def add_primitive(spec: Any, body: Any, primitive: Primitive, name: str, friction: Friction) -> None:
     """Add a collision primitive of the hand. `name` is the name of the mesh that a hull needs."""
     import mujoco
@@ -111,23 +96,13 @@ def add_object(
         )
 
 
-def add_others(spec: Any, others: Sequence[FreeBody], friction: Friction) -> tuple[str, ...]:
-    """Add free bodies around the object. Return their body names."""
-    names = tuple(f"other {index + 1}" for index in range(len(others)))
-    for name, other in zip(names, others, strict=True):
-        add_object(spec, other.model, other.parts, friction, name=name, pose=other.pose)
-    return names
-
-
 def add_support(spec: Any, hand: HandModel, parts: Sequence[TriangleMesh], friction: Friction, support: Plane) -> None:
-    """Add gravity, a plane for the hand, and a plane for the object at the bottom of its `parts`, if there are any."""
+    """Add gravity, a plane for the hand, and a plane for the object at the bottom of its `parts`."""
     spec.option.gravity = -_GRAVITY * support.normal
     add_plane(spec, TABLE, replace(support, offset=support.offset + support.margin), friction)
     for link in hand.link_names:
         # Real hands carry their own weight.
         spec.body(f"link:{link}").gravcomp = 1.0
-    if not parts:
-        return
     lowest = min(float((part.vertices @ support.normal).min()) for part in parts)
     add_plane(spec, _REST, Plane(support.normal, lowest), friction)
     spec.add_exclude(bodyname1=TABLE, bodyname2=OBJECT)
@@ -273,7 +248,6 @@ class World:
         coupled_addresses: index into `qpos` of each coupled joint, in the order of `mimics`.
         mimics: the coupled joints.
         fingers: number of the hand's fingertips.
-        others: body ids of the other free bodies.
         spare: `mujoco.MjData` of ended trials, which `trial_data` reuses.
         closed: squeeze, protocol and closed-hand state of the last grasps that held. `payload` reuses them.
         watch: called with the `mujoco.MjData` after every step of a trial. None in planning.
@@ -291,7 +265,6 @@ class World:
     coupled_addresses: np.ndarray = field(default_factory=lambda: np.zeros(0, dtype=np.int64))
     mimics: tuple[Mimic, ...] = ()
     fingers: int = 3
-    others: tuple[int, ...] = ()
     spare: deque[Any] = field(default_factory=deque, repr=False, compare=False)
     closed: deque[ClosedState] = field(default_factory=lambda: deque(maxlen=_MOST_CLOSED), repr=False, compare=False)
     watch: Callable[[Any], None] | None = field(default=None, repr=False, compare=False)
@@ -349,8 +322,6 @@ def build_world(
     protocol: Protocol,
     support: Plane | None = None,
     obstacles: Sequence[Obstacle] = (),
-    *,
-    others: Sequence[FreeBody] | None = None,
 ) -> World:
     """Compile the world of one hand and one object.
 
@@ -362,7 +333,6 @@ def build_world(
             its own plane through its lowest point, because a reconstructed bottom may be millimetres too high or too
             low.
         obstacles: fixed bodies, as their convex hulls. An obstacle that overlaps the object does not collide with it.
-        others: other free bodies. If given, even if empty, the object rests on `support` itself.
     """
     import mujoco
 
@@ -377,13 +347,11 @@ def build_world(
     add_object(spec, target, parts, protocol.friction)
     fixed = [TABLE] if support is not None else []
     if support is not None:
-        add_support(spec, hand, parts if others is None else (), protocol.friction, support)
+        add_support(spec, hand, parts, protocol.friction, support)
     for index, obstacle in enumerate(obstacles):
         fixed.append(f"neighbour {index + 1}")
         add_obstacle(spec, fixed[-1], obstacle, target, protocol.friction)
-    free = add_others(spec, others or (), protocol.friction)
-    world = _world_of(spec.compile(), hand, target, fixed, None if support is None else support.normal)
-    return replace(world, others=tuple(int(world.model.body(name).id) for name in free))
+    return _world_of(spec.compile(), hand, target, fixed, None if support is None else support.normal)
 
 
 def _world_of(

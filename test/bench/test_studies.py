@@ -32,7 +32,6 @@ PAGES = {
     "main": ("bench", "README.md"),
     "rgbd": ("rgbd", "docs/tables/clouds.md"),
     "cameras": ("cameras", "docs/tables/clouds.md"),
-    "piles": ("piles", "docs/tables/clouds.md"),
     "robust": ("robust", "docs/tables/stress.md"),
     "steered": ("steered", "docs/usage.md"),
     "early": ("early-ends", "docs/tables/bench.md"),

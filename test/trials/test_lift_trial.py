@@ -11,16 +11,16 @@ import numpy as np
 import pytest
 from made_meshes import box_of
 
-from graspd_bench.trials import Lifted, lift_out, placed, settle
+from graspd_bench.trials import FreeBody, settle
 from graspd_core import HandModel
 from graspd_core.errors import ConfigError
 from graspd_core.hands.kinematics import retreat_posture
 from graspd_core.mesh.sdf import build_sdf
 from graspd_core.perception.scene import Obstacle
-from graspd_core.types import Grasp, Plane, Posture, TrialResult, Verdict
+from graspd_core.types import Plane, TrialResult, Verdict
 from graspd_core.verify.lift_trial import LiftSettings, lift_trial
 from graspd_core.verify.trial_registry import TrialContext, grasp_trials
-from graspd_core.verify.world import PROTOCOLS, FreeBody, World, build_world
+from graspd_core.verify.world import PROTOCOLS, World, build_world
 from graspd_viewer.trial_controls import record_trial
 
 # On softer springs than the trials' own, so that a millimetre of squeeze is half a newton.
@@ -222,7 +222,6 @@ def test_a_trial_that_does_not_apply_is_refused(context, closing):
         record_trial(replace(context, around=None), closing(*GOOD), "lift")
 
 
-LIFT = LiftSettings(lift_height=0.25, hold_time=0.5)
 HALF = 0.02
 
 
@@ -239,74 +238,16 @@ def block(cube):
     return build
 
 
-def from_above(closing, z: float = 0.0, turned: bool = False) -> Grasp:
-    """The gripper straight down about a cube that stands at height z; turned, it points up, away from the cube."""
-    good = closing(0.015, 0.025, (0.04, 0.04))
-    # The fingers reach 70 mm along +z of the base; half a turn about y lets them come from above, 2 mm off the table.
-    quaternion = np.array([1.0, 0.0, 0.0, 0.0]) if turned else np.array([0.0, 0.0, 1.0, 0.0])
-
-    def there(posture: Posture) -> Posture:
-        place = np.array([0.0, 0.0, z + (0.13 if turned else 0.072)])
-        return replace(posture, position=place, quaternion_wxyz=quaternion)
-
-    return replace(good, pregrasp=there(good.pregrasp), grasp=there(good.grasp), squeeze=there(good.squeeze))
-
-
-def lifted(hand: HandModel, bodies: Sequence[FreeBody], index: int, grasp: Grasp) -> Lifted:
-    return lift_out(hand, bodies, index, grasp, STANDARD, LIFT)
-
-
 def test_a_pile_settles_on_the_table_the_same_way_every_time(block):
     pile = [block(0.0, 0.005, 0.06, (0.4, 0.2, 0.0)), block(0.01, 0.0, 0.14, (0.1, 0.7, 0.3)), block(0, 0.012, 0.22)]
     poses = settle(pile, wall=0.06)
     assert np.array_equal(poses, settle(pile, wall=0.06))
     rest = settle([replace(body, pose=pose) for body, pose in zip(pile, poses, strict=True)])
     for body, pose in zip(pile, rest, strict=True):
-        lowest = placed(replace(body, pose=pose))[0].mesh.vertices[:, 2].min()
+        lowest = (body.model.mesh.vertices @ pose[:3, :3].T + pose[:3, 3])[:, 2].min()
         # On the table, on one other or on two.
         assert -0.002 < lowest < 4 * HALF + 0.002
     # What rests goes on resting.
     again = settle([replace(body, pose=pose) for body, pose in zip(pile, rest, strict=True)])
     assert np.allclose(again, rest, atol=1e-3)
     assert settle([]) == ()
-
-
-def test_the_thing_that_is_held_comes_up_and_the_others_stay(hand, block, closing):
-    bodies = [block(0.15, 0.1, HALF), block(0.0, 0.0, HALF), block(-0.12, 0.0, HALF)]
-    came = lifted(hand, bodies, 1, from_above(closing))
-    assert came.result.passed, came.result
-    assert came.poses[1][:3, 3] == pytest.approx([0, 0, HALF + LIFT.lift_height], abs=0.01)
-    for k in (0, 2):
-        assert came.poses[k] == pytest.approx(bodies[k].pose, abs=2e-3)
-    assert came.hand is not None
-    assert came.hand.position[2] == pytest.approx(0.072 + LIFT.lift_height, abs=1e-6)
-
-
-def test_a_thing_that_lies_on_another_is_lifted_off_it(hand, block, closing):
-    grasp = from_above(closing, z=2 * HALF)
-    came = lifted(hand, [block(0, 0, HALF), block(0, 0, 3 * HALF)], 1, grasp)
-    assert came.result.passed, came.result
-    assert came.poses[0][2, 3] == pytest.approx(HALF, abs=2e-3)
-
-
-def test_a_grasp_turned_away_fails_and_says_so(hand, block, closing):
-    came = lifted(hand, [block(0.0, 0.0, HALF)], 0, from_above(closing, turned=True))
-    assert not came.result.passed
-    assert came.result.reason.endswith("while lifting")
-    assert came.poses[0][2, 3] == pytest.approx(HALF, abs=2e-3)
-
-
-def test_a_hand_that_would_reach_into_the_table_never_moves(hand, block, closing):
-    grasp = from_above(closing)
-    low = replace(grasp.grasp, position=grasp.grasp.position - [0, 0, 0.01])
-    came = lifted(hand, [block(0.0, 0.0, HALF)], 0, replace(grasp, grasp=low))
-    assert "into the support" in came.result.reason
-    assert came.hand is None
-    assert np.array_equal(came.poses[0], np.array(block(0.0, 0.0, HALF).pose))
-
-
-def test_a_neighbour_in_the_way_is_pushed(hand, block, closing):
-    """The open fingers end at y = ±40 mm: what lies there is hit as they come down, and is moved."""
-    bodies = [block(0.0, 0.0, HALF), block(0.0, 0.055, HALF)]
-    came = lifted(hand, bodies, 0, from_above(closing))
-    assert np.linalg.norm(came.poses[1][:3, 3] - bodies[1].pose[:3, 3]) > 0.005
