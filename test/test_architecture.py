@@ -69,7 +69,7 @@ MAX_PACKAGE_LINES = {
     "graspd_dataset": 2_961,
     "graspd_viewer": 2_394,
     "graspd_cell": 3_794,
-    "test": 32_829,
+    "test": 32_844,
 }
 # Lines that a program reaches through its imports, those inside functions too.
 # The layout aims at 22,000 of the node.

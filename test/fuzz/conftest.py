@@ -1,19 +1,30 @@
-"""Ways to spoil the inputs of the parsers in benchmarks/fuzz_targets.py."""
+"""The parsers of benchmarks/fuzz_targets.py, and ways to spoil their inputs."""
 
 import copy
+import importlib
 import re
 import xml.etree.ElementTree as ET
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
+from types import ModuleType
 
 import pytest
 from hypothesis import strategies as st
 
+BENCHMARKS = Path(__file__).parents[2] / "benchmarks"
 NASTY = (
     *("nan", "NaN", "inf", "-inf", ".nan", "1e400", "1e308", "-1e308", "1e-320", "-1", "0", "", " ", "x", "null"),
     *("true", "99999999999999999999", "-9223372036854775808", "4294967295", "1" + 400 * "0", 5000 * "1", "٣", "\x00"),
     *("[", "{", "[[1, 2], [3]]", "\n", "<a/>", "&x;", "<!DOCTYPE a>", "*a", "&a [1]", "0x" + 5000 * "f", '"', "../x"),
 )  # fmt: skip
+
+
+@pytest.fixture(scope="session")
+def fuzz() -> Iterator[ModuleType]:
+    """The module fuzz_targets."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.syspath_prepend(str(BENCHMARKS))
+        yield importlib.import_module("fuzz_targets")
 
 
 @pytest.fixture(scope="session")
