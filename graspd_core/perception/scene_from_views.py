@@ -22,8 +22,9 @@ from graspd_core.perception.segment.target_selection import Target
 from graspd_core.runtime.worker_process import run_isolated
 from graspd_core.types import Plane
 
-# From this distance to the origin on, float32 coordinates are coarser than a camera [m].
-_FAR = 100.0
+# From this distance to the origin on, float32 coordinates are coarser than a camera [m]. Coordinates from `_ENDLESS` on
+# count as infinite, because their squares exceed the largest number.
+_FAR, _ENDLESS = 100.0, 1e100
 # Least range of depth cameras [m], and fraction of points out of range above which the unit of a scene is doubtful.
 _NEAREST, _CUT_OFF = 0.1, 0.3
 
@@ -115,8 +116,10 @@ def reconstruct_object(
 
 
 def _single(points: Points) -> Points:
-    near = np.abs(points[np.isfinite(points)]).max(initial=0.0) < _FAR
-    return points.astype(np.float32).astype(float) if near else points
+    farthest = np.abs(points[np.isfinite(points)]).max(initial=0.0)
+    if farthest < _FAR:
+        return points.astype(np.float32).astype(float)
+    return points if farthest < _ENDLESS else _single(np.where(np.abs(points) < _ENDLESS, points, np.nan))
 
 
 def _unit_doubts(seen: Segmentation, views: Sequence[PointCloud], farthest: float) -> tuple[str, ...]:

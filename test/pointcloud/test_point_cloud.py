@@ -20,6 +20,7 @@ from graspd_core.perception.cloud.point_cloud import (
     transform_cloud,
 )
 from graspd_core.perception.reconstruct.reconstruct import reconstruct
+from graspd_core.perception.scene_from_views import scene_from_views
 from graspd_core.perception.segment.segment import segment
 
 ORIGIN = np.zeros(3)
@@ -58,6 +59,16 @@ def test_one_point_far_away_does_not_spoil_the_others(far):
     np.testing.assert_array_equal(clean, clean_cloud(points))
     with pytest.raises(CloudError, match="too far apart"):
         clean_cloud(points * 1e300)
+
+
+@pytest.mark.filterwarnings("error")
+def test_in_a_scene_numbers_whose_squares_overflow_count_as_missing():
+    points, _ = surface_samples(make_shape("box"), 3000, 0)
+    missing, far = (np.vstack([points, [[place, 0, 0]]]) for place in (np.nan, 1e300))
+    seen = [scene_from_views([PointCloud(cloud, np.zeros(3))], alone=True) for cloud in (missing, far)]
+    np.testing.assert_array_equal(seen[0].object.mesh.vertices, seen[1].object.mesh.vertices)
+    with pytest.raises(CloudError, match="NaN or infinite"):
+        scene_from_views([PointCloud(np.full((1, 3), 1e300), np.zeros(3))])
 
 
 def test_a_cloud_moves_with_its_camera():
