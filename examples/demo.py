@@ -29,6 +29,7 @@ from std_msgs.msg import String
 
 from graspd_bench.rendering.render import camera_of_view, look_at, render_depth, render_shaded, save_png
 from graspd_core import Posture, TriangleMesh, cloud_from_depth, load_hand, make_shape, save_mesh
+from graspd_core.types import joined
 from graspd_viewer.grasp_page import placed_hand
 
 GRASPS = 8
@@ -136,8 +137,10 @@ def describe(best: dict[str, Any]) -> str:
 
 
 def cloud_of(mug: TriangleMesh) -> PointCloud2:
-    """Return a cloud of one side of the mug, as a depth camera sees it, in the camera's optical frame."""
-    points = cloud_from_depth(render_depth(mug, CAMERA, T_MUG_CAMERA), CAMERA).points.astype("<f4")
+    """Return a cloud of the mug on a table, as a depth camera sees it, in the camera's optical frame."""
+    corners = [(x, y, mug.vertices[:, 2].min()) for x, y in ((-0.3, -0.3), (0.3, -0.3), (0.3, 0.3), (-0.3, 0.3))]
+    scene = joined(mug, TriangleMesh(np.array(corners), np.array([[0, 1, 2], [0, 2, 3]])))
+    points = cloud_from_depth(render_depth(scene, CAMERA, T_MUG_CAMERA), CAMERA).points.astype("<f4")
     fields = [PointField(name=n, offset=4 * i, datatype=PointField.FLOAT32, count=1) for i, n in enumerate("xyz")]
     cloud = PointCloud2(height=1, width=len(points), fields=fields, point_step=12, row_step=12 * len(points))
     cloud.header.frame_id = "camera_optical_frame"
