@@ -76,7 +76,7 @@ def grasps_of_view(case: CameraView) -> list[dict[str, Any]]:
         shapes = [hold.passed for hold in islice(possible, OTHER_SHAPES)]
         rows.append({
             "view": case.label, "way": case.way, "lowered": result.mass is not None, "places": sum(places),
-            "slippery": slippery, "shapes": sum(shapes), "of_shapes": len(shapes), "doubted": bool(asked.doubts),
+            "slippery": slippery, "shapes": sum(shapes), "of_shapes": len(shapes),
             "own": hold_trial(own, grasp, out_of_place(protocol)).passed,
         })  # fmt: skip
     return rows
@@ -117,8 +117,7 @@ def main() -> None:
                 lines.append({"view": case.label, "grasps": [], "refused": str(error)})
             file.write(json.dumps(lines[-1]) + "\n")
             file.flush()
-    rows = [row for line in lines for row in line["grasps"] if not row["doubted"]]
-    print(f"doubted scene: {share([row for line in lines for row in line['grasps'] if row['doubted']])}")
+    rows = [row for line in lines for row in line["grasps"]]
     two = lambda row: row["shapes"] == row["of_shapes"]  # noqa: E731
     most = lambda row: row["places"] >= 2  # noqa: E731
     every = lambda row: row["places"] == 3 and row["slippery"]  # noqa: E731

@@ -205,10 +205,11 @@ def executed(attempt: Record) -> bool:
 
 
 def first_attempts(attempts: Sequence[Record]) -> list[Record]:
-    """Return the first attempt at each object, as identified by the referee."""
+    """Return the first attempt at each object, as identified by the referee. It identifies none if nothing is near."""
     firsts: dict[str, Record] = {}
     for attempt in attempts:
-        firsts.setdefault(attempt["target"], attempt)
+        if attempt["target"]:
+            firsts.setdefault(attempt["target"], attempt)
     return list(firsts.values())
 
 

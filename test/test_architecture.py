@@ -63,17 +63,17 @@ MAY_IMPORT = {
 # Most lines of Python per package. They are lowered when the code shrinks, and raised only with a reason.
 # The layout aims at 22,000 of graspd_core, 4,500 of graspd_ros, 26,000 of test. Input checks added 1,700, 500, 3,300.
 MAX_PACKAGE_LINES = {
-    "graspd_core": 27_404,
+    "graspd_core": 27_405,
     "graspd_ros": 5_241,
     "graspd_bench": 8_331,
     "graspd_dataset": 2_961,
     "graspd_viewer": 2_394,
-    "graspd_cell": 3_794,
-    "test": 32_855,
+    "graspd_cell": 3_795,
+    "test": 32_856,
 }
 # Lines that a program reaches through its imports, those inside functions too.
 # The layout aims at 22,000 of the node.
-MAX_REACH = {"graspd_core.cli.synthesize_command": 22_417, "graspd_ros.node": 26_247}
+MAX_REACH = {"graspd_core.cli.synthesize_command": 22_418, "graspd_ros.node": 26_248}
 
 # The launch file imports this one where ROS runs it, perhaps without any library of graspd.
 SHORT = ("graspd_core/paths.py",)

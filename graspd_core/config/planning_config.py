@@ -119,7 +119,7 @@ class HeldShares:
     fails_shapes: float
 
 
-# Measured on 385 grasps planned without a mass and 544 with the true mass, from 152 single views (docs/clouds.md).
+# Measured on 385 grasps planned without a mass and 544 with the true mass, on 76 single views (docs/clouds.md).
 # An assumed mass is the heavy end of what the volume allows, so trials lift more than most objects weigh.
 MASS_ASSUMED = HeldShares(0.85, 0.88, 0.95, 0.77, 0.85)
 MASS_KNOWN = HeldShares(0.80, 0.89, 0.95, 0.61, 0.83)

@@ -23,7 +23,7 @@ from graspd_core.runtime.worker_process import run_isolated
 from graspd_core.types import Plane
 
 # From this distance to the origin on, float32 coordinates are coarser than a camera [m]. Coordinates from `_ENDLESS` on
-# count as infinite, because their squares exceed the largest number.
+# count as missing, because their squares overflow.
 _FAR, _ENDLESS = 100.0, 1e100
 # Least range of depth cameras [m], and fraction of points out of range above which the unit of a scene is doubtful.
 _NEAREST, _CUT_OFF = 0.1, 0.3

@@ -1,8 +1,9 @@
 """Planning for any object of a scene: find one object with a verified grasp, else rank the objects by probability.
 
 Objects with fewer earlier failures come first. Among equals, higher objects come first, because nothing lies on them.
-An object without failures gets one round of the planner. The first verified grasp ends the search. After `enough`
-objects, a likely grasp also ends the search, to limit its time. `result_of_things` returns the result of one request.
+An object gets one round of the planner, and all rounds if an earlier search found no grasp for it. The first verified
+grasp ends the search. After `enough` objects, a likely grasp also ends the search, to limit its time.
+`result_of_things` returns the result of one request.
 """
 
 from __future__ import annotations

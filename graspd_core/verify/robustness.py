@@ -1,9 +1,9 @@
 """Robustness checks for objects seen by cameras: other poses, less friction, other shapes of the hidden side.
 
-A grasp that holds on the likeliest scene must also pass these checks. It must hold on two other shapes and turn them
-less, because the hidden side may be guessed wrong. docs/clouds.md reports how often such grasps hold on the true
-object. Trials run on several threads. `results_in_order` yields the same results in the same order for any number of
-threads.
+A grasp that holds on the likeliest scene must also pass these checks. It must hold on two other shapes, with two thirds
+of the usual limit of rotation, because the hidden side may be guessed wrong. docs/clouds.md reports how often such
+grasps hold on the true object. Trials run on several threads. `results_in_order` yields the same results in the same
+order for any number of threads.
 """
 
 from __future__ import annotations
@@ -139,7 +139,7 @@ class CheckStage:
     Attributes:
         items: the checks, in the order in which they run.
         least: number of checks that a grasp must pass. If there are fewer possible checks, it must pass all.
-        may_fail: number of checks that it may fail before.
+        may_fail: number of checks that it may fail before it has passed `least`.
         though_failed: probability that a grasp holds on the true object although it fails this stage.
     """
 
@@ -261,7 +261,7 @@ def doubted_if_weak(checks: RobustnessChecks, most: float, heavy: float) -> Robu
 def less_sure(checks: RobustnessChecks, most: float, heavy: float) -> RobustnessChecks:
     """Scale all probabilities by the fraction of objects that weigh at most the payload `most` [kg].
 
-    See `doubted_if_weak`, which comes first.
+    First the doubt of `doubted_if_weak` is added.
     """
     checks, share = doubted_if_weak(checks, most, heavy), share_as_light(most, heavy)
     stages = tuple(replace(stage, though_failed=share * stage.though_failed) for stage in checks.stages)

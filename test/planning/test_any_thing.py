@@ -99,7 +99,8 @@ def test_a_grasp_like_one_that_was_lost_is_not_given_again(views: tuple[PointClo
     assert first[0].grasp.verdict is Verdict.VERIFIED
     assert again[0].grasp.verdict is Verdict.UNVERIFIED
     assert "an earlier grasp of this object failed" in again[0].reason
-    assert (again[0].grasp.probability or 0.0) <= DOUBTED_SHARE
+    assert again[0].grasp.probability is not None
+    assert 0 < again[0].grasp.probability <= DOUBTED_SHARE
 
 
 def test_nothing_on_the_table_is_no_thing_and_an_empty_cloud_is_told(views: tuple[PointCloud, ...]):
