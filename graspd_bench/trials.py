@@ -30,6 +30,7 @@ from graspd_core.types import Grasp, Plane, Posture, TriangleMesh
 from graspd_core.verify.early_stop import CHECK_EVERY, CREEPING, ObjectState
 from graspd_core.verify.hold_trial import DIRECTIONS, close_hand, diverged, moved, object_state
 from graspd_core.verify.world import (
+    OBJECT,
     PROTOCOLS,
     Protocol,
     World,

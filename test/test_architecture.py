@@ -65,7 +65,7 @@ MAY_IMPORT = {
 MAX_PACKAGE_LINES = {
     "graspd_core": 27_405,
     "graspd_ros": 5_241,
-    "graspd_bench": 8_331,
+    "graspd_bench": 8_332,
     "graspd_dataset": 2_961,
     "graspd_viewer": 2_394,
     "graspd_cell": 3_795,
