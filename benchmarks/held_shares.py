@@ -71,7 +71,7 @@ def grasps_of_view(case: CameraView) -> list[dict[str, Any]]:
     rows = []
     for grasp in (grasp for grasp in result.tried if grasp.verdict is Verdict.VERIFIED):
         holds = [(item.hold(grasp, lambda: False) for item in stage.items) for stage in asked.stages]
-        *places, slippery = (hold is not None and hold.passed for hold in holds[0]) if holds else (False,)
+        *places, slippery = (hold is not None and hold.passed for hold in holds[0])
         possible = (hold for hold in holds[1] if hold is not None) if len(holds) > 1 else iter(())
         shapes = [hold.passed for hold in islice(possible, OTHER_SHAPES)]
         rows.append({

@@ -63,7 +63,7 @@ def read_record(folder: Path, study: str, case: Case, code: str | None, *, faile
     return record if (failed or not record.get("error")) and code in (None, record.get("code")) else None
 
 
-def results_document(records: Sequence[Record]) -> dict[str, Any]:
+def results_document(records: Sequence[Record]) -> Record:
     """Return the content of results.json, JSON-ready."""
     return {"format": FORMAT, "version": VERSION, "records": records}
 
