@@ -3,9 +3,10 @@
     ranking.py try [--objects shape:mug PATH ...] [--hands allegro_right ...] [--out results/ranking]
     ranking.py fit [--out results/ranking] [--held-out results/ranking-scans]
 
-`try` finds candidates, 24 grasps' worth a block, of random size, friction of the trial and preset, and tries all,
-whatever their rank; it goes on where it was stopped. Without --objects it takes the eleven shapes, at 0.2 to 2 times
-their size, and five kinds of large things with thin walls, of random sizes (`hollow`). `fit` trains a network on them,
+`try` finds candidates, 24 grasps' worth a block, and tries all, whatever their rank. Mass, trial friction and preset
+are random, and every second object stands on a table. `try` goes on where it was stopped. Without --objects it takes
+the eleven shapes, at 0.2 to 2 times their size, five kinds of large things with thin walls, of random sizes (`hollow`),
+and the seven families of irregular objects that the study `cameras` does not use. `fit` trains a network on them,
 leaves each object out in turn and each hand, tells what its order is worth against the order by chance, by the linear
 score of before and by the network that ships, and writes the network of all.
 """
@@ -14,6 +15,7 @@ from __future__ import annotations
 
 import argparse
 from collections.abc import Sequence
+from dataclasses import replace
 from itertools import pairwise, product
 from pathlib import Path
 from typing import Any
@@ -23,6 +25,9 @@ import torch
 import trimesh
 from torch import nn
 
+from graspd_bench.rendering.families import FAMILIES, PREFIX, draw_object
+from graspd_bench.rendering.tabletop import moved, resting_pose
+from graspd_bench.studies.cameras import CHOSEN_ON, FIRST_SEED
 from graspd_bench.study import all_shapes
 from graspd_core import load_hand, load_scene
 from graspd_core.optimize import ranking
@@ -31,7 +36,7 @@ from graspd_core.optimize.loop import Hooks
 from graspd_core.optimize.plan_config import load_preset, method_row
 from graspd_core.optimize.ranking import FARTHEST, log_odds, ranking_figures
 from graspd_core.perception.scene import Scene, object_parts
-from graspd_core.types import TriangleMesh
+from graspd_core.types import Plane, TriangleMesh
 from graspd_core.verify.hold_trial import hold_trial
 from graspd_core.verify.world import PROTOCOLS, at_friction, build_world
 from graspd_dataset.run_records import markdown_table
@@ -40,9 +45,11 @@ SHIPS = Path(ranking.__file__).with_suffix(".npz")
 HANDS = ("allegro_right", "leap_right", "barrett_like", "parallel_gripper")
 PRESETS = ("balanced", "balanced", "fast", "accurate")
 HOLLOW = ("hollow:cup", "hollow:bowl", "hollow:tube", "hollow:carton", "hollow:tray")
-VARIANTS, COUNT = 3, 24
-SCALES = (0.2, 2.0)
-WIDTH, EPOCHS, BATCH, RATE, DECAY = 16, 30, 256, 3e-3, 1.0
+IRREGULAR = tuple(PREFIX + name for name in FAMILIES if name in CHOSEN_ON)
+VARIANTS, COUNT = 5, 24
+# Ranges of sizes, relative to the shapes, and of masses, relative to the heavy end of what the volume allows.
+SCALES, MASSES = (0.2, 2.0), (0.05, 1.5)
+WIDTH, EPOCHS, BATCH, RATE, DECAY = 32, 60, 256, 3e-3, 0.1
 # Candidates that one order is told by, or all where there are fewer, and those of them that a robot would look at.
 GROUP, FIRST, DRAWS = 32, 8, 40
 # Candidates of an object and hand that a plan would take.
@@ -74,13 +81,19 @@ def hollow(kind: str, rng: np.random.Generator) -> trimesh.Trimesh:
 
 
 def thing_scene(source: str, rng: np.random.Generator, friction: float, resolution: int) -> Scene:
-    """The scene of a block's object: a shape of random size, a hollow thing of a kind, or what a file holds."""
+    """The scene of a block's object: a shape of random size, a hollow or irregular thing, or what a file holds."""
     if source in HOLLOW:
         made = hollow(source, rng)
         mesh = TriangleMesh(np.asarray(made.vertices), np.asarray(made.faces))
-        return load_scene(mesh, mass=0.1, friction=friction, resolution=resolution)
-    scale = float(np.exp(rng.uniform(*np.log(SCALES)))) if source.startswith("shape:") else 1.0
-    return load_scene(source, mass=0.1, scale=scale, friction=friction, resolution=resolution)
+    elif source.startswith(PREFIX):
+        mesh = draw_object(source.removeprefix(PREFIX), int(rng.integers(FIRST_SEED))).mesh
+    else:
+        scale = float(np.exp(rng.uniform(*np.log(SCALES)))) if source.startswith("shape:") else 1.0
+        mesh = load_scene(source, scale=scale).object.mesh
+    scene = load_scene(moved(mesh, resting_pose(mesh, rng)), friction=friction, resolution=resolution)
+    thing = scene.object.at_mass(float(np.exp(rng.uniform(*np.log(MASSES)))) * scene.object.mass)
+    table = Plane(np.array([0.0, 0.0, 1.0]), float(thing.mesh.vertices[:, 2].min()))
+    return replace(scene, object=thing, support=table if rng.random() < 0.5 else None)
 
 
 def try_block(where: Path, source: str, hand_name: str, variant: int, count: int) -> None:
@@ -97,17 +110,19 @@ def try_block(where: Path, source: str, hand_name: str, variant: int, count: int
     task = PlannerInput(scene, hand, count, variant, config, Hooks())
     some = staged(task.problem, hand, method_row(config.method).plan(task).poses, config)
     grasps = finished(task.problem, hand, some)
+    # A candidate in the table is dropped before its trial.
+    kept = np.flatnonzero([np.isfinite(grasp.score) for grasp in grasps])
     held = {}
     for trial in ("standard", "hard"):
         protocol = at_friction(PROTOCOLS[trial], friction)
         world = build_world(hand, scene.object, object_parts(scene.object), protocol)
-        held[trial] = np.array([hold_trial(world, grasp, protocol).passed for grasp in grasps])
-    figures = ranking_figures(task.problem, some).numpy()
+        held[trial] = np.array([hold_trial(world, grasps[row], protocol).passed for row in kept], dtype=bool)
+    figures = ranking_figures(task.problem, some).numpy()[kept]
     partial = file.with_suffix(".partial")
     with partial.open("wb") as out:
         np.savez(out, figures=figures, object=source, hand=hand_name, preset=preset, **held)
     partial.rename(file)
-    print(f"{name}: {preset}, {held['standard'].sum()} of {len(grasps)} hold, {held['hard'].sum()} the hard trial")
+    print(f"{name}: {preset}, {held['standard'].sum()} of {len(kept)} hold, {held['hard'].sum()} the hard trial")
 
 
 def fitted(data: dict[str, np.ndarray], rows: np.ndarray, seed: int = 0) -> dict[str, np.ndarray]:
@@ -236,7 +251,7 @@ def fit(folder: Path, held_out: Path | None, to: Path) -> None:
 def main(arguments: Sequence[str] | None = None) -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("what", choices=("try", "fit"))
-    parser.add_argument("--objects", nargs="+", default=[*all_shapes(), *HOLLOW])
+    parser.add_argument("--objects", nargs="+", default=[*all_shapes(), *HOLLOW, *IRREGULAR])
     parser.add_argument("--hands", nargs="+", default=list(HANDS))
     parser.add_argument("--variants", type=int, default=VARIANTS)
     parser.add_argument("--count", type=int, default=COUNT)

@@ -273,7 +273,7 @@ def _mean(group: Sequence[Row], figure: str) -> float | None:
 
 
 def comparison(old: Sequence[Record], new: Sequence[Record]) -> str:
-    """Return a text table of the changed values. Below it are the cells that only one of the two runs has."""
+    """Return a text table of the values that differ between two runs. Below it are the cases that only one run has."""
     old, new = ([record for record in records if "kind" in record] for records in (old, new))
     lines = [f"{'cells':9} {'preset':32} {'object':22} {'figure':22} {'old':>9} {'new':>9}  change"]
     for move in moves(old, new):

@@ -167,7 +167,7 @@ class Picker:
                 if offer.exhausted:
                     return
                 if offer.grasp is not None:
-                    self._failures.append(Failure(offer.place, offer.grasp.grasp))
+                    self._failures.append(Failure(offer.place, offer.grasp.grasp, executed=False))
                 continue
             attempts += 1
             attempt = self.attempt(offer, self.world_of(view), began, attempts)
@@ -322,7 +322,8 @@ class Picker:
         if attempt.ending is Ending.PICKED:
             self._failures = [failure for failure in self._failures if failure.grasp is not None]
         elif offer.grasp is not None:
-            self._failures.append(Failure(offer.place, offer.grasp.grasp))
+            executed = attempt.ending is not Ending.NO_WAY
+            self._failures.append(Failure(offer.place, offer.grasp.grasp, executed))
 
     # Helpers of the behaviours.
 

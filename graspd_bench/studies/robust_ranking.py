@@ -37,7 +37,10 @@ def robust_cases(request: Request) -> tuple[ObjectCase, ...]:
 
 
 def run_robust(case: ObjectCase) -> Record:
-    """Plan with and without ranking. Return both CPU times, and each grasp's score, noisy share, and evaluation."""
+    """Plan with and without ranking. Return both CPU times and the figures of each verified grasp.
+
+    These are its score, the share of ranking trials that it holds, and the share of further trials that it holds.
+    """
     config = case.config
     ranked = replace(config, robust=replace(config.robust, rank=True))
     hand, scene = case.load(friction=FRICTION)

@@ -73,7 +73,10 @@ def drawn_constraint(case: SteeredCase, scene: Scene) -> Steering:
 
 
 def _end_of(vertices: Float[np.ndarray, "n 3"], rng: np.random.Generator, share: float, beyond: float) -> Box:
-    """Draw a box around an end of the object. It has `share` of the object's length, plus `beyond` [m] on each side."""
+    """Draw a box around one end of the object, along a random axis.
+
+    The end is `share` of the object's length on this axis. The box extends `beyond` [m] further on every side.
+    """
     low, high = vertices.min(0), vertices.max(0)
     axis, side = int(rng.integers(3)), int(rng.integers(2))
     breadth = max(share * (high - low)[axis], _BREADTH if beyond < _BEYOND else 0.0)

@@ -60,7 +60,10 @@ def _build(options: argparse.Namespace) -> int:
 
 
 def _add_object(options: argparse.Namespace, library: GraspLibrary, source: str, scale: float, *rest: Any) -> int:
-    """Plan and add the missing grasps (`rest`: hand, config, request, stop). Return the object's number of grasps."""
+    """Plan the grasps that the library lacks of the object. Return the number that it has then.
+
+    `rest` holds hand, config, request and stop hook.
+    """
     from graspd_core.library.grasp_library import entry_of
     from graspd_core.library.known_grasps import add_planned
     from graspd_core.perception.load_scene import load_scene

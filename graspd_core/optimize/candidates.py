@@ -96,15 +96,16 @@ class Candidates:
     interrupted: str
 
 
-def find_candidates(task: PlannerInput) -> Candidates:
+def find_candidates(task: PlannerInput, *, searches: int | None = None) -> Candidates:
     """Run the configured method and return its ranked candidates, perhaps fewer than `count`.
 
     If the ranking expects too few grasps to hold, the search is repeated from new starts. This helps on small, large
-    and long objects. Restrictions act here only on the starts. The caller checks the candidates against them.
+    and long objects. There are at most `searches` searches. None takes the method's setting. Restrictions act here
+    only on the starts. The caller checks the candidates against them.
     """
     config, count = task.config, task.count
     found = _searched(task)
-    for again in range(1, method_row(config.method).searches(config.settings)):
+    for again in range(1, searches or method_row(config.method).searches(config.settings)):
         if found.interrupted or expected_to_hold(found.grasps[:count]) >= _LEAST_EXPECTED * count:
             break
         more = _searched(replace(task, seed=task.seed + _SEED_STEP * again))

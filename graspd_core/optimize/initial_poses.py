@@ -156,7 +156,8 @@ def _aimed(
 ) -> StartPool:
     """Turn and move the hands of a pool so that they meet `aim`. The joints do not change.
 
-    Each grip faces a random wanted place, else a `surface` point [m], at its standoff from the first surface before it.
+    The grip of each hand faces a random place of `aim`, or a random `surface` point [m] if `aim` has no places. It
+    keeps its standoff from the outermost surface in front of that point.
     """
     count, rotation = len(pool.joints), pool.rotation
     if aim.direction is not None:

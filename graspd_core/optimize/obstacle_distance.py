@@ -138,7 +138,7 @@ def extreme_points(hand: HandModel) -> tuple[Float[np.ndarray, "corners 3"], Flo
 
 
 def extreme_points_of_solids(hand: HandModel) -> list[tuple[Float[np.ndarray, "n 3"], float, int]]:
-    """Return each primitive's extreme points in the link frame [m], their radius [m], and the link."""
+    """Return balls whose convex hull is the primitive, for each one: centres in the link frame, radius [m], link."""
     found = ((*_extremes(primitive), primitive) for primitive in hand.primitives)
     return [(at @ solid.rotation.T + solid.translation, radius, solid.link) for at, radius, solid in found]
 

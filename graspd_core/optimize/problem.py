@@ -151,10 +151,10 @@ class ObjectTensors:
 def make_hand_tensors(
     hand: HandModel, candidates: int, patch_size: int, device: str, dtype: torch.dtype
 ) -> HandTensors:
-    """Convert a hand to tensors. The coarse set is the first `candidates` of the hand's contact candidates.
+    """Convert a hand to tensors. Coarse steps use only the first `candidates` of the hand's contact candidates.
 
-    Each rigid group of links is one group of candidates. If `patch_size` is not 0, it is split into patches of about
-    `patch_size` coarse candidates. The tensors of recent hands are cached.
+    The candidates of each rigid group of links form one group. If `patch_size` is not 0, each group is split into
+    patches of about `patch_size` coarse candidates. The tensors of recent hands are cached.
     """
 
     def tensor(values: np.ndarray) -> Tensor:

@@ -111,7 +111,7 @@ def ranking_figures(problem: Problem, staged: Staged) -> Float[Tensor, "batch fi
         shift / 0.01,
         to_center.norm(dim=-1),
         (to_center * (rotation @ palm[1])).sum(-1),
-        torch.full_like(shift, float(np.log(length))),
+        *(torch.full_like(shift, float(np.log(value))) for value in (length, problem.object.mass)),
     ]
     return torch.nan_to_num(torch.stack(columns, -1).double().cpu())
 

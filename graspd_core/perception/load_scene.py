@@ -96,7 +96,7 @@ def scaled_views(
     """Return the views of a point cloud file or a depth image [m]. Raises CloudError like `load_scene`."""
     if camera is not None:
         if view_point is not None:
-            raise CloudError(f"view_point: {source} is a depth image; valid with clouds of points only")
+            raise CloudError(f"view_point: {source} is a depth image; only a cloud of points takes a view point")
         return [load_depth_view(source, camera, None if scale == 1.0 else scale)]
     if is_depth_image(source):
         raise CloudError(f"{source}: a depth image needs the camera that took it: --camera camera.json")

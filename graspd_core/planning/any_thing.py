@@ -51,11 +51,13 @@ class Failure:
 
     Attributes:
         place: mean of the object's points [m]. None if the object is unknown. Then only the grasp is avoided.
-        grasp: hand posture at the failed grasp. None if no grasp was tried.
+        grasp: hand posture at the failed grasp. None if there was no grasp.
+        executed: whether a robot executed the grasp. If it did, the object's scene is doubted.
     """
 
     place: Float[np.ndarray, "3"] | None
     grasp: Posture | None = None
+    executed: bool = True
 
 
 @dataclass(frozen=True, eq=False)
@@ -123,7 +125,7 @@ def plan_any_thing(
         mass: mass of each object [kg]. None assumes the `heavy_mass` of each object's volume.
         friction: Coulomb friction coefficient between hand and objects.
         source: name of the views, for messages.
-        failures: failures of earlier requests. Grasps like the failed ones are left out, and their objects are doubted.
+        failures: failures of earlier requests. Grasps like the failed ones are left out.
         tries: number of failures after which an object is skipped.
         deadline: time after which the whole search ends [s]. None for no limit.
         enough: number of objects after which a likely grasp ends the search.
@@ -209,9 +211,9 @@ def _scene_among(
 ) -> Scene | str:
     """Return the scene of the object with these points, or the message of the error.
 
-    `about` holds other arguments of `scene_from_views`. If a grasp of the object failed, the scene is doubted.
+    `about` holds other arguments of `scene_from_views`. If an executed grasp failed, the scene is doubted.
     """
-    again = any(failure.grasp is not None for failure in failed)
+    again = any(failure.grasp is not None and failure.executed for failure in failed)
     # The target is a point on the object, because the middle of a ring is empty.
     middle = points[np.linalg.norm(points - points.mean(0), axis=1).argmin()]
     try:

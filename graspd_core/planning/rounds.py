@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time
 from collections import Counter
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 
@@ -14,7 +14,7 @@ from graspd_core.errors import ResourceError
 from graspd_core.hands.model import HandModel
 from graspd_core.optimize.candidates import PlannerInput, find_candidates
 from graspd_core.optimize.loop import Hooks, Poses
-from graspd_core.optimize.plan_config import PlanConfig
+from graspd_core.optimize.plan_config import PlanConfig, method_row
 from graspd_core.optimize.restrictions import UNRESTRICTED, BoundRestrictions
 from graspd_core.perception.scene import Scene
 from graspd_core.types import Grasp, Snapshot, Stage, Verdict
@@ -135,19 +135,22 @@ def run_rounds(
 ) -> RoundsResult:
     """Find and try candidates, round by round, until `count` grasps are `RoundsResult.good`.
 
-    If many grasps are requested, a small batch comes first, for an early answer. If too few grasps hold, the next round
+    If many grasps are requested, a small batch comes first, for an early answer. If too few grasps hold, the next batch
     starts from other initial poses. Candidates that a restriction refuses are not tried. `prefetched` holds the worlds
     of the trials. Without it, no candidate is tried.
     """
     state = RoundsResult(time.perf_counter())
-    rounds = rounds[:1] if scene.evidence is not None and scene.evidence.doubts else rounds
-    early = [(config, _FIRST_BATCH) for config in rounds[:1] if prefetched is not None and count >= _MANY]
-    for attempt, (config, most) in enumerate([*early, *((config, count) for config in rounds)]):
-        enough, good, began = min(most + state.good, count), state.good, time.perf_counter()
-        options = {"config": config, "hooks": _hooks(run, good), "device": device, "restrictions": restrictions}
+    doubted = scene.evidence is not None and bool(scene.evidence.doubts)
+    early = prefetched is not None and count >= _MANY
+    # Trials show sooner than the ranking whether another search is needed. In doubtful scenes they show little.
+    once = prefetched is not None and not doubted
+    for attempt, batch in enumerate(_batches(rounds[:1] if doubted else rounds, count, early, once)):
+        enough, good, began = min(batch.most + state.good, count), state.good, time.perf_counter()
+        options = {"config": batch.config, "hooks": _hooks(run, good), "device": device, "restrictions": restrictions}
         seek = enough - good if good or not attempt else max(enough, _MANY)
         with enough_memory(f"{seek} grasps at once"):
-            candidates = find_candidates(PlannerInput(scene, hand, seek, seed + _SEED_STEP * attempt, **options)).grasps
+            task = PlannerInput(scene, hand, seek, seed + _SEED_STEP * attempt, **options)
+            candidates = find_candidates(task, searches=1 if once else None).grasps
         # The time is counted here, because the loop below does not run after an interrupted search.
         state, began = _searched_since(state, began), time.perf_counter()
         for some in _in_rank_order(candidates, enough - good, restrictions):
@@ -159,9 +162,8 @@ def run_rounds(
                 tried = TriedGrasps(measured(scene, hand, first) if measure else first)
             elif admitted:
                 if state.context is None:
-                    context = make_trial_context(
-                        run, scene, hand, prefetched, config.certainty, measure=measure, friction=config.robust.friction
-                    )
+                    asked = {"measure": measure, "friction": batch.config.robust.friction}
+                    context = make_trial_context(run, scene, hand, prefetched, batch.config.certainty, **asked)
                     state = replace(state, context=context)
                 if state.context is not None:
                     tried = run_trials(run, state.context, admitted, enough - state.good, state.good)
@@ -173,13 +175,36 @@ def run_rounds(
         if state.good >= count or run.over():
             break
         # Lower the mass only after a second round for stronger grasps. Without an unverified grasp, lower it at once.
-        doubted = any(grasp.verdict is Verdict.UNVERIFIED for grasp in state.grasps)
-        too_heavy = attempt >= len(early) + doubted and not state.good and scene.object.mass_assumed
+        unsure = any(grasp.verdict is Verdict.UNVERIFIED for grasp in state.grasps)
+        too_heavy = batch.ends_round > unsure and not state.good and scene.object.mass_assumed
         if too_heavy and prefetched is not None and state.lowered is None:
-            state = _tried_lighter(run, scene, prefetched, state, config.certainty, count)
+            state = _tried_lighter(run, scene, prefetched, state, batch.config.certainty, count)
             if state.good >= count or run.over():
                 break
     return state
+
+
+@dataclass(frozen=True)
+class _Batch:
+    """One search and its trials.
+
+    Attributes:
+        most: greatest number of grasps to find.
+        ends_round: number of the round that ends after this batch, from 1. 0 if none does.
+    """
+
+    config: PlanConfig
+    most: int
+    ends_round: int
+
+
+def _batches(rounds: Sequence[PlanConfig], count: int, early: bool, once: bool) -> Iterator[_Batch]:
+    """Yield the batches of all rounds, first a small one if `early` is set. With `once`, each search is a batch."""
+    if early:
+        yield _Batch(rounds[0], _FIRST_BATCH, 0)
+    for number, config in enumerate(rounds, 1):
+        for left in reversed(range(method_row(config.method).searches(config.settings) if once else 1)):
+            yield _Batch(config, count, 0 if left else number)
 
 
 def _searched_since(state: RoundsResult, began: float) -> RoundsResult:

@@ -77,7 +77,8 @@ class CompiledHand:
     """The collision primitives of a hand in the kernel's layout.
 
     Attributes:
-        bodies: addresses of `arrays`, as the kernel expects them.
+        bodies: counts and addresses of `arrays`, as the kernel expects them.
+        arrays: numbers that describe the primitives.
         apart: 1 for each pair of links that must not touch, else 0.
     """
 

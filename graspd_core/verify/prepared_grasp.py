@@ -202,9 +202,9 @@ def _link_balls(hand: HandModel) -> tuple[Float[np.ndarray, "links 3"], Float[np
 def arrival(context: MetricsContext, grasp: Grasp, support: Plane | None) -> Posture | None:
     """Return a posture at the grasp with fingers as open as possible and a collision-free path from the pregrasp.
 
-    graspd's own trial closes the fingers while the hand approaches. Some planners close them only after arriving, when
-    the open fingers may penetrate the object. This function therefore closes the fingers in part or moves the hand back
-    by at most 3 mm. Return None if no such posture is free of collisions with object and support.
+    Some planners close the fingers only at the grasp. Their open fingers may penetrate the object there. To avoid this,
+    the function closes the fingers in part, moves the hand back by at most 3 mm, or both. Return None if
+    no such posture is free of collisions with object and support.
     """
     open_joints, closing = grasp.pregrasp.joint_positions, grasp.grasp.joint_positions - grasp.pregrasp.joint_positions
     back = grasp.pregrasp.position - grasp.grasp.position

@@ -148,7 +148,7 @@ def add_mesh(spec: Any, name: str, vertices: np.ndarray, faces: np.ndarray) -> N
 
 
 def full_inertia(inertia: Float[np.ndarray, "3 3"], floor: float) -> list[float]:
-    """Return xx yy zz xy xz yz [kg·m²] of an inertia corrected to be valid, with principal moments ≥ `floor`."""
+    """Make an inertia valid, with principal moments of at least `floor`. Return xx, yy, zz, xy, xz, yz [kg·m²]."""
     moments, axes = np.linalg.eigh(0.5 * (inertia + inertia.T))
     moments = np.maximum(moments, floor)
     moments[2] = min(moments[2], 0.999 * (moments[0] + moments[1]))

@@ -1,5 +1,7 @@
 """Of all things seen, one with a grasp that is sure enough; what failed is not asked again in the same way."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -101,6 +103,11 @@ def test_a_grasp_like_one_that_was_lost_is_not_given_again(views: tuple[PointClo
     assert "an earlier grasp of this object failed" in again[0].reason
     assert again[0].grasp.probability is not None
     assert 0 < again[0].grasp.probability <= DOUBTED_SHARE
+    # A grasp that no robot executed says nothing about the scene.
+    spared = plan_any_thing(views, HAND, failures=[replace(lost, executed=False), *out], **ASKED)
+    assert spared[0].grasp is not None
+    assert unlike([spared[0].grasp], [first[0].grasp.grasp])
+    assert spared[0].grasp.verdict is Verdict.VERIFIED
 
 
 def test_nothing_on_the_table_is_no_thing_and_an_empty_cloud_is_told(views: tuple[PointCloud, ...]):

@@ -50,16 +50,17 @@ def test_without_a_trial_or_with_something_about_it_the_first_round_has_all_step
 def test_where_nothing_is_found_more_is_sought_however_few_are_asked_for(scene, monkeypatch):
     asked = []
 
-    def none_found(task):
+    def none_found(task, searches):
         asked.append(task.count)
         return Candidates((), "")
 
     monkeypatch.setattr(planning_rounds, "find_candidates", none_found)
     plan_grasps(scene, load_hand("parallel_gripper"), count=1)
-    assert asked == [1, 8, 8]
+    # The first round has one search, each other round three.
+    assert asked == [1, *6 * [8]]
     asked.clear()
     plan_grasps(scene, load_hand("parallel_gripper"), count=20)
-    assert asked == [2, 20, 20, 20]
+    assert asked == [2, *7 * [20]]
 
 
 POSTURE = Posture(np.zeros(3), np.array([1.0, 0.0, 0.0, 0.0]), np.zeros(1))

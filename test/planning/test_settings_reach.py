@@ -97,11 +97,12 @@ held = partial(Case, base=HOLDING, hand="parallel_gripper", count=1, verify="sta
 table = Case(scene="table")
 CASES = {
     "closed_form.fingertip_starts": Case(1.0),
+    "closed_form.searches": Case(1, FAR_JUMPS, count=10),
     "closed_form.keep_per_grasp": Case(1.0, (("closed_form.keep_per_grasp", 0.1),), count=10),
     "closed_form.drops": Case(6, (("closed_form.keep_per_grasp", 0.1), ("closed_form.explore_steps", 6)), count=10),
     "problem.confidence_floor": table,
     "closed_form.weights.obstacle": table,
-    "closed_form.polish_weights.obstacle": table,
+    "closed_form.polish_weights.obstacle": Case(base=(("closed_form.polish_steps", 12),), scene="table", count=8),
     "closed_form.weights.penetration": Case(base=FAR_JUMPS),
     "closed_form.weights.self_collision": Case(base=FAR_JUMPS),
     "closed_form.polish_weights.self_collision": Case(

@@ -252,7 +252,7 @@ def test_nothing_at_the_target_lists_what_there_is(target, complaint):
 
 def test_what_is_too_large_to_be_grasped_is_told_as_that():
     view, _ = seen(THREE.meshes)
-    with pytest.raises(NoObjectError, match=r"3 objects are seen, .* each is larger than largest_object=0.03 m"):
+    with pytest.raises(NoObjectError, match=r"3 objects are seen, .* longer than largest_object=0.03 m"):
         segment([view], settings=SegmentationConfig(largest_object=0.03))
 
 

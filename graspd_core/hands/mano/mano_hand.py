@@ -268,7 +268,7 @@ def _bare_hand(still: _Rest) -> HandModel:
 
 
 def _skins(hand: HandModel, still: _Rest) -> tuple[tuple[int, TriangleMesh], ...]:
-    """Return for each body its link, and the skin faces with a vertex of the body, in the link frame [m]."""
+    """Return the link and a skin mesh of each body: all faces with a vertex of the body, in the link frame [m]."""
     faces = still.data.faces
     own = [faces[(still.owner[faces] == body).any(1)] for body in range(len(BODIES))]
     return tuple(

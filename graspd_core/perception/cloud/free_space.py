@@ -64,8 +64,8 @@ class FreeSpace:
     Attributes:
         view_depths: one depth image per camera, none if the cameras are unknown.
         standing: whether the object stands on a support that fills z < 0.
-        lowest: height of the lowest seen points [m]. Segmentation cuts lower points off with the support, so outlines
-            may end too high by this much.
+        lowest: height of the lowest seen points [m]. Segmentation removes lower points together with the
+            support, so seen outlines may end too high by `lowest`.
         slack: precision of seen outlines and surfaces [m].
         tolerance: a guessed point this near to a seen surface confirms the guess [m].
     """

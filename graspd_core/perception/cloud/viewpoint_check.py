@@ -133,7 +133,9 @@ def check_viewpoint(thing: PointCloud, view: PointCloud, up: Vector | None = Non
     nearer = np.full(len(near), max(HIDDEN_DEPTH, ROUGHNESS_TIMES * _roughness(near, tree)))
     away = _away_share(own, surfaces, view.viewpoint)
     if away > MAX_AWAY_SHARE:
-        raise _refusal(view.viewpoint, f"{100 * away:.0f} % of the object would be seen from behind")
+        raise _refusal(
+            view.viewpoint, f"{100 * away:.0f} % of the object's points would show the camera the inside of the surface"
+        )
     hidden = hidden_share(near, view.viewpoint, nearer, tree)
     if hidden > MAX_HIDDEN_SHARE:
         raise _refusal(view.viewpoint, f"{100 * hidden:.1f} % of the points around the object are hidden from there")

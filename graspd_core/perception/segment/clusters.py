@@ -80,7 +80,7 @@ def link_length(points: Points, settings: SegmentationConfig) -> float:
 def link_points(
     points: Points, weight: Float[np.ndarray, "n"], link: float, neighbour_share: float
 ) -> Int[np.ndarray, "n"]:
-    """Cluster evenly dense points. Return cluster numbers, from the largest, and -1 for noise.
+    """Cluster points of even density. Return the cluster of each point. The largest cluster is 0, and noise is -1.
 
     As in DBSCAN, only core points, which have enough neighbours, extend a cluster. Others join the nearest core point.
 

@@ -311,9 +311,8 @@ def _nothing(parted: _Parted) -> str:
     told = f"cloud: no object among {len(scene.points)} points:"
     if label.max(initial=-1) >= 0:
         sizes = [extent(scene.mean[label == k]) for k in range(int(label.max()) + 1)]
-        each = f"{sizes[0]:.2f} m long:" if len(sizes) == 1 else f"the shortest {min(sizes):.2f} m long: each is"
-        limit = f"larger than largest_object={settings.largest_object:g} m"
-        return f"{told} {seen(scene, label)}, {each} {limit}; give the wanted part as a box or a mask"
+        limit = f"longer than largest_object={settings.largest_object:g} m (the shortest {min(sizes):.2f} m)"
+        return f"{told} {seen(scene, label)}, {limit}; give the wanted part as a box or a mask"
     flat = ([] if ground.support is None else [ground.support]) + list(ground.background)
     if not flat:
         near = float(np.median(scene.mean_distance))

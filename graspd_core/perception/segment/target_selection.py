@@ -137,7 +137,7 @@ def seen(scene: VoxelScene, label: Labels) -> str:
         return "no object is seen"
     places = [_place(scene.mean[label == k].mean(0)) for k in range(min(many, MAX_LISTED_THINGS))]
     told = f"{many} objects are seen, the largest" if many > 1 else "one object is seen,"
-    return f"{told} about {', '.join(places)} m"
+    return f"{told} at {', '.join(places)} m"
 
 
 def _thing_of(
