@@ -68,9 +68,9 @@ _SEED_STEP = 1_000_003
 _MANY, _FIRST_BATCH = 8, 2
 
 
-# If no grasp holds the assumed mass: number of grasps whose payload is measured, tried mass as a fraction of the
-# greatest payload, and upper limit of the tried mass as a fraction of the assumed mass.
-_WEIGHED, _LIFTED, _HALF = 60, 0.8, 0.5
+# If no grasp holds the assumed mass: number of grasps whose payload is measured, and tried mass as a fraction of the
+# greatest payload. The tried mass is at most the least one at which a grasp may be verified.
+_WEIGHED, _LIFTED = 60, 0.8
 
 
 @dataclass(frozen=True)
@@ -140,17 +140,13 @@ def run_rounds(
     of the trials. Without it, no candidate is tried.
     """
     state = RoundsResult(time.perf_counter())
-    doubted = scene.evidence is not None and bool(scene.evidence.doubts)
-    early = prefetched is not None and count >= _MANY
-    # Trials show sooner than the ranking whether another search is needed. In doubtful scenes they show little.
-    once = prefetched is not None and not doubted
-    for attempt, batch in enumerate(_batches(rounds[:1] if doubted else rounds, count, early, once)):
+    for attempt, batch in enumerate(_batches(scene, rounds, count, prefetched is not None)):
         enough, good, began = min(batch.most + state.good, count), state.good, time.perf_counter()
         options = {"config": batch.config, "hooks": _hooks(run, good), "device": device, "restrictions": restrictions}
         seek = enough - good if good or not attempt else max(enough, _MANY)
         with enough_memory(f"{seek} grasps at once"):
             task = PlannerInput(scene, hand, seek, seed + _SEED_STEP * attempt, **options)
-            candidates = find_candidates(task, searches=1 if once else None).grasps
+            candidates = find_candidates(task, searches=batch.searches).grasps
         # The time is counted here, because the loop below does not run after an interrupted search.
         state, began = _searched_since(state, began), time.perf_counter()
         for some in _in_rank_order(candidates, enough - good, restrictions):
@@ -186,25 +182,33 @@ def run_rounds(
 
 @dataclass(frozen=True)
 class _Batch:
-    """One search and its trials.
+    """Candidates that are tried together.
 
     Attributes:
         most: greatest number of grasps to find.
+        searches: greatest number of searches for the candidates. None takes the method's setting.
         ends_round: number of the round that ends after this batch, from 1. 0 if none does.
     """
 
     config: PlanConfig
     most: int
+    searches: int | None
     ends_round: int
 
 
-def _batches(rounds: Sequence[PlanConfig], count: int, early: bool, once: bool) -> Iterator[_Batch]:
-    """Yield the batches of all rounds, first a small one if `early` is set. With `once`, each search is a batch."""
-    if early:
-        yield _Batch(rounds[0], _FIRST_BATCH, 0)
-    for number, config in enumerate(rounds, 1):
+def _batches(scene: Scene, rounds: Sequence[PlanConfig], count: int, tried: bool) -> Iterator[_Batch]:
+    """Yield the batches of all rounds, first a small one if many grasps are requested. `tried`: trials run.
+
+    Trials show sooner than the ranking whether another search is needed, so each search is a batch. Trials in a doubted
+    scene show little, so there the ranking chooses from all searches of the only round.
+    """
+    doubted = scene.evidence is not None and bool(scene.evidence.doubts)
+    once = tried and not doubted
+    if tried and count >= _MANY:
+        yield _Batch(rounds[0], _FIRST_BATCH, 1 if once else None, 0)
+    for number, config in enumerate(rounds[:1] if doubted else rounds, 1):
         for left in reversed(range(method_row(config.method).searches(config.settings) if once else 1)):
-            yield _Batch(config, count, 0 if left else number)
+            yield _Batch(config, count, 1 if once else None, 0 if left else number)
 
 
 def _searched_since(state: RoundsResult, began: float) -> RoundsResult:
@@ -225,7 +229,7 @@ def _tried_lighter(
     best, others = state.grasps[:_WEIGHED], state.grasps[_WEIGHED:]
     lifted = payloads(state.context, best, run.known_over)
     most = max(lifted, default=0.0)
-    mass = min(_LIFTED * most, _HALF * heavy)
+    mass = min(_LIFTED * most, light_end(heavy))
     if most <= LEAST_PAYLOAD or run.over():
         return state
     context = lighter(scene, prefetched, state.context, certainty, mass, most)

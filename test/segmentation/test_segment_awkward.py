@@ -84,7 +84,7 @@ def test_what_is_too_large_is_said_to_be_so_and_a_box_says_which_part_is_meant()
     small = SegmentationConfig(largest_object=0.03)
     with pytest.raises(
         NoObjectError,
-        match=r"one object is seen, .*, 0\.1\d m long: larger than .*=0.03 m; give the wanted part as a box",
+        match=r"one object is seen, .* longer than .*=0.03 m \(the shortest 0\.1\d m\); give the wanted part as a box",
     ):
         segment([view_of_box()], settings=small)
     meant = Target(box=(np.array([-0.03, -0.03, 0.0]), np.array([0.03, 0.03, 0.2])))
