@@ -16,13 +16,13 @@ from graspd_core.io.bags import jazzy_types
 from graspd_core.perception.cloud.camera import PinholeCamera
 from graspd_core.transforms import SECOND
 
-# The most that a pixel of 16 bits can hold [mm].
+# Greatest depth that a pixel of 16 bits can hold [mm].
 _MOST_MILLIMETRES = 2**16 - 1
 
 
 @dataclass(frozen=True, eq=False)
 class Record:
-    """One message to write: its topic, its time [ns], and the message, from one of the functions below."""
+    """One message to write, with topic and time [ns]. `cloud_message` and other functions below make the message."""
 
     topic: str
     stamp: int
@@ -32,7 +32,7 @@ class Record:
 def write_bag(path: str | Path, records: Iterable[Record], *, storage: str = "sqlite3") -> None:
     """Write a new recording: a directory with metadata.yaml and one storage file, of sqlite3 or mcap.
 
-    What cannot be written raises the error of rosbags.
+    If a message cannot be written, rosbags raises its own error.
     """
     from rosbags.interfaces import Qos, QosDurability, QosHistory, QosLiveliness, QosReliability, QosTime
     from rosbags.rosbag2 import StoragePlugin, Writer
@@ -56,7 +56,7 @@ def write_bag(path: str | Path, records: Iterable[Record], *, storage: str = "sq
 
 
 def cloud_message(points: Float[np.ndarray, "*n 3"], frame: str, stamp: int) -> Any:
-    """Return a PointCloud2 of float32 points [m], organised if they are a grid of rows. NaN is kept."""
+    """Return a PointCloud2 of float32 points [m]. A grid of rows becomes an organised cloud. NaN is kept."""
     types = jazzy_types().types
     fields = [types["sensor_msgs/msg/PointField"](name, 4 * axis, 7, 1) for axis, name in enumerate("xyz")]
     data = np.ascontiguousarray(points, dtype="<f4").view(np.uint8).reshape(-1)
@@ -68,7 +68,7 @@ def cloud_message(points: Float[np.ndarray, "*n 3"], frame: str, stamp: int) -> 
 
 
 def depth_message(depth: Float[np.ndarray, "height width"], frame: str, stamp: int, *, encoding: str = "16UC1") -> Any:
-    """A depth image [m]: 16UC1 or mono16 in millimetres, 32FC1 in metres; 0 or NaN where there is none."""
+    """Return an Image of a depth image [m]. 16UC1 and mono16 hold mm, 32FC1 holds m. Without depth: 0 or NaN."""
     height, width = depth.shape
     known = np.isfinite(depth) & (depth > 0)
     if encoding != "32FC1":
@@ -82,11 +82,11 @@ def depth_message(depth: Float[np.ndarray, "height width"], frame: str, stamp: i
 
 
 def packed_depth(depth: Float[np.ndarray, "height width"], encoding: str = "16UC1") -> bytes:
-    """Return a depth image [m] as image_transport's `compressedDepth` packs it: 12 bytes, then a PNG of 16 bits."""
+    """Return a depth image [m] in the format `compressedDepth` of image_transport: 12 bytes, then a 16-bit PNG."""
     from PIL import Image
 
     known = np.isfinite(depth) & (depth > 0)
-    # The quantisation of its defaults: inverse depth in 100 steps a unit at 1 m, for at most 10 m.
+    # Default quantisation of `compressedDepth`: inverse depth in 100 steps per unit at 1 m, for depths up to 10 m.
     a, b = (100.0 * 101.0, 1.0 - 101.0 * 100.0 / 10.0) if encoding == "32FC1" else (0.0, 0.0)
     away = np.where(known, depth, 1.0)
     values = np.rint(a / away + b if encoding == "32FC1" else 1e3 * away)
@@ -96,14 +96,14 @@ def packed_depth(depth: Float[np.ndarray, "height width"], encoding: str = "16UC
 
 
 def packed_message(depth: Float[np.ndarray, "height width"], frame: str, stamp: int, encoding: str = "16UC1") -> Any:
-    """A CompressedImage of a depth image [m]."""
+    """Return a CompressedImage of a depth image [m]."""
     data = np.frombuffer(packed_depth(depth, encoding), np.uint8)
     kind = jazzy_types().types["sensor_msgs/msg/CompressedImage"]
     return kind(_header(frame, stamp), f"{encoding}; compressedDepth png", data)
 
 
 def camera_info_message(camera: PinholeCamera, frame: str, stamp: int) -> Any:
-    """The CameraInfo of a camera that is not part of a stereo pair."""
+    """Return the CameraInfo of a camera that is not part of a stereo pair."""
     types = jazzy_types().types
     matrix = [camera.fx, 0.0, camera.cx, 0.0, camera.fy, camera.cy, 0.0, 0.0, 1.0]
     projection = [*matrix[0:3], 0.0, *matrix[3:6], 0.0, *matrix[6:9], 0.0]
@@ -126,7 +126,7 @@ def camera_info_message(camera: PinholeCamera, frame: str, stamp: int) -> Any:
 
 
 def transforms_message(transforms: Sequence[tuple[str, str, Float[np.ndarray, "4 4"]]], stamp: int) -> Any:
-    """A TFMessage of (parent, child, T_parent_child)."""
+    """Return a TFMessage. Each transform is (parent, child, T_parent_child)."""
     from scipy.spatial.transform import Rotation
 
     types = jazzy_types().types

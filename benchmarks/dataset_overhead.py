@@ -1,9 +1,9 @@
-"""What `graspd dataset` costs beside the grasps: `plan_grasps` in a loop against one worker and two.
+"""Measure the overhead of `graspd dataset`: the same blocks by `plan_grasps` in a loop, by one worker, and by two.
 
     dataset_overhead.py [--blocks 8] [--count 64] [--object shape:mug]
 
-The same blocks three ways, in turns. Wall-clock time says how it scales on a quiet machine; CPU time, of all processes
-that take part, Ray's own among them, says what it costs on any. Starting Ray and its workers is told apart.
+Wall time shows how the work scales on an idle machine. CPU time shows the cost on any machine. CPU time includes all
+child processes, also those of Ray. The time to start Ray and its workers has a column of its own.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ from graspd_dataset.run_records import markdown_table
 
 
 def loop(blocks: Sequence[Block]) -> tuple[float, float, int]:
-    """Wall and CPU seconds of `plan_grasps` over blocks, and the rows."""
+    """Run `plan_grasps` over the blocks. Return wall and CPU time [s], and the number of rows."""
     scene, hand = load_scene(blocks[0].object.source), load_hand(blocks[0].hand)
     plan_grasps(scene, hand, count=2, preset=blocks[0].config)
     wall, cpu, rows = time.perf_counter(), time.process_time(), 0
@@ -37,7 +37,7 @@ def loop(blocks: Sequence[Block]) -> tuple[float, float, int]:
 
 
 def family_cpu() -> dict[int, float]:
-    """CPU seconds of this process and all below it, by process."""
+    """Return the CPU time of this process and its descendants, by process id [s]."""
     taken = {}
     for process in [psutil.Process(), *psutil.Process().children(recursive=True)]:
         try:
@@ -48,7 +48,7 @@ def family_cpu() -> dict[int, float]:
 
 
 def on_ray(blocks: Sequence[Block], first: Sequence[Block], workers: int) -> tuple[float, float, int, float, float]:
-    """Wall and CPU seconds of blocks on workers that are warm, the rows, seconds to begin, MB of all processes."""
+    """Run blocks on warm workers. Return wall time, CPU time [s], rows, start time [s], memory of children [MB]."""
     with TemporaryDirectory() as folder, ray_running(None, workers) as ray:
         begin = time.perf_counter()
         engine = RayEngine(ray, DatasetStore(folder), Limits(), ship=False)

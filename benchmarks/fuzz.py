@@ -1,11 +1,11 @@
-"""Coverage-guided fuzzing of the parsers that are graspd's own, by atheris (libFuzzer). Not a test.
+"""Coverage-guided fuzzing of graspd's own parsers by atheris (libFuzzer). Not a test.
 
     python benchmarks/fuzz.py [--minutes 10] [--targets urdf mano ...] [--out results/fuzz] [--seed 1]
 
-The minutes are shared among the targets, one process at a time. A finding is an input that ended neither in a value
-nor in one clear error, took more than five seconds, or asked for more than 2 GB: its bytes and its traceback are kept
-under OUT/findings, one for each place in the code. What was learnt is kept in OUT/corpus for the next run. Exit status
-1 where something was found. Needs `pip install -e .[fuzz]`.
+The targets share the minutes and run one process at a time. Every input must give a value or one clear error. An input
+that does not, takes more than five seconds, or asks for more than 2 GB is a finding. OUT/findings keeps the bytes and
+the traceback of one finding for each place in the code. OUT/corpus keeps useful inputs for the next run. The exit
+status is 1 if there are findings. The program needs `pip install -e .[fuzz]`.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ SECONDS_PER_INPUT, MEGABYTES = 5, 2048
 
 @dataclass(frozen=True)
 class Figures:
-    """What a target's run came to: inputs tried, edges of the instrumented code reached, and seconds."""
+    """Result of a target's run: number of inputs, edges of instrumented code reached, and duration [s]."""
 
     inputs: int
     edges: int
@@ -36,13 +36,13 @@ class Figures:
 
 
 def fuzz_here(name: str, seconds: int, out: Path, seed: int) -> None:
-    """Fuzz one target in this process until the time is over; does not return."""
+    """Fuzz one target in this process until the time is over. The process then ends, so the function never returns."""
     import atheris
 
     corpus, findings = out / "corpus" / name, out / "findings"
     for folder in (corpus, findings):
         folder.mkdir(parents=True, exist_ok=True)
-    # What the seeds import is instrumented, and is there before memory is bounded.
+    # Run the seeds here, so that the modules they import are instrumented and loaded before memory is limited.
     with atheris.instrument_imports(  # pyright: ignore[reportAttributeAccessIssue]
         include=["graspd_core"], enable_loader_override=False
     ):
@@ -79,7 +79,7 @@ def _virtual_memory() -> int:
 
 
 def _keep(findings: Path, name: str, data: bytes, error: Exception) -> None:
-    """Write a finding down, unless a shorter one of the same place is there."""
+    """Write a finding to disk. Keep only the shortest input for each place and kind of error."""
     frames = [f for f in traceback.extract_tb(error.__traceback__) if "graspd_core" in f.filename]
     place = f"{Path(frames[-1].filename).name}:{frames[-1].lineno}" if frames else "target"
     key = hashlib.sha256(f"{place} {type(error).__name__}".encode()).hexdigest()[:8]
@@ -92,7 +92,7 @@ def _keep(findings: Path, name: str, data: bytes, error: Exception) -> None:
 
 
 def fuzz(name: str, seconds: float, out: Path, seed: int) -> Figures:
-    """Fuzz one target in processes of its own, anew after each that dies of an input, until the time is over."""
+    """Fuzz one target in a child process until the time is over. If an input kills the process, start another one."""
     inputs, edges, begun = 0, 0, time.monotonic()
     while (left := seconds - (time.monotonic() - begun)) >= 1:
         arguments = ["--child", name, "--seconds", str(int(left)), "--out", str(out), "--seed", str(seed)]
@@ -111,7 +111,7 @@ def fuzz(name: str, seconds: float, out: Path, seed: int) -> Figures:
 
 
 def main() -> int:
-    """Fuzz what was asked for, and print a table."""
+    """Fuzz the requested targets, and print a table. Return the exit status."""
     parser = argparse.ArgumentParser(description="Coverage-guided fuzzing of graspd's parsers.")
     parser.add_argument("--minutes", type=float, default=10.0)
     parser.add_argument("--targets", nargs="*", default=[])
@@ -135,7 +135,7 @@ def main() -> int:
     print("| target | inputs | edges | seconds | findings |\n|---|---:|---:|---:|---:|", flush=True)
     for name in names:
         figures = fuzz(name, given.minutes * 60 / len(names), out, given.seed)
-        # libFuzzer's own: what hung or killed the process.
+        # The count includes libFuzzer's own files: inputs that hung or killed the process.
         found = [file for file in (out / "findings").glob(f"{name}-*") if file.suffix != ".txt"]
         print(f"| {name} | {figures.inputs} | {figures.edges} | {figures.seconds:.0f} | {len(found)} |", flush=True)
     left = sorted(file for file in (out / "findings").glob("*") if file.suffix != ".txt")

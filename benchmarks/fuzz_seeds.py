@@ -1,4 +1,4 @@
-"""Small whole inputs for the targets of fuzz_targets.py, each with most of what its format can hold."""
+"""Small valid inputs for the targets of fuzz_targets.py. Each input uses most features of its format."""
 
 from __future__ import annotations
 
@@ -94,13 +94,13 @@ DAES = [
 <translate>1 0 0</translate><node><rotate>0 0 1 90</rotate><scale>1 1 -2</scale><instance_geometry url="#g"/></node>
 <matrix>1 0 0 0 0 1 0 0 0 0 1 0 0 0 0 1</matrix></node></visual_scene></library_visual_scenes></COLLADA>""",
 ]
-# Width, height, steps, byte order, and byte offset and type of x, y and z.
+# Head of a layout file: width, height, step of a point and of a row, byte order, then offset and type of x, y and z.
 LAYOUT_HEAD = struct.Struct("<IIIIBIBIBIB")
 _POINTS = np.array([[0.0, 0.0, 0.5], [0.01, 0.0, 0.5], [0.0, 0.01, 0.5], [np.nan, 0.0, 0.5]], dtype=np.float32)
 
 
 def pickles() -> list[bytes]:
-    """A MANO file of four vertices in two protocols, and parts of one."""
+    """Return a MANO file of 16 vertices in two pickle protocols, and a small pickle with other types in three."""
     from scipy.sparse import csc_matrix
 
     parents = (-1, *(0 if k % 3 == 0 else k for k in range(15)))
@@ -124,7 +124,7 @@ def pickles() -> list[bytes]:
 
 
 def clouds() -> list[bytes]:
-    """Arrays, archives of points and of depth images, ply and pcd, ascii and binary."""
+    """Return cloud files: npy, npz with points and with depth images, and ply and pcd as text and binary."""
 
     def archive(**arrays: Any) -> bytes:
         out = io.BytesIO()
@@ -154,7 +154,7 @@ def clouds() -> list[bytes]:
 
 
 def layouts() -> list[bytes]:
-    """Clouds of four points, of both byte orders."""
+    """Return layout files of four points, one for each byte order."""
     places = (0, 7, 4, 7, 8, 7)
     plain, big = LAYOUT_HEAD.pack(4, 1, 12, 48, 0, *places), LAYOUT_HEAD.pack(2, 2, 12, 24, 1, *places)
     return [plain + _POINTS.tobytes(), big + _POINTS.astype(">f4").tobytes()]
@@ -177,7 +177,7 @@ def _messages() -> list[Any]:
 
 
 def messages() -> list[bytes]:
-    """One message of each type, its type's number in front."""
+    """Return messages of every type, with the number of the type as first byte."""
     from graspd_core.io.bags import jazzy_types
 
     numbers = (0, 1, 2, 3, 1)
@@ -188,7 +188,7 @@ def messages() -> list[bytes]:
 
 
 def bags() -> list[bytes]:
-    """A recording of each kind of message, in both storages."""
+    """Return recordings with every kind of message, in both storages."""
     from bag_writer import Record, write_bag
 
     topics = ("/points", "/depth/image_raw", "/depth/camera_info", "/tf", "/depth/image_rect")

@@ -1,8 +1,8 @@
-"""The parsers that are graspd's own, each as a function of bytes that must end in a value or in one clear error.
+"""Fuzzing targets: each of graspd's own parsers as a function of a file, which must give a value or one clear error.
 
-A target makes something of its input, or refuses it as documented. Whatever else comes out is a finding: another
-exception, a warning, an error of several lines, a value that is not finite. Used by benchmarks/fuzz.py, which throws
-mutated bytes at them, and by test/fuzz, which throws what was found once.
+A target returns a value or raises a documented error. Anything else is a finding: another exception, a warning, an
+error of several lines, or a number that is not finite. benchmarks/fuzz.py calls the targets with mutated bytes, and
+test/fuzz calls them with inputs that were findings once.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ from fuzz_seeds import (
     pickles,
 )
 
-# The longest message: what is wrong must be found in it.
+# Greatest length of an error message [characters]. In a longer message a user would not find the fault.
 LONGEST = 2000
 
 
@@ -43,13 +43,13 @@ class Target:
     """One parser.
 
     Attributes:
-        name: of the target.
-        run: reads the file that holds the input; returns what it made, or raises one of `refusals`.
-        ending: of the file.
-        seeds: whole inputs to begin with.
-        refusals: the errors that its documentation names.
-        words: what to put into inputs now and then.
-        most: the longest input [bytes].
+        name: name of the target.
+        run: reads the file with the input. Returns the value, or raises one of `refusals`.
+        ending: ending of the file's name.
+        seeds: returns valid inputs to begin with.
+        refusals: errors that the parser's documentation names.
+        words: words that the fuzzer inserts into inputs.
+        most: length of the longest input [bytes].
     """
 
     name: str
@@ -62,14 +62,14 @@ class Target:
 
 
 def try_input(target: Target, data: bytes, folder: Path) -> str | None:
-    """Why the target refused the input, None where it made something of it; raises where it did neither properly."""
+    """Return why the target refused the input, or None if it returned a value. Raise the error if it is a finding."""
     path = folder / f"input.{target.ending}"
     path.write_bytes(data)
     return outcome(lambda: target.run(path), *target.refusals)[1]
 
 
 def outcome(run: Callable[[], Any], *refusals: type[Exception]) -> tuple[Any, str | None]:
-    """What came of a call: its value, or None and the one line that it was refused with; raises what else it raises."""
+    """Return (value, None) of a call, or (None, message) if it raises one of `refusals`. Pass on all other errors."""
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         try:
@@ -82,12 +82,12 @@ def outcome(run: Callable[[], Any], *refusals: type[Exception]) -> tuple[Any, st
 
 
 def scratch() -> Any:
-    """A folder for inputs, in memory where there is such a place."""
+    """Return a temporary folder for inputs, in memory if the machine has /dev/shm."""
     return tempfile.TemporaryDirectory(dir="/dev/shm" if os.path.isdir("/dev/shm") else None)
 
 
 def finite(*arrays: Any) -> None:
-    """Raise where a number is not finite."""
+    """Raise AssertionError if a number is not finite."""
     for array in arrays:
         if not np.isfinite(np.asarray(array, dtype=float)).all():
             raise AssertionError(f"not finite: {array!r}"[:300])
@@ -173,7 +173,7 @@ def _cloud(path: Path) -> Any:
 
 
 def _layout(path: Path) -> Any:
-    """Width, height, step of a point and of a row, byte order and three fields, then the data."""
+    """Read points from a file with a `LAYOUT_HEAD` and the data of a PointCloud2."""
     from graspd_core.io.messages import points_from_message
 
     data = path.read_bytes().ljust(LAYOUT_HEAD.size, b"\0")
@@ -205,7 +205,7 @@ def _bag(path: Path) -> Any:
 
 
 def _message(path: Path) -> Any:
-    """A message of one of four types, named by the first byte, as CDR."""
+    """Read a message in CDR. The first byte of the file selects one of four types."""
     from bag_writer import camera_info_message
 
     from graspd_core.errors import FormatError
@@ -218,7 +218,7 @@ def _message(path: Path) -> Any:
     kind = (CLOUD, IMAGE, INFO, TRANSFORMS)[data[0] % 4]
     try:
         message = jazzy_types().deserialize_cdr(data[1:], kind)
-    except Exception as error:  # the library's own affair: BagError names it
+    except Exception as error:  # rosbags rejects broken CDR, which is no fault of graspd
         raise FormatError("not a message") from error
     if kind == CLOUD:
         return ORIGIN.cloud(message, no_lookup)

@@ -2,10 +2,10 @@
 
     python benchmarks/held_shares.py --out shares.jsonl [--seeds 50:58] [--scans FOLDER]
 
-Every object of `CHOSEN_ON` is seen once a seed, compounds three times. So are five scans, `SCANS`, of a folder that has
-a stats.csv of masses. Four kinds of cameras take turns, and every other view is crowded. Each view is planned without a
-mass and with the object's own. Grasps that hold on the likeliest shape run every robustness check, and are tried on the
-true object at its own mass. Views that are in the file are skipped. A view takes fifteen CPU seconds.
+Every object of `CHOSEN_ON` has one view per seed, compounds have three. The five scans `SCANS` have one too, if FOLDER
+has them and a stats.csv of masses. Four kinds of cameras take turns, and half of the views are crowded. Each view is
+planned without a mass and with the object's own mass. Grasps that hold on the likeliest shape run every robustness
+check, and are tried on the true object at its own mass. Views in the file are skipped. A view takes 15 CPU seconds.
 """
 
 from __future__ import annotations
@@ -43,7 +43,7 @@ SURE = CertaintyConfig().probability
 
 
 def cases(seeds: range, scans: Path | None) -> Iterator[CameraView]:
-    """Yield the views, each planned in two ways."""
+    """Yield each view twice: without a given mass, and with the object's own mass."""
     things = [(thing, 0) for thing in (*CHOSEN_ON, *(str(scans / f"{name}.obj") for name in SCANS if scans))]
     things += [("compound", 100), ("compound", 200)]
     for seed in seeds:
@@ -54,7 +54,7 @@ def cases(seeds: range, scans: Path | None) -> Iterator[CameraView]:
 
 
 def grasps_of_view(case: CameraView) -> list[dict[str, Any]]:
-    """Return which checks each grasp passes that holds on the likeliest shape, and whether it holds on the truth."""
+    """Return the checks passed by each grasp that holds on the likeliest shape, and whether it holds on the truth."""
     stage, cloud, mass, target = view_of(case)
     hand, config = load_hand(case.hand), replace(load_preset(case.preset), certainty=CertaintyConfig(0.0))
     disk_cache.forget()
@@ -83,7 +83,7 @@ def grasps_of_view(case: CameraView) -> list[dict[str, Any]]:
 
 
 def share(rows: list[dict[str, Any]]) -> str:
-    """Return the fraction that holds on the truth, and the 90 % interval of resampled views."""
+    """Return as text the fraction that holds on the true object, with the 90 % interval over resampled views."""
     views: dict[str, list[bool]] = {}
     for row in rows:
         views.setdefault(row["view"], []).append(row["own"])
@@ -100,7 +100,7 @@ def share(rows: list[dict[str, Any]]) -> str:
 
 
 def main() -> None:
-    """Fill the file, and print the shares."""
+    """Add the missing views to the file, and print the shares held."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--out", type=Path, required=True)
     parser.add_argument("--seeds", default="50:58")

@@ -1,10 +1,10 @@
-"""What a library of grasps costs: look-ups cold and warm, a node that answers from it, memory. Not a test.
+"""Measure the cost of a library of grasps: cold and warm look-ups, a node's answers, and memory. Not a test.
 
     python benchmarks/known_objects.py [--objects 1000] [--grasps 8] [--node]
 
-Grasps are planned for each authored shape once. An object is a shape scaled at random, whose record holds the grasps of
-the shape as it is: what is measured is time, not how good the grasps are. `--node` also asks a node in a process of its
-own over DDS, from the request to the answer.
+Grasps are planned once for each built-in shape. An object is a randomly scaled shape, but its record holds the grasps
+of the unscaled shape. This is enough, because only time and memory are measured. `--node` also times a node in another
+process over DDS, from the request to the answer.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
 
-# One thread, said before torch is imported.
+# One thread. The variable must be set before torch is imported.
 os.environ.update(OMP_NUM_THREADS="1")
 
 import numpy as np
@@ -36,7 +36,7 @@ STEPS = (100, 1000)
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--objects", type=int, default=1000)
-    parser.add_argument("--grasps", type=int, default=8, help="of each object")
+    parser.add_argument("--grasps", type=int, default=8, help="grasps per object")
     parser.add_argument("--hand", default="allegro_right")
     parser.add_argument("--node", action="store_true", help="ask a node too")
     parser.add_argument("--cold", type=Path, default=None, help=argparse.SUPPRESS)
@@ -58,7 +58,7 @@ def main() -> None:
 
 
 def fill(library: GraspLibrary, objects: int, hand_name: str, count: int) -> None:
-    """Scaled copies of planned records until there are so many objects."""
+    """Add scaled copies of planned records until the library has `objects` objects."""
     library.create()
     hand, config, random = load_hand(hand_name), load_preset("fast"), np.random.default_rng(objects)
     there = library.names()
@@ -84,14 +84,14 @@ def planned_scene(shape: str) -> Scene:
 
 
 def measure_look_ups(library: GraspLibrary, hand_name: str, count: int) -> None:
-    """From a name to a GraspResult."""
+    """Print the time from an object's name to a GraspResult, cold and warm, and the memory."""
     command = [sys.executable, __file__, "--cold", str(library.path), "--hand", hand_name, "--grasps", str(count)]
     cold = [float(subprocess.run(command, capture_output=True, text=True, check=True).stdout) for _ in range(10)]
     tell("look-up, cold: first of a process", cold)
     hand, names = load_hand(hand_name), library.names()
     drawn = np.random.default_rng(0).choice(names, 1000)
     tell("look-up, warm", [timed(lambda name=name: look_up(library, hand, name, count)) for name in drawn])
-    print(f"  memory of this process after them: {memory(os.getpid()):.0f} MB")
+    print(f"  memory of this process afterwards: {memory(os.getpid()):.0f} MB")
 
 
 def look_up(library: GraspLibrary, hand, name: str, count: int):
@@ -116,13 +116,13 @@ def tell(what: str, seconds: Sequence[float]) -> None:
 
 
 def memory(process: int) -> float:
-    """Resident memory [MB]."""
+    """Return the resident memory of a process [MB]."""
     pages = int(Path(f"/proc/{process}/statm").read_text().split()[1])
     return pages * os.sysconf("SC_PAGE_SIZE") / 1e6
 
 
 def measure_node(library: GraspLibrary, hand_name: str, count: int) -> None:
-    """From a request on ~/request to its answer on ~/grasps, in two processes."""
+    """Print the time from a request on ~/request to its answer on ~/grasps, and the memory of the node."""
     import rclpy
     from graspd_msgs.msg import GraspArray, GraspRequest
 
@@ -151,12 +151,12 @@ def measure_node(library: GraspLibrary, hand_name: str, count: int) -> None:
     try:
         while not (publisher.get_subscription_count() and node.count_publishers("/graspd/grasps")):
             rclpy.spin_once(node, timeout_sec=0.1)
-        # Until its hand is warm the node takes requests, and answers none.
+        # While the node warms up its hand, it accepts requests but does not answer them.
         time.sleep(30.0)
         print(f"  node, cold: first request {timed(lambda: ask('first', 'object7')) * 1e3:.1f} ms")
         drawn = np.random.default_rng(1).choice(library.names(), 500)
         tell("node, warm", [timed(lambda i=i, name=name: ask(f"r{i}", str(name))) for i, name in enumerate(drawn)])
-        print(f"  memory of the node after them: {memory(process.pid):.0f} MB")
+        print(f"  memory of the node afterwards: {memory(process.pid):.0f} MB")
     finally:
         node.destroy_node()
         rclpy.shutdown()

@@ -1,9 +1,9 @@
-"""A hand in MANO's file format that is nobody's licensed model: anatomically plausible, seeded, free to pass on.
+"""Write a synthetic hand in MANO's file format. It is plausible, depends only on the seed, and needs no licence.
 
     python benchmarks/mano_synthetic.py OUT.pkl [--seed 0]
 
-Bones of an adult's proportions in capsules of flesh, one smooth surface, open at the wrist. Lengths and breadths are
-round numbers, not measurements; blend shapes are small and random. Tests and `benchmarks/mano.py` use it.
+Bones have an adult's proportions, in capsules of flesh. One smooth surface covers them, open at the wrist. Lengths and
+breadths are round numbers, not measurements. Blend shapes are small and random. Tests and `make bench` use the hand.
 """
 
 from __future__ import annotations
@@ -19,8 +19,8 @@ import numpy as np
 
 BODIES = 16
 PARENTS = (-1, 0, 1, 2, 0, 4, 5, 0, 7, 8, 0, 10, 11, 0, 13, 14)
-# Right hand, model axes as MANO's: fingers along -x, the palm faces -y, the thumb is on the side of +z. Of each finger
-# (index, middle, little, ring) the knuckle [mm], the lengths of its three bones and their radii.
+# A right hand in MANO's axes: fingers point along -x, the palm faces -y, the thumb is on the side of +z. For each
+# finger (index, middle, little, ring): position of the knuckle, lengths of the three bones, and their radii [mm].
 _KNUCKLES = ((-88, 0, 24), (-92, 2, 3), (-74, -1, -36), (-85, 1, -17))
 _LENGTHS = ((42, 25, 20), (46, 29, 21), (33, 19, 18), (43, 27, 20))
 _RADII = ((10.0, 9.0, 8.0), (10.5, 9.0, 8.0), (8.5, 7.5, 7.0), (9.5, 8.5, 7.5))
@@ -28,13 +28,13 @@ _SPREAD = (0.06, 0.0, -0.16, -0.07)
 _THUMB = ((-22, -14, 22), (-52, -22, 46), (-78, -24, 63), (-101, -24, 76))
 _THUMB_RADII = (13.0, 11.0, 9.5)
 _ORIGIN = np.array([0.09, 0.006, 0.006])
-# Grid spacing, blending of the flesh, depth of the wrist behind its joint, breadth of a joint in the skin [m].
+# Grid spacing, width of blends, distance of the cut behind the wrist joint, width of skinning across a joint [m].
 _CELL, _BLEND, _STUB, _SKIN = 0.003, 0.004, 0.012, 0.004
 _FACES = 1560
 
 
 def synthetic_model(seed: int = 0) -> dict[str, Any]:
-    """The entries of a MANO file, as numpy arrays."""
+    """Return the entries of a MANO file, as numpy arrays."""
     from scipy.sparse import csc_matrix
 
     rng = np.random.default_rng(seed)
@@ -44,7 +44,7 @@ def synthetic_model(seed: int = 0) -> dict[str, Any]:
     count = len(vertices)
     shapes = 0.01 * np.einsum("vi,sij->vjs", vertices - joints[0], rng.normal(size=(10, 3, 3)))
     shapes[..., 0] = 0.02 * (vertices - joints[0])
-    # The skin gives by up to a millimetre where the body moves whose rotation it follows.
+    # Pose blend shapes move the skin of a rotated body by up to a millimetre.
     pose = 3e-4 * np.einsum("vb,bfc->vcbf", weights[:, 1:], rng.normal(size=(15, 9, 3))).reshape(count, 3, 135)
     mean = np.zeros((15, 3))
     mean[:12, 2] = 0.35
@@ -67,16 +67,16 @@ def synthetic_model(seed: int = 0) -> dict[str, Any]:
 
 
 def write_synthetic(path: Path, seed: int = 0) -> dict[str, Any]:
-    """Write a synthetic hand as a MANO file, and return its entries."""
+    """Write a synthetic hand as a MANO file. Return the entries of the file."""
     model = synthetic_model(seed)
     path.write_bytes(mano_pickle(model))
     return model
 
 
 def mano_pickle(model: dict[str, Any]) -> bytes:
-    """The entries as a pickle of protocol 2, `shapedirs` as the chumpy expression that the licensed files hold.
+    """Return the entries as a pickle of protocol 2. `shapedirs` is a chumpy expression, as in the licensed files.
 
-    chumpy is not needed: classes of its names are there while the pickle is written.
+    chumpy is not needed, because stand-ins for its classes exist while the pickle is written.
     """
     modules = {name: ModuleType(name) for name in ("chumpy", "chumpy.ch", "chumpy.reordering")}
     leaf = type("Ch", (), {"__module__": "chumpy.ch"})
@@ -85,7 +85,7 @@ def mano_pickle(model: dict[str, Any]) -> bytes:
     vars(modules["chumpy.reordering"])["Select"] = select
     shapes = model["shapedirs"]
     source, chosen = leaf(), select()
-    # As in the licensed files: a longer basis, of which the first ten are selected by their numbers when flat.
+    # As in the licensed files, the basis is longer than needed. Flat indices select its first ten shapes.
     vars(source).update(x=np.concatenate([shapes, np.zeros_like(shapes)], axis=-1), _dirty_vars={"x"})
     numbers = np.arange(shapes.size * 2).reshape(*shapes.shape[:2], -1)[..., : shapes.shape[-1]]
     vars(chosen).update(a=source, idxs=numbers.ravel(), preferred_shape=shapes.shape, _status="new")
@@ -102,13 +102,13 @@ def mano_pickle(model: dict[str, Any]) -> bytes:
 
 
 def _bones() -> tuple[list[tuple[int, np.ndarray, np.ndarray, float]], np.ndarray]:
-    """Segments (body, start, end, radius) [m] and the sixteen joints."""
+    """Return the segments (body, start, end, radius) and the positions of the sixteen joints [m]."""
     joints = np.zeros((BODIES, 3))
     segments: list[tuple[int, np.ndarray, np.ndarray, float]] = []
     wrist = np.zeros(3)
     for finger, knuckle in enumerate(_KNUCKLES):
         start = 1e-3 * np.array(knuckle, dtype=float)
-        # The palm: a ray of flesh to every knuckle, from a wrist as broad as half the palm.
+        # The palm consists of capsules from the wrist to each knuckle. The wrist is half as broad as the palm.
         root = np.array([0.02, 0.0, 0.35 * start[2]])
         segments.append((0, root, start * [0.98, 1.0, 1.0], 0.0125))
         along = np.array([-np.cos(_SPREAD[finger]), 0.0, np.sin(_SPREAD[finger])])
@@ -128,7 +128,7 @@ def _bones() -> tuple[list[tuple[int, np.ndarray, np.ndarray, float]], np.ndarra
 
 
 def _depths(segments: list[tuple[int, np.ndarray, np.ndarray, float]], points: np.ndarray) -> np.ndarray:
-    """Signed distance [m] of points to every segment's capsule."""
+    """Return the signed distance of points to every segment's capsule [m]."""
     distances = []
     for _, a, b, radius in segments:
         share = np.clip((points - a) @ (b - a) / ((b - a) @ (b - a)), 0.0, 1.0)
@@ -137,7 +137,7 @@ def _depths(segments: list[tuple[int, np.ndarray, np.ndarray, float]], points: n
 
 
 def _surface(segments: list[tuple[int, np.ndarray, np.ndarray, float]]) -> tuple[np.ndarray, np.ndarray]:
-    """One smooth surface about the segments, open where the wrist is cut off: vertices [m] and faces."""
+    """Return vertices [m] and faces of one smooth surface around the segments. It is open at the wrist."""
     import fast_simplification
     import igl
 
@@ -146,7 +146,7 @@ def _surface(segments: list[tuple[int, np.ndarray, np.ndarray, float]]) -> tuple
     axes = [np.arange(a, b, _CELL) for a, b in zip(low, high, strict=True)]
     grid = np.stack(np.meshgrid(*axes, indexing="ij"), -1)
     points = grid.reshape(-1, 3)
-    # Quilez' exponential smooth minimum, cut off by the plane of the wrist.
+    # Quilez' exponential smooth minimum joins the capsules. The plane of the wrist cuts the surface.
     flesh = -_BLEND * np.log(np.exp(-_depths(segments, points) / _BLEND).sum(-1))
     cut = _ORIGIN[0] + _STUB
     field = np.maximum(flesh, points[:, 0] - cut)
@@ -168,7 +168,7 @@ def _surface(segments: list[tuple[int, np.ndarray, np.ndarray, float]]) -> tuple
 
 
 def _weights(segments: list[tuple[int, np.ndarray, np.ndarray, float]], vertices: np.ndarray) -> np.ndarray:
-    """Skinning weights: the nearest body, blended with its neighbours in the tree across a joint's breadth."""
+    """Return skinning weights: of the nearest body, blended with its parent and children near the joints."""
     depths = _depths(segments, vertices)
     nearest = np.full((len(vertices), BODIES), np.inf)
     for column, (body, *_) in enumerate(segments):
@@ -182,7 +182,7 @@ def _weights(segments: list[tuple[int, np.ndarray, np.ndarray, float]], vertices
 
 
 def _regressor(vertices: np.ndarray, joints: np.ndarray) -> np.ndarray:
-    """Rows that sum to one and give the joints from the forty vertices nearest to each (least norm)."""
+    """Return the joint regressor. A row gives a joint from its 40 nearest vertices, with least norm and sum one."""
     rows = np.zeros((BODIES, len(vertices)))
     for row, joint in zip(rows, joints, strict=True):
         near = np.argsort(np.linalg.norm(vertices - joint, axis=1))[:40]

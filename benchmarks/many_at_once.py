@@ -1,7 +1,7 @@
-"""Grasps a second of many at once: `python benchmarks/many_at_once.py [--device cuda] [--counts 64,1024]`.
+"""Measure grasps per second of large requests: `python benchmarks/many_at_once.py [--device cuda] [--counts 64,1024]`.
 
-Raw grasps come from the search alone, and a sample of them is tried in MuJoCo behind the clock. With `--threads` of the
-CPU, verified grasps with and without metrics follow, and the share of the work that is serial by Amdahl's law.
+Raw grasps are candidates without trials. A sample of them is tried in MuJoCo, which is not timed. With `--threads`, the
+program also plans verified grasps on CPU threads, with and without metrics. Amdahl's law gives the serial fraction.
 """
 
 from __future__ import annotations
@@ -17,12 +17,12 @@ SHAPES = ("mug", "box", "bowl")
 
 
 def raw_rates(device: str, name: str, preset: str, count: int, sample: int) -> None:
-    """Print raw grasps a second of each shape, `count` at once, and the share of a sample that holds."""
+    """Print raw grasps per second of each shape, for requests of `count`, and the share of a sample that holds."""
     hand, rates, shares = graspd_core.load_hand(name), [], []
     for shape in SHAPES:
         scene = graspd_core.load_scene(f"shape:{shape}")
         if shape == SHAPES[0]:
-            # Warms the device up.
+            # Warm up the device.
             graspd_core.plan_grasps(scene, hand, count=16, preset="fast", verify="none", measure=False, device=device)
         began = time.perf_counter()
         result = graspd_core.plan_grasps(
@@ -39,7 +39,7 @@ def raw_rates(device: str, name: str, preset: str, count: int, sample: int) -> N
 
 
 def verified_rate(name: str, preset: str, count: int, measure: bool) -> float:
-    """Return verified grasps a second over all shapes, on as many threads as torch has."""
+    """Return verified grasps per second over all shapes, on torch's number of threads."""
     hand, found, seconds = graspd_core.load_hand(name), 0, 0.0
     for shape in SHAPES:
         scene = graspd_core.load_scene(f"shape:{shape}")
@@ -69,7 +69,7 @@ def main() -> None:
         for measure, row in rates.items():
             row[threads] = verified_rate(given.hand, given.preset, 32, measure)
             most, one = row[threads], row[min(row)]
-            # Amdahl: speed-up s of n threads leaves (n/s - 1)/(n - 1) serial.
+            # Amdahl's law: if n threads have the speed-up s, the serial fraction is (n/s - 1)/(n - 1).
             serial = (threads * one / most - 1) / (threads - 1) if threads > 1 else 0.0
             kind = "with metrics" if measure else "without"
             print(f"{threads} threads: {most:.1f} verified a second {kind}, {100 * serial:.0f} % serial", flush=True)

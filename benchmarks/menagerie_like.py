@@ -1,10 +1,10 @@
-"""An Allegro in the frames of Menagerie's right hand, as text of MuJoCo: an oracle for what DexGraspBench is given."""
+"""MJCF of an Allegro with the frames of Menagerie's right hand. Tests check exports for DexGraspBench with it."""
 
 from __future__ import annotations
 
 
 def menagerie_like() -> str:
-    """An Allegro as Menagerie builds it: its names and frames, the palm turned in the frame of the qpos."""
+    """Return the MJCF of an Allegro with Menagerie's names and frames. The palm is turned in the frame of the qpos."""
 
     def finger(name: str, place: str) -> str:
         lengths, axes = ("0 0 0.0164", "0 0 0.054", "0 0 0.0384"), ("0 0 1", "0 1 0", "0 1 0", "0 1 0")

@@ -1,11 +1,11 @@
-"""The pictures of the docs, drawn from what `graspd view` shows: plans and draws, the same every time. Not a test.
+"""Draw the pictures of the docs. Not a test.
 
     python benchmarks/pictures.py [--figures docs/figures] [--pages results/bench]
 
-grasps.png of README.md, and view_hero.png, view_sequence.png, view_cloud.png, view_hands.png and view_failed.png of
-docs/viewer.md: rays against the meshes of `graspd_viewer.drawing`, so that no browser and no screen is needed.
-With --pages instead the screenshots of docs/viewer.md, one of them of that benchmark: these need playwright and
-Chromium, and differ a little each time.
+Without --pages, draw grasps.png of README.md, and view_hero.png, view_sequence.png, view_cloud.png, view_hands.png and
+view_failed.png of docs/viewer.md. Rays are cast at the meshes of `graspd_viewer.drawing`, so no browser or screen is
+needed, and every run draws the same. With --pages, take the screenshots of docs/viewer.md instead. One of them shows
+the given benchmark. Screenshots need playwright and Chromium, and differ a little each time.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
-# One thread, said before torch is imported: the same grasps on machines with other cores.
+# One thread, so that all machines find the same grasps. The variable must be set before torch is imported.
 os.environ.update(OMP_NUM_THREADS="1")
 
 import numpy as np
@@ -58,18 +58,18 @@ from graspd_viewer.session import make_session
 from graspd_viewer.trial_controls import record_trial
 from graspd_viewer.viewer import Viewer
 
-# What is grasped on the README's picture, and by which hand.
+# Objects on the README's picture, and the hand that grasps each.
 PAIRS = (("shape:mug", "allegro_right"), ("shape:torus", "barrett_like"), ("shape:hammer", "leap_right"))
-# Ways to turn things before they are looked at [rad].
+# Rotations about the vertical among which `clearest` chooses [rad].
 TURNS = np.arange(0.0, 2 * np.pi, np.pi / 8)
-# Pixels of a picture's side; rays are cast through four times as many.
+# Height of a picture [pixels]. Each pixel is the mean of `FINER` x `FINER` rays.
 SIDE, FINER = 360, 2
 
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--figures", type=Path, default=Path("docs/figures"))
-    parser.add_argument("--pages", type=Path, default=None, metavar="BENCHMARK", help="screenshots instead")
+    parser.add_argument("--pages", type=Path, default=None, metavar="BENCHMARK", help="take screenshots instead")
     options = parser.parse_args()
     torch.set_num_threads(1)
     options.figures.mkdir(parents=True, exist_ok=True)
@@ -93,7 +93,7 @@ def main() -> None:
 
 
 def pages(figures: Path, benchmark: Path) -> None:
-    """Screenshots of the page with grasps, a failed trial, a slice, the help, a run, and of a benchmark's chart."""
+    """Save screenshots of the page (grasps, a failed trial, a slice, a run, the help) and of a benchmark's chart."""
     from playwright.sync_api import sync_playwright
 
     sys.path.insert(0, str(Path(__file__).parents[1] / "test" / "viewer"))
@@ -114,7 +114,7 @@ def pages(figures: Path, benchmark: Path) -> None:
 
         page.tab.goto(viewer.url)
         page.text("#0 verified")
-        # viser's word on drawing in software.
+        # Close viser's notification about rendering in software.
         page.tab.locator(".mantine-Notification-closeButton").first.click(timeout=10_000)
         shoot("view_page")
         page.choose("Show", "failed")
@@ -149,7 +149,7 @@ def pages(figures: Path, benchmark: Path) -> None:
 
 
 def pairs() -> np.ndarray:
-    """Three hands, each with the best grasp that held."""
+    """Return a picture of three hands, each with its best verified grasp. Raise RuntimeError if there is none."""
     found = []
     for source, name in PAIRS:
         scene, hand = load_scene(source), load_hand(name)
@@ -162,7 +162,7 @@ def pairs() -> np.ndarray:
 
 
 def hero(scene: Scene, hand: HandModel, grasp: Grasp) -> np.ndarray:
-    """A grasp with its contacts, squeeze forces and weakest push, beside it without the hand."""
+    """Return a picture of a grasp, and beside it the object with contacts, squeeze forces and weakest push."""
     push = weakest_push(make_metrics_context(scene.object, hand), grasp)
     marks = [*contact_parts(grasp.contacts), *squeeze_parts(grasp.contacts)]
     marks += weakest_parts(push, scene.object) if push is not None else []
@@ -171,13 +171,13 @@ def hero(scene: Scene, hand: HandModel, grasp: Grasp) -> np.ndarray:
 
 
 def sequence(scene: Scene, hand: HandModel, grasp: Grasp) -> np.ndarray:
-    """From the retreat to the squeeze."""
+    """Return pictures of the hand from the retreat to the squeeze."""
     ways = (posture_at(hand, grasp, float(stage)) for stage in range(len(STAGES)))
     return np.hstack([shot(scene, scene_parts(scene) + at(hand, way), near=0.8) for way in ways])
 
 
 def cloud() -> np.ndarray:
-    """A mug on a table as one depth camera sees it: what was seen and what was guessed, and a grasp of it."""
+    """Return pictures of a mug seen by one camera: the cloud, the seen and guessed surface, and a grasp."""
     table = tabletop("mug", yaw=2.2)
     camera = camera_of_view(320, 240)
     poses = ring_poses(1, distance=0.5, elevation=0.7)
@@ -193,7 +193,7 @@ def cloud() -> np.ndarray:
 
 
 def dots(points: np.ndarray, scene: Scene) -> Part:
-    """The points about the object as small solids."""
+    """Return the points within 3 cm of the object's bounding box as small tetrahedra."""
     corners = scene.object.mesh.vertices
     near = ((points > corners.min(0) - 0.03) & (points < corners.max(0) + 0.03)).all(1)
     solid = 0.0008 * np.array([[1, 1, 1], [1, -1, -1], [-1, 1, -1], [-1, -1, 1]])
@@ -204,7 +204,7 @@ def dots(points: np.ndarray, scene: Scene) -> Part:
 
 
 def hands() -> np.ndarray:
-    """Every hand that graspd ships with, on the same bottle."""
+    """Return pictures of a bottle grasped by each hand that graspd ships."""
     scene, found = load_scene("shape:bottle"), []
     for name in hand_names():
         hand = load_hand(name)
@@ -214,7 +214,7 @@ def hands() -> np.ndarray:
 
 
 def failed() -> np.ndarray:
-    """A grasp that is told not to press: as it is pulled, half-way out, and at the moment of its failure."""
+    """Return pictures of a grasp that fails without squeeze: when the pull begins, half-way, and at the failure."""
     scene, hand = load_scene("shape:bottle"), load_hand("barrett_like")
     grasp = plan_grasps(scene, hand, count=1, preset="fast", measure=False).grasps[0]
     soft = grasp.grasp.joint_positions
@@ -231,13 +231,13 @@ def failed() -> np.ndarray:
 
 
 def at(hand: HandModel, posture: Posture) -> list[Part]:
-    """The hand at a posture."""
+    """Return the parts of the hand at a posture."""
     positions, quaternions = placed_links(hand, posture)
     return [moved(part, positions[link], quaternions[link]) for link, part in hand_parts(hand).items()]
 
 
 def moved(part: Part, position: np.ndarray, quaternion: np.ndarray) -> Part:
-    """A part somewhere else."""
+    """Return the part at a pose: position [m] and quaternion wxyz."""
     rotation = rotation_from_quaternion(torch.as_tensor(quaternion).double()).numpy()
     return replace(part, mesh=TriangleMesh(part.mesh.vertices @ rotation.T + position, part.mesh.faces))
 
@@ -245,7 +245,7 @@ def moved(part: Part, position: np.ndarray, quaternion: np.ndarray) -> Part:
 def shot(
     scene: Scene, parts: Sequence[Part], *, width: float = 1.0, near: float = 1.0, turn: float = 0.0
 ) -> np.ndarray:
-    """A picture of parts, the support's free side up; `width` is its share of the height."""
+    """Return a picture of parts, with the support's normal up. `width` is a fraction of the picture's height."""
     meshes, pose = stood(scene, parts, near, turn)
     colours = [part.colour for part in parts]
     size = {"width": round(width * SIDE) * FINER, "height": SIDE * FINER}
@@ -255,7 +255,7 @@ def shot(
 
 
 def clearest(scene: Scene, shown: Sequence[Part], before: Sequence[Part]) -> float:
-    """The turn in which the fewest of what is shown is hidden by what may be before it [rad]."""
+    """Return the rotation of `TURNS` at which the parts `before` hide the least of the parts `shown` [rad]."""
 
     def seen(turn: float) -> int:
         meshes, pose = stood(scene, [*shown, *before], 1.0, turn)
@@ -267,7 +267,7 @@ def clearest(scene: Scene, shown: Sequence[Part], before: Sequence[Part]) -> flo
 def stood(
     scene: Scene, parts: Sequence[Part], near: float, turn: float
 ) -> tuple[list[TriangleMesh], Float[np.ndarray, "4 4"]]:
-    """Meshes with up at z, from where the light comes, turned about it; and the camera."""
+    """Return the meshes with up along z and turned by `turn` about z, and the camera pose. Light comes from z."""
     corners = scene.object.mesh.vertices
     middle = 0.5 * (corners.min(0) + corners.max(0))
     up = np.array([0.0, 0.0, 1.0]) if scene.support is None else scene.support.normal

@@ -1,14 +1,14 @@
-"""Fit the score that candidates are tried in order of: `graspd_core/optimize/ranking.npz`.
+"""Fit the network whose score orders candidates for their trials: `graspd_core/optimize/ranking.npz`.
 
     ranking.py try [--objects shape:mug PATH ...] [--hands allegro_right ...] [--out results/ranking]
     ranking.py fit [--out results/ranking] [--held-out results/ranking-scans]
 
-`try` finds candidates, 24 grasps' worth a block, and tries all, whatever their rank. Mass, trial friction and preset
-are random, and every second object stands on a table. `try` goes on where it was stopped. Without --objects it takes
-the eleven shapes, at 0.2 to 2 times their size, five kinds of large things with thin walls, of random sizes (`hollow`),
-and the seven families of irregular objects that the study `cameras` does not use. `fit` trains a network on them,
-leaves each object out in turn and each hand, tells what its order is worth against the order by chance, by the linear
-score of before and by the network that ships, and writes the network of all.
+`try` finds the candidates of a request for 24 grasps per block, and tries all of them. Mass, trial friction and preset
+are random, and half of the objects stand on a table. A stopped `try` continues. Without --objects, `try` uses the
+eleven shapes at 0.2 to 2 times their size, five kinds of large objects with thin walls and random sizes (`hollow`), and
+the seven families of irregular objects that the study `cameras` does not use. `fit` trains a network on all blocks and
+writes it. `fit` also trains without each object and each hand in turn, and prints how good the network's order is.
+Chance and the earlier linear score are printed too, and for blocks of --held-out also the shipped network.
 """
 
 from __future__ import annotations
@@ -47,19 +47,19 @@ PRESETS = ("balanced", "balanced", "fast", "accurate")
 HOLLOW = ("hollow:cup", "hollow:bowl", "hollow:tube", "hollow:carton", "hollow:tray")
 IRREGULAR = tuple(PREFIX + name for name in FAMILIES if name in CHOSEN_ON)
 VARIANTS, COUNT = 5, 24
-# Ranges of sizes, relative to the shapes, and of masses, relative to the heavy end of what the volume allows.
+# Ranges of sizes, relative to the shapes, and of masses, relative to the greatest plausible mass for the volume.
 SCALES, MASSES = (0.2, 2.0), (0.05, 1.5)
 WIDTH, EPOCHS, BATCH, RATE, DECAY = 32, 60, 256, 3e-3, 0.1
-# Candidates that one order is told by, or all where there are fewer, and those of them that a robot would look at.
+# `worth` draws `GROUP` candidates of an object and hand (or all if fewer), `DRAWS` times, and looks at the `FIRST`.
 GROUP, FIRST, DRAWS = 32, 8, 40
-# Candidates of an object and hand that a plan would take.
+# Number of best candidates of an object and hand that `told` looks at: as many as a plan would take.
 BEST = 16
-# The linear score of the first five figures, by which candidates were ordered before.
+# Weights of the first four figures in the linear score, which ordered candidates in earlier versions.
 LINEAR = (-1.7, -1.3, -0.7, -5.5)
 
 
 def hollow(kind: str, rng: np.random.Generator) -> trimesh.Trimesh:
-    """A large thing with walls of 2 to 4 mm: 6 to 30 cm across, 3 to 35 cm high, its floor at z = 0 [m]."""
+    """Return a large object with walls of 2 to 4 mm, 6 to 30 cm across and 3 to 35 cm high [m]."""
     wall = rng.uniform(0.002, 0.004)
     if kind in ("hollow:cup", "hollow:bowl"):
         top, height = ((0.03, 0.14), (0.1, 0.3)) if kind == "hollow:cup" else ((0.08, 0.15), (0.04, 0.1))
@@ -81,7 +81,7 @@ def hollow(kind: str, rng: np.random.Generator) -> trimesh.Trimesh:
 
 
 def thing_scene(source: str, rng: np.random.Generator, friction: float, resolution: int) -> Scene:
-    """The scene of a block's object: a shape of random size, a hollow or irregular thing, or what a file holds."""
+    """Return the scene of a block's object: a shape of random size, a hollow or irregular object, or a mesh file."""
     if source in HOLLOW:
         made = hollow(source, rng)
         mesh = TriangleMesh(np.asarray(made.vertices), np.asarray(made.faces))
@@ -97,7 +97,7 @@ def thing_scene(source: str, rng: np.random.Generator, friction: float, resoluti
 
 
 def try_block(where: Path, source: str, hand_name: str, variant: int, count: int) -> None:
-    """Candidates of one object, hand and variant for `count` grasps, and how the trials of each ended."""
+    """Plan and try the candidates of one object, hand and variant. Write their figures and results to a file."""
     name = "".join(c if c.isalnum() else "_" for c in f"{Path(source).stem}-{hand_name}-{variant}")
     file = where / f"{name}.npz"
     if file.exists():
@@ -110,7 +110,7 @@ def try_block(where: Path, source: str, hand_name: str, variant: int, count: int
     task = PlannerInput(scene, hand, count, variant, config, Hooks())
     some = staged(task.problem, hand, method_row(config.method).plan(task).poses, config)
     grasps = finished(task.problem, hand, some)
-    # A candidate in the table is dropped before its trial.
+    # Candidates that penetrate the table have the score −inf and are not tried.
     kept = np.flatnonzero([np.isfinite(grasp.score) for grasp in grasps])
     held = {}
     for trial in ("standard", "hard"):
@@ -126,9 +126,9 @@ def try_block(where: Path, source: str, hand_name: str, variant: int, count: int
 
 
 def fitted(data: dict[str, np.ndarray], rows: np.ndarray, seed: int = 0) -> dict[str, np.ndarray]:
-    """Mean and deviation of the figures, and the layers of a network that is trained on how the trials of rows ended.
+    """Train a network on the trials of `rows`. Return mean and deviation of the figures, and the network's layers.
 
-    It is trained on both trials, so that its layers serve both; the odds of the hard one are not kept.
+    The training predicts both trials, so that both shape the layers. The output for the hard trial is not kept.
     """
     torch.manual_seed(seed)
     figures, held = data["figures"][rows], np.stack([data["standard"][rows], data["hard"][rows]], 1)
@@ -154,18 +154,18 @@ def fitted(data: dict[str, np.ndarray], rows: np.ndarray, seed: int = 0) -> dict
 
 
 def odds(network: dict[str, np.ndarray], figures: np.ndarray) -> np.ndarray:
-    """Log-odds by a network."""
+    """Return the log-odds that a network predicts."""
     tensors = {name: torch.as_tensor(values).double() for name, values in network.items()}
     return log_odds(tensors, torch.as_tensor(figures)).numpy()
 
 
 def linear(figures: np.ndarray) -> np.ndarray:
-    """The score before."""
+    """Return the linear score of earlier versions."""
     return figures[:, :4] @ LINEAR - 10.0 * (figures[:, 4] - 1.0).clip(0.0)
 
 
 def worth(order: np.ndarray, held: np.ndarray, group: np.ndarray) -> tuple[float, float, float]:
-    """Share of the first 8 of 32 that hold, trials for each of 8 verified, and the area under the ROC curve."""
+    """Return the share held of the first 8 of 32, trials per verified grasp until 8 hold, and the ROC's area."""
     rng = np.random.default_rng(0)
     first, trials, area = [], [], []
     for name in np.unique(group):
@@ -184,7 +184,7 @@ def worth(order: np.ndarray, held: np.ndarray, group: np.ndarray) -> tuple[float
 
 
 def left_out(data: dict[str, np.ndarray], by: str) -> np.ndarray:
-    """Log-odds of every candidate by a network that saw none with its object, or hand."""
+    """Return the log-odds of every candidate by a network trained without the candidate's object (or hand)."""
     result = np.zeros(len(data["standard"]))
     for name in np.unique(data[by]):
         out = data[by] == name
@@ -193,7 +193,7 @@ def left_out(data: dict[str, np.ndarray], by: str) -> np.ndarray:
 
 
 def read(folder: Path) -> dict[str, np.ndarray]:
-    """All blocks of a folder, one row a candidate."""
+    """Read all blocks of a folder. Each row is one candidate."""
     blocks = [dict(np.load(file)) for file in sorted(folder.glob("*.npz"))]
     if not blocks:
         raise SystemExit(f"{folder} has no blocks: `ranking.py try --out {folder}` makes them")
@@ -203,17 +203,17 @@ def read(folder: Path) -> dict[str, np.ndarray]:
 
 
 def told(title: str, data: dict[str, np.ndarray], log_odds: np.ndarray) -> None:
-    """Print how many of the best of each object and hand a network expects to hold, and how many do."""
+    """Print the share of the best candidates that should hold by the network, and the share that held."""
     group = np.char.add(np.char.add(data["object"], " "), data["hand"])
     blocks = [np.flatnonzero(group == name) for name in np.unique(group)]
     best = [rows[np.argsort(-log_odds[rows], kind="stable")[:BEST]] for rows in blocks]
     expected = np.mean([(1 / (1 + np.exp(-log_odds[rows]))).mean() for rows in best])
     held = np.mean([data["standard"][rows].mean() for rows in best])
-    print(f"{title}: of the best {BEST} of each object and hand it expects {expected:.1%} to hold; {held:.1%} do")
+    print(f"{title}: of the best {BEST} of each object and hand {expected:.1%} should hold, {held:.1%} do")
 
 
 def table(title: str, data: dict[str, np.ndarray], orders: dict[str, np.ndarray]) -> None:
-    """Print what orders are worth, for all hands and for each."""
+    """Print the values of `worth` for every order, for all hands together and for each hand."""
     group, rows = np.char.add(np.char.add(data["object"], " "), data["hand"]), []
     for hand in ("all", *np.unique(data["hand"])):
         chosen = (data["hand"] == hand) | (hand == "all")
@@ -226,12 +226,12 @@ def table(title: str, data: dict[str, np.ndarray], orders: dict[str, np.ndarray]
 
 
 def by_others(data: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
-    """The order by chance and the linear one."""
+    """Return the scores to compare with: random numbers and the linear score."""
     return {"chance": np.random.default_rng(0).random(len(data["standard"])), "linear": linear(data["figures"])}
 
 
 def fit(folder: Path, held_out: Path | None, to: Path) -> None:
-    """Train a network on a folder's blocks, print what its order is worth, and write it."""
+    """Train a network on a folder's blocks, print how good its order is, and write the network to `to`."""
     data, ships = read(folder), dict(np.load(SHIPS))
     kinds = [kind for kind in ("object", "hand") if len(np.unique(data[kind])) > 1]
     unseen = {f"network, {kind} left out": left_out(data, kind) for kind in kinds}
@@ -269,5 +269,5 @@ def main(arguments: Sequence[str] | None = None) -> None:
 
 
 if __name__ == "__main__":
-    torch.set_num_threads(1)  # The networks are too small to be shared out.
+    torch.set_num_threads(1)  # The networks are too small for several threads.
     main()

@@ -1,10 +1,10 @@
-"""A node under mixed load for minutes: does its memory stay flat, does it answer in time, does each request end once?
+"""Test a node under mixed load for minutes: memory growth, waiting times, and whether each request ends once.
 
     python benchmarks/soak.py [--minutes 10] [--out results/soak] [--readme docs/reference/node_load.md]
 
-Three processes besides this one's client: the node (with a timer of its own to measure by), a camera of 640×480 at
-30 Hz, and a control that only ticks: how late that comes is the machine's doing. Nothing is mocked. The record, the
-line on its origin and the filling of pages are those of `graspd bench`.
+This process is the client. It starts three processes: the node with a timer that measures delays, a camera of 640×480
+at 30 Hz, and a control that only sleeps. The lateness of the control comes from the machine. Nothing is mocked. Code of
+`graspd bench` writes the record, the line on its origin, and the pages.
 """
 
 from __future__ import annotations
@@ -31,10 +31,10 @@ from graspd_bench.tables import fill, sourced, written
 from graspd_dataset.run_records import code_version, markdown_table
 
 PARTS = Path(__file__).with_name("soak_parts.py")
-SAMPLE_PERIOD = 5.0  # seconds between two looks at the node's memory
-SETTLED = 0.2  # share of the time after which memory is expected to be flat
-GROWTH = 0.05  # most that memory may grow after that
-# Most that the 99th percentile of a wait may be [ms]; of those whose names begin so, the longest counts.
+SAMPLE_PERIOD = 5.0  # seconds between two measurements of the node's memory
+SETTLED = 0.2  # fraction of the run after which memory should be flat
+GROWTH = 0.05  # greatest allowed growth of memory after `SETTLED`
+# Limits on the 99th percentile of waits [ms]. A limit applies to all waits whose names begin with its key.
 LIMITS = {
     "timer lateness in the node": 50.0,
     "trivial service": 50.0,
@@ -45,13 +45,13 @@ LIMITS = {
 
 @dataclass(frozen=True)
 class Soak(Case):
-    """Minutes of load."""
+    """A run of the given number of minutes."""
 
     minutes: float
 
 
 def run_soak(case: Soak) -> Record:
-    """All figures of one run, in a domain and a cache of its own."""
+    """Run once, in a separate ROS domain and with a separate cache. Return the results."""
     from graspd_core.paths import config_dir
 
     with tempfile.TemporaryDirectory() as folder:
@@ -66,8 +66,8 @@ def run_soak(case: Soak) -> Record:
 
 
 def soak(folder: Path, seconds: float) -> Record:
-    """Start the processes, keep them busy, gather the figures."""
-    from soak_client import SCENES, Client  # it imports ROS, which reads the environment set above
+    """Start the processes, send requests for `seconds`, and return the results."""
+    from soak_client import SCENES, Client  # soak_client imports ROS, which reads the environment of `run_soak`
 
     from graspd_core.mesh.mesh_files import save_mesh
     from graspd_core.mesh.shapes import make_shape
@@ -94,7 +94,7 @@ def soak(folder: Path, seconds: float) -> Record:
         alive = node.poll() is None
         client.settle()
         sent, ticks = (json.loads(process.communicate(timeout=60)[0] or "[]") for process in others)
-        time.sleep(6.0)  # the node's last notes
+        time.sleep(6.0)  # until the node has written its last delays
         node.terminate()
         node.wait(10)
     finally:
@@ -124,20 +124,20 @@ def _memory(pid: int) -> float:
 
 
 def spread(values: Sequence[float]) -> dict[str, float]:
-    """Median, 99th percentile and greatest [ms]."""
+    """Return the number of values [s], and their median, 99th percentile and maximum [ms]."""
     median, p99 = np.percentile(values, [50, 99]) * 1e3
     return {"n": len(values), "p50": float(median), "p99": float(p99), "max": max(values) * 1e3}
 
 
 def growth(memory: Sequence[float]) -> float | None:
-    """The median of the last fifth over that of the first fifth after settling, less one; None: unknown."""
+    """Return the growth of memory from the first to the last fifth after `SETTLED`, by medians. None if unknown."""
     flat = memory[int(SETTLED * len(memory)) :]
     fifth = max(len(flat) // 5, 1)
     return float(np.median(flat[-fifth:]) / np.median(flat[:fifth]) - 1) if len(flat) > 1 else None
 
 
 def targets(record: Record) -> dict[str, bool]:
-    """What is expected of the node, and whether it did so; what was not measured is not met."""
+    """Return for each target whether the node met it. A target without measurements is not met."""
     grown = growth(record["memory_mb"])
     met = {
         "the node is alive at the end": record["alive"],
@@ -153,7 +153,7 @@ def targets(record: Record) -> dict[str, bool]:
 
 
 def soak_sections(record: Record) -> Sections:
-    """The waits, the counts, and what of the targets is met."""
+    """Return the tables of waits, counts and targets."""
     waits = [[name, *(f"{s[key]:.{int(key != 'n')}f}" for key in s)] for name, s in record["waits"].items()]
     memory, grown = record["memory_mb"] or [0.0], growth(record["memory_mb"])
     first, last = (f"{age:.1f}" for age in record["ages_ms"] or [float("nan")] * 2)
@@ -174,11 +174,11 @@ def soak_sections(record: Record) -> Sections:
 
 
 def main() -> int:
-    """Run, print the tables; 1 when a target is not met."""
+    """Run, and print the tables. Return 1 if a target is not met or the run failed, otherwise 0."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--minutes", type=float, default=10.0)
     parser.add_argument("--out", type=Path, default=Path("results/soak"), metavar="DIR")
-    parser.add_argument("--readme", type=Path, help="fill its section of the name `faults`")
+    parser.add_argument("--readme", type=Path, help="page whose section `faults` to fill")
     options = parser.parse_args()
     case = Soak(options.minutes)
     record: dict[str, Any] = run_job(Job("soak", case, run_soak, code_version()))

@@ -1,4 +1,4 @@
-"""The client of soak.py: sends what robots send, and notes what comes back and when."""
+"""Client of soak.py. It sends requests like a robot, and records all answers and waiting times."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from rclpy.qos import DurabilityPolicy, QoSProfile
 from std_msgs.msg import String
 from std_srvs.srv import Trigger
 
-TIMEOUT = 90.0  # seconds for any one answer
+TIMEOUT = 90.0  # longest wait for an answer [s]
 PING_PERIOD = 0.05
 STATUSES = ("succeeded", "partial", "failed", "cancelled", "superseded", "refused")
 LONG = {"num_grasps": 64, "preset": "accurate"}
@@ -36,10 +36,10 @@ MALFORMED: tuple[dict[str, Any], ...] = (
 
 
 class Client:
-    """One node that talks to graspd; everything happens while it spins."""
+    """ROS node that sends requests to graspd. Answers arrive only during `spin`."""
 
     def __init__(self, sample: Callable[[], None], period: float) -> None:
-        """Args: what is called every `period` seconds while it spins."""
+        """Create the node. `spin` calls `sample` every `period` seconds."""
         rclpy.init()
         self._sample, self._period, self._sampled = sample, period, 0.0
         self.node = rclpy.create_node("soak_client")
@@ -73,7 +73,7 @@ class Client:
         self.stages[message.request_id].append(message.stage)
 
     def spin(self) -> None:
-        """A little while; a trivial service is called all the time."""
+        """Process messages for up to 5 ms. Call a trivial service again and again, and record its waiting times."""
         self._executor.spin_once(timeout_sec=0.005)
         now = time.monotonic()
         if self.ready and now - self._sampled >= self._period:
@@ -86,7 +86,7 @@ class Client:
             self._pinged, self._ping = now, self._parameters.call_async(GetParameters.Request(names=["seed"]))
 
     def wait(self, condition: Callable[[], Any], what: str) -> float:
-        """Spin until the condition holds; how long that took. What does not come counts among the timeouts."""
+        """Spin until the condition holds or `TIMEOUT` passes. Return the time waited [s]. Count timeouts."""
         begun = time.monotonic()
         while not condition():
             if time.monotonic() > begun + TIMEOUT:
@@ -97,7 +97,7 @@ class Client:
         return time.monotonic() - begun
 
     def request(self, **fields: Any) -> str:
-        """Send a request; its name."""
+        """Send a request. Return its id."""
         name = f"soak-{len(self.sent)}"
         self.sent[name] = time.monotonic()
         self._requests.publish(GraspRequest(id=name, **fields))
@@ -107,7 +107,7 @@ class Client:
         return self.wait(lambda: self.answers[name], what)
 
     def settle(self) -> None:
-        """Wait for the answers to everything sent, and a little longer for those that come twice."""
+        """Wait for an answer to every request. Then wait 1 s longer for answers that come twice."""
         self.wait(lambda: all(self.answers[name] for name in self.sent), "all answers")
         end = time.monotonic() + 1.0
         self.wait(lambda: time.monotonic() > end, "the end")
@@ -124,30 +124,30 @@ class Client:
             "waits": dict(self.waits),
         }
 
-    # What robots do.
+    # Each method below acts like a robot in one situation.
 
     def grasp_mesh(self, script: random.Random) -> None:
-        """One object by its mesh, from an idle node."""
+        """Request grasps of a mesh from an idle node."""
         mesh = {"source": GraspRequest.MESH, "mesh_uri": f"{script.choice(['sphere', 'mug', 'box'])}.obj"}
         name = self.request(**mesh, preset=script.choice(["fast", "balanced"]), seed=script.randrange(1000))
         self.waits["request to first progress"].append(self.wait(lambda: self.stages[name], "progress"))
         self.answered(name)
 
     def grasp_cloud(self, script: random.Random) -> None:
-        """What the camera shows now."""
+        """Request grasps of the object in the camera's latest cloud."""
         name = self.request(source=GraspRequest.LATEST_CLOUD, preset="fast", num_grasps=4)
         self.waits["request to first progress"].append(self.wait(lambda: self.stages[name], "progress"))
         self.answered(name)
 
     def grasp_views(self, script: random.Random) -> None:
-        """Three views together."""
+        """Request grasps of an object seen in three views."""
         for service in ("add_view", "add_view", "add_view"):
             self.call(service)
         self.answered(self.request(source=GraspRequest.VIEWS, preset="fast", num_grasps=4))
         self.call("reset_views")
 
     def grasp_by_action(self, script: random.Random) -> None:
-        """A goal, to its result."""
+        """Send an action goal, and wait for its result."""
         name = f"soak-{len(self.sent)}"
         self.sent[name] = time.monotonic()
         request = GraspRequest(id=name, source=GraspRequest.MESH, mesh_uri="box.obj", preset="fast", num_grasps=4)
@@ -161,7 +161,7 @@ class Client:
         self.answered(name)
 
     def change_of_mind(self, script: random.Random) -> None:
-        """A request that is cancelled in some stage."""
+        """Send a request, and cancel it in a random stage."""
         stage = script.choice(["queued", "load", "optimise", "verify"])
         size = {"num_grasps": 16, "preset": "fast"} if stage == "verify" else {}
         mesh = {"source": GraspRequest.MESH, "mesh_uri": "mug.obj"}
@@ -176,7 +176,7 @@ class Client:
             self.answered(ahead)
 
     def impatience(self, script: random.Random) -> None:
-        """A burst, and then nothing of it after all."""
+        """Send a burst of 40 requests, and cancel all of them after 35 answers."""
         names = [self.request(source=GraspRequest.MESH, mesh_uri="mug.obj", **LONG) for _ in range(40)]
         self.wait(lambda: sum(bool(self.answers[name]) for name in names) >= 35, "35 refusals")
         self._cancels.publish(String(data=""))
@@ -184,7 +184,7 @@ class Client:
             self.answered(name)
 
     def nonsense(self, script: random.Random) -> None:
-        """Malformed requests."""
+        """Send malformed requests."""
         for name in [self.request(**fields) for fields in MALFORMED]:
             self.answered(name)
 

@@ -1,4 +1,4 @@
-"""The other processes of soak.py: a node that measures itself, a camera, and a control.
+"""Processes that soak.py starts: a node that measures its own delays, a camera, and a control process.
 
 `python soak_parts.py node|camera|control ...`
 """
@@ -21,7 +21,7 @@ BALL, RADIUS, NOISE = np.array([0.0, 0.0, 0.5]), 0.035, 0.0005  # metres
 
 
 def run_node(file: Path, arguments: list[str]) -> int:
-    """graspd_node, with a timer that notes how late it comes and a note of each cloud's age on arrival."""
+    """Run graspd_node. Append the lateness of a timer and the age of each arriving cloud to `file` [s]."""
     from graspd_ros import grasp_node as service
     from graspd_ros import node
     from graspd_ros.convert import nanoseconds
@@ -40,7 +40,7 @@ def run_node(file: Path, arguments: list[str]) -> int:
             now = time.monotonic()
             if self._due:
                 self.late.append(max(now - self._due, 0.0))
-            # From this tick on: one long stall is one late tick, as the timer skips those that it missed.
+            # The next tick is due one period after this tick. The timer skips missed ticks, so a stall counts once.
             self._due = now + TIMER_PERIOD
 
         def _see(self, sensor_frame: SensorFrame) -> None:
@@ -58,7 +58,7 @@ def run_node(file: Path, arguments: list[str]) -> int:
 
 
 def run_camera(seconds: float) -> None:
-    """A ball in front of an RGB-D camera: organised clouds of 9.8 MB, with fresh noise, best effort, as drivers do."""
+    """Publish clouds of a ball in front of an RGB-D camera: organised, 9.8 MB, noisy, best effort as from drivers."""
     import rclpy
     from rclpy.qos import qos_profile_sensor_data
     from sensor_msgs.msg import PointCloud2, PointField
@@ -86,7 +86,7 @@ def run_camera(seconds: float) -> None:
 
 
 def run_control(seconds: float) -> None:
-    """Sleep as long as the node's timer does, and print how late each waking came [s]."""
+    """Sleep again and again for the node's timer period. Print how late the process woke each time [s]."""
     late: list[float] = []
     end = time.monotonic() + seconds
     while (now := time.monotonic()) < end:
@@ -96,7 +96,7 @@ def run_control(seconds: float) -> None:
 
 
 def ball_cloud(seed: int) -> array.array:
-    """The bytes of one organised cloud; NaN where the ball is not."""
+    """Return the bytes of one organised cloud. Pixels beside the ball are NaN."""
     u, v = np.meshgrid((np.arange(WIDTH) - WIDTH / 2) / FOCAL, (np.arange(HEIGHT) - HEIGHT / 2) / FOCAL)
     rays = np.stack([u, v, np.ones_like(u)], -1)
     a, b, c = (rays**2).sum(-1), rays @ BALL, BALL @ BALL - RADIUS**2

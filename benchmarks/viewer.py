@@ -1,9 +1,9 @@
-"""What the viewer costs: opening 200 grasps, scrubbing, watching a run, and minutes of random clicking. Not a test.
+"""Measure the viewer's cost: opening 200 grasps, dragging the slider, watching a run, random clicks. Not a test.
 
     python benchmarks/viewer.py [--minutes 10] [--grasps grasps.json] [--pace 0.5] [--clicks-only]
 
-Needs viser, playwright and a Chromium of the system's packages, as test/viewer does. Without a graphics card the
-browser draws in software, on the same cores as the server: its frames are a lower bound. Memory is resident memory.
+The program needs viser, playwright and the system's package of Chromium, like test/viewer. Without a graphics card the
+browser draws in software on the server's cores, so the frame rate is a lower bound. Memory is resident memory.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ import time
 from pathlib import Path
 from typing import Any
 
-# One thread, said before torch is imported.
+# One thread. The variable must be set before torch is imported.
 os.environ.update(OMP_NUM_THREADS="1")
 
 import numpy as np
@@ -36,12 +36,12 @@ from graspd_core import load_hand, load_preset, load_scene, plan_grasps, save_re
 from graspd_viewer.session import make_session, open_grasps
 from graspd_viewer.viewer import Viewer
 
-# What three.js says of itself, by way of viser: frames that were really drawn.
+# JavaScript that counts the frames drawn by three.js. viser exposes the counter.
 FRAMES = """() => {
   const drawn = () => window.__viserTestpoints.rendererInfo.render.frame, first = drawn();
   window.drawn = () => drawn() - first;
 }"""
-# To and fro over the slider, 60 times a second: the driver's own mouse waits for a frame behind each move.
+# JavaScript that drags the slider to and fro, 60 moves a second. Playwright's mouse would wait for a frame each time.
 DRAG = """([left, right, y]) => {
   let moves = 0;
   const step = () => {
@@ -54,8 +54,8 @@ DRAG = """([left, right, y]) => {
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--minutes", type=float, default=10.0, help="of random clicking")
-    parser.add_argument("--grasps", type=Path, default=None, help="a file of many grasps; without it 200 are planned")
+    parser.add_argument("--minutes", type=float, default=10.0, help="duration of random clicks")
+    parser.add_argument("--grasps", type=Path, default=None, help="file of many grasps (default: plan 200)")
     parser.add_argument("--pace", type=float, default=0.05, help="seconds between clicks")
     parser.add_argument("--clicks-only", action="store_true", help="leave out the scrubs and the watched runs")
     options = parser.parse_args()
@@ -83,7 +83,7 @@ def main() -> None:
 
 
 def planned(count: int) -> Path:
-    """So many grasps of the mug by the Allegro hand."""
+    """Plan `count` grasps of the mug with the Allegro hand. Return the path of their file."""
     scene, hand, config = load_scene("shape:mug"), load_hand("allegro_right"), load_preset("fast")
     path = Path(tempfile.mkdtemp()) / "grasps.json"
     save_result(path, plan_grasps(scene, hand, count=count, preset=config), scene.object, hand, config)
@@ -91,7 +91,7 @@ def planned(count: int) -> Path:
 
 
 def opened(viewer: Viewer, page: Any, path: Path) -> None:
-    """From the file to the page that says its first grasp."""
+    """Print the time from opening a file until the page shows the first grasp, then the time after a reload."""
     page.goto(viewer.url)
     page.wait_for_selector("canvas")
     time.sleep(3.0)
@@ -107,7 +107,7 @@ def opened(viewer: Viewer, page: Any, path: Path) -> None:
 
 
 def scrubbed(viewer: Viewer, page: Any, address: str) -> None:
-    """Frames of the browser and poses of the hand while the slider is dragged to and fro for ten seconds."""
+    """Drag the slider for ten seconds. Print frames of the browser, poses of the hand, and CPU time."""
     page.get_by_text("#0 verified").first.wait_for()
     time.sleep(3.0)
     poses, nodes = [0], viewer._nodes
@@ -137,7 +137,7 @@ def scrubbed(viewer: Viewer, page: Any, address: str) -> None:
 
 
 def watched(viewer: Viewer, who: str, repeats: int = 6) -> None:
-    """CPU seconds of a planning thread, and wall seconds of a run, with and without somebody who watches."""
+    """Print CPU time of the planning thread and the process, and wall time of a run, with and without live view."""
     scene, hand, config = load_scene("shape:mug"), load_hand("allegro_right"), load_preset("balanced")
     session = make_session("mug", hand, (), scene, config, np.zeros((0, 3)), ())
     figures: dict[bool, list[tuple[float, float, float]]] = {False: [], True: []}
@@ -155,11 +155,11 @@ def watched(viewer: Viewer, who: str, repeats: int = 6) -> None:
 
 
 def clicked(viewer: Viewer, page: Any, minutes: float, pace: float) -> None:
-    """Memory of the server and the browser while somebody clicks anywhere in the panel and types any key.
+    """Print memory of server and browser during random clicks in the panel and random keys.
 
     Args:
-        minutes: so long.
-        pace: seconds between the end of a click and the next.
+        minutes: duration [min].
+        pace: pause after each click or key [s].
     """
     random.seed(0)
     page.reload()
@@ -190,7 +190,7 @@ def _tell_memory(clicks: int) -> None:
 
 
 def resident(process: int) -> float:
-    """Resident memory of a process [MB]; none where it is gone."""
+    """Return the resident memory of a process [MB], or 0 if the process has ended."""
     try:
         return int(Path(f"/proc/{process}/statm").read_text().split()[1]) * os.sysconf("SC_PAGE_SIZE") / 1e6
     except OSError:
@@ -198,7 +198,7 @@ def resident(process: int) -> float:
 
 
 def children() -> list[int]:
-    """Processes below this one, by number."""
+    """Return the process ids of all descendants of this process."""
     parents = {}
     for stat in Path("/proc").glob("[0-9]*/stat"):
         try:
@@ -214,7 +214,7 @@ def children() -> list[int]:
 
 
 def browser_cpu() -> float:
-    """CPU seconds of everything that this process has started and that still runs."""
+    """Return the CPU time of all running descendants of this process [s]."""
     ticks = 0
     for process in children():
         with contextlib.suppress(OSError):
@@ -224,7 +224,7 @@ def browser_cpu() -> float:
 
 
 def browser_memory() -> float:
-    """Resident memory of everything that this process has started [MB]; what processes share counts for each."""
+    """Return the resident memory of all descendants of this process [MB]. Shared memory counts for each process."""
     return sum(map(resident, children()))
 
 

@@ -1,12 +1,12 @@
-"""What becomes of clouds of which a wrong place of the camera is said.
+"""Measure what graspd does with clouds whose stated camera position is wrong.
 
     python benchmarks/wrong_viewpoints.py [--count 500] [--frames FOLDER]
 
-Clouds are of ten rendered scenes (things of `graspd bench cameras` that no threshold was chosen on, seeds from 100) and
-of the depth frames in a folder (`NAME/camera.json` with K, `NAME/depth_mm.png`). They are given as unordered points, so
-that no pixel tells where the camera stood: all points, thinned to 8 mm, and the object's alone. Wrong places are a
-robot's base, the mirror image of the true place, 5 m away, or anywhere at the true distance. Each turns the line of
-sight by more than 20°. What is verified is tried on the true thing, where that is known.
+Clouds come from ten rendered scenes (objects of `graspd bench cameras` on which no threshold was chosen, seeds from
+100), and from the depth frames in a folder (`NAME/camera.json` with K, `NAME/depth_mm.png`). Points are unordered, so
+that no pixel shows where the camera stood. Each cloud has three forms: all points, points thinned to 8 mm, and only the
+object's points. Wrong positions are a robot's base, the mirror image of the true position, 5 m away, or anywhere at the
+true distance. Each turns the line of sight by more than 20°. Verified grasps are tried on the true object, if known.
 """
 
 from __future__ import annotations
@@ -43,7 +43,7 @@ LEAST_TURN = np.radians(20.0)
 
 @dataclass(frozen=True)
 class Seen:
-    """A cloud, where its camera stood, a point of the thing, up [m], and the true thing if that is known."""
+    """Points of a cloud [m], the true camera position [m], a point of the object [m], up, and the true mesh or None."""
 
     name: str
     points: Points
@@ -78,7 +78,7 @@ def frames(folder: Path) -> Iterator[Seen]:
 
 
 def wrong_place(seen: Seen, rng: np.random.Generator) -> tuple[str, Vector]:
-    """A place that sees the target from another direction."""
+    """Draw a wrong camera position that sees the target from another direction. Return its kind and position [m]."""
     first = perpendicular(seen.up)
     away, said = seen.place - seen.target, np.zeros(3)
     while True:
@@ -104,7 +104,7 @@ def forms(seen: Seen, rng: np.random.Generator) -> dict[str, PointCloud]:
 
 
 def outcome(seen: Seen, form: str, cloud: PointCloud, place: Vector) -> str:
-    """What the answer is: refused, doubted, no verified grasp, or verified and whether all of those hold."""
+    """Return graspd's answer: refused, doubted, none verified, or verified and whether all verified grasps hold."""
     hand, protocol = load_hand("allegro_right"), out_of_place(PROTOCOLS["standard"])
     target = None if form == "alone" else Target(point=seen.target)
     try:

@@ -33,10 +33,10 @@ from graspd_core.types import joined
 from graspd_viewer.grasp_page import placed_hand
 
 GRASPS = 8
-TIMEOUT = 180.0  # seconds; each step takes a few on a quiet machine
+TIMEOUT = 180.0  # longest wait for a step [s]. A step takes a few seconds on a quiet machine
 CAMERA = camera_of_view(320, 240)
 T_MUG_CAMERA = look_at(eye=(0.32, -0.28, 0.25), target=(0.0, 0.0, 0.0))
-VIEWS = ((0.35, -0.30, 0.22), (-0.25, 0.40, 0.15))  # where the pictures are taken from, mug frame [m]
+VIEWS = ((0.35, -0.30, 0.22), (-0.25, 0.40, 0.15))  # camera positions of the pictures, mug frame [m]
 MUG_COLOUR, HAND_COLOUR = (0.85, 0.55, 0.25), (0.35, 0.45, 0.60)
 DOMAIN = str(1 + os.getpid() % 100)
 
@@ -74,7 +74,7 @@ class Robot:
         self.pose = message
 
     def wait_for(self, condition: Callable[[], Any], what: str) -> Any:
-        """Spin until the condition returns a true value, and return that."""
+        """Spin until the condition returns a true value, and return this value. Raises DemoError: error or timeout."""
         end = time.monotonic() + TIMEOUT
         while not (found := condition()):
             error = next((event for event in self.events if event["event"] == "error"), None)
@@ -91,7 +91,7 @@ class Robot:
         return self.wait_for(lambda: next((e for e in self.events if e["event"] == name), None), f"event {name}")
 
     def request(self, title: str, send: Callable[[], None]) -> tuple[Event, TriangleMesh]:
-        """Send an object and print the answers. Return the result event and the hand as received."""
+        """Send an object and print the answers. Return the result event and the mesh of the received hand."""
         self.events.clear()
         self.joints = self.pose = None
         begun = time.monotonic()
@@ -110,13 +110,13 @@ class Robot:
         if first_verified is not None:
             say(f"  first verified grasp    {first_verified:6.2f} s")
         say(f"  all grasps              {elapsed:6.2f} s")
-        say(f"  verified                {result['verified']:3d} of {result['grasps']} tried, {GRASPS} asked for")
+        say(f"  verified                {result['verified']:3d} of {result['grasps']} tried, {GRASPS} requested")
         say(f"  best: {describe(result['best'])}")
         return result, hand_in_object_frame(joints, pose)
 
 
 def hand_in_object_frame(joints: JointState, stamped: PoseStamped) -> TriangleMesh:
-    """Return the hand at the received joint values and pose."""
+    """Return the hand's mesh at the received joint values and pose [m]."""
     hand = load_hand("allegro_right")
     value_of = dict(zip(joints.name, joints.position, strict=True))
     at, turn = stamped.pose.position, stamped.pose.orientation
@@ -161,7 +161,7 @@ def picture(mug: TriangleMesh, hand: TriangleMesh, path: Path) -> None:
 
 
 def start_node(directory: Path) -> subprocess.Popen:
-    """Start `graspd_node` as a user does. Its output goes to demo/node.log."""
+    """Start `graspd_node` in another process. Its output goes to node.log in `directory`."""
     parameters = [f"num_grasps:={GRASPS}", "mesh_roots:=['.']", "output_dir:=results"]
     arguments = [part for parameter in parameters for part in ("-p", parameter)]
     with (directory / "node.log").open("w") as log:
@@ -179,12 +179,12 @@ def stop_node(process: subprocess.Popen) -> None:
 
 
 def run(directory: Path, process: subprocess.Popen) -> None:
-    """Make both requests and write their files."""
+    """Send both requests and write the files."""
     begun = time.monotonic()
     robot = Robot(process)
     robot.wait_for_event("ready")
     robot.wait_for(lambda: robot.mesh.get_subscription_count() and robot.points.get_subscription_count(), "match")
-    time.sleep(0.3)  # the first messages after a match can still be lost
+    time.sleep(0.3)  # messages sent right after the discovery can still be lost
     say(f"node ready after {time.monotonic() - begun:.1f} s")
     mug = make_shape("mug")
     save_mesh(directory / "mug.obj", mug)

@@ -1,7 +1,7 @@
 """Plan grasps on a depth image: python examples/grasp_a_cloud.py [depth.png camera.json].
 
 The camera's file has `width`, `height`, `K` and optionally `T_world_camera` (docs/clouds.md). The target is in the
-world frame. Without files, a cylinder on a table is rendered. The object is completed, and the table is an obstacle.
+world frame. Without files, a cylinder on a table is rendered. graspd guesses the hidden side. The table is an obstacle.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ from graspd_core import (
 
 
 def rendered_view() -> PointCloud:
-    """Return the view of a camera on a cylinder on a table: points and camera position."""
+    """Render a cylinder on a table. Return the points that the camera sees, and the camera's position."""
     camera = PinholeCamera(320, 240, fx=300.0, fy=300.0, cx=159.5, cy=119.5)
     (pose,) = ring_poses(1, elevation=0.6)
     ((depth, _),) = depth_views(tabletop("cylinder"), camera, [pose])
@@ -39,7 +39,7 @@ def main(arguments: Sequence[str]) -> int:
     """Return 0 if there is a verified grasp, 1 if not, 2 if the view shows no object."""
     view = load_depth_view(arguments[0], arguments[1]) if arguments else rendered_view()
     try:
-        # Several views of one scene go into the list; Target also takes a box or a mask.
+        # The list may hold several views of one scene. The target may also be a box or a mask.
         scene = scene_from_views([view], target=Target(point=np.array([0.0, 0.0, 0.05])), settings=SceneConfig())
     except GraspdError as error:
         print(f"no object: {error}")

@@ -1,6 +1,6 @@
 """Plan verified grasps of a mesh: python examples/grasp_a_mesh.py [mug.obj] [grasps.json].
 
-Coordinates of the file are metres. `scale=0.001` reads millimetres. Without a file, the object is a built-in mug.
+Coordinates in the file are metres. Pass `scale=0.001` for millimetres. Without a file, the object is a built-in mug.
 """
 
 from __future__ import annotations
@@ -49,9 +49,9 @@ def main(arguments: Sequence[str]) -> int:
         print(f"    fingers at {posture.joint_positions.round(2)} rad")
         print(f"    {len(grasp.contacts)} links touch, epsilon {metrics.get('epsilon')}")
 
-    # What a robot does: open at `pregrasp`, close to `grasp`, press towards `squeeze`.
+    # A robot opens the hand at `pregrasp`, closes the hand to `grasp`, and presses towards `squeeze`.
     save_result(out, result, scene.object, hand, preset)
-    print(f"{out}: {len(load_grasps(out))} grasps, those that failed a trial last")
+    print(f"{out}: {len(load_grasps(out))} grasps, failed grasps last")
     return 0 if verified else 1
 
 

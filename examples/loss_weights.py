@@ -17,7 +17,7 @@ COUNT = 4
 
 
 def gentle(config: PlanConfig) -> PlanConfig:
-    """Return settings that reduce depth in the object while polishing, at the cost of resistance."""
+    """Return settings that reduce penetration during polishing, at the cost of wrench resistance."""
     return override(
         config,
         {
@@ -29,7 +29,7 @@ def gentle(config: PlanConfig) -> PlanConfig:
 
 
 def row(name: str, config: PlanConfig, source: str) -> str:
-    """Return a line of the table: how many grasps held, and their mean depth and resistance."""
+    """Return a line of the table: how many grasps held, their mean penetration and epsilon, and the time."""
     result = plan_grasps(load_scene(source), load_hand("allegro_right"), count=COUNT, seed=0, preset=config)
     held = [grasp for grasp in result.grasps if grasp.verdict is Verdict.VERIFIED]
 

@@ -1,6 +1,6 @@
 """Plan for a folder of objects: python examples/many_objects.py OUT OBJECT ... (files, folders or shape:NAME).
 
-The program writes a JSON file for each object, and a table. An unusable object gives a line and does not end the run.
+The program writes a JSON file for each object, and a table. An unusable object gets a line and does not end the run.
 The same command resumes a stopped run. Several processes, each on one core, share the work.
 """
 
@@ -31,7 +31,7 @@ def hand() -> graspd.HandModel:
 
 
 def objects(arguments: Sequence[str]) -> Iterator[str]:
-    """Return every object that the arguments name."""
+    """Yield every object that the arguments name."""
     for argument in arguments:
         folder = Path(argument)
         if folder.is_dir():
@@ -60,7 +60,7 @@ def plan(out: Path, source: str) -> tuple[str, int, str]:
 
 
 def main(arguments: Sequence[str], processes: int | None = None) -> int:
-    """Return the number of objects without a verified grasp."""
+    """Plan for all objects, write the table, and return the number of objects without a verified grasp."""
     out, *named = arguments or ["grasps"]
     out, sources = Path(out), list(objects(named or ["shape:mug", "shape:box"]))
     with ProcessPoolExecutor(processes or os.cpu_count(), mp_context=get_context("spawn")) as pool:

@@ -24,7 +24,7 @@ def main() -> int:
     goal.object.header.frame_id = "table"
     goal.object.primitives = [SolidPrimitive(type=SolidPrimitive.BOX, dimensions=sizes)]
     pose = Pose()
-    pose.position.z = sizes[2] / 2  # it stands on the table, whose surface is z = 0
+    pose.position.z = sizes[2] / 2  # the box stands on the table, whose surface is z = 0
     goal.object.primitive_poses = [pose]
     goal.object.surface = Plane(coef=[0.0, 0.0, 1.0, 0.0])
 

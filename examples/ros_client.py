@@ -16,11 +16,11 @@ from graspd_msgs.msg import Grasp, GraspArray, GraspRequest
 from rclpy.action.client import ActionClient
 from rclpy.utilities import try_shutdown
 
-TIMEOUT = 120.0  # [s]
+TIMEOUT = 120.0  # longest wait for the node [s]
 
 
 def ask(node: Any, request: GraspRequest) -> GraspArray:
-    """Send a goal and wait for its answer. Raises TimeoutError and RuntimeError."""
+    """Send a goal and wait for its answer. Raises TimeoutError: no answer. Raises RuntimeError: goal refused."""
     client = ActionClient(node, SynthesizeGrasps, "/graspd/synthesize")
     if not client.wait_for_server(timeout_sec=TIMEOUT):
         raise TimeoutError("no graspd_node answers; is it running, in the same ROS_DOMAIN_ID?")

@@ -1,7 +1,7 @@
 """Train a small network on a data set of `graspd dataset`: python examples/train_on_dataset.py DIR [HAND [EPOCHS]].
 
-It learns to predict which candidates hold, from the object's surface in the hand's frame and from the joints. A quarter
-of the objects is held out. The program prints the share that holds, of all their candidates and of the best half.
+The network predicts whether a candidate holds, from the object's surface in the hand's frame and from the joints. A
+quarter of the objects is held out. Of their candidates, the program prints how many hold: of all, and of the best half.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ POINTS = 128
 
 
 def surface(vertices: Sequence[np.ndarray], faces: Sequence[np.ndarray], rng: np.random.Generator) -> np.ndarray:
-    """Return points spread evenly over a mesh, object frame [m]."""
+    """Return points drawn uniformly from the surface of a mesh, object frame [m]."""
     corners = np.stack(list(vertices))[np.stack(list(faces))]
     area = np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1)
     weights = rng.dirichlet(np.ones(3), POINTS)
@@ -27,7 +27,7 @@ def surface(vertices: Sequence[np.ndarray], faces: Sequence[np.ndarray], rng: np
 
 
 def read(where: str, hand: str) -> tuple[Tensor, Tensor, Tensor, np.ndarray]:
-    """Return for every candidate the object's points in the hand's frame [m], joints, whether it held, and object."""
+    """Return for each candidate: object points in the hand's frame [m], joints, 1 if it held, and the object's hash."""
     rows = pd.read_parquet(f"{where}/grasps", filters=[("hand", "=", hand)])
     meshes, rng = pd.read_parquet(f"{where}/objects"), np.random.default_rng(0)
     columns = (meshes[name] for name in ("object_sha256", "vertices", "faces"))
@@ -49,7 +49,7 @@ class Network(nn.Module):
         self.head = nn.Sequential(nn.Linear(128 + joints, 64), nn.ReLU(), nn.Linear(64, 1))
 
     def forward(self, points: Tensor, joints: Tensor) -> Tensor:
-        # Centimetres: of the size that layers are initialised for.
+        # Use centimetres, because the initial weights suit inputs of about 1.
         features = self.points(100 * points).amax(1)
         return self.head(torch.cat([features, joints], dim=1)).squeeze(1)
 

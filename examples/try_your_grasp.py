@@ -1,7 +1,7 @@
 """Try a grasp of another planner: python examples/try_your_grasp.py [OBJECT].
 
 The other planner gives a gripper's pose and opening width. `verify_grasps` tries the grasp in MuJoCo and measures it
-like graspd's own grasps. For a hand with many joints, give its three postures in the same way.
+like graspd's own grasps. For a hand with many joints, give all its joint values in the three postures.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ import numpy as np
 
 from graspd_core import Grasp, HandModel, Posture, load_hand, load_scene, verify_grasps
 
-OPENING, PRESS = 0.015, 0.010  # by how much each jaw opens before, and wants to close after the touch [m]
+OPENING, PRESS = 0.015, 0.010  # motion of each jaw from the touch: out to the pregrasp, in to the target [m]
 
 
 @dataclass(frozen=True)
@@ -23,7 +23,7 @@ class GripperGrasp:
 
     Attributes:
         position: origin of the gripper's base in the object's frame [m].
-        quaternion_wxyz: orientation of the base. It approaches along z, and the jaws close along y.
+        quaternion_wxyz: orientation of the base. The gripper approaches along z, and the jaws close along y.
         width: distance between the jaws when they touch [m].
     """
 
@@ -33,7 +33,7 @@ class GripperGrasp:
 
 
 FROM_ABOVE, SIDEWAYS = (0.0, 1.0, 0.0, 0.0), (0.0, np.sqrt(0.5), np.sqrt(0.5), 0.0)
-# On a box of 6 x 6 x 9 cm about the origin.
+# Grasps of a box of 6 x 6 x 9 cm whose centre is the origin.
 GRASPS = {
     "from above": GripperGrasp((0.0, 0.0, 0.15), FROM_ABOVE, 0.06),
     "turned by 90 degrees": GripperGrasp((0.0, 0.0, 0.15), SIDEWAYS, 0.06),
@@ -52,7 +52,7 @@ def as_graspd(grasp: GripperGrasp, hand: HandModel) -> Grasp:
 
 
 def main(arguments: Sequence[str]) -> int:
-    """Return how many of the grasps failed."""
+    """Return the number of grasps that failed a trial."""
     scene, hand = load_scene(*(arguments or ["shape:box"]), mass=0.2, friction=0.6), load_hand("parallel_gripper")
     tried = verify_grasps(scene, hand, [as_graspd(grasp, hand) for grasp in GRASPS.values()], verify="standard")
     for name, grasp in zip(GRASPS, tried, strict=True):

@@ -1,6 +1,6 @@
 """Use your own hand from its URDF: python examples/your_own_hand.py [my_hand.urdf].
 
-If a URDF has no description, palm and postures are guessed. A description in YAML beside it corrects the guesses.
+If a URDF has no description, palm and postures are guessed. A YAML description beside the URDF corrects the guesses.
 `graspd hands inspect my_hand.urdf --picture hand.png` shows the hand. Without a file, the program writes a claw.
 """
 
@@ -15,7 +15,7 @@ from graspd_core import HandModel, Verdict, load_hand, load_scene, plan_grasps
 
 LINK = '<link name="{name}"><inertial><mass value="{mass}"/><inertia ixx="1e-4" iyy="1e-4" izz="1e-4" ixy="0" ixz="0" iyz="0"/></inertial><collision><origin xyz="{at}"/><geometry><box size="{size}"/></geometry></collision></link>'  # noqa: E501
 JOINT = '<joint name="{name}" type="revolute"><parent link="{parent}"/><child link="{child}"/><origin xyz="{at}"/><axis xyz="{axis}"/><limit lower="-0.8" upper="1.0" effort="2" velocity="2"/></joint>'  # noqa: E501
-# Fingers stand up from the palm (z) and bend towards the middle, each about the edge that it stands on.
+# Fingers point out of the palm (z). Each finger bends towards the middle, about the axis given here.
 FINGERS = {"left": ("0 0.05 0.03", "1 0 0"), "right": ("0 -0.05 0.03", "-1 0 0"), "thumb": ("0.05 0 0.03", "0 -1 0")}
 
 
@@ -55,7 +55,7 @@ def main(arguments: Sequence[str]) -> int:
         for warning in guessed.warnings:
             print(f"guessed: {warning}")
         hand = guessed if arguments else described(urdf, guessed.joint_names)
-    print(f"{hand.name}: {len(hand.joint_names)} joints; palm at {hand.palm_center}, out of it {hand.palm_normal}")
+    print(f"{hand.name}: {len(hand.joint_names)} joints; palm at {hand.palm_center}, normal {hand.palm_normal}")
     result = plan_grasps(load_scene("shape:sphere"), hand, count=1, preset="fast")
     print(result.outcome.value)
     return 0 if any(grasp.verdict is Verdict.VERIFIED for grasp in result.grasps) else 1

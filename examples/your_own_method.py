@@ -1,4 +1,4 @@
-"""A method of your own, planned with and measured like the built-in ones:
+"""Add your own planning method, and use and measure it like the built-in methods:
 
     graspd synthesize shape:box --plugin examples/your_own_method.py --method draws -n 2 --out grasps.json
     graspd bench --plugin examples/your_own_method.py --presets draws.yaml --objects shape:box
@@ -19,11 +19,11 @@ from graspd_core import METHODS, Method, PlannerInput, PlannerOutput, draw_start
 
 @dataclass(frozen=True)
 class DrawsConfig:
-    """Draw hands around the object and optimise nothing.
+    """Settings of a method that draws hands around the object and optimises nothing.
 
     Attributes:
-        per_grasp: hands drawn for each grasp asked for.
-        closing: share of the way from the open to the closed posture.
+        per_grasp: number of hands drawn for each requested grasp.
+        closing: how far the hands close, from 0 (open posture) to 1 (closed posture).
     """
 
     per_grasp: int = 32

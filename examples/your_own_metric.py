@@ -1,7 +1,7 @@
-"""A metric of your own, measured like the built-in ones: python examples/your_own_metric.py [OBJECT].
+"""Add your own metric, measured like the built-in metrics: python examples/your_own_metric.py [OBJECT].
 
-A metric is one row of a dictionary. From then on every verified grasp has it, and files and tables show it. It sees the
-hand's surface samples in the object's frame (`grasp.placed`), the object and the hand (`grasp.context`).
+A metric is one row of `METRICS`. Every verified grasp then has the metric, and files and tables show the metric. A
+metric reads surface samples of the hand in the object's frame (`grasp.placed`), object and hand (`grasp.context`).
 """
 
 from __future__ import annotations
@@ -39,10 +39,11 @@ def main(arguments: Sequence[str]) -> int:
     scene, hand, preset = load_scene(*(arguments or ["shape:hammer"])), load_hand("allegro_right"), load_preset("fast")
     result = plan_grasps(scene, hand, count=4, seed=0, preset=preset)
     held = [grasp for grasp in result.grasps if grasp.verdict is Verdict.VERIFIED and grasp.metrics]
-    # The steadiest first: held near the centre of mass.
-    held.sort(key=lambda grasp: (grasp.metrics or {}).get("contact_offset") or np.inf)
+    # Grasps near the centre of mass come first, because they are the steadiest.
+    values_of = lambda grasp: grasp.metrics or {}  # noqa: E731
+    held.sort(key=lambda grasp: np.inf if (offset := values_of(grasp)["contact_offset"]) is None else offset)
     for grasp in held:
-        values = [(METRICS[name], (grasp.metrics or {})[name]) for name in ("contact_offset", "penetration", "epsilon")]
+        values = [(METRICS[name], values_of(grasp)[name]) for name in ("contact_offset", "penetration", "epsilon")]
         print(", ".join(row.text(value) for row, value in values if value is not None))
     save_result("grasps.json", result, scene.object, hand, preset)
     print('grasps.json: each grasp has "contact_offset_mm" among its metrics')

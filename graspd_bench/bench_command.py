@@ -1,4 +1,4 @@
-"""The command `graspd bench`: it runs or resumes studies, and writes their results, tables, charts and pages."""
+"""The command `graspd bench`: run or resume studies, and write their results, tables, charts and pages."""
 
 from __future__ import annotations
 
@@ -19,11 +19,11 @@ EXIT_FAULTS = 1
 
 
 def add_command(commands: Any) -> None:
-    """Add this command to the parser."""
+    """Add `bench` to the commands of the parser."""
     parser = commands.add_parser("bench")
     parser.set_defaults(run=run)
-    parser.add_argument("studies", nargs="*", metavar="STUDY", help="main (default), all, or others of docs/bench.md")
-    parser.add_argument("--suite", action="append", default=[], metavar="STUDY", help="the same")
+    parser.add_argument("studies", nargs="*", metavar="STUDY", help="main (default), all, or a name of docs/bench.md")
+    parser.add_argument("--suite", action="append", default=[], metavar="STUDY", help="another way to give STUDY")
     parser.add_argument("--presets", nargs="+", default=(), metavar="PRESET", help="default: all built-in ones")
     add_plugin_option(parser)
     parser.add_argument(
@@ -38,23 +38,23 @@ def add_command(commands: Any) -> None:
         nargs="+",
         default=(),
         metavar="CASE",
-        help="of stress: names, families; maps: names; cell: sizes, ARM+HAND",
+        help="cases to run. stress: names or families, maps: names, cell: sizes or ARM+HAND",
     )
     parser.add_argument("--seeds", nargs="+", type=int, default=(), metavar="N", help="default: by study")
     parser.add_argument("--count", type=int, default=None, help="grasps of a case (default: by study and method)")
     parser.add_argument("--hand", default="", metavar="NAME|PATH", help="default: allegro_right")
-    parser.add_argument("--trials", default="", metavar="A,B", help="of raw grasps (docs/bench.md lists them)")
-    parser.add_argument("--import", dest="imported", default="", metavar="PATH", help="grasps of others, beside ours")
-    parser.add_argument("--joint-order", default="", metavar="A,B,…", help="of imported npy files")
-    parser.add_argument("--python", default="", metavar="PATH", help="that runs a checkout: dexgraspbench FOLDER")
-    parser.add_argument("--armature", action="store_true", help="of dexgraspbench: its Allegro with our armature, too")
-    parser.add_argument("--grasps", default="", metavar="FILE", help="of dexgraspbench: ours from this file")
-    parser.add_argument("--quick", action="store_true", help="few objects and grasps: minutes")
-    parser.add_argument("--out", type=Path, default=Path("results/bench"), metavar="DIR", help="for finished cases")
+    parser.add_argument("--trials", default="", metavar="A,B", help="trials of raw grasps (listed in docs/bench.md)")
+    parser.add_argument("--import", dest="imported", default="", metavar="PATH", help="grasps to compare with ours")
+    parser.add_argument("--joint-order", default="", metavar="A,B,…", help="joint names of imported npy files")
+    parser.add_argument("--python", default="", metavar="PATH", help="Python that runs the checkout of dexgraspbench")
+    parser.add_argument("--armature", action="store_true", help="dexgraspbench: also try its hand with our armature")
+    parser.add_argument("--grasps", default="", metavar="FILE", help="dexgraspbench: use our grasps of this file")
+    parser.add_argument("--quick", action="store_true", help="run few objects and grasps, which takes minutes")
+    parser.add_argument("--out", type=Path, default=Path("results/bench"), metavar="DIR", help="folder of records")
     parser.add_argument("--processes", type=int, default=1, help="cases at a time, each on one thread (default 1)")
     parser.add_argument("--any-code", action="store_true", help="keep finished cases of other versions of the code")
     parser.add_argument("--no-run", action="store_true", help="only report on the finished cases")
-    parser.add_argument("--compare", type=Path, default=None, metavar="OLD.json", help="what moved since that run")
+    parser.add_argument("--compare", type=Path, default=None, metavar="OLD.json", help="list changes since that run")
     parser.add_argument("--chart", type=Path, default=None, metavar="PATH", help="PATH.png, PATH.svg, …")
     parser.add_argument(
         "--readme", type=Path, action="append", default=[], metavar="FILE", help="fill its marked sections (repeatable)"
@@ -62,7 +62,7 @@ def add_command(commands: Any) -> None:
 
 
 def run(options: argparse.Namespace) -> int:
-    """Run the command. Return the exit status: 0, 1 if a case has faults, 130 after Ctrl-C. Finished cases are kept."""
+    """Run the command and keep finished cases. Return the exit status: 0, 1 if a case has faults, 130 after Ctrl-C."""
     from graspd_bench.result_store import read_results, results_document, write_results
     from graspd_bench.run_studies import faults_of, make_plan, records_of, run_plan, studies_of
     from graspd_bench.study import Request
@@ -140,7 +140,7 @@ def _report(options: argparse.Namespace, plan: Plan) -> None:
 
 
 class Lines:
-    """Progress over cases: a bar on a terminal, otherwise a line per case. The first line estimates the duration."""
+    """Progress display: a bar on a terminal, otherwise a line per case. It begins with an estimate of the time."""
 
     def __init__(self, plan: Plan, processes: int) -> None:
         self.plan, self.processes = plan, processes
@@ -151,7 +151,7 @@ class Lines:
             print_note(f"{done} of {total} cases had finished before")
         if self.plan.missing and self.processes:
             minutes = self.plan.seconds(self.processes) / 60
-            cost = f"{len(self.plan.missing)} cases, about {minutes:.0f} minutes on {self.processes} quiet cores"
+            cost = f"{len(self.plan.missing)} cases, about {minutes:.0f} minutes on {self.processes} idle cores"
             print_note(cost)
         self._bar = bar("cases", total, done)
         return self

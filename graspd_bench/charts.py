@@ -33,7 +33,7 @@ from graspd_bench.suites import SWEEPS
 from graspd_core.errors import Extra
 from graspd_core.optimize.plan_config import method_row
 
-# Colours of Okabe and Ito (2008), which colour-blind readers can distinguish. Markers differ in shape too.
+# Colour of the Pareto front. Methods have colours of Okabe and Ito (2008), which colour-blind readers can distinguish.
 FRONT = "#222222"
 _STYLE: Any = {
     "font.size": 9,
@@ -49,14 +49,14 @@ _STYLE: Any = {
 }
 # Style of the line from a distant label to its point.
 _LEADER = {"arrowstyle": "-", "lw": 0.5, "alpha": 0.6, "shrinkA": 0, "shrinkB": 3}
-# Candidate positions of a label around its point: angles [rad] and distances [points]. The nearest free one is used.
+# Possible positions of a label around its point: angles [rad] and distances [points]. The nearest free one is used.
 _ANGLES = np.deg2rad([0, 180, 90, 270, 45, 135, 315, 225, 22, 158, 202, 338, 67, 113, 247, 293])
 _DISTANCES = (7.0, 13.0, 20.0, 28.0, 38.0, 50.0, 64.0)
 
 
 @contextmanager
 def figure(width: float, height: float, **grid: Any) -> Iterator[tuple[Any, Any]]:
-    """Yield a figure of `width` by `height` [inches] and its axes, made by `subplots(**grid)`. Close it at the end."""
+    """Yield a figure (`width` by `height` inches) and the axes of `subplots(**grid)`. Close the figure afterwards."""
     with Extra("bench"):
         import matplotlib
 
@@ -72,7 +72,7 @@ def figure(width: float, height: float, **grid: Any) -> Iterator[tuple[Any, Any]
 
 
 def save(made: Any, path: Path) -> Path:
-    """Write a figure as PNG and SVG and return the PNG's path. The same data give the same bytes."""
+    """Write a figure as PNG and SVG and return the PNG's path. Equal data give byte-identical files."""
     png, svg = path.with_name(f"{path.name}.png"), path.with_name(f"{path.name}.svg")
     png.parent.mkdir(parents=True, exist_ok=True)
     made.savefig(png, dpi=160, metadata={"Software": None})
@@ -85,7 +85,7 @@ def place_labels(
 ) -> None:
     """Write a label beside each point so that it overlaps no point, label or frame, if possible.
 
-    Call it last, because it needs the final layout.
+    Call this function after all drawing, because it needs the final layout.
     """
     from matplotlib.patheffects import withStroke
 
@@ -120,7 +120,7 @@ def _place(point: np.ndarray, half: np.ndarray, distance: float, angle: float) -
 
 
 def _trouble(place: np.ndarray, half: np.ndarray, taken: Sequence[tuple[float, ...]], frame: Any) -> float:
-    """Return the cost of a label position: its overlap with `taken` boxes plus 50 times its length beyond the frame."""
+    """Return a label position's cost: area shared with `taken` boxes, plus 50 times the length outside the frame."""
     low, high = place - half, place + half
     shared = 0.0
     for x0, y0, x1, y1 in taken:
@@ -146,10 +146,10 @@ class Panel:
     Attributes:
         figure: name of the value in `figures.Row.values`.
         label: label of the vertical axis.
-        factor: conversion factor from the value's unit to the label's unit.
+        factor: factor that converts the value to the unit of the label.
         less_is_better: True if smaller values are better.
         mean: if True, plot the mean over objects instead of the median. The median of a success rate hides failures.
-        log: True for a logarithmic vertical axis.
+        log: True if the vertical axis is logarithmic.
     """
 
     figure: str
@@ -165,17 +165,17 @@ PANELS = (
     Panel("sd_cm", "simulation displacement SD [cm]", log=True),
     Panel("penetration_mm", "penetration [mm]"),
 )
-# A logarithmic axis shows smaller values as this value [cm].
+# Least value on a logarithmic axis [cm]. Smaller values are drawn at this value.
 _LEAST = 0.01
-# Most objects that a chart lists by name. For more it gives their number.
+# Greatest number of objects that a chart lists by name. A chart with more objects gives only their number.
 _NAMED = 4
 
 
 @dataclass(frozen=True)
 class Point:
-    """Point of one preset on a panel: (low, middle, high) on both axes. `held` is True if any grasp held.
+    """Point of one preset on a panel. `x` and `y` are (low, middle, high). `held` is True if any grasp held.
 
-    Low and high are quartiles over objects, or over grasps of a single object. For a share they are its 95 % interval.
+    Low and high are quartiles over objects, or over grasps of a single object. For a share, they are its 95 % interval.
     """
 
     name: str
@@ -188,7 +188,7 @@ class Point:
 def draw_charts(records: Sequence[Record], path: Path) -> dict[str, Path]:
     """Draw all charts for which the records have data: PATH, PATH_short, PATH_planned and PATH_ladder (.png, .svg).
 
-    Return the paths of the PNGs by "speed", "short", "planned" and "ladder". Charts without data are missing.
+    `path` gives PATH. Return the PNGs' paths by name: "speed" (PATH), "short", "planned", "ladder", if drawn.
     """
     found = rows(records)
     swept = [row for row in found if is_sweep_value(row.name)]
@@ -205,7 +205,7 @@ def draw_charts(records: Sequence[Record], path: Path) -> dict[str, Path]:
 
 
 def about_records(records: Sequence[Record], kind: str) -> str:
-    """Return two lines on runs of `kind` ("" if none): hands and objects, number of grasps and meaning of the bars."""
+    """Describe the runs of `kind` in two lines: hands, objects, grasps and meaning of error bars. "" if none ran."""
     rows = [r for r in records if r.get("kind") == kind and not r["error"] and is_preset(r["name"])]
     if not rows:
         return ""
@@ -224,7 +224,7 @@ def about_records(records: Sequence[Record], kind: str) -> str:
 
 
 def draw_planned(presets: dict[str, list[Row]], path: Path, about: str = "") -> Path | None:
-    """Draw CPU seconds per verified grasp against those to the first one. Return the PNG's path, None without data."""
+    """Draw CPU time per verified grasp against CPU time to the first. Return the PNG's path, or None without data."""
     panel = Panel("cpu_per_verified", "CPU seconds per verified grasp, all included")
     points = points_of(presets, "first_cpu", panel)
     if not points:
@@ -241,7 +241,7 @@ def draw_planned(presets: dict[str, list[Row]], path: Path, about: str = "") -> 
 
 
 def draw_speed(presets: dict[str, list[Row]], path: Path, about: str = "") -> Path | None:
-    """Draw each measure of accuracy against CPU seconds per raw grasp. Return the PNG's path, None without data.
+    """Draw each `PANELS` value against CPU seconds per raw grasp. Return the PNG's path, or None if data are missing.
 
     `about` is the text below the chart, from `about_records`.
     """
@@ -260,7 +260,7 @@ def draw_speed(presets: dict[str, list[Row]], path: Path, about: str = "") -> Pa
 
 
 def points_of(presets: dict[str, list[Row]], time: str, panel: Panel) -> list[Point]:
-    """Return a point for each preset that has both the time and the panel's value, in the panel's unit."""
+    """Return the points of all presets with both values: `time`, and the panel's value in the unit of its label."""
     points = []
     for name, group in presets.items():
         x, y = spread(group, time), spread(group, panel.figure)
@@ -300,7 +300,7 @@ def _draw_panel(axis: Any, points: Sequence[Point], panel: Panel) -> int:
             zorder=5,
             clip_on=False,
         )
-    # A preset without any held grasp is drawn, but is not part of the front. Its penetration is low for no merit.
+    # A preset without any held grasp is drawn, but is not part of the front: its low penetration is no merit.
     spots = np.array([place[p.name] for p in points if p.held] or list(place.values()))
     front = spots[pareto_front(spots * [1.0, 1.0 if panel.less_is_better else -1.0])]
     axis.plot(*front[front[:, 0].argsort()].T, color=FRONT, lw=1.2, alpha=0.6, zorder=1)
@@ -320,7 +320,7 @@ def _draw_panel(axis: Any, points: Sequence[Point], panel: Panel) -> int:
 
 
 def _few_ticks(axis: Any) -> None:
-    """Label a logarithmic axis with few round numbers. A range below one decade gets linear ticks."""
+    """Label a logarithmic axis with few round numbers. If it spans less than one decade, space the ticks evenly."""
     from matplotlib.ticker import FuncFormatter, LogLocator, MaxNLocator, NullFormatter
 
     low, high = axis.get_view_interval()
@@ -336,7 +336,7 @@ def _bars(low: float, middle: float, high: float) -> list[list[float]]:
 
 
 def _legend(made: Any, points: Sequence[Point], *, front: bool) -> None:
-    """Add a legend with the methods that are drawn, the ablations and the front."""
+    """Add a legend with the methods of the points, and with ablations and Pareto front if they are drawn."""
     from matplotlib.lines import Line2D
 
     plain = {"ls": "none", "ms": 7, "mew": 1.3}
@@ -352,7 +352,7 @@ def _legend(made: Any, points: Sequence[Point], *, front: bool) -> None:
 
 
 def draw_sweeps(found: Sequence[Row], path: Path) -> Path:
-    """Draw one panel per settings sweep. Return the PNG's path."""
+    """Draw hold success and CPU time over the values of each swept setting, one panel each. Return the PNG's path."""
     sweeps = {name: {} for name in SWEEPS}
     for name, group in by_name(found).items():
         sweep, sweep_value = name.split("=")

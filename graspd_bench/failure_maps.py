@@ -1,7 +1,7 @@
-"""Failure maps: heat maps that show under which conditions methods fail. `MAPS` is the registry.
+"""Failure maps: heat maps that show under which conditions methods fail. `MAPS` has all maps.
 
-The axes are friction and mass, object size, view and noise, or wall and grid. A case plans once and tries its grasps in
-one or more cells of a map. A cell shows the share of grasps that held. A line marks where it falls below one half.
+Axes: friction × mass, size × object, view × noise, or cup wall × grid size. A case plans once and tries its grasps in
+one or more cells of a map. A cell shows the share of grasps that held. A line marks where the share falls below half.
 """
 
 from __future__ import annotations
@@ -38,10 +38,10 @@ from graspd_core.verify.hold_trial import hold_trial
 from graspd_core.verify.world import PROTOCOLS, Protocol, at_friction, build_world
 from graspd_dataset.run_records import markdown_table
 
-# The place of a cell on an axis: a number, or the name of an object.
+# The value of a cell on an axis: a number, or the name of an object.
 Place = float | str
 
-# Reasons of failure for requested grasps that do not exist.
+# Reasons of failure of requested grasps that were not found, or were not planned because no scene could be built.
 NOT_FOUND, NO_SCENE = "no grasp found", "no scene"
 
 
@@ -53,9 +53,9 @@ class MapCase(Case):
         map: name of the map.
         preset: preset of the method.
         thing: name of the object.
-        across: place of all its cells on the horizontal axis.
-        up: places of its cells on the vertical axis.
-        count: number of requested raw grasps. Each is tried in every cell.
+        across: value of all cells of the case on the horizontal axis, such as a friction coefficient.
+        up: values of the case's cells on the vertical axis, such as masses [kg].
+        count: number of requested raw grasps. Each grasp is tried in every cell of the case.
         seed: random seed of the planner and the sensor noise.
         hand: name of the hand.
     """
@@ -80,7 +80,7 @@ class MapCell:
     """Results of one case's grasps in one cell.
 
     Attributes:
-        up: place of the cell on the vertical axis.
+        up: value of the cell on the vertical axis.
         held: number of grasps that passed the hold trial.
         reasons: number of failed grasps by reason. Grasps that were not found count as failed.
     """
@@ -95,7 +95,7 @@ Run = Callable[[MapCase], tuple[MapCell, ...]]
 
 
 def run_on(run: Run, case: MapCase) -> tuple[MapCell, ...]:
-    """Run a case. If its scene cannot be built, all of its grasps fail for that reason."""
+    """Run a case. If the scene cannot be built, all grasps of the case fail for that reason."""
     try:
         return run(case)
     except GraspdError as error:
@@ -114,7 +114,7 @@ def hand_for(name: str, candidates: int) -> HandModel:
 
 
 def plan(case: MapCase, scene: Scene) -> tuple[HandModel, tuple[Grasp, ...]]:
-    """Return the hand, and the first grasps of the method's own ranking. No trial filters them."""
+    """Return the hand, and the first `case.count` grasps in the method's own ranking. No trial has filtered them."""
     config = settings(case.preset)
     hand = hand_for(case.hand, config.problem.fine_candidates)
     return hand, raw_grasps(scene, hand, config, case.count, case.seed)
@@ -123,7 +123,7 @@ def plan(case: MapCase, scene: Scene) -> tuple[HandModel, tuple[Grasp, ...]]:
 def try_grasps(
     case: MapCase, up: Place, hand: HandModel, target: ObjectModel, grasps: Sequence[Grasp], protocol: Protocol
 ) -> MapCell:
-    """Run the hold trial of every grasp on `target`. Return the results as the cell at `up`."""
+    """Run the hold trial of every grasp on `target`. Return the results as the map cell with vertical value `up`."""
     if not grasps:
         return MapCell(up, 0, {NOT_FOUND: case.count})
     world = build_world(hand, target, object_parts(target), protocol)
@@ -139,7 +139,7 @@ _YAW, _AZIMUTH = 0.3, np.deg2rad(20.0)
 
 
 def run_friction_mass(case: MapCase) -> tuple[MapCell, ...]:
-    """Plan with the case's friction and a mass of 0.1 kg. Try the grasps at every mass [kg]."""
+    """Plan with friction `case.across` and a mass of 0.1 kg. Try the grasps at every mass of `case.up` [kg]."""
     config = settings(case.preset)
     scene = load_scene(
         f"shape:{case.thing}", mass=PROTOCOL_MASS, friction=float(case.across), resolution=config.resolution
@@ -150,7 +150,7 @@ def run_friction_mass(case: MapCase) -> tuple[MapCell, ...]:
 
 
 def run_size(case: MapCase) -> tuple[MapCell, ...]:
-    """Plan and try on a scaled shape of 0.1 kg. Its least width is the fraction `case.across` of the hand's span."""
+    """Plan and try on a scaled shape of 0.1 kg. Its least width is `case.across` times the hand's span."""
     config = settings(case.preset)
     width = float(case.across) * _span(case.hand, config.problem.fine_candidates)
     scale = width / least_width(make_shape(case.thing))
@@ -167,7 +167,7 @@ def least_width(mesh: TriangleMesh) -> float:
 def hand_span(hand: HandModel) -> float:
     """Return the greatest distance between two fingertips within the joint limits [m].
 
-    It is the maximum over 4096 seeded random postures, about 1 mm below the true value.
+    The result is the maximum over 4096 seeded random postures, about 1 mm below the true value.
     """
     fingers = find_fingers(hand)
     draw = torch.Generator().manual_seed(0)
@@ -187,7 +187,7 @@ def _span(hand: str, candidates: int) -> float:
 
 
 def run_view(case: MapCase) -> tuple[MapCell, ...]:
-    """Plan on the reconstruction of one view. Try on the true object. `case.across` is the elevation [deg]."""
+    """Plan on the reconstruction of one view, at elevation `case.across` [deg]. Try the grasps on the true object."""
     (noise,) = case.up
     truth, scene = _seen(case.thing, float(case.across), float(noise), case.seed, settings(case.preset).resolution)
     hand, grasps = plan(case, scene)
@@ -195,9 +195,9 @@ def run_view(case: MapCase) -> tuple[MapCell, ...]:
 
 
 def noise_at(times: float) -> DepthNoise:
-    """Return the default depth noise with errors and losses scaled by `times`, or no noise if `times` is 0.
+    """Return the default depth noise with errors and losses multiplied by `times`, or no noise if `times` is 0.
 
-    Resolution, range and grazing angle are not scaled, because they are not noise.
+    Rounding, depth range, lens distance and grazing angle stay the same, because they are not noise.
     """
     if not times:
         return NONE
@@ -208,7 +208,7 @@ def noise_at(times: float) -> DepthNoise:
 
 @lru_cache(maxsize=1)
 def _seen(thing: str, elevation: float, noise: float, seed: int, resolution: int) -> tuple[ObjectModel, Scene]:
-    """Return the true object, and the scene of one view at `elevation` [deg]. Raises CloudError: no usable object."""
+    """Return the true object, and the scene reconstructed from one view. Raises CloudError: no object is found."""
     stage = tabletop(thing, yaw=_YAW)
     poses = ring_poses(1, elevation=float(np.deg2rad(elevation)), azimuth=float(_AZIMUTH))
     views = views_of(stage, CAMERA, poses, noise_at(noise), seed)
@@ -217,7 +217,7 @@ def _seen(thing: str, elevation: float, noise: float, seed: int, resolution: int
 
 
 def run_wall(case: MapCase) -> tuple[MapCell, ...]:
-    """Plan on a cup. `case.up` is its wall thickness [mm], `case.across` the resolution of its SDF grid."""
+    """Plan and try on a cup. `case.up` is the wall thickness [mm]. `case.across` is the resolution of the SDF grid."""
     (wall,) = case.up
     scene = on_grid(cup(float(wall)), int(case.across))
     hand, grasps = plan(case, scene)
@@ -231,14 +231,14 @@ def cup(wall: float) -> Scene:
 
 
 def on_grid(scene: Scene, resolution: int) -> Scene:
-    """Return the scene with its SDF on a grid of `resolution`, even if that is far too coarse."""
+    """Return the scene with an SDF of at most `resolution`³ nodes, even if such a grid is far too coarse."""
     return replace(scene, sdf=build_sdf(scene.object.mesh, resolution=resolution))
 
 
-# The compared methods and their presets. With the published settings of graspd2022 no grasp holds in any cell. Its
-# repaired settings take seven times as long as the short ones.
+# The compared methods and their presets. `graspd2022_short` is used for two reasons: with the published settings no
+# grasp holds in any cell, and the repaired settings take seven times as long.
 METHODS: Mapping[str, str] = {"closed_form": "balanced", "graspd2022": "graspd2022_short"}
-# Raw grasps per cell and seed, divided evenly among the cell's objects.
+# Raw grasps per cell and seed. The objects of a cell share them evenly.
 COUNT, SEEDS = 16, (0, 1, 2)
 # Objects of the size map, one row each.
 _SIZED = ("sphere", "box", "cylinder")
@@ -246,7 +246,7 @@ _SIZED = ("sphere", "box", "cylinder")
 
 @dataclass(frozen=True)
 class MapAxis:
-    """One axis of a map: its label, and the places of its cells, from left to right or from bottom to top."""
+    """One axis of a map: its label, and the values of its cells, from left to right or from bottom to top."""
 
     label: str
     places: tuple[Place, ...]
@@ -259,9 +259,9 @@ class Map:
     Attributes:
         title: title of the map.
         across, up: horizontal and vertical axis.
-        things: objects. Every cell sums over all of them, unless each row is one object.
+        things: names of the objects. A cell sums over all objects. If `rows` is true, each row is one object.
         run: function that runs a case.
-        together: whether one planning run serves all cells of a column.
+        together: whether the grasps of one planning run are tried in all cells of a column.
     """
 
     title: str
@@ -273,7 +273,7 @@ class Map:
 
     @property
     def rows(self) -> bool:
-        """Return whether each row of the map is one object."""
+        """Return whether each row of the map shows one object."""
         return self.up.places == self.things
 
 
@@ -316,7 +316,7 @@ def map_cases(request: Request) -> tuple[MapCase, ...]:
         raise ConfigError(f"unknown map {unknown[0]!r}; {choices(unknown[0], MAPS)}")
     names = request.cases or (tuple(MAPS)[1:2] if request.quick else tuple(MAPS))
     seeds = request.seeds or (SEEDS[:1] if request.quick else SEEDS)
-    # The methods run one after another on each object, so that the second reuses the cached object.
+    # The methods run one after another on each object, so that the second method reuses the cached object.
     pairs = (zip(*(cases_of(name, method) for method in METHODS), strict=True) for name in names)
     return tuple(replace(case, seed=seed) for pair in pairs for cases in pair for seed in seeds for case in cases)
 
@@ -346,13 +346,13 @@ def map_seconds(case: MapCase) -> float:
 
 Shares = Mapping[tuple[Place, Place], float]
 
-# Nuñez, Anderton and Renslow (2018): lightness is uniform, and red-green colour-blind viewers see it alike.
+# Colour map of Nuñez, Anderton and Renslow (2018): lightness rises evenly, and colour-blind viewers can read the map.
 _COLOURS = "cividis"
 _CELL, _EDGE = 0.52, "#D55E00"
 
 
 def draw_map(drawn: Map, methods: Mapping[str, Shares], path: Path) -> Path:
-    """Draw a map with one panel for each method. `methods` holds shares by caption. Return the PNG's path.
+    """Draw a map with one panel per method, from the `shares` by panel caption in `methods`. Return the PNG's path.
 
     Cells without a record are white. Rows and columns without any record are left out.
     """
@@ -404,7 +404,7 @@ def _panel(axis: Any, drawn: Map, shares: Shares) -> Any:
 
 
 def _border(axis: Any, grid: Any) -> None:
-    """Draw a line between neighbouring cells if only one of them holds at least half of its grasps."""
+    """Draw a line between two neighbouring cells if at least half of the grasps held in only one of them."""
     works, known = grid >= 50, np.isfinite(grid)
     beside = (works[:, 1:] != works[:, :-1]) & known[:, 1:] & known[:, :-1]
     above = (works[1:] != works[:-1]) & known[1:] & known[:-1]
@@ -420,7 +420,7 @@ def _written(place: Place) -> str:
 
 
 def map_sections(records: Sequence[Record], chart: Path | None) -> Sections:
-    """Return a section with a picture for each map, and a section with the failures of all maps by reason."""
+    """Return a section with a picture for each map, if `chart` is given, and one that counts failures by reason."""
     sections: dict[str, list[str | Picture | None]] = {}
     body = []
     for name, drawn in MAPS.items():
@@ -438,7 +438,7 @@ def map_sections(records: Sequence[Record], chart: Path | None) -> Sections:
 
 
 def shares(records: Sequence[Record]) -> dict[tuple[Place, Place], float]:
-    """Return the share of requested grasps that held, over all objects, by place (across, up)."""
+    """Return the share of requested grasps that held, over all objects, by the cell's values (across, up)."""
     held, asked = Counter[tuple[Place, Place]](), Counter[tuple[Place, Place]]()
     for record in records:
         for cell in record["cells"]:

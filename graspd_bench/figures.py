@@ -1,4 +1,4 @@
-"""Compute numbers of benchmark records by name (preset, sweep value or hand) and object, and compare two runs."""
+"""Summarise benchmark records by name (preset, sweep value or hand) and by object, and compare two benchmark runs."""
 
 from __future__ import annotations
 
@@ -16,44 +16,44 @@ from graspd_bench.study import Record
 from graspd_core.optimize.plan_config import preset_names
 from graspd_core.verify.metrics import METRICS
 
-# Presets of the first page: the usual ones for planning, the published method, its repaired form, and a baseline.
+# Presets of the short table and chart: three for planning, the published method, its repaired form, and a baseline.
 FEW = ("fast", "balanced", "accurate", "graspd2022", "graspd2022_repaired", "random_closure")
-# Prefixes of ablations and their parents. The first prefix that fits a name counts. Parents have no parent.
+# Prefixes of the names of ablations, and the preset that the ablation varies (its parent). The first that fits counts.
 _ABLATIONS = (("closed_form_", "balanced"), ("graspd2022_no_", "graspd2022_repaired"))
 
 
 def parent_of(name: str) -> str | None:
-    """Return the preset that `name` is an ablation of, or None."""
+    """Return the preset of which `name` is an ablation (a variant without one part), or None."""
     return next((parent for prefix, parent in _ABLATIONS if name.startswith(prefix)), None)
 
 
 def hand_row(hand: str) -> str:
-    """Return the name of a hand's cells in study `hands`, such as `hand:leap_right`."""
+    """Return the name under which study `hands` records the results of a hand, such as `hand:leap_right`."""
     return f"hand:{Path(hand).stem}"
 
 
 def is_hand(name: str) -> bool:
-    """Return True if a name is that of a hand's cells, such as `hand:leap_right`."""
+    """Return True if a name stands for a hand, such as `hand:leap_right`."""
     return name.startswith("hand:")
 
 
 def is_preset(name: str) -> bool:
-    """Return True if a name is that of a preset, and not of a sweep value or a hand."""
+    """Return True if a name stands for a preset, not for a sweep value or a hand."""
     return not is_sweep_value(name) and not is_hand(name)
 
 
 def is_few(name: str) -> bool:
-    """Return True if the short table and chart show a preset: it is one of `FEW`, or a user's own."""
+    """Return True if a preset is one of `FEW` or a user's own. The short table and chart show only such presets."""
     return is_preset(name) and (name in FEW or name not in preset_names())
 
 
 def is_sweep_value(name: str) -> bool:
-    """Return True if a name is that of a sweep value, such as `steps=90`."""
+    """Return True if a name stands for the value of a swept setting, such as `steps=90`."""
     return "=" in name
 
 
 def short_name(name: str) -> str:
-    """Return the label of a preset in charts. For an ablation it is the name without the method."""
+    """Return the label of a preset in charts. If the preset is an ablation, the label omits the method."""
     parent = parent_of(name)
     if parent is None:
         return name
@@ -61,9 +61,9 @@ def short_name(name: str) -> str:
     return name.removeprefix(method).replace("_", " ")
 
 
-# Trials whose figure is the share of requested grasps that passed. A grasp that was not found has not passed.
+# Trials that give the share of requested grasps that passed. A grasp that was not found has not passed.
 TRIAL_FIGURES = ("standard", "hard", "noisy")
-# The trial that measured each displacement figure [cm].
+# Displacements [cm], and the trial that measured each.
 _DISPLACEMENTS = {"sd_cm": "sd", "gravity_cm": "gravity"}
 
 
@@ -75,11 +75,11 @@ class Row:
         count: number of requested grasps.
         given: number of grasps found.
         held: number of grasps that passed the standard hold trial.
-        spent: CPU time of the optimiser and of the standard hold trials [s].
-        values: numbers by name, None if not measured: medians over grasps (`_grasp_figures`), shares of the requested
-            grasps (`TRIAL_FIGURES`), and times [s]. `cpu_per_grasp` is that of the optimiser, `cpu_per_verified` is
-            `spent` / `held`. `first_cpu` and `first_wall` are the times to the first verified grasp.
-        quartiles: lower and upper quartile of each value over the grasps.
+        spent: CPU time [s] of optimiser and standard hold trials, or of the whole run if verified grasps are planned.
+        values: numbers by name, None if not measured: medians over grasps (`_grasp_figures`), shares of requested
+            grasps (`TRIAL_FIGURES`), times [s], memory, rounds. `cpu_per_grasp` is the optimiser's time per requested
+            grasp, `cpu_per_verified` is `spent` / `held`. `first_cpu` and `first_wall` end at the first verified grasp.
+        quartiles: lower and upper quartile over the grasps, for each value that is a median over grasps.
     """
 
     name: str
@@ -105,9 +105,9 @@ class Spread:
 
 
 def rows(records: Iterable[Record], kind: str = "raw") -> list[Row]:
-    """Return a row for every name and object of the records of `kind`, in their order. Failed cells are left out."""
+    """Return a row for every name and object of the records of `kind`, in record order. Leave out failed cells."""
     groups: dict[tuple[str, str], list[Record]] = {}
-    # A record without grasps does not show its trials. It then counts as tried in those of all other records.
+    # A record without grasps does not name its trials. They are taken to be the trials of the other records.
     ran = {TRIAL_FIGURES[0]}
     for record in records:
         if record.get("kind") == kind and not record["error"]:
@@ -128,7 +128,7 @@ def _row(group: Sequence[Record], ran: Collection[str]) -> Row:
         outcomes = [_inner(grasp, trial, "share" if trial == "noisy" else "passed") for grasp in grasps]
         tried = any(outcome is not None for outcome in outcomes) if grasps else trial in ran
         values[trial] = sum(outcome or 0.0 for outcome in outcomes) / count if tried else None
-    # Planned runs have one total. Raw runs count what a plan would spend: the optimiser and the standard trial.
+    # Planned runs record one total. For raw runs, sum the parts that a plan has too: optimiser and standard trial.
     spent = sum(r["cpu"].get("total", r["cpu"].get("optimise", 0.0) + r["cpu"].get("standard", 0.0)) for r in group)
     values["cpu_per_grasp"] = sum(r["cpu"].get("optimise", r["cpu"].get("total", 0.0)) for r in group) / count
     prepared = sum(r["cpu"].get("scene", 0.0) for r in group)
@@ -143,7 +143,7 @@ def _row(group: Sequence[Record], ran: Collection[str]) -> Row:
 
 
 def spread(rows: Iterable[Row], figure: str) -> Spread | None:
-    """Return the spread of a value over the rows. With one row, quartiles are over its grasps. None without values."""
+    """Return the spread of a value over the rows, None without values. For one row, take quartiles of its grasps."""
     known = [row for row in rows if row.values.get(figure) is not None]
     values = [row.values[figure] or 0.0 for row in known]
     if not values:
@@ -164,9 +164,9 @@ def share_interval(held: int, count: int) -> tuple[float, float]:
 
 
 def per_verified(rows: Sequence[Row]) -> float | None:
-    """Return the CPU time of optimiser and trials per held grasp, over all objects [s]. None if no grasp held.
+    """Return the CPU time of optimiser and trials per held grasp, summed over all objects [s]. None if no grasp held.
 
-    This is no mean over objects, because an object on which no grasp held has also cost time.
+    The result is not a mean over objects, because an object on which no grasp held has also cost time.
     """
     held = sum(row.held for row in rows)
     return sum(row.spent for row in rows) / held if held else None
@@ -200,14 +200,14 @@ def _inner(grasp: dict[str, Any], trial: str, figure: str) -> float | None:
 def pareto_front(points: Float[np.ndarray, "points axes"]) -> Bool[np.ndarray, "points"]:
     """Return which points are on the Pareto front, if less is better on every axis.
 
-    A point is off the front if another is no worse on every axis and better on one. Equal points are both on it.
+    A point is not on it if another is no worse on every axis and better on one. Equal points do not exclude each other.
     """
     no_worse = (points[:, None] <= points[None]).all(-1)
     better = (points[:, None] < points[None]).any(-1)
     return np.asarray(~(no_worse & better).any(0))
 
 
-# Figures to compare: heading, digits, and the least reported change, relative to the old value and absolute.
+# Values to compare between runs: heading, digits, relative limit and absolute limit. A change beyond both is reported.
 FIGURES = {
     "standard": ("held", 3, 0.0, 0.001),
     "hard": ("held hard", 3, 0.0, 0.001),
@@ -233,7 +233,7 @@ class Move:
 
 
 def moves(old: Sequence[Record], new: Sequence[Record]) -> list[Move]:
-    """Return what changed between two runs, per name: the mean over common objects ("all"), then each object."""
+    """Return the changes between two runs. For each name, compare means over shared objects ("all"), then each one."""
     found: list[Move] = []
     for kind in ("raw", "verified"):
         before = {(row.name, row.object): row for row in rows(old, kind)}
@@ -273,7 +273,7 @@ def _mean(group: Sequence[Row], figure: str) -> float | None:
 
 
 def comparison(old: Sequence[Record], new: Sequence[Record]) -> str:
-    """Return a text table of the values that differ between two runs. Below it are the cases that only one run has."""
+    """List as text the values that differ between two runs. Below them, list the cases that only one run has."""
     old, new = ([record for record in records if "kind" in record] for records in (old, new))
     lines = [f"{'cells':9} {'preset':32} {'object':22} {'figure':22} {'old':>9} {'new':>9}  change"]
     for move in moves(old, new):

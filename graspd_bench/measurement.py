@@ -1,6 +1,6 @@
-"""Cells of the suites, and the functions that run them. A cell is a kind of run with settings, object, hand and seed.
+"""Cells of the suites, and the functions that run them. A cell is one run with settings, object, hand and seed.
 
-Trials have the names that `--trials` accepts (docs/metrics.md). Suffixes of names are units, such as `_cm`.
+Trials have the names that `--trials` accepts (docs/metrics.md). A result's name ends with its unit, such as `_cm`.
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ from graspd_core.verify.prepared_grasp import make_metrics_context
 from graspd_core.verify.world import PROTOCOLS, build_world
 from graspd_dataset.run_records import Stopwatch, object_name
 
-# Runs one trial of a grasp and returns its figures by name.
+# Runs one trial of a grasp. Returns the results of the trial by name.
 Trial = Callable[[Grasp], dict[str, Any]]
 
 
@@ -103,14 +103,14 @@ TRIALS: Mapping[str, Callable[[Tried], Trial]] = {
     "noisy": _noisy,
     "bullet": _second,
 }
-# Default trials of a raw cell. The noisy trial is not among them, because it takes eight times as long as the others.
+# Default trials of a raw cell. The noisy trial takes eight times as long as another trial, so it is not among them.
 USUAL = ("standard", "hard", "sd", "gravity")
 
 
 Kind = Literal["raw", "verified", "pace", "start"]
 _RUNS = 3
 
-# A new process that does what `graspd synthesize` does, from the first import on.
+# Program of a new process, which imports the libraries and plans one grasp, like the command `graspd synthesize`.
 _FRESH = """
 import sys, time
 import torch; torch.set_num_threads(1)
@@ -134,7 +134,7 @@ class Cell(Case):
         name: name of the settings: a preset, a sweep value, or a hand.
         settings: the settings.
         object: a mesh file or shape:NAME.
-        hand: name or path.
+        hand: name or path of the hand.
         seed: random seed of the method.
         count: number of requested grasps.
         trials: names of the trials of every raw grasp.
@@ -177,7 +177,7 @@ def run_cell(cell: Cell) -> Record:
 
 
 def run_raw(cell: Cell) -> dict[str, Any]:
-    """Run the trials and metrics of raw grasps. Grasps that the method does not find are not listed."""
+    """Plan raw grasps, run their trials and compute their metrics. Return counts, times, and a result per grasp."""
     stopwatch = Stopwatch()
     hand = load_hand(cell.hand, candidates=cell.settings.problem.fine_candidates)
     with stopwatch("scene"):
@@ -187,7 +187,7 @@ def run_raw(cell: Cell) -> dict[str, Any]:
     with stopwatch("parts"):
         tried = Tried(hand, scene.object, object_parts(scene.object))
     results: list[dict[str, Any]] = [{"score": grasp.score, "links": len(grasp.contacts)} for grasp in grasps]
-    # Without grasps no trial is run, so only scene and search cost time.
+    # If there are no grasps, no trial is run.
     first: dict[str, float] | None = None
     for name in cell.trials if grasps else ():
         with stopwatch(f"world {name}"):
@@ -196,7 +196,7 @@ def run_raw(cell: Cell) -> dict[str, Any]:
             with stopwatch(name):
                 result[name] = trial(grasp)
             if name == "standard" and first is None and result[name]["passed"]:
-                # `plan_grasps` builds the parts in parallel to the optimiser. Their CPU seconds count nevertheless.
+                # `plan_grasps` builds the convex parts in parallel to the optimiser. Here their CPU seconds count too.
                 first = {"cpu": sum(stopwatch.cpu.values()), "wall": sum(stopwatch.wall.values())}
     context = make_metrics_context(scene.object, hand)
     for grasp, result in zip(grasps, results, strict=True):
@@ -228,7 +228,7 @@ class _First:
 
 
 def run_verified(cell: Cell) -> dict[str, Any]:
-    """Plan `count` verified grasps. Return how many were verified, and the CPU and wall time of the whole run [s]."""
+    """Plan verified grasps. Return their number, the CPU and wall time of the whole run [s], and all verdicts."""
     hand = load_hand(cell.hand)
     began = _now()
     first = _First(began)
@@ -252,9 +252,9 @@ def _now() -> dict[str, float]:
 
 
 def run_pace(cell: Cell) -> dict[str, Any]:
-    """Time one batch of raw grasps. Return its CPU and wall time [s], and its `grasp_steps`.
+    """Time a batch of raw grasps. Return its CPU and wall time [s], and its number of optimiser steps, `grasp_steps`.
 
-    The times are those of the fastest of three batches. A batch that is not timed runs first.
+    Three batches are timed, after an untimed batch. The times are those of the fastest batch.
     """
     hand = load_hand(cell.hand, candidates=cell.settings.problem.fine_candidates)
     scene = load_scene(cell.object, mass=PROTOCOL_MASS, resolution=cell.settings.resolution)
@@ -269,7 +269,7 @@ def run_pace(cell: Cell) -> dict[str, Any]:
 
 
 def grasp_steps(cell: Cell) -> int | None:
-    """Return the optimiser steps of a batch, summed over its start postures. None if the method is not closed_form."""
+    """Return the optimiser steps of a batch, summed over all starts. None if the method is not `closed_form`."""
     s = cell.settings.settings
     if not isinstance(s, ClosedFormConfig):
         return None
@@ -278,7 +278,7 @@ def grasp_steps(cell: Cell) -> int | None:
 
 
 def run_start(cell: Cell) -> dict[str, Any]:
-    """Run a new process up to its first verified grasp. Return its CPU and wall time [s]. The disk cache is off."""
+    """Start a new process that plans a verified grasp. Return its CPU and wall time [s]. The disk cache is off."""
     environment = {**os.environ, "GRASPD_CACHE": "off", "OMP_NUM_THREADS": "1"}
     command = [sys.executable, "-c", _FRESH, cell.object, cell.hand, str(cell.seed)]
     began = time.perf_counter()

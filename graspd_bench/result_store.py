@@ -1,4 +1,4 @@
-"""Records of cases on disk, one file per case. The key of a record is a hash of the case. results.json holds all."""
+"""Records of cases on disk: a file for each case, and results.json with all. A record's key is a hash of its case."""
 
 from __future__ import annotations
 
@@ -17,23 +17,23 @@ from graspd_core.io.grasps_json import save_text
 from graspd_dataset.run_records import code_version, commit, finite
 
 FORMAT, VERSION = "graspd/bench", 2
-# Files of graspd_bench that the figures of every study depend on.
+# Files of graspd_bench on which the results of every study depend.
 _COUNTED = ("baselines/*.py", "rendering/*.py", "trials.py")
 
 
 def case_key(study: str, case: Case) -> str:
-    """Return the SHA-256 of the study's name and all inputs of a case, hexadecimal. The code version is not in it."""
+    """Return the SHA-256 of a study's name and all inputs of a case, as hexadecimal. It ignores the code version."""
     return hashlib.sha256(json.dumps({"study": study, **case.inputs()}, sort_keys=True).encode()).hexdigest()
 
 
 def case_file(study: str, case: Case) -> str:
-    """Return the file name of a case's record: the study, the label, and the first digits of the key."""
+    """Return the file name of a case's record: the study, the case's label, and the first 12 digits of the key."""
     words = re.sub(r"[^A-Za-z0-9_.=-]+", "_", f"{study}-{case.label}")
     return f"{words[:120]}-{case_key(study, case)[:12]}.json"
 
 
 def head(study: str, case: Case, code: str) -> Record:
-    """Return the fields of a record that are known before the run."""
+    """Return the fields of a record that are known before the case runs."""
     return {
         **case.recorded(),
         "study": study,
@@ -53,7 +53,7 @@ def write_record(folder: Path, study: str, case: Case, record: Record) -> None:
 
 
 def read_record(folder: Path, study: str, case: Case, code: str | None, *, failed: bool = False) -> Record | None:
-    """Return the record of a case by code version `code` (None: any), or None. Skip failed records unless `failed`."""
+    """Return a case's record of code version `code` (None: any), or None. `failed` allows records of failed cases."""
     try:
         record = json.loads((folder / case_file(study, case)).read_text(encoding="utf-8"))
     except (OSError, ValueError):
@@ -92,5 +92,5 @@ def read_results(path: Path) -> list[Record]:
 
 
 def bench_version(sources: tuple[str, ...]) -> str:
-    """Return the code version of a study. It hashes graspd_core, `_COUNTED`, and `sources`: globs in graspd_bench."""
+    """Return a study's code version: package version, and hash of graspd_core and files `_COUNTED` and `sources`."""
     return code_version(tuple(f"graspd_bench/{pattern}" for pattern in (*_COUNTED, *sources)))

@@ -1,4 +1,4 @@
-"""Runs of studies: make the cases, skip finished cases, run the others, and collect the sections of pages.
+"""Runs of studies: make the cases, skip finished cases, run the other cases, and collect sections for Markdown pages.
 
 Each worker process runs one case after another. If a worker dies, only its current case is lost.
 """
@@ -39,8 +39,8 @@ class Job:
         study: name of the study.
         case: the case.
         run: function that runs the case.
-        code: code version for the record.
-        alone: whether the case gets a new process without warm-up.
+        code: code version that the record will name.
+        alone: whether the case gets a new process of its own, without a first plan that loads libraries.
         patience: seconds until the case counts as hung.
     """
 
@@ -57,8 +57,8 @@ def run_cases(
 ) -> Iterator[tuple[Job, Record]]:
     """Run jobs on `processes` workers. Yield each job and its record when the job ends. The record is then on disk.
 
-    If `stop` returns true, kill the workers and end early. If a worker dies (such as out of memory) or hangs, write a
-    record with that error and start another worker.
+    If `stop` returns true, kill the workers and end early. If a worker dies (for example, out of memory) or hangs,
+    write a record with that error and start another worker.
     """
     waiting = deque(jobs)
     idle: list[_Worker] = []
@@ -107,7 +107,7 @@ class _Worker:
             self.pipe.send(job)
 
     def receive(self, folder: Path) -> Record:
-        """Return the record that the worker sends. If the worker died, write and return a record of that failure."""
+        """Return the record that the worker sends. If the worker died, write and return a record of the failure."""
         try:
             return self.pipe.recv()
         except (EOFError, ConnectionResetError):
@@ -116,9 +116,9 @@ class _Worker:
             return self._write(folder, failure(died, "died"))
 
     def lost(self, folder: Path) -> Record:
-        """Kill the worker because it hung. Write and return a record that says so."""
+        """Kill the worker because it hung. Write and return a record of the timeout."""
         self.end()
-        return self._write(folder, failure(TimeoutError(f"no end after {self.job.patience:.0f} s"), "hung"))
+        return self._write(folder, failure(TimeoutError(f"did not end within {self.job.patience:.0f} s"), "hung"))
 
     def end(self) -> None:
         self.process.kill()
@@ -149,7 +149,7 @@ def _work(pipe: connection.Connection, folder: Path, warm: bool) -> None:
 def run_job(job: Job) -> Record:
     """Run a job in this process and return its record. An exception becomes an error record and is not raised.
 
-    Caches in memory are cleared first, so no case uses results of another.
+    Caches in memory are cleared first, so no case uses results of another case.
     """
     from graspd_core.runtime import disk_cache
 
@@ -190,7 +190,7 @@ ALL = "all"
 
 @dataclass(frozen=True)
 class Plan:
-    """All jobs of a command, the folder of their records, and the records of finished jobs."""
+    """All jobs of a command, the folder of their records, and the records of those jobs that are finished."""
 
     folder: Path
     jobs: tuple[Job, ...]
@@ -201,7 +201,7 @@ class Plan:
         return tuple(job for job in self.jobs if job not in self.done)
 
     def seconds(self, processes: int) -> float:
-        """Return the estimated wall time of the missing cases on idle cores [s]."""
+        """Return the estimated wall time of the missing cases [s], if each process has an idle core."""
         return sum(STUDIES[job.study].seconds(job.case) for job in self.missing) / processes
 
 
@@ -219,7 +219,7 @@ def studies_of(names: Sequence[str]) -> dict[str, Study]:
 def make_plan(
     studies: dict[str, Study], request: Request, folder: Path, *, any_code: bool = False, failed: bool = False
 ) -> Plan:
-    """List the jobs of some studies, and read the records of finished ones.
+    """List the jobs of some studies, and read the records of the finished jobs.
 
     Args:
         any_code: whether records of other code versions count as finished.
@@ -244,14 +244,14 @@ def make_plan(
 
 
 def run_plan(plan: Plan, processes: int, stop: Callable[[], bool] = lambda: False) -> Iterator[tuple[Job, Record]]:
-    """Run the missing jobs. Yield each job and its record when it ends, and add the record to `plan.done`."""
+    """Run the missing jobs. Yield each job and its record when the job ends. Add the record to `plan.done`."""
     for job, record in run_cases(plan.missing, plan.folder, processes, stop):
         plan.done[job] = record
         yield job, record
 
 
 def records_of(plan: Plan) -> dict[str, list[Record]]:
-    """Return the finished records of each study, in the order of its cases."""
+    """Return the finished records of each study, in the order of the study's cases."""
     found: dict[str, list[Record]] = {job.study: [] for job in plan.jobs}
     for job in plan.jobs:
         if job in plan.done:
@@ -260,7 +260,7 @@ def records_of(plan: Plan) -> dict[str, list[Record]]:
 
 
 def report_of(plan: Plan, chart: Path | None) -> dict[str, Sequence[str | Picture]]:
-    """Return the sections of all studies with records, by marker. If `chart` is a path, draw charts as well."""
+    """Return the page sections of all studies with records, by marker name. Draw charts too if `chart` is given."""
     sections: dict[str, Sequence[str | Picture]] = {}
     for name, records in records_of(plan).items():
         study = STUDIES[name]
@@ -271,7 +271,7 @@ def report_of(plan: Plan, chart: Path | None) -> dict[str, Sequence[str | Pictur
 
 
 def faults_of(plan: Plan) -> list[str]:
-    """Return the faults of all finished jobs, one line per fault."""
+    """Return what is wrong with the results of all finished jobs, one line per fault."""
     return [
         f"{job.study} {job.case.label}: {fault}"
         for job in plan.jobs

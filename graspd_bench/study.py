@@ -1,4 +1,4 @@
-"""Base classes of the studies: a study, its cases, a user's request, and grasps of one object."""
+"""Base classes of the studies: a study, its cases, a user's request, and cases with grasps of one object."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from graspd_dataset.run_records import object_name
 
 Record = dict[str, Any]
 
-# Default mass of objects [kg]. It is DexGraspBench's convention, so that figures can be compared.
+# Default mass of objects [kg]. DexGraspBench uses the same mass, so that results can be compared.
 PROTOCOL_MASS = 0.1
 
 
@@ -39,16 +39,16 @@ Sections = Mapping[str, Sequence[str | Picture | None]]
 
 @dataclass(frozen=True)
 class Case:
-    """Base class of one run of a study. Files in the fields `object`, `hand` and `preset` are compared by content."""
+    """Base class of one run of a study. Files in `object`, `hand` and `preset` count by content, not by path."""
 
     @property
     def label(self) -> str:
-        """Return the name of the case for progress lines and file names. It joins all fields that are not empty."""
+        """Return the name of the case for progress lines and file names. It joins the case's texts and numbers."""
         values = (getattr(self, field.name) for field in fields(self))
         return " ".join(object_name(value) for value in values if isinstance(value, str | int | float) and value != "")
 
     def inputs(self) -> Record:
-        """Return all inputs of the run except the code, JSON-ready. Cases with equal inputs share one record."""
+        """Return all inputs of the run except the code, ready for JSON. Cases with equal inputs share one record."""
         said = asdict(self)
         if "object" in said:
             said["object"] = [object_name(said["object"]), object_hash(said["object"])]
@@ -59,7 +59,7 @@ class Case:
         return said
 
     def recorded(self) -> Record:
-        """Return the fields of the case that its record holds."""
+        """Return the fields of the case that go into its record."""
         return asdict(self)
 
 
@@ -70,18 +70,18 @@ class Request:
     Attributes:
         presets: names or files of presets.
         objects: shape:NAME, mesh files, or folders of mesh files.
-        cases: names or families of the study's own cases.
+        cases: which cases to run, by name or family, in studies that name their cases.
         seeds: random seeds. Every case is run with each seed.
         count: number of grasps of a case.
         hand: name or path of the hand.
-        trials: names of the trials of raw grasps.
+        trials: names of the trials to run on raw grasps.
         quick: whether to run a small selection that takes minutes.
         imported: file or folder of imported grasps.
         joint_order: joint names in the order of the imported npy files.
         checkout: folder of DexGraspBench.
         python: Python program that runs DexGraspBench.
-        armature: whether to also run DexGraspBench's hand with our armature.
-        grasps: file of our grasps to use instead of planning.
+        armature: whether to try grasps also with DexGraspBench's hand plus our joint armature.
+        grasps: file of our grasps, which DexGraspBench tries instead of newly planned ones.
     """
 
     presets: tuple[str, ...] = ()
@@ -107,7 +107,7 @@ class Request:
                 raise ConfigError(f"seed: {seed}; valid: 0 to 2^31 - 1")
 
     def preset(self, usual: str = "balanced") -> str:
-        """Return the requested preset, or `usual`. Raises ConfigError: several presets, or an unknown one."""
+        """Return the requested preset, or `usual`. Raises ConfigError: several presets, or an unknown preset."""
         if len(self.presets) > 1:
             raise ConfigError(f"presets: {', '.join(self.presets)}; this study takes one at a time")
         name = (self.presets or (usual,))[0]
@@ -116,7 +116,7 @@ class Request:
 
 
 def error_of(record: Record) -> tuple[str, ...]:
-    """Return the error of a failed case in a tuple. Empty if the case did not fail."""
+    """Return a tuple with the error of a case that failed, or an empty tuple."""
     return (record["error"],) if record["error"] else ()
 
 
@@ -130,18 +130,18 @@ class Study:
     """One study of the benchmark.
 
     Attributes:
-        about: the question of the study, in one line.
+        about: what the study compares or measures, in one line.
         cases: returns the cases of a request. Raises GraspdError if the request has unknown names.
         run: runs a case and returns its results. It must be a module-level function, because workers unpickle it.
-        sections: returns page sections from records and a path prefix for charts. With None it draws no charts.
-        sources: glob patterns of the files in graspd_bench that its results depend on.
+        sections: returns page sections from records and a path prefix for charts. If the prefix is None, draw none.
+        sources: glob patterns of the files in graspd_bench that the study's results depend on.
         takes: names of the `Request` fields that the study uses.
         seconds: returns the estimated CPU time of a case [s].
         faults: returns the faults of a record, one line per fault.
-        summary: returns the result of a record without faults, in a few words.
-        alone: whether every case gets a new process without warm-up.
+        summary: returns the result in a record without faults, in a few words.
+        alone: whether every case gets a new process of its own, without a first plan that loads libraries.
         patience: returns the seconds until a case counts as hung.
-        usual: whether `graspd bench all` includes the study. It must then need only shipped files.
+        usual: whether `graspd bench all` includes the study. False, for example, if it needs files of the user.
         failures: whether `sections` also needs the records of failed cases.
     """
 
@@ -161,12 +161,12 @@ class Study:
 
 
 def all_shapes() -> tuple[str, ...]:
-    """Return the sources of all built-in shapes, as `shape:NAME`."""
+    """Return all built-in shapes, as `shape:NAME`."""
     return tuple(f"shape:{name}" for name in SHAPES)
 
 
 def find_objects(sources: Sequence[str]) -> tuple[str, ...]:
-    """Return the objects of `sources`, with folders expanded. Raises MeshError: unknown object, or equal names."""
+    """List `sources` with folders replaced by their meshes. Raises MeshError: unknown object, or two of one name."""
     found = object_sources(sources)
     names = [object_name(source) for source in found]
     if twice := sorted({name for name in names if names.count(name) > 1}):
@@ -190,7 +190,7 @@ class ObjectCase(Case):
         return load_preset(self.preset)
 
     def load(self, friction: float = 0.6) -> tuple[HandModel, Scene]:
-        """Return the hand, and a scene with the object alone, at 0.1 kg and the given Coulomb friction."""
+        """Return the hand, and a scene with only the object, at 0.1 kg and the given Coulomb friction."""
         hand = load_hand(self.hand, candidates=self.config.problem.fine_candidates)
         return hand, load_scene(self.object, mass=PROTOCOL_MASS, resolution=self.config.resolution, friction=friction)
 
@@ -204,5 +204,5 @@ def object_cases(request: Request, objects: Sequence[str], count: int, quick_cou
 
 
 def raw_grasps(scene: Scene, hand: HandModel, config: PlanConfig, count: int, seed: int) -> tuple[Grasp, ...]:
-    """Return the first `count` grasps of the method's own ranking. No trial filters them."""
+    """Return the first `count` grasps in the method's own ranking. No trial has filtered them."""
     return find_candidates(PlannerInput(scene, hand, count, seed, config, Hooks())).grasps[:count]

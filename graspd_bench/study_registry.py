@@ -1,4 +1,4 @@
-"""Registry of all studies. `graspd bench NAME` runs a study. To add a study, write its file and a row here.
+"""Registry of all studies. `graspd bench NAME` runs a study. To add a study, write its file and add it to `STUDIES`.
 
 Other packages add studies through entry points of the group `graspd.studies`.
 """
@@ -71,7 +71,7 @@ STUDIES: dict[str, Study] = {
         suites.cell_seconds,
     ),
     "rgbd": Study(
-        "what cameras see of things on a table, planned on and tried on the truth",
+        "grasps planned on camera views of objects on a table, and tried on the true objects",
         seen_objects.seen_cases,
         seen_objects.run_seen,
         seen_objects.rgbd_sections,
@@ -81,7 +81,7 @@ STUDIES: dict[str, Study] = {
         summary=lambda record: record.get("refused") or f"{record['held']} of {record['verified']} hold on the truth",
     ),
     "cameras": Study(
-        "views by four kinds of cameras of things that nothing was fitted to, tried on the truth at their own mass",
+        "grasps on views by four kinds of cameras, tried on the true objects at their own mass",
         cameras.camera_cases,
         cameras.run_view,
         cameras.camera_sections,
@@ -92,7 +92,7 @@ STUDIES: dict[str, Study] = {
         usual=False,
     ),
     "robust": Study(
-        "what ranking by noisy trials buys and costs",
+        "benefit and cost of ranking by noisy trials",
         robust_ranking.robust_cases,
         robust_ranking.run_robust,
         robust_ranking.robust_sections,
@@ -110,7 +110,7 @@ STUDIES: dict[str, Study] = {
         failure_maps.map_seconds,
     ),
     "stress": Study(
-        "what breaks methods, each case in a process of its own",
+        "faulty and extreme inputs, each in its own process",
         stress_cases.stress_runs,
         stress_cases.run_stress,
         stress_cases.stress_sections,
@@ -124,7 +124,7 @@ STUDIES: dict[str, Study] = {
         failures=True,
     ),
     "early": Study(
-        "trials that stop early against the full length",
+        "trials that stop early, compared with trials of full length",
         early_ends.early_cases,
         early_ends.run_early,
         early_ends.early_sections,
@@ -143,7 +143,7 @@ STUDIES: dict[str, Study] = {
         usual=bullet_available(),
     ),
     "steered": Study(
-        "grasps with a wish for direction, place and roll against the same without",
+        "requests with and without constraints on direction, place and roll",
         steered.steered_cases,
         steered.run_steered,
         steered.steered_sections,
@@ -172,7 +172,7 @@ STUDIES: dict[str, Study] = {
         usual=False,
     ),
     "imported": Study(
-        "somebody else's grasps beside ours on the same objects and hand (--import FOLDER --hand NAME)",
+        "imported grasps compared with ours on the same objects and hand (--import FOLDER --hand NAME)",
         imported.imported_cases,
         imported.run_imported,
         imported.imported_sections,
@@ -182,7 +182,7 @@ STUDIES: dict[str, Study] = {
         usual=False,
     ),
     "dexgraspbench": Study(
-        "our grasps through DexGraspBench's own code (dexgraspbench FOLDER --python PATH)",
+        "our grasps evaluated by DexGraspBench's own code (dexgraspbench FOLDER --python PATH)",
         dexgraspbench.bench_cases,
         dexgraspbench.run_bench,
         dexgraspbench.bench_sections,
@@ -193,7 +193,7 @@ STUDIES: dict[str, Study] = {
         usual=False,
     ),
     "mano": Study(
-        "a human hand of the user's, in the units of the Grasp'D paper",
+        "grasps of the user's MANO hand, in the units of the Grasp'D paper",
         human_hand.mano_cases,
         human_hand.run_mano,
         human_hand.mano_sections,
@@ -202,7 +202,7 @@ STUDIES: dict[str, Study] = {
         usual=False,
     ),
     "frames": Study(
-        "frames of a real depth camera, in folders",
+        "grasps on the user's frames of a real depth camera",
         frames.frame_cases,
         frames.run_frame,
         frames.frame_sections,

@@ -12,19 +12,19 @@ from graspd_core.errors import ConfigError, choices
 from graspd_core.hands.library import hand_names
 from graspd_core.optimize.plan_config import PlanConfig, load_preset, method_row, override, preset_names
 
-# Number of verified grasps of a planned cell, and batch size of a pace cell.
+# Number of grasps of a cell of kind "verified", and batch size of a cell of kind "pace".
 VERIFIED, BATCH = 8, 32
 # Grasps of a raw cell in the studies `hands` and `decades`.
 HAND_COUNT = 8
-# Shipped presets that users plan with. A preset of their own is planned with too.
+# Built-in presets with cells of kind "verified". Presets of users have such cells too.
 PLANNED = ("fast", "balanced", "accurate")
 # Variant of `balanced` with the same effort in every round, for comparison.
 STEADY = "balanced_steady"
-# This preset is skipped: it only orders verified grasps differently, and its raw grasps are those of `balanced`.
+# The study `main` skips this preset: it has the raw grasps of `balanced`, and only orders verified grasps differently.
 _RANKED = "robust"
-# If settings have more steps than `_LONG`, a raw cell takes `_LONG_COUNT` grasps, because each takes seconds.
+# If settings have more steps than `_LONG`, a raw cell has `_LONG_COUNT` grasps, because a grasp takes seconds.
 _LONG, _LONG_COUNT = 2000, 4
-# With more steps than this, a grasp takes three times as long again.
+# With more steps than `_LONGEST`, a grasp takes three times as long as with `_LONG` steps.
 _LONGEST = 7000
 # Trials of the settings sweeps.
 _SWEEP_TRIALS = ("standard",)
@@ -32,14 +32,14 @@ _SWEEP_OBJECTS = ("shape:box", "shape:mug", "shape:bowl", "shape:hammer")
 _SWEEP_PRESET = "balanced"
 _QUICK_OBJECTS = ("shape:sphere", "shape:box", "shape:mug")
 _QUICK_COUNT = 4
-# Presets of a quick run. The others take minutes per cell.
+# Presets of a quick run. Other presets take minutes per cell.
 _QUICK_PRESETS = ("fast", "balanced", "accurate", "random_closure", "graspd2022_short")
 
-# CPU seconds per grasp by method, on an idle core. `cell_seconds` has those of long settings and of other methods.
+# CPU seconds per grasp by method, on an idle core. `cell_seconds` has the times of long settings and other methods.
 _SECONDS = {"closed_form": 0.05, "graspd2022": 1.2, "annealing": 3.3, "random_closure": 0.3}
 
 _STEPS = {"explore": 50, "refine": 80, "polish": 50}
-# Sweeps: each value is a set of changes to `balanced`.
+# Settings sweeps by name. Each value of a sweep is a set of changes to `balanced`.
 SWEEPS: Mapping[str, Sequence[Mapping[str, int]]] = {
     "candidates": [{"problem.candidates": n} for n in (32, 64, 128, 256, 512)],
     "directions": [{"problem.directions": n} for n in (6, 12, 24, 48, 96)],
@@ -49,7 +49,7 @@ SWEEPS: Mapping[str, Sequence[Mapping[str, int]]] = {
         for share in (0.2, 0.5, 1.0, 2.0, 4.0)
     ],
 }
-# Sweeps over three decades: title, preset, setting, and its values. They include the preset's own value.
+# Sweeps over three decades: title, preset, setting and values. The values include the preset's own value.
 DECADES = (
     (
         "Grasp'D, stiffness [N/m]",
@@ -64,7 +64,7 @@ DECADES = (
 
 
 def main_suite(request: Request) -> tuple[Cell, ...]:
-    """Return the cells of study `main`: raw and verified grasps of presets on objects, pace cells, and a start cell."""
+    """Return the cells of study `main`: raw and verified grasps of presets on objects, and cells that measure speed."""
     names = (name for name in preset_names() if name != _RANKED)
     defaults = [name for name in names if not request.quick or name in _QUICK_PRESETS]
     presets = {name: load_preset(name) for name in request.presets or defaults}
@@ -76,7 +76,7 @@ def main_suite(request: Request) -> tuple[Cell, ...]:
     for thing in find_objects(request.objects or (_QUICK_OBJECTS if request.quick else all_shapes())):
         for name, config in presets.items():
             cells += _cells(request, "raw", name, config, thing, _count(request, config), trials)
-        # Users call `plan_grasps` with presets of closed_form. The others are compared by raw grasps only.
+        # Users call `plan_grasps` with presets of closed_form. Other presets are compared by raw grasps only.
         for name, config in planned.items():
             cells += _cells(request, "verified", name, config, thing, _QUICK_COUNT if request.quick else VERIFIED)
     if not request.objects:
@@ -101,7 +101,7 @@ def sweep_suite(request: Request) -> tuple[Cell, ...]:
 
 
 def decades_suite(request: Request) -> tuple[Cell, ...]:
-    """Return raw cells that sweep contact settings over three decades. They show how wrong a setting may be."""
+    """Return raw cells that sweep contact settings over three decades. They show how exact a setting must be."""
     count, trials = request.count or HAND_COUNT, _trials(request, _SWEEP_TRIALS)
     return tuple(
         cell

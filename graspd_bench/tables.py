@@ -1,4 +1,4 @@
-"""Markdown tables of records, and insertion of texts into the marked sections of pages."""
+"""Markdown tables of records, and replacement of the marked sections of Markdown pages by new texts."""
 
 from __future__ import annotations
 
@@ -30,13 +30,13 @@ def provenance(command: str, records: Sequence[Record]) -> str:
 
 
 def sourced(command: str, records: Sequence[Record], sections: Sections) -> dict[str, Sequence[str | Picture]]:
-    """Return the sections that are not empty. Append to each the sentence of `provenance`."""
+    """Return the sections that are not empty. Append the sentence of `provenance` to each section."""
     filled = {name: [part for part in parts if part] for name, parts in sections.items()}
     return {name: [*parts, provenance(command, records)] for name, parts in filled.items() if parts}
 
 
 def written(parts: Sequence[str | Picture], document: Path | None = None) -> str:
-    """Return the parts of a section as Markdown. Pictures become links relative to `document`, if given."""
+    """Return the parts of a section as Markdown. Pictures are links relative to `document`, or left out without it."""
     texts = []
     for part in parts:
         if isinstance(part, str):
@@ -96,12 +96,12 @@ def _columns() -> list[tuple[str, str, str]]:
 
 
 def summary_table(records: Sequence[Record]) -> str:
-    """Return a table with a row for each preset: means over objects, of raw grasps."""
+    """Return a table of raw grasps with a row for each preset. The numbers are means over objects."""
     return _summary("preset", by_name(row for row in rows(records) if is_preset(row.name)))
 
 
 def hands_table(records: Sequence[Record]) -> str:
-    """Return a table with a row for each hand: means over objects, and the object on which fewest grasps held."""
+    """Return a table with a row for each hand: means over objects, and the object on which the smallest share held."""
     found = by_name(row for row in rows(records) if is_hand(row.name))
     worst = [min(group, key=lambda row: row.held / row.count) for group in found.values()]
     hands = {name.removeprefix("hand:"): group for name, group in found.items()}
@@ -109,7 +109,7 @@ def hands_table(records: Sequence[Record]) -> str:
 
 
 def _summary(kind: str, found: Mapping[str, Sequence[Row]], last: tuple[str, list[str]] | None = None) -> str:
-    """Return a table with a row for each name, or "" without names. `last` is an extra column: heading and cells."""
+    """Return a table with a row for each name, "" if `found` is empty. `last` is an extra column: heading and cells."""
     if not found:
         return ""
     columns = [column for column in _columns() if column[1] in _SUMMARY and _known(found, column[1])]
@@ -124,7 +124,7 @@ def _summary(kind: str, found: Mapping[str, Sequence[Row]], last: tuple[str, lis
 
 
 def object_tables(records: Sequence[Record]) -> str:
-    """Return a table for each preset: medians over the grasps of each object, and the mean over objects."""
+    """Return a table for each preset: a row for each object with medians over its grasps, and the mean over objects."""
     blocks = []
     for name, group in by_name(row for row in rows(records) if is_preset(row.name)).items():
         columns = [column for column in _columns() if _known({name: group}, column[1])]
@@ -139,7 +139,7 @@ def object_tables(records: Sequence[Record]) -> str:
 
 
 def planned_table(records: Sequence[Record]) -> str:
-    """Return a table of planned runs with a row for each preset: verified grasps, and their cost with trials."""
+    """Return a table of runs that plan verified grasps, by preset: grasps, times and CPU time with trials."""
     body = []
     for name, group in by_name(rows(records, "verified")).items():
         held, count = sum(row.held for row in group), sum(row.count for row in group)
@@ -155,7 +155,7 @@ def planned_table(records: Sequence[Record]) -> str:
 
 
 def pace_table(records: Sequence[Record]) -> str:
-    """Return a table of computing times: of each raw grasp, and of a new process until its first verified grasp."""
+    """Return a table of computing times: per raw grasp of a batch, and of a new process until a verified grasp."""
     body = []
     for r in records:
         if r["error"]:
@@ -172,7 +172,7 @@ def pace_table(records: Sequence[Record]) -> str:
 
 
 def main_sections(records: Sequence[Record], chart: Path | None) -> Sections:
-    """Return the sections of study `main`: the short table, all presets, planned runs, and single objects."""
+    """Return the sections of study `main`: short table, table of all presets, planned grasps, tables of objects."""
     drawn = drawn_charts(records, chart)
     few = [record for record in records if is_few(record["name"])]
     return {
@@ -184,7 +184,7 @@ def main_sections(records: Sequence[Record], chart: Path | None) -> Sections:
 
 
 def ladder_sections(records: Sequence[Record], chart: Path | None) -> Sections:
-    """Return the section of study `ladder`: the chart of the settings sweeps."""
+    """Return the section of study `ladder`: the chart of hold success and CPU time over each swept setting."""
     return {"bench-ladder": [drawn_charts(records, chart).get("ladder")]}
 
 
@@ -201,12 +201,12 @@ def decades_sections(records: Sequence[Record], chart: Path | None) -> Sections:
 
 
 def hands_sections(records: Sequence[Record], chart: Path | None) -> Sections:
-    """Return the section of study `hands`: one table."""
+    """Return the section of study `hands`: one table of all hands."""
     return {"bench-hands": [hands_table(records)]}
 
 
 def drawn_charts(records: Sequence[Record], chart: Path | None) -> Mapping[str, Picture]:
-    """Draw the charts for which the records have data. Return them by name. Draw none if `chart` is None."""
+    """Draw the charts for which the records have data. Return them by name. If `chart` is None, draw none."""
     if chart is None:
         return {}
     from graspd_bench.charts import draw_charts
@@ -223,7 +223,7 @@ def metrics_table() -> str:
 
 
 def missing(records: Sequence[Record]) -> str:
-    """Return a sentence that names presets without results for some objects, or "" if there is no such preset."""
+    """Return a sentence that names presets without results for some objects, or "" if there are no such presets."""
     found = by_name(row for row in rows(records) if is_preset(row.name))
     objects = {r["object"] for r in records if r["kind"] == "raw" and is_preset(r["name"])}
     fewer = [f"`{name}` of {len(group)}" for name, group in found.items() if len(group) < len(objects)]

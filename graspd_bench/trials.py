@@ -1,14 +1,14 @@
 """More trials in MuJoCo: displacement under gravity with a frozen and with a driven hand, and falling objects.
 
-`displacement_trial` repeats PyBullet's displacement trial in MuJoCo, to show how much its result depends on the engine.
-Hand, mass and steps are the same: a frozen hand, 1 kg, 35 steps of 1/240 s, 9.8 m/s². The friction of a pair is the
-product of Bullet's two coefficients, 3 times 3. Nothing bounces. In Bullet the hand's restitution of 0 prevents it.
+`displacement_trial` repeats PyBullet's displacement trial in MuJoCo. The two results show how much depends on the
+simulator. Both trials have a frozen hand, an object of 1 kg, 35 steps of 1/240 s, and 9.8 m/s². Friction is the product
+of Bullet's two coefficients, 3 times 3. Nothing bounces, as the hand's restitution in Bullet is 0.
 
-`gravity_trial` measures how far gravity moves an object within 2 s while the hand squeezes it. The displacement trial
-of the papers has a frozen hand, without motors and effort limits. Its 0.15 s are too short to show a slow slip. Hand,
-object and physics of `gravity_trial` are those of the hold trial.
+`gravity_trial` measures how far gravity moves an object within 2 s while the hand squeezes the object. Hand, object and
+physics are those of the hold trial. The displacement trial of the papers differs: its hand is frozen, without motors
+and effort limits, and its 0.15 s are too short to show a slow slip.
 
-`dropped` lets objects come to rest on a table.
+`dropped` lets objects fall on a table and come to rest.
 """
 
 from __future__ import annotations
@@ -47,7 +47,7 @@ from graspd_core.verify.world import (
 
 TIMESTEP, STEPS = 1 / 240, 35
 GRAVITY, MASS, FRICTION = 9.8, 1.0, 3.0
-# Bullet multiplies the coefficients of the two bodies.
+# Bullet multiplies the friction coefficients of the two bodies.
 _PAIR_FRICTION = (FRICTION**2, 0.0, 0.0)
 
 
@@ -91,7 +91,7 @@ def build_frozen_world(hand: HandModel, target: ObjectModel, parts: Sequence[Tri
 def displacement_trial(
     world: FrozenWorld, posture: Posture, *, directions: Float[np.ndarray, "directions 3"] = DIRECTIONS
 ) -> float:
-    """Return how far the object's centre of mass moves in 35 steps of 1/240 s [m], mean over gravity directions."""
+    """Return how far gravity moves the object's centre of mass in 35 steps of 1/240 s [m], mean over its directions."""
     import mujoco
 
     moved = []
@@ -121,11 +121,11 @@ def _place_links(world: FrozenWorld, data: Any, posture: Posture) -> None:
 
 
 DROP_GRAVITY, DURATION = 9.8, 2.0
-# The trial along one direction ends at this displacement [m]. An object that was never held counts as moved so far.
+# Gravity along one direction ends at this displacement [m]. It is also the result if the hand fails to close.
 LOST = 0.1
-# The trial along one direction ends when its final displacement is known with this tolerance [m].
+# Gravity along one direction ends early when its final displacement is known with this tolerance [m].
 TOLERANCE = 1e-4
-# Number of checks over which a speed is computed. Safety factor on the change of the predicted displacement.
+# `_WINDOW` checks give one speed. `_SAFETY` times the change of the prediction must be below `TOLERANCE`.
 _WINDOW, _SAFETY = 2, 4
 
 
@@ -133,8 +133,8 @@ def gravity_trial(world: World, grasp: Grasp, protocol: Protocol, *, stop: Calla
     """Return the displacement of the object's centre of mass [m], mean over six gravity directions.
 
     The hand closes and squeezes as in the hold trial. Then gravity acts on the object along ±x, ±y, ±z in turn for 2 s.
-    An object that moves 10 cm is lost and counts as 10 cm. So does a grasp that the hold trial would refuse.
-    A direction ends early when the displacement predicted for 2 s is constant within 0.1 mm. Then it is the result.
+    An object that moves 10 cm is lost and counts as 10 cm. If the hand fails to close, the result is also 10 cm.
+    A direction ends early when its prediction for 2 s is constant within 0.1 mm. Then the prediction counts.
     With `protocol.full_length` no direction ends early. If `stop` returns true, the displacement so far counts.
     """
     import mujoco
@@ -154,7 +154,7 @@ def gravity_trial(world: World, grasp: Grasp, protocol: Protocol, *, stop: Calla
 
 
 def _fall(world: World, data: Any, protocol: Protocol, stop: Callable[[], bool]) -> float:
-    """Simulate gravity for 2 s, until the final displacement is known or the object is lost. Return it [m]."""
+    """Return the object's displacement after 2 s of gravity [m]. Stop early if the object is lost or creeps evenly."""
     import mujoco
 
     checks, states = round(DURATION / protocol.timestep / CHECK_EVERY), list[ObjectState]()
@@ -173,7 +173,7 @@ def _fall(world: World, data: Any, protocol: Protocol, stop: Callable[[], bool])
 
 
 def _end(states: list[ObjectState], checks: int) -> Float[np.ndarray, "3"] | None:
-    """Predict the centre of mass after all `checks` from `states`, if it creeps evenly [m]. None if uncertain."""
+    """Predict the centre of mass after check number `checks` [m]. None if the object does not creep evenly."""
     recent = states[-2 * _WINDOW - 1 :]
     if len(recent) <= 2 * _WINDOW or not all(s.speed < CREEPING.speed and s.spin < CREEPING.spin for s in recent):
         return None
@@ -189,8 +189,8 @@ def _end(states: list[ObjectState], checks: int) -> Float[np.ndarray, "3"] | Non
 
 _FLOOR, _WALL = "floor", "wall"
 _GRAVITY = 9.81
-# Damping of translation and rotation per mass and inertia [1/s]. Falling objects are damped strongly, to 0.6 m/s, so
-# that they neither bounce nor pass through thin walls. Objects at rest are damped less, so that balls stop rolling.
+# Damping of translation and rotation per mass and inertia [1/s]. Strong damping limits the fall to 0.6 m/s, so that
+# objects neither bounce nor pass through thin walls. Objects on the table are damped less. There damping stops balls.
 _FALLING, _RESTING = (16.0, 16.0), (1.0, 4.0)
 # Objects are at rest after `_STILL` steps in a row in which all are slower than `_SPEED` [m/s] and `_SPIN` [rad/s].
 _SPEED, _SPIN, _STILL = 0.002, 0.05, 50
@@ -199,11 +199,11 @@ Pose = Float[np.ndarray, "4 4"]
 
 @dataclass(frozen=True, eq=False)
 class FreeBody:
-    """A free body of the scene.
+    """An object that can move freely.
 
     Attributes:
-        model: the body's object model, in the body's own frame.
-        parts: the body's convex parts, in the body's own frame [m].
+        model: the object model, in the object's own frame.
+        parts: convex parts of the object, in its own frame [m].
         pose: `T_world_body` [m].
     """
 
@@ -219,13 +219,13 @@ def settle(
 
     Args:
         bodies: objects at their start poses. They must not overlap.
-        wall: half the side of a square fence around the origin [m]. Objects fall slowly within it. If None, there is
-            no fence, and the objects already lie on the table.
+        wall: half the side of a square fence around the origin [m]. Inside it, strong damping slows the objects' fall.
+            If None, there is no fence, and the objects already lie on the table.
         seconds: limit of the simulated time [s].
-        protocol: physics settings. None takes those of the standard trial.
+        protocol: physics settings. None: the settings of the standard trial.
 
     Returns:
-        The final poses. They are the same for the same bodies.
+        The final poses `T_world_body`. Equal bodies give equal poses.
     """
     import mujoco
 
@@ -265,10 +265,10 @@ def _damp(model: Any, names: Sequence[str], slow: float, turn: float) -> None:
 
 
 def dropped(models: Sequence[ObjectModel], seed: int, wall: float, *, stays: bool = False) -> tuple[FreeBody, ...]:
-    """Drop objects into a square fence on the table z = 0, then remove the fence. Return the objects at rest.
+    """Drop objects into a square fence on the table z = 0, then remove it. Return the objects when they are at rest.
 
     Args:
-        models: the objects, from the lowest to the highest before the fall.
+        models: the objects. They start above each other, with the first object lowest.
         seed: random seed of their orientations and places.
         wall: half the side of the fence around the origin [m].
         stays: whether to keep the fence.

@@ -16,13 +16,13 @@ from graspd_core.se3 import SE3
 
 Joints = Float[np.ndarray, "joints"]
 Pose = Float[np.ndarray, "4 4"]
-# Step between two poses of a straight path [m], and the greatest joint motion in one step [rad].
+# Step of a straight path [m], greatest joint motion in a step [rad], and iterations of inverse kinematics.
 _STEP, _JUMP = 0.02, 0.25
 _STEPS = 12
 
 
 def tip_pose(mover: Mover, q: Joints) -> Pose:
-    """Return `T_base_tip` at joint values."""
+    """Return `T_base_tip` [m] at the arm's joint values `q`."""
     rotation, place = mover.shape.links(q[None])
     pose = np.eye(4)
     pose[:3, :3], pose[:3, 3] = rotation[0, mover.shape.arm.tip], place[0, mover.shape.arm.tip]
@@ -30,9 +30,9 @@ def tip_pose(mover: Mover, q: Joints) -> Pose:
 
 
 def straight(mover: Mover, q: Joints, way: Float[np.ndarray, "3"]) -> Float[np.ndarray, "rows joints"]:
-    """Return joint values along the straight displacement `way` of the tip, base frame [m]. The first row is `q`.
+    """Return joint values that move the tip straight by `way` [m], base frame. The first row is `q`.
 
-    The path ends at the last pose that inverse kinematics reaches without collision.
+    The path ends before the first pose that collides, is out of reach, or makes a joint jump.
     """
     arm, pose, rows = mover.shape.arm, tip_pose(mover, q), [q]
     allowed = mover.allowed(q[None])
@@ -50,7 +50,7 @@ def straight(mover: Mover, q: Joints, way: Float[np.ndarray, "3"]) -> Float[np.n
 
 
 def held_balls(mover: Mover, q: Joints, surface: Points) -> Balls:
-    """Return the mover's carried balls and the balls of one more object, all in the tip frame.
+    """Return the mover's collision balls that move with the tip, plus balls of a held object, in the tip frame [m].
 
     `surface` has the object's surface points [m] in the base frame. The arm is at joint values `q`.
     """
@@ -68,7 +68,7 @@ _HEIGHTS = (0.08, 0.12, 0.17, 0.22, 0.28)
 
 
 def dropped_box(thing: Points) -> Box:
-    """Return a box on the table that covers an object released at the points `thing` [m], which no camera sees."""
+    """Return a box on the table as obstacle for a released object. `thing` has its surface points at release [m]."""
     low, high = thing.min(0), thing.max(0)
     half, rise = 0.5 * (high - low)[:2], 0.5 * float(high[2] - low[2])
     x, y = (0.5 * (low + high))[:2].tolist()
@@ -76,14 +76,14 @@ def dropped_box(thing: Points) -> Box:
 
 
 def release_posture(mover: Mover, q: Joints, thing: Points, bin_: Bin, number: int) -> Joints | None:
-    """Return the nearest clear posture with the object above a bin, rotated about the vertical only. Otherwise None.
+    """Return a collision-free posture near `q` with the object above a bin, or None. Only turn it about the vertical.
 
     Args:
         mover: arm and hand with the object in the hand.
         q: current joint values of the arm.
         thing: points of the object's surface at `q`, base frame [m].
         bin_: the target bin.
-        number: count of objects already released. The release spots are used in turn.
+        number: number of objects already released. It selects the release spot that is tried first.
     """
     arm, pose = mover.shape.arm, tip_pose(mover, q)
     middle = np.array([*thing.mean(0)[:2], thing[:, 2].min()])

@@ -31,7 +31,7 @@ _PATIENCE = 20.0
 
 
 def add_command(commands: Any) -> None:
-    """Add this command to the parser's."""
+    """Add the subcommand cell to the parsers in `commands`."""
     parser = commands.add_parser("cell")
     parser.set_defaults(run=run)
     parser.add_argument("--arm", default="ur5e_like", metavar="NAME|PATH", help="default: ur5e_like")
@@ -41,20 +41,20 @@ def add_command(commands: Any) -> None:
         help="family:NAME[:NUMBER], shape:NAME or a folder of meshes with a csv of masses (default: families)",
     )  # fmt: skip
     parser.add_argument("--count", type=int, default=5, metavar="N", help="things in the bin (default 5)")
-    parser.add_argument("--seed", type=int, default=0, help="of the things and of how they fall (default 0)")
-    parser.add_argument("--preset", default="balanced", help="of graspd (default balanced)")
-    parser.add_argument("--attempts", type=int, default=None, metavar="N", help="at most (default: two a thing)")
+    parser.add_argument("--seed", type=int, default=0, help="seed of the things and of their fall (default 0)")
+    parser.add_argument("--preset", default="balanced", help="graspd's preset (default balanced)")
+    parser.add_argument("--attempts", type=int, default=None, metavar="N", help="at most N (default: 3 + 2 per thing)")
     parser.add_argument(
         "--picks", type=int, default=None, metavar="N", help="refill the bin until N attempts were made"
     )
-    parser.add_argument("--film", type=Path, default=None, metavar="PATH.png", help="eight frames of the first pick")
+    parser.add_argument("--film", type=Path, default=None, metavar="PATH.png", help="save 8 frames of the first pick")
     parser.add_argument("--view", action="store_true", help="show the cell in a browser, in real time")
-    parser.add_argument("--speed", type=float, default=1.0, metavar="X", help="of --view, times real time (default 1)")
+    parser.add_argument("--speed", type=float, default=1.0, metavar="X", help="speed of --view (default 1: real time)")
     add_address(parser)
 
 
 def run(options: argparse.Namespace) -> int:
-    """Empty the bin. Return 0 if no object is left, 3 if one is left, 130 after Ctrl-C."""
+    """Empty the bin. Return 0 if all objects are in the place bin, 3 if not, 130 after Ctrl-C."""
     import torch
 
     from graspd_cell.cell_view import Film, LiveCell, ToldSource
@@ -65,7 +65,7 @@ def run(options: argparse.Namespace) -> int:
 
     _refuse(options)
     torch.set_num_threads(1)
-    # Objects still frozen at exit are never freed. OMPL prints many warnings about them.
+    # Unfreeze at exit. Frozen objects are never freed, and OMPL prints many warnings about such objects.
     atexit.register(gc.unfreeze)
     arm, hand = load_arm(options.arm), load_hand(options.hand)
     if options.picks is not None:
@@ -122,16 +122,16 @@ def _filled_cell(options: argparse.Namespace, arm: Arm, hand: HandModel, seed: i
 
 
 def _many_picks(options: argparse.Namespace, arm: Arm, hand: HandModel) -> int:
-    """Empty one bin after another until `--picks` attempts were made. Print each failure, the endings and the memory.
+    """Empty bins until `--picks` attempts were made. Print failed attempts, counts of endings, and memory use.
 
-    The seeds of the bins count up from `--seed`. Return the exit status.
+    The first bin has the seed `--seed`. Each later bin has the next seed. Return the exit status.
     """
     from graspd_cell.grasp_source import InProcessGrasps
     from graspd_cell.picker import Attempt, Ending, Picker, summary
 
     attempts, memory, ended = list[Attempt](), list[float](), Counter[str]()
     with Interrupt() as interrupt:
-        # A bin may end without an attempt, so that the bins are counted too.
+        # A bin may end without an attempt. The number of bins is limited too, so that the loop ends.
         while len(attempts) < options.picks and len(memory) < options.picks and not interrupt.is_interrupted():
             robot, number = _filled_cell(options, arm, hand, options.seed + len(memory)), len(memory) + 1
             source = InProcessGrasps(arm, hand, robot.world.layout, preset=options.preset, seed=options.seed)
@@ -155,7 +155,7 @@ def _many_picks(options: argparse.Namespace, arm: Arm, hand: HandModel) -> int:
 
 
 def resident_mb() -> float:
-    """Return the memory of this process that is resident [MB]."""
+    """Return the resident memory of this process [MB]."""
     return int(Path("/proc/self/statm").read_text().split()[1]) * os.sysconf("SC_PAGE_SIZE") / 1e6
 
 
@@ -164,24 +164,24 @@ def _refuse(options: argparse.Namespace) -> None:
     from graspd_core.io.grasps_json import check_writable
 
     if not 1 <= options.count <= MOST_THINGS:
-        raise ConfigError(f"--count {options.count}: valid: 1 to {MOST_THINGS}")
+        raise ConfigError(f"--count: {options.count}; valid: 1 to {MOST_THINGS}")
     if not 0 <= options.seed < 2**31:
-        raise ConfigError(f"--seed {options.seed}: valid: 0 to 2^31 - 1")
+        raise ConfigError(f"--seed: {options.seed}; valid: 0 to 2^31 - 1")
     if options.attempts is not None and options.attempts < 1:
-        raise ConfigError(f"--attempts {options.attempts}: valid: 1 or more")
+        raise ConfigError(f"--attempts: {options.attempts}; valid: 1 or more")
     if options.picks is not None and options.picks < 1:
-        raise ConfigError(f"--picks {options.picks}: valid: 1 or more")
+        raise ConfigError(f"--picks: {options.picks}; valid: 1 or more")
     if options.picks is not None and (options.view or options.film):
-        raise ConfigError("--picks: --view or --film is given too; give one of them")
+        raise ConfigError("--picks cannot be combined with --view or --film; remove one of them")
     if not options.speed > 0:
-        raise ConfigError(f"--speed {options.speed}: valid: more than zero")
+        raise ConfigError(f"--speed: {options.speed}; valid: more than zero")
     if options.film is not None:
         check_writable(options.film)
 
 
 def _greet(live: LiveCell | None, stop: Callable[[], bool]) -> None:
     if live is not None:
-        print_note(f"{live.page.url} - the arm begins when it is open")
+        print_note(f"{live.page.url} - the arm starts when this page is open")
         live.page.wait_for_visitor(_PATIENCE, stop)
 
 

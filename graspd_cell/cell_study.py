@@ -1,8 +1,8 @@
 """`graspd bench cell`: bins emptied in simulated cells, and the true outcome of each attempt.
 
 The picker knows only joint readings and depth images. The tables report the simulator's ground truth (the referee).
-Before a bin is emptied, the study finds the objects that the hand can hold at all. For these graspd finds a verified
-grasp of the true mesh at its true mass in free space. Seeds up to `DEVELOPED_ON` were used to develop the picker.
+Before a bin is emptied, the study finds the objects that can be held. An object can be held if graspd finds a verified
+grasp of its true mesh at its true mass in free space. Seeds up to `DEVELOPED_ON` were used to develop the picker.
 """
 
 from __future__ import annotations
@@ -34,10 +34,10 @@ from graspd_dataset.run_records import markdown_table, peak_mb
 
 PAIRS = ("ur5e_like+allegro_right", "panda_like+leap_right", "ur5e_like+parallel_gripper")
 SIZES, MOST_THINGS = (1, 5, 10), 24
-# Seeds from `_FIRST_SEED` on were not used to choose anything.
+# No setting was chosen with seeds from `_FIRST_SEED` on.
 DEVELOPED_ON, _FIRST_SEED = 199, 200
 SEEDS = tuple(range(_FIRST_SEED, _FIRST_SEED + 4))
-# Most attempts at a bin: this many per object, plus some more.
+# Greatest number of attempts at a bin: `_TRIES_A_THING` for each object, plus `_MORE_TRIES`.
 _TRIES_A_THING, _MORE_TRIES = 2, 3
 # Upper bounds of the probability bands in the calibration table.
 _BANDS = (0.5, 0.7, 0.85, 0.95, 1.01)
@@ -45,7 +45,7 @@ _BANDS = (0.5, 0.7, 0.85, 0.95, 1.01)
 
 @dataclass(frozen=True)
 class CellCase(Case):
-    """One bin and one robot. The bin holds `size` objects, drawn from `things` or from the families."""
+    """One bin and one robot. The bin gets `size` objects of `things` or, if this is empty, of random families."""
 
     pair: str
     size: int
@@ -70,7 +70,7 @@ class CellCase(Case):
 
 
 def cell_cases(request: Request) -> tuple[CellCase, ...]:
-    """Return one case per pair, size and seed. Raises ConfigError: a pair, a size or an object is unknown."""
+    """Return a case for each arm-hand pair, object count and seed. Raises ConfigError: a case or object is invalid."""
     pairs, sizes = list[str](), list[int]()
     for case in request.cases:
         if case.isdigit() and 1 <= int(case) <= MOST_THINGS:
@@ -142,7 +142,7 @@ class _TimedSource:
         self._source, self.cpu, self.all_cpu, self.looks = source, 0.0, 0.0, 0
 
     def next(self, view: Any, failures: Any) -> Offer:
-        """Return the offer of the wrapped source and add its CPU seconds."""
+        """Return the offer of the wrapped source. Store the CPU seconds of this call and of all calls."""
         began = time.process_time()
         offer = self._source.next(view, failures)
         self.cpu = time.process_time() - began
@@ -154,8 +154,7 @@ class _TimedSource:
 class AttemptWatch:
     """Comparison of the picker's report of each attempt with the referee's ground truth.
 
-    Attributes:
-        records: one JSON-ready record per attempt.
+    `records` has one JSON-ready record per attempt.
     """
 
     def __init__(self, robot: SimulatedRobot) -> None:
@@ -189,7 +188,7 @@ class AttemptWatch:
         return record
 
     def _target(self, place: np.ndarray) -> str:
-        """Return the name of the object in the pick bin that is nearest to `place`, base frame [m]. "" if empty."""
+        """Return the name of the object in the pick bin nearest to `place`, base frame [m]. "" if the bin is empty."""
         world = self._robot.world
         surfaces = [
             (np.linalg.norm((thing.seen.vertices @ pose[:3, :3].T + pose[:3, 3]) - place, axis=1).min(), thing.name)
@@ -205,7 +204,7 @@ def executed(attempt: Record) -> bool:
 
 
 def first_attempts(attempts: Sequence[Record]) -> list[Record]:
-    """Return the first attempt at each object, as identified by the referee. It identifies none if nothing is near."""
+    """Return the first attempt at each object, as identified by the referee. Skip attempts without an object."""
     firsts: dict[str, Record] = {}
     for attempt in attempts:
         if attempt["target"]:
@@ -220,7 +219,7 @@ _HEADINGS = [
 
 
 def cell_sections(records: Sequence[Record], chart: Path | None) -> Sections:
-    """Return four tables: results per pair and size, calibration of the probability, endings and times."""
+    """Return three tables (results, calibration of the probability, endings) and a line with median times."""
     groups: dict[tuple[str, str], list[Record]] = {}
     for record in records:
         groups.setdefault((_stock(record), str(record["size"])), []).append(record)
@@ -232,7 +231,7 @@ def cell_sections(records: Sequence[Record], chart: Path | None) -> Sections:
 
 
 def _stock(record: Record) -> str:
-    """Return the pair of arm and hand, with `given things` if the user named the objects."""
+    """Return the label of a table row: the arm-hand pair, and `given things` if the user named the objects."""
     return f"{record['pair']}, given things" if record.get("things") else str(record["pair"])
 
 

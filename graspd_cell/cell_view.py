@@ -51,7 +51,7 @@ def colour_of(name: str, names: Sequence[str]) -> Colour:
 
 
 def view_point(robot: SimulatedRobot) -> tuple[np.ndarray, np.ndarray]:
-    """Return the camera position and the point it looks at, base frame [m]. It looks across the bins at the robot."""
+    """Return the camera's position and target, base frame [m]. The camera looks across the bins at the robot."""
     pick, place = (np.array([*bin_.center, 0.0]) for bin_ in (robot.world.layout.pick, robot.world.layout.place))
     middle = 0.4 * (pick + place)
     ahead = middle / np.linalg.norm(middle)
@@ -62,7 +62,7 @@ def view_point(robot: SimulatedRobot) -> tuple[np.ndarray, np.ndarray]:
 def cell_picture(
     robot: SimulatedRobot, meshes: Sequence[tuple[str, TriangleMesh]]
 ) -> UInt8[np.ndarray, "rows columns 3"]:
-    """Render the surfaces that `SimulatedRobot.meshes` returns as an RGB image."""
+    """Render an RGB image of the surfaces `meshes`, which come from `SimulatedRobot.meshes`."""
     names = [thing.name for thing in robot.world.things]
     coloured = [(mesh, colour_of(name, names)) for name, mesh in meshes]
     image = render_shaded(coloured, T_world_camera=look_at(*view_point(robot)), width=_WIDTH, height=_HEIGHT)
@@ -71,7 +71,7 @@ def cell_picture(
 
 
 class Film:
-    """Recorder of one attempt, which writes eight of its frames. It is a watcher of the simulated robot."""
+    """Recorder of one attempt, which it saves as eight frames. The robot calls it as one of its `watchers`."""
 
     def __init__(self, robot: SimulatedRobot) -> None:
         self._robot, self._due = robot, 0.0
@@ -88,7 +88,7 @@ class Film:
         self._moments.clear()
 
     def save(self, path: Path) -> None:
-        """Write eight frames, evenly spaced over the recording, and stop recording."""
+        """Stop recording, and write one image of eight frames, evenly spaced over the recording."""
         self._robot.watchers.remove(self._watch)
         places = np.linspace(0, len(self._moments) - 1, FRAMES).round().astype(int)
         frames = [cell_picture(self._robot, self._moments[k]) for k in places]
@@ -98,7 +98,7 @@ class Film:
 
 
 class LiveCell:
-    """Web page that shows a simulated cell while a picker empties its bin. It is a watcher of the robot.
+    """Web page that shows a simulated cell while a picker empties its bin. The robot calls it as one of its `watchers`.
 
     Args:
         robot: the robot to show.
@@ -124,7 +124,7 @@ class LiveCell:
             return
         self._due = robot.time + _PICTURE
         self.page.place(robot.solid_poses())
-        # No simulated time passes during planning. The view does not catch up afterwards.
+        # Simulated time stops while graspd plans. The page does not catch up on this time.
         wait = (robot.time - self._simulated) / self._speed - (time.monotonic() - self._wall)
         if not wait > -0.2:
             self._wall, self._simulated = time.monotonic(), robot.time

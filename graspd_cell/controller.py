@@ -11,7 +11,7 @@ from jaxtyping import Float
 from graspd_cell.robot import JointMotion
 from graspd_core.errors import ConfigError
 
-# Rounding error that limits allow: of positions [rad] or [m], and of speeds as a factor.
+# Rounding errors allowed beyond the limits: of positions [rad] or [m], and of speeds as a factor.
 _SLACK, _SPEED_SLACK = 1e-3, 1.05
 
 
@@ -46,7 +46,7 @@ class Tolerances:
 
     Attributes:
         path: greatest error of a joint during the motion [rad] or [m].
-        goal: greatest error of a joint at the end [rad] or [m].
+        goal: greatest error of a joint at the end of the motion [rad] or [m].
         goal_time: time allowed after the last waypoint to reach the goal [s].
     """
 
@@ -84,7 +84,7 @@ class TrajectoryController:
         self.motion, self.targets = None, np.clip(positions, self.limits.lower, self.limits.upper)
 
     def advance(self, now: float, step: float) -> tuple[Float[np.ndarray, "joints"], Float[np.ndarray, "joints"]]:
-        """Return the targets at `now` [s] and their mean speeds over the last `step` [s]."""
+        """Return the joint targets at `now` [s], and their mean speeds since the last call, `step` [s] ago."""
         if self.motion is None:
             return self.targets, np.zeros_like(self.targets)
         before = self.targets
@@ -92,7 +92,7 @@ class TrajectoryController:
         return self.targets, (self.targets - before) / step
 
     def state(self, now: float, positions: Float[np.ndarray, "joints"]) -> tuple[MotionState, str]:
-        """Return the state of the motion at measured positions [rad] or [m], and the reason if it must be aborted."""
+        """Return the state of the motion at measured positions [rad] or [m], and the reason if the motion failed."""
         motion = self.motion
         if motion is None:
             return MotionState.REACHED, ""
@@ -119,7 +119,7 @@ class TrajectoryController:
         if motion.names == names:
             return motion
         if sorted(motion.names) != sorted(names):
-            raise ConfigError(f"a motion of joints {', '.join(motion.names)}; valid: all of {', '.join(names)}")
+            raise ConfigError(f"the motion has joints {', '.join(motion.names)}; valid: all of {', '.join(names)}")
         return motion.part(names)
 
     def _refuse(self, motion: JointMotion) -> None:
@@ -128,12 +128,12 @@ class TrajectoryController:
         if (beyond > _SLACK).any():
             joint = int(beyond.argmax())
             valid = f"[{low[joint]:g}, {high[joint]:g}]"
-            raise ConfigError(f"joint {names[joint]!r} is sent {beyond[joint]:.3f} beyond its limits; valid: {valid}")
+            raise ConfigError(f"joint {names[joint]!r} would go {beyond[joint]:.3f} beyond its limits; valid: {valid}")
         times, ways = np.append(0.0, motion.times), np.vstack([self.targets, motion.positions])
         first = 1 if motion.times[0] == 0 else 0
         speed = np.abs(np.diff(ways[first:], axis=0)) / np.diff(times[first:])[:, None]
         fast = speed.max(0, initial=0.0) / self.limits.velocity
         if (fast > _SPEED_SLACK).any():
             joint = int(fast.argmax())
-            told = f"is sent at {fast[joint] * self.limits.velocity[joint]:.2f} a second"
+            told = f"would move at {fast[joint] * self.limits.velocity[joint]:.2f} rad/s or m/s"
             raise ConfigError(f"joint {names[joint]!r} {told}; valid: at most {self.limits.velocity[joint]:.2f}")

@@ -1,8 +1,8 @@
 """Detection of a held object from joint positions and efforts, which real hands report.
 
-A joint presses if its squeeze target lies beyond the grasp. An object in the hand stops it before the target. A joint
-that reaches its target presses on nothing, and its effort drops. Fingers also stop early if they press on each other,
-or if an object rotates between jaws. Surface points of the fingers distinguish these two cases.
+A joint presses if its squeeze target lies beyond the grasp. An object in the hand stops the joint before the target. A
+joint that reaches its target presses on nothing, and its effort drops. Joints also stop early if fingers press on each
+other, or if an object rotates between jaws. Surface points of the fingers distinguish these two cases.
 """
 
 from __future__ import annotations
@@ -23,16 +23,16 @@ Joints = Float[np.ndarray, "joints"]
 # A joint presses if its target is farther than this from its value at the grasp [rad].
 _PRESSES = 0.03
 # Joints that press on nothing cover more than this fraction of the motion from grasp to target. With an object held,
-# the median joint covered up to 0.75 in 28 lifts, because objects turn in the hand. Without one it covered at least
-# 0.86 in 19 of 26.
+# the median joint covered up to 0.75 in 28 lifts, because objects turn in the hand. Without an object, the median joint
+# covered at least 0.86 in 19 of 26 cases.
 _ARRIVED = 0.8
-# Fingers that press on each other cover more than the first fraction after the squeeze, and later more than the second:
-# fingers that held an object and touched each other covered up to 0.6.
+# Fingers that press on each other cover more than this fraction: `_MEETING` after the squeeze, `_MEETING_LATER` later.
+# Fingers that held an object and touched each other covered up to 0.6.
 _MEETING, _MEETING_LATER = 0.4, 0.62
 # Two fingers meet if points of theirs were farther apart than `_APART` at the grasp and are within `_NEAR` now [m].
 _APART, _NEAR = 0.009, 0.004
-# If the object slipped out, less than this fraction of the effort after the squeeze is left. With an object it was at
-# least 0.52 in the 28 lifts.
+# If the object slipped out, less than this fraction of the effort after the squeeze is left. With an object in hand,
+# at least 0.52 was left in the 28 lifts.
 _EFFORT_LEFT = 0.45
 
 
@@ -54,8 +54,8 @@ class Hold:
     """State of the hand after the squeeze.
 
     Attributes:
-        presses: True for joints that press.
-        touch, target: joint values at the grasp and squeeze targets [rad] or [m].
+        presses: True for joints that press, because their squeeze target lies beyond the grasp.
+        touch, target: planned joint values of the grasp and of the squeeze [rad] or [m].
         positions, efforts: joint readings after the squeeze [rad] or [m], [N·m] or [N].
     """
 
@@ -67,7 +67,7 @@ class Hold:
 
 
 def after_squeeze(hand: HandModel, grasp: Grasp, reading: JointReading) -> Hold:
-    """Return the reference for later readings. `reading` is taken after the squeeze."""
+    """Return the state of the hand from `reading`, which is taken after the squeeze."""
     own = reading.of(hand.joint_names)
     scale = np.where(hand.slides, 1.0 / METRES_PER_RADIAN, 1.0)
     touch, target = (np.clip(p.joint_positions, hand.lower, hand.upper) for p in (grasp.grasp, grasp.squeeze))
@@ -84,12 +84,12 @@ def still_holds(hold: Hold, hand: HandModel, reading: JointReading) -> Held:
     own, toward = reading.of(hand.joint_names), np.sign(hold.target - hold.touch)
     before, now = (np.maximum((toward * efforts)[hold.presses], 0.0).sum() for efforts in (hold.efforts, own.efforts))
     if before > 0 and now < _EFFORT_LEFT * before:
-        return Held(False, f"the joints press with {100 * now / before:.0f} % of what they did")
+        return Held(False, f"the joints press with {100 * now / before:.0f} % of their effort after the squeeze")
     return _stopped(hold, hand, own.positions, _MEETING_LATER)
 
 
 def _stopped(hold: Hold, hand: HandModel, positions: Joints, meeting: float) -> Held:
-    """Decide whether an object stops the joints before their targets, and not another finger."""
+    """Decide whether an object stops the joints. Touching fingers that covered more than `meeting` hold no object."""
     if not hold.presses.any():
         return Held(True)
     way = (hold.target - hold.touch)[hold.presses]

@@ -29,7 +29,7 @@ __all__ = ["Failure", "GraspSource", "InProcessGrasps", "Offer", "cloud_of"]
 
 @dataclass(frozen=True, eq=False)
 class Offer:
-    """A grasp of one of the objects seen, or the reason why there is none. All poses are in the base frame.
+    """Grasp of one of the objects seen, or the reason why there is no grasp. All poses are in the base frame.
 
     Attributes:
         grasp: the grasp with its arm path. None if no object can be grasped.
@@ -74,7 +74,7 @@ def cloud_of(view: DepthView) -> PointCloud:
 
 # Reason if no object is left.
 EMPTY = "the bin is empty"
-# Error of measured surfaces, and greatest height of objects above the floor [m].
+# Distance of the crop box from the walls, which allows for camera errors, and height of its top above the table [m].
 _STRAY, _RISE = 0.006, 0.3
 # Plane that hands keep above. Its offset above the table top [m] allows for errors of arm and camera.
 TABLE = Plane(np.array([0.0, 0.0, 1.0]), 0.002)
@@ -93,9 +93,9 @@ class InProcessGrasps:
     Args:
         arm, hand, layout: parts of the cell.
         preset: name of graspd's preset.
-        most: greatest number of objects planned for in one view. Unlike a time limit, it gives equal results.
+        most: greatest number of objects planned for in one view. Unlike a time limit, it gives repeatable results.
         seed: seed of the optimiser.
-        tries: failed grasps of an object before it is given up.
+        tries: number of failed grasps after which an object is given up.
     """
 
     def __init__(

@@ -1,4 +1,4 @@
-"""Poses of table, bins and camera relative to an arm. The base frame is that of the arm's base link, z up."""
+"""Poses of table, bins and camera relative to an arm. The base frame is the frame of the arm's base link, z up."""
 
 from __future__ import annotations
 
@@ -66,7 +66,7 @@ class Bin:
 
 @dataclass(frozen=True, eq=False)
 class CellLayout:
-    """Objects in the cell beside the robot. Measure the same values in a real cell.
+    """Table, bins and camera around the robot. Measure these values in a real cell.
 
     Attributes:
         table: the table, whose top is the plane z = 0.
@@ -86,7 +86,7 @@ class CellLayout:
 
     @property
     def solids(self) -> tuple[Box, ...]:
-        """Table and walls."""
+        """Table and the walls of both bins."""
         return (self.table, *self.pick.walls, *self.place.walls)
 
 
@@ -100,9 +100,9 @@ _ELEVATION, _DISTANCE = np.deg2rad(62.0), 0.75
 
 
 def layout_of(arm: Arm) -> CellLayout:
-    """Return the cell of an arm. Both bins lie in the direction of the tip at the arm's `seed` posture.
+    """Return the cell of an arm. The bins lie in the direction (rounded to 90°) of the tip in the arm's `seed` posture.
 
-    The first joint must rotate about the vertical. At the start it is rotated beyond the place bin.
+    The first joint must rotate about the vertical. At `CellLayout.start` it turns the arm beyond the place bin.
     """
     tip = arm_links(arm, torch.as_tensor(arm.seed)[None]).translation[0, arm.tip].numpy()
     # Rotate by a multiple of 90°, so that the table's edges stay along the axes.

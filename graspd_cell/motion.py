@@ -1,11 +1,12 @@
 """Collision-free motions of the arm between postures. Obstacles are the camera's points and the known solids.
 
-Arm, hand and the held object are modelled as balls. The arm's balls come from its capsules (docs/arms.md). The others
-come from surface points, which are fixed to the tip during a motion. Obstacles are a distance grid of the points seen,
-a floor, and boxes. OMPL's RRTConnect finds paths and checks whole edges at once. toppra times them within the limits.
+Arm, hand and the held object are modelled as balls. The arm's balls come from its capsules (docs/arms.md). Hand and
+object have balls at surface points, which are fixed to the tip during a motion. Obstacles are a distance grid of the
+points seen, a floor, and boxes. OMPL's RRTConnect finds paths and checks whole edges at once. toppra times the paths
+within limits.
 
-OMPL's wheel has no dependencies. roboplan's needs 25 other packages and its own model of arm and scene. Ruckig's wheel
-connects only two states, and sends waypoints in between to a server.
+OMPL is used because its wheel has no dependencies. The alternative roboplan needs 25 other packages and its own model
+of arm and scene. The alternative to toppra, Ruckig, connects only two states, and sends further waypoints to a server.
 """
 
 from __future__ import annotations
@@ -44,14 +45,14 @@ _CELL, _AROUND = 0.01, 0.12
 
 @dataclass(frozen=True, eq=False)
 class SeenWorld:
-    """Obstacles of a motion, base frame [m].
+    """Obstacles of a motion, base frame [m]. The arm's base and first moving link may touch them.
 
     Attributes:
-        floor: height of the floor. The base and the first moving link are not checked against it.
+        floor: height of the floor.
         boxes: known solids.
         points: points seen, without those on floor and boxes.
-        origin: lowest corner of the grid.
-        distances: distance of each cell to the nearest point seen. None without points.
+        origin: lowest corner of the grid `distances`.
+        distances: distance of each grid cell to the nearest point seen. None without points.
     """
 
     floor: float
@@ -92,7 +93,7 @@ def seen_world(points: Points, floor: float, boxes: Sequence[Box] = (), slack: f
     free = np.ones(shape, dtype=bool)
     free[tuple(cell.T)] = False
     away: Any = distance_transform_edt(free)
-    # A distance runs from the centre of one cell to any point in another.
+    # The transform measures between cell centres. A point may be half a cell nearer.
     return replace(known, points=points, origin=origin, distances=(_CELL * (away - 0.5)).astype(np.float32))
 
 
@@ -104,7 +105,7 @@ class Balls:
     radius: Float[np.ndarray, "_"]
 
 
-# Spacing of the surface points kept of hands and objects, and radius of their balls [m].
+# Spacing of the surface points that are kept of hands and objects, and radius of the ball at each point [m].
 _SPACING, _BALL = 0.012, 0.004
 # Points sampled on a hand's surface.
 _SAMPLES = 4000
@@ -152,7 +153,7 @@ class ArmShape:
 
     @cached_property
     def _constants(self) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-        """Return A, B, C and d of each link. Its rotation is `R = A + sin(q) B + cos(q) C`, its slide `q d` [m]."""
+        """Return A, B, C, d per link. Joint value q rotates by `R = A + sin(q) B + cos(q) C` or slides by `q d` [m]."""
         chain = self.arm.chain
         x, y, z = chain.joint_axis.T
         zero = np.zeros_like(x)
@@ -215,8 +216,8 @@ class Mover:
     Attributes:
         shape: the arm.
         world: the obstacles.
-        carried: balls of the hand and the held object, tip frame.
-        margin: distance that a motion keeps from obstacles, unless one of its ends is nearer [m].
+        carried: collision balls of the hand and the held object, tip frame.
+        margin: distance that a motion keeps from obstacles [m]. It is smaller if an end of the motion is nearer.
     """
 
     shape: ArmShape
@@ -226,7 +227,7 @@ class Mover:
 
     @cached_property
     def _own(self) -> tuple[Balls, np.ndarray, np.ndarray]:
-        """Return coarse carried balls, and the index pairs to check: arm with arm balls, and arm with coarse balls."""
+        """Return coarse balls of hand and object, and index pairs to check: arm with arm, and arm with coarse balls."""
         shape, arm = self.shape, self.shape.arm
         coarse = balls_about(self.carried.at, _COARSE, 0.5 * _COARSE)
         group = arm.chain.link_group
@@ -248,7 +249,7 @@ class Mover:
         return balls, carried.at @ rotation[:, tip].swapaxes(1, 2) + place[:, None, tip]
 
     def placed(self, q: Joints) -> tuple[Points, Points]:
-        """Return the centres of the arm's balls and of the carried balls, base frame [m]."""
+        """Return the collision balls' centres: of the arm, and of hand and held object, base frame [m]."""
         balls, carried = self._placed(q[None], self.carried)
         return balls[0], carried[0]
 
@@ -257,9 +258,9 @@ class Mover:
         return float(self.shape.links(q[None])[1][0, self.shape.arm.tip, 2])
 
     def clearances(self, q: Path) -> Float[np.ndarray, "rows balls"]:
-        """Return distances of the checked balls to obstacles, then distances between own balls [m].
+        """Return distances of the robot's balls to obstacles, then distances between pairs of these balls [m].
 
-        The margin is added to the latter, so that own balls may come close but not overlap.
+        The distances of pairs include `margin`, because two balls of the robot may come close, but not overlap.
         """
         shape = self.shape
         coarse, pairs, with_carried = self._own
@@ -278,15 +279,15 @@ class Mover:
         return np.concatenate(parts, 1)
 
     def arm_clearances(self, q: Path) -> Float[np.ndarray, "rows balls"]:
-        """Return the distance of the arm's balls, without the carried ones, to floor, boxes and points seen [m]."""
+        """Return the distances of the arm's balls (not of hand and object) to floor, boxes and points seen [m]."""
         return self.clearances(q)[:, : int(self.shape.beyond_shoulder.sum())]
 
     def allowed(self, ends: Path) -> Float[np.ndarray, "balls"]:
-        """Return the distance each ball must keep [m]: the margin, or less if it is nearer at one of the ends."""
+        """Return the distance that each ball must keep [m]: the margin, or less if it is nearer at one of `ends`."""
         return np.minimum(self.margin, self.clearances(ends).min(0) - 1e-3)
 
     def clear(self, path: Path, allowed: Float[np.ndarray, "balls"]) -> bool:
-        """Return True if straight lines in joint space between rows keep the allowed distances [m]."""
+        """Return True if straight lines in joint space between the rows of `path` keep the allowed distances [m]."""
         return bool((self.clearances(dense(path)) >= allowed).all())
 
 
@@ -303,21 +304,20 @@ def dense(path: Path, step: float = _STEP) -> Path:
     return np.concatenate([*parts, path[-1:]])
 
 
-# Deepest penetration allowed at the end of a motion [m]: of the whole robot, because the grid is as coarse as a cell,
-# and of the arm alone, because its capsules are larger than its links.
+# Deepest penetration allowed at a motion's goal [m]. `_DEEPEST` is for the whole robot, because the grid is coarse.
+# `ARM_DEEPEST` is for the arm alone, because its capsules are larger than its links.
 _DEEPEST, ARM_DEEPEST = -0.02, -0.01
 
-
-# Most checks of postures and straight lines in a search, and then to shorten its path. Counts, so that a busy machine
-# changes nothing.
+# Greatest number of checks of postures and straight lines to find a path, and then to shorten the path. Limits of time
+# would give other paths on a busy machine.
 _CHECKS, _SHORTENING = 3000, 150
 
 
 def find_path(mover: Mover, start: Joints, goal: Joints, checks: int = _CHECKS) -> Path:
-    """Return waypoints from one posture to another. Straight lines between them are collision-free.
+    """Return waypoints from one posture to another. Straight lines between the waypoints are collision-free.
 
     Raises:
-        NoMotionError: the goal is in collision, or `checks` of postures and straight lines found no path.
+        NoMotionError: the goal is in collision, or no path was found with `checks` collision checks.
     """
     ends = np.stack([start, goal])
     # Only the goal is checked. The arm is already at the start, even if it touches something there.
@@ -394,7 +394,7 @@ def _planned(mover: Mover, start: Joints, goal: Joints, allowed: np.ndarray, che
 
 
 def _rounded(mover: Mover, path: Path, allowed: np.ndarray) -> Path:
-    """Return the path with its corners cut twice (Chaikin), or the path itself if that would collide."""
+    """Return the path with its corners cut twice (Chaikin), or the path itself if the cut path collides."""
     smooth = path
     for _ in range(2):
         inner = [row for a, b in pairwise(smooth) for row in (0.75 * a + 0.25 * b, 0.25 * a + 0.75 * b)]
@@ -407,7 +407,7 @@ class Speeds:
     """Speed limits of an arm motion.
 
     Attributes:
-        share: fraction of the arm's joint speed limits.
+        share: fraction of the arm's joint speed limits that the motion may use.
         acceleration: greatest joint acceleration [rad/s²].
     """
 
@@ -420,13 +420,13 @@ _PERIOD = 0.02
 
 
 def timed(arm: Arm, path: Path, speeds: Speeds) -> JointMotion:
-    """Return the fastest motion from rest to rest along a path within the limits. Raises NoMotionError: none exists."""
+    """Return the fastest motion from rest to rest along a path within the limits. Raises NoMotionError: none found."""
     import toppra
     from toppra.algorithm import TOPPRA
     from toppra.constraint import JointAccelerationConstraint, JointVelocityConstraint
 
     rows = dense(path)
-    # Repeated rows have no direction.
+    # Drop repeated rows, because the path has no direction there.
     rows = rows[np.r_[True, np.abs(np.diff(rows, axis=0)).max(1) > 1e-6]]
     if len(rows) < 2:
         return JointMotion(arm.joint_names, np.array([_PERIOD]), path[-1:], np.zeros_like(path[-1:]))
@@ -442,7 +442,7 @@ def timed(arm: Arm, path: Path, speeds: Speeds) -> JointMotion:
         limits, toppra.SplineInterpolator(along, rows), parametrizer="ParametrizeConstAccel"
     ).compute_trajectory()
     if trajectory is None:
-        raise NoMotionError(f"motion: toppra found no timing for a path of {len(rows)} rows of {arm.name}")
+        raise NoMotionError(f"motion: toppra cannot time a path of {len(rows)} postures of {arm.name}")
     times = np.linspace(0.0, trajectory.duration, max(2, 1 + int(np.ceil(trajectory.duration / _PERIOD))))
     # The spline may exceed a limit that the path touches.
     rows = np.clip(trajectory(times)[1:], arm.lower, arm.upper)

@@ -1,7 +1,7 @@
 """Bin picking loop: take an image, ask graspd for a grasp, carry the object to the other bin, until the bin is empty.
 
-Use it as a template. Each behaviour is one method of `Picker`. Every wait has a timeout. The picker uses only joint
-readings and depth images, so it drives a real cell if given another `Robot`. When `cancelled` returns True, the arm
+Use this module as a template. Each behaviour is one method of `Picker`. Every wait has a timeout. The picker uses only
+joint readings and depth images. With another `Robot` it drives a real cell. When `cancelled` returns True, the arm
 stops and the hand keeps its posture.
 """
 
@@ -67,9 +67,9 @@ class Attempt:
         place: centre of the object's points, base frame [m].
         verified: True if graspd verified the grasp.
         probability: graspd's success probability. None if graspd gave none.
-        tries: earlier failures at this object.
+        tries: number of earlier failures at this object.
         graspd_seconds: wall-clock time from the image to the grasp [s].
-        closing_seconds: robot time from the image to the closed hand, without graspd's planning [s].
+        closing_seconds: robot time from the image to the closed hand [s]. Simulated time stops while graspd plans.
         seconds: robot time of the whole attempt [s].
         things: number of objects seen before the attempt.
     """
@@ -141,7 +141,7 @@ class Picker:
         self._pace, self._cancelled = pace or Pace(), cancelled
         self._failures: list[Failure] = []
         self._picked = 0
-        # Joint values last sent to the hand. An object keeps a squeezing hand away from them.
+        # Joint targets last sent to the hand. A squeezing hand does not reach its targets, because the object stops it.
         self._sent = hand.open_posture
         # Boxes of objects in the place bin, which the camera hardly sees.
         self._dropped: list[Box] = []
@@ -153,7 +153,7 @@ class Picker:
 
         Raises:
             Cancelled: the caller cancelled.
-            MotionAborted: the arm cannot return to `start`, where it does not occlude the camera.
+            MotionAborted, NoMotionError: the arm cannot return to `start`, where it does not occlude the camera.
         """
         attempts = 0
         while attempts < most:
@@ -176,7 +176,7 @@ class Picker:
         self.why_ended = f"{most} attempts"
 
     def attempt(self, offer: Offer, world: SeenWorld, began: float, number: int = 1) -> Attempt:
-        """Carry one object to the place bin and return the outcome. `began` is robot time at the image [s]."""
+        """Carry one object to the place bin and return the outcome. `began` is the image's robot time [s]."""
         taking: _Taking | None = None
         try:
             assert offer.grasp is not None
@@ -244,7 +244,7 @@ class Picker:
             told = f"penetrates an obstacle by {1e3 * depth:.0f} mm on the grasp's path"
             raise NoMotionError(f"motion: {self._arm.name} {told}; valid: a path without collision")
         goal = taking.execution.arm[0]
-        # Come straight down as far as that is collision-free. The planner finds the rest.
+        # Approach straight down as far as the line is collision-free. The planner finds the rest of the path.
         above = straight(mover, goal, np.array([0.0, 0.0, 0.12]))[::-1]
         path = find_path(mover, self._arm_now(), above[0])
         self._follow_arm(np.concatenate([path, above[1:]]), self._pace.free)
@@ -268,7 +268,7 @@ class Picker:
         self._follow_gate(taking.execution, "lifted")
 
     def carry(self, taking: _Taking) -> str:
-        """Carry the object above the place bin. Return why it was lost, or an empty string if it is still held."""
+        """Carry the object above the place bin. Return why the object was lost, or "" if the hand still holds it."""
         hold, here = taking.hold, self._arm_now()
         assert hold is not None
         thing = self._held_now(taking, here)
@@ -301,7 +301,7 @@ class Picker:
         return lost or still_holds(hold, self._hand, self._robot.joints()).reason
 
     def let_go(self, taking: _Taking) -> None:
-        """Open the hand slowly."""
+        """Open the hand to the pregrasp and store a box where the object was released."""
         self._move_hand(taking.execution.hand[0])
         self._wait(self._pace.settle)
         self._picked += 1
@@ -318,7 +318,7 @@ class Picker:
             self._stop_if_cancelled()
 
     def _learn(self, attempt: Attempt, offer: Offer) -> None:
-        """Store a failed grasp. After a success forget objects without a grasp, because one may be free now."""
+        """Store a failed grasp. After a success, retry objects without a grasp, because they may be reachable now."""
         if attempt.ending is Ending.PICKED:
             self._failures = [failure for failure in self._failures if failure.grasp is not None]
         elif offer.grasp is not None:
@@ -329,7 +329,7 @@ class Picker:
 
     @property
     def _known(self) -> tuple[Box, ...]:
-        """Known solids of the cell and boxes of released objects. The camera need not see them."""
+        """Obstacles that the camera may not see: walls of the bins, and boxes of released objects."""
         return (*self._layout.solids[1:], *self._dropped)
 
     def _mover(self, world: SeenWorld, fingers: np.ndarray | None = None) -> Mover:
@@ -365,7 +365,7 @@ class Picker:
             self._follow(timed(self._arm, path, speeds), stop)
 
     def _follow_gate(self, execution: Execution, gate: str) -> None:
-        """Execute the grasp's trajectory from the gate before `gate` to `gate`, a point where all joints rest."""
+        """Execute the grasp's trajectory from the previous gate to `gate`. All joints rest at gates."""
         rows = execution.rows_to(gate)
         times = execution.times[rows] - execution.times[rows.start]
         positions = np.concatenate([execution.arm[rows], execution.hand[rows]], 1)[1:]

@@ -1,6 +1,6 @@
 """Ground truth of a simulated cell: where objects are, what the hand holds, and the robot's contact forces.
 
-The picker never uses it.
+The picker never uses this module.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ _LOST = -0.1
 _TOUCH = 0.05
 # A greater normal force counts as a hard collision [N].
 HARD = 50.0
-# Normal force [N] of each touching pair. A key holds a number of `PARTS`, and a number of `PARTS` or of an object.
+# Normal force [N] of each touching pair. A key has the numbers of both, from `PARTS` or `THING` + index of an object.
 Forces = dict[tuple[int, int], float]
 
 
@@ -32,7 +32,7 @@ class Report:
         time: simulated time [s].
         places: place of each object by name: `pick bin`, `place bin`, `table` or `lost`.
         in_hand: name of the object in the hand. Empty if the hand holds none.
-        hardest: greatest force of each pair since the last `clear` [N], by names such as `hand on pear 0`.
+        hardest: peak force of each touching pair since the last `clear` [N], by names such as `hand on pear 0`.
     """
 
     time: float
@@ -41,7 +41,7 @@ class Report:
     hardest: Mapping[str, float]
 
     def hard(self, target: str = "") -> dict[str, float]:
-        """Return the forces above `HARD` by pair [N], except that of the hand on the object `target`."""
+        """Return the peak forces above `HARD` by pair [N], without the force of the hand on the object `target`."""
         return {pair: force for pair, force in self.hardest.items() if force > HARD and pair != f"hand on {target}"}
 
 
@@ -75,7 +75,7 @@ class Referee:
 
 
 def robot_forces(world: CellWorld, data: Any) -> Forces:
-    """Return the summed normal force of each pair of arm or hand with another body [N]."""
+    """Return the normal forces of arm and hand on table, bins and objects, summed for each pair [N]."""
     return {(a, b): force for (a, b), force in _pair_forces(world, data).items() if a in (ARM, HAND) and b >= TABLE}
 
 
@@ -104,9 +104,9 @@ def place_of(world: CellWorld, data: Any, index: int) -> str:
 
 
 def thing_in_hand(world: CellWorld, data: Any) -> int | None:
-    """Return the index of the held object. None if there is none.
+    """Return the index of the held object. None if no object is held.
 
-    The hand presses on a held object, and table and bins do not touch it. Of several, take the one pressed hardest.
+    An object is held if the hand presses on it, and it touches no table or bin. Of several, the hardest pressed counts.
     """
     forces = _pair_forces(world, data)
     pressed = {b - THING: force for (a, b), force in forces.items() if a == HAND and b >= THING and force > _TOUCH}

@@ -1,6 +1,6 @@
 """Robot interface of the picker: joint readings, depth images and motions, simulated or over ROS.
 
-The base frame is that of the arm's base link, z up. The table's top is the plane z = 0.
+The base frame is the frame of the arm's base link, z up. The table's top is the plane z = 0.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ from graspd_core.errors import ConfigError, GraspdError
 
 
 class MotionAborted(GraspdError):
-    """A motion did not end as commanded. If a joint was off, the message names joint, error and tolerance."""
+    """A motion did not end as commanded. If a joint left its tolerance, the message names joint, error, tolerance."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -62,7 +62,7 @@ class DepthView:
 class JointMotion:
     """Timed trajectory of the joints of the arm, the hand, or both.
 
-    If a tolerance is None, the controller's default applies. A hand has no default, because objects stop its fingers.
+    If a tolerance is None, the controller's default applies. Hand controllers allow any error: objects stop fingers.
 
     Attributes:
         names: joint names.
@@ -70,7 +70,7 @@ class JointMotion:
         positions: joint positions, one row per waypoint [rad] or [m].
         velocities: joint velocities, one row per waypoint [rad/s] or [m/s]. If None, waypoints are joined linearly.
         path_tolerance: greatest joint error during the motion, for all or for each joint [rad] or [m].
-        goal_tolerance: greatest joint error at the end, for all or for each joint [rad] or [m].
+        goal_tolerance: greatest joint error at the end of the motion, for all or for each joint [rad] or [m].
         goal_time: time allowed after the last waypoint to reach the goal [s]. None takes the controller's default.
     """
 
@@ -110,7 +110,7 @@ class JointMotion:
     def at(self, time: float, start: Float[np.ndarray, "joints"]) -> Float[np.ndarray, "joints"]:
         """Return the joint targets at `time` [s] if the motion begins with the targets `start`.
 
-        Interpolate as ros2_control does: cubic if the waypoints have velocities, otherwise linear.
+        Like ros2_control, interpolate cubically if the waypoints have velocities, and linearly if not.
         """
         times, positions, velocities = self._with_start(start)
         last = len(times) - 1
@@ -123,7 +123,7 @@ class JointMotion:
         a = (time - times[after - 1]) / span
         if velocities is None:
             return (1 - a) * positions[after - 1] + a * positions[after]
-        # The cubic Hermite basis.
+        # Values of the cubic Hermite basis.
         first, second = (1 + 2 * a) * (1 - a) ** 2, a**2 * (3 - 2 * a)
         rise, fall = a * (1 - a) ** 2 * span, -(a**2) * (1 - a) * span
         return (

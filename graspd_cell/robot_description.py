@@ -46,7 +46,7 @@ def robot_description(arm: Arm, hand: HandModel) -> str:
             root.append(element)
     mount, turn = ET.SubElement(root, "joint", name=f"{HAND_PREFIX}mount", type="fixed"), tip_hand(arm, hand)
     with warnings.catch_warnings():
-        # In gimbal lock the angles are not unique. Any set is correct.
+        # SciPy warns if the angles are not unique (gimbal lock). Any of the solutions is correct.
         warnings.simplefilter("ignore")
         roll, pitch, yaw = Rotation.from_matrix(turn.rotation.numpy()).as_euler("xyz")
     x, y, z = turn.translation.tolist()
@@ -57,7 +57,7 @@ def robot_description(arm: Arm, hand: HandModel) -> str:
 
 
 def frames_of(world: CellWorld, poses: Mapping[str, Pose]) -> list[tuple[str, str, Pose]]:
-    """Return parent, child and `T_parent_child` [m] of each link.
+    """Return parent, child and `T_parent_child` [m] for each link except the arm's base.
 
     Args:
         world: the cell.

@@ -34,7 +34,7 @@ _RESULT = FollowJointTrajectory.Result
 
 
 class RobotSilentError(GraspdError):
-    """A topic or an action server does not answer. The message names it and the timeout."""
+    """A topic or an action server does not answer. The error names topic or server, and the timeout."""
 
 
 @dataclass(frozen=True)
@@ -62,7 +62,7 @@ class RobotTopics:
 
 @dataclass
 class _Heard:
-    """Newest messages. `joints_at` and `image_at` are robot time, `heard_at` is monotonic time [s]."""
+    """Newest messages. `joints_at`, `image_at`: stamps. `heard_at`: monotonic time of the last joint state [s]."""
 
     joints: dict[str, tuple[float, float]] = field(default_factory=dict)
     joints_at: float = 0.0
@@ -116,7 +116,7 @@ class RosRobot:
 
     def look(self) -> DepthView:
         """Return a depth image that was taken after this call. See `Robot`."""
-        # Joint states have stamps of the same clock as the images.
+        # Stamps of joint states and images come from the same clock.
         begun = self.joints().time
         topics, heard = self._topics, self._heard
         self._until(lambda: heard.info is not None, lambda: topics.camera_info)
@@ -166,7 +166,7 @@ class RosRobot:
         self._until(lambda: self._heard.joints_at >= end, lambda: self._topics.joint_states, extra=10 * seconds)
 
     def _parts(self, motion: JointMotion) -> list[tuple[ActionClient, JointMotion]]:
-        """Return the controllers of a motion's joints, each with its part. Raises MotionAborted: not all are driven."""
+        """Return each controller with its part of the motion. Raises MotionAborted: a joint has no controller."""
         parts = []
         for client, names in zip(self._clients, self._names, strict=True):
             if set(names) <= set(motion.names):
@@ -185,7 +185,7 @@ class RosRobot:
         return self._begun(client.send_goal_async, goal_of(motion))
 
     def _wait_for(self, future: Any, end: float, stop: Callable[[], bool], watched: Any = ()) -> None:
-        """Wait for `future`. Raises MotionAborted: stopped, robot time over `end` [s], silence, `watched` failed."""
+        """Wait for `future`. Raises MotionAborted: stopped, later than `end` [s], no joint state, `watched` failed."""
         while not future.done() or watched:
             if stop():
                 raise MotionAborted("the motion was stopped")
@@ -197,16 +197,16 @@ class RosRobot:
             if self._heard.joints_at > end:
                 raise MotionAborted("the motion took longer than its timeout")
             if time.monotonic() - self._heard.heard_at > self._topics.patience:
-                raise MotionAborted(f"nothing came on {self._topics.joint_states} for {self._topics.patience:g} s")
+                raise MotionAborted(f"no message came on {self._topics.joint_states} for {self._topics.patience:g} s")
             time.sleep(_POLL)
 
     def _begun(self, request: Callable[..., Any], *arguments: Any) -> Any:
         """Return the future of a request to a controller. The thread that receives the answer sends the request.
 
-        If another thread sends it, rclpy 7.1 fails when the answer comes first.
+        If another thread sends the request, rclpy 7.1 fails when the answer arrives early.
         """
         task = self._executor.create_task(request, *arguments)
-        self._until(task.done, lambda: "the turn of a request to a controller")
+        self._until(task.done, lambda: "the executor's turn to send a request to a controller")
         return task.result()
 
     def _cancel(self, handles: list[Any]) -> None:
@@ -256,4 +256,6 @@ def goal_of(motion: JointMotion) -> FollowJointTrajectory.Goal:
         if allowed is not None:
             widths = zip(motion.names, np.broadcast_to(allowed, len(motion.names)).tolist(), strict=True)
             setattr(goal, field_, [JointTolerance(name=name, position=width) for name, width in widths])
+    # A duration of zero takes the controller's default.
+    goal.goal_time_tolerance = duration_of(motion.goal_time or 0.0)
     return goal

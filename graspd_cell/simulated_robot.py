@@ -53,7 +53,7 @@ class SimulatedRobot:
         self.hand = TrajectoryController(self._limits(slice(count, None)), Tolerances(), world.start[count:])
         self._referee = Referee(world)
         self._solids = _visible_solids(world)
-        # Callbacks after every step that the referee observes, for films and pages.
+        # Films and pages add callbacks here. They run after every step that the referee observes.
         self.watchers: list[Callable[[SimulatedRobot], None]] = []
 
     @property
@@ -117,7 +117,7 @@ class SimulatedRobot:
             if not reason and stop():
                 reason = "the motion was stopped"
             elif not reason and self.time >= end:
-                reason = f"the motion took more than its {timeout:g} s"
+                reason = f"the motion took longer than its timeout of {timeout:g} s"
         for controller, _ in parts:
             self.hold(controller)
         self.wait(_BRAKING)
@@ -130,7 +130,7 @@ class SimulatedRobot:
             self.step(min(_LOOK_EVERY, steps - done))
 
     def parts_of(self, motion: JointMotion) -> list[tuple[TrajectoryController, JointMotion]]:
-        """Return the controllers of a motion, each with its part. Unknown joints go to the arm controller and fail."""
+        """Return each controller with its part of the motion. The arm controller rejects unknown joints."""
         hand = tuple(name for name in motion.names if name in self.hand.limits.names)
         arm = tuple(name for name in motion.names if name not in hand)
         if not hand or not arm:
@@ -138,7 +138,7 @@ class SimulatedRobot:
         return [(self.arm, motion.part(arm)), (self.hand, motion.part(hand))]
 
     def state_of(self, controller: TrajectoryController) -> tuple[MotionState, str]:
-        """Return the state of a controller's motion, and the reason if it must be aborted."""
+        """Return the state of a controller's motion, and the reason if the motion failed."""
         return controller.state(self.time, self._positions(controller))
 
     def hold(self, controller: TrajectoryController) -> None:
@@ -146,14 +146,14 @@ class SimulatedRobot:
         controller.hold(self._positions(controller))
 
     def step(self, steps: int = 1) -> None:
-        """Simulate `steps` steps. The referee observes the last one."""
+        """Simulate `steps` steps. The referee and the `watchers` see the state after the last step."""
         import mujoco
 
         world, data = self.world, self._data
         timestep, count = world.model.opt.timestep, len(self.arm.limits.names)
         for _ in range(steps):
             targets, speeds = self.arm.advance(data.time + timestep, timestep)
-            # A motor's damping would make the arm lag behind its targets.
+            # The speed term cancels the motors' damping. Otherwise the arm would lag behind its targets.
             data.ctrl[world.actuators[:count]] = targets + DAMPING_TIME * speeds
             data.ctrl[world.actuators[count:]] = self.hand.advance(data.time + timestep, timestep)[0]
             mujoco.mj_step(world.model, data)
@@ -197,7 +197,7 @@ class SimulatedRobot:
 
 
 def _visible_solids(world: CellWorld) -> list[tuple[str, int, TriangleMesh]]:
-    """Return name, body id (-1 if fixed) and surface in the body's frame [m] of robot, table and bins."""
+    """Return name, body id (-1 if fixed) and surface [m] in the body's frame of each link, table and bin wall."""
     fixed = [(solid.name, -1, box_mesh(solid)) for solid in world.layout.solids]
     robot: Sequence[tuple[str, HandModel, Any]] = (
         ("arm", world.arm.chain, world.arm_bodies),

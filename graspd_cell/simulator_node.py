@@ -1,7 +1,7 @@
 """`graspd_cell_simulator`: the simulated cell in real time, with the ROS interfaces of a real cell's drivers.
 
-It publishes /joint_states, /tf, /tf_static, /robot_description, /camera/depth/image_raw and camera_info. It serves
-FollowJointTrajectory for arm and hand, as ros2_control does. Only /cell/referee carries the ground truth.
+It publishes /joint_states, /tf, /tf_static, /robot_description, /camera/depth/image_raw and camera_info. Like
+ros2_control, it serves FollowJointTrajectory for arm and hand. Only /cell/referee carries the ground truth.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ from graspd_ros.node import Parser, run_command
 
 # Periods of joint states, transforms, referee reports and action feedback [s].
 _JOINTS, _FRAMES, _REFEREE, _FEEDBACK = 0.01, 0.02, 0.2, 0.05
-# If the simulation falls farther behind real time than this, it does not catch up [s].
+# Greatest delay behind real time that the simulation catches up [s].
 _LATE = 0.2
 
 
@@ -40,10 +40,11 @@ def _parse(arguments: list[str]) -> argparse.Namespace:
     )
     parser.add_argument("--arm", default="ur5e_like", metavar="NAME|PATH", help="default: ur5e_like")
     parser.add_argument("--hand", default="allegro_right", metavar="NAME|PATH", help="default: allegro_right")
-    parser.add_argument("--things", nargs="+", default=["family:pear", "family:jar", "family:banana"], metavar="THING")
-    parser.add_argument("--seed", type=int, default=0, help="of how the things fall (default 0)")
+    things = {"nargs": "+", "metavar": "THING", "default": ["family:pear", "family:jar", "family:banana"]}
+    parser.add_argument("--things", **things, help="objects in the bin (default: %(default)s)")
+    parser.add_argument("--seed", type=int, default=0, help="seed of the fall and the camera noise (default 0)")
     parser.add_argument("--clock", action="store_true", help="publish /clock, and stamp with simulated time")
-    parser.add_argument("--speed", type=float, default=1.0, metavar="X", help="times as fast as real time (default 1)")
+    parser.add_argument("--speed", type=float, default=1.0, metavar="X", help="speed, in times real time (default 1)")
     options = parser.parse_args(arguments)
     if not options.speed > 0:
         raise ConfigError(f"speed: {options.speed}; valid: more than zero")
@@ -71,7 +72,7 @@ def _serve(options: argparse.Namespace, stop: threading.Event) -> None:
         try:
             executor.spin()
         except Exception:
-            # The shutdown may interrupt a callback.
+            # Ignore an error after the stop, because the shutdown may interrupt a callback.
             if not stop.is_set():
                 stop.set()
                 raise
@@ -222,7 +223,7 @@ class SimulatorNode:
         return TFMessage(transforms=transforms)
 
     def begin(self, controller: TrajectoryController, motion: JointMotion) -> None:
-        """Start a motion. Raises ConfigError: it names other joints or exceeds a limit."""
+        """Start a motion. Raises ConfigError: the motion has other joints or exceeds a limit."""
         with self._lock:
             controller.begin(motion, self.robot.time)
 
@@ -232,7 +233,7 @@ class SimulatorNode:
             self.robot.hold(controller)
 
     def progress(self, controller: TrajectoryController) -> tuple[MotionState, str, np.ndarray, np.ndarray]:
-        """Return state, reason of an abort, joint targets and joint positions of a controller's motion."""
+        """Return state, reason of a failure, joint targets and joint positions of a controller's motion."""
         with self._lock:
             state, reason = self.robot.state_of(controller)
             positions = self.robot.joints().of(controller.limits.names).positions
@@ -245,7 +246,7 @@ class SimulatorNode:
 
 
 class MotionServer:
-    """FollowJointTrajectory server of one controller. A new goal replaces the running one, which is aborted."""
+    """FollowJointTrajectory server of one controller. A new goal replaces and aborts the running goal."""
 
     def __init__(self, cell: SimulatorNode, name: str, controller: TrajectoryController) -> None:
         from control_msgs.action import FollowJointTrajectory
@@ -300,7 +301,7 @@ class MotionServer:
                 handle.publish_feedback(feedback_of(self._controller.limits.names, targets, positions))
             time.sleep(_JOINTS)
         handle.abort()
-        return result(error_code=result.INVALID_GOAL, error_string="the simulator ends")
+        return result(error_code=result.INVALID_GOAL, error_string="the simulator is shutting down")
 
 
 def feedback_of(names: tuple[str, ...], targets: np.ndarray, positions: np.ndarray) -> Any:
@@ -321,9 +322,9 @@ def motion_of(goal: Any, controller: TrajectoryController) -> JointMotion:
         for index, point in enumerate(points):
             count = len(getattr(point, kind))
             if count != len(names) and (kind == "positions" or count):
-                raise ConfigError(f"point {index} has {count} {kind}; valid: {len(names)}, one a joint")
+                raise ConfigError(f"point {index} has {count} {kind}; valid: {len(names)}, one per joint")
     if goal.multi_dof_trajectory.points:
-        raise ConfigError("multi_dof_trajectory is not served; valid: trajectory")
+        raise ConfigError("multi_dof_trajectory is not supported; valid: trajectory")
     seconds = [point.time_from_start.sec + 1e-9 * point.time_from_start.nanosec for point in points]
     velocities = [point.velocities for point in points if len(point.velocities)]
     if velocities and len(velocities) != len(points):
@@ -341,7 +342,7 @@ def motion_of(goal: Any, controller: TrajectoryController) -> JointMotion:
 
 
 def _tolerances(given: Any, names: tuple[str, ...], usual: float, field: str) -> np.ndarray | None:
-    """Return one tolerance per joint, or None if `given` is empty. 0 means the default, a negative value no limit."""
+    """Return one tolerance per joint, or None if `given` is empty. 0 means the default, below 0 no limit."""
     if not given:
         return None
     allowed = np.full(len(names), usual)

@@ -61,7 +61,7 @@ def family_sources(seeds: Sequence[int], families: Sequence[str] = tuple(FAMILIE
 
 
 def find_sources(names: Sequence[str]) -> tuple[ThingSource, ...]:
-    """Return the object sources of names: `family:NAME[:SEED]`, `shape:NAME`, or a folder.
+    """Return the object sources that `names` give: `family:NAME[:SEED]`, `shape:NAME`, or a folder.
 
     Raises ConfigError: a name is unknown, or a folder lacks meshes or masses.
     """

@@ -1,8 +1,8 @@
 """MuJoCo model of the cell: an arm with link masses, a hand, table, bins, and objects in a bin.
 
 Contacts, friction, solver and the hand's motors are the same as in the trials (graspd_core/verify/world.py). Only the
-arm and the surrounding solids differ. The arm's motors hold stiff positions within their effort limits. They compensate
-the weight of arm and hand, as real controllers do, but not the weight of the held object.
+arm and the surrounding solids differ. The arm's motors are stiff position servos with effort limits. Like real
+controllers, the motors compensate the weight of arm and hand, but not the weight of the held object.
 """
 
 from __future__ import annotations
@@ -85,7 +85,7 @@ class CellWorld:
 
     @property
     def start(self) -> Float[np.ndarray, "joints"]:
-        """Joint values at the start [rad] or [m]: the arm out of the camera's view, the hand open."""
+        """Joint values of the start posture [rad] or [m]: the arm out of the camera's view, the hand open."""
         return np.concatenate([self.layout.start, self.hand.open_posture])
 
 
@@ -218,7 +218,7 @@ def pile_cell(
     """Compile a cell with objects dropped into the pick bin. The same seed gives the same poses."""
     layout, things = layout_of(arm), [load_thing(source) for source in sources]
     poses = []
-    # The fence keeps objects from rolling into the bin's walls.
+    # The fence stays until the objects rest, so that no object rolls into the bin's walls.
     for body in dropped([thing.model for thing in things], seed, layout.pick.half - _GAP, stays=True):
         pose = body.pose.copy()
         pose[:2, 3] += layout.pick.center
@@ -236,7 +236,7 @@ def put_robot(world: CellWorld, data: Any, values: Float[np.ndarray, "joints"]) 
 
 
 def _touching(world: CellWorld) -> set[tuple[str, str]]:
-    """Return pairs of an arm link and another link whose collision shapes, being too wide, overlap at the start."""
+    """Return pairs of an arm link and a robot link whose collision shapes overlap in the start posture."""
     import mujoco
 
     data = mujoco.MjData(world.model)

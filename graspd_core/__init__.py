@@ -1,4 +1,4 @@
-"""Verified grasps for multi-fingered hands. This package exports every name that a user of the library needs.
+"""Plan verified grasps for multi-fingered hands. This package exports every name that a user of the library needs.
 
     from graspd_core import load_hand, load_scene, plan_grasps
 
@@ -151,7 +151,7 @@ def __dir__() -> list[str]:
 
 
 class _MovedModules:
-    """Import finder that names the new path of a moved module. As the last finder, it sees only failed imports."""
+    """Import finder whose error names the new path of a moved module. Python asks it only after all other finders."""
 
     def find_spec(self, fullname: str, path: Any = None, target: Any = None) -> ModuleSpec | None:
         if not fullname.startswith(f"{__name__}."):
@@ -161,7 +161,7 @@ class _MovedModules:
             raise ImportError(_moved_to(fullname, moved[fullname]), name=fullname)
         if not any(old.startswith(f"{fullname}.") for old in moved):
             return None
-        # The old folder no longer exists. Python imports the parent package first, so return an empty package for it.
+        # Python first imports the parent package of a moved module. Its folder is gone, so return an empty package.
         return ModuleSpec(fullname, cast(Any, self), is_package=True)
 
     def create_module(self, spec: ModuleSpec) -> None:

@@ -1,7 +1,7 @@
 """`graspd doctor`: check the installation and name the remedy for each failure.
 
-Each library is imported in a subprocess, because a library that aborts on import would end the report. The ROS check
-also runs in a subprocess, so that rclpy is never loaded here.
+Each library is imported in a subprocess, because a library that aborts at import would end the report. The ROS check
+also runs in a subprocess, so that this process never loads rclpy.
 """
 
 from __future__ import annotations
@@ -18,12 +18,12 @@ from typing import Any
 
 from graspd_core.cli.output import answer, waiting
 
-PROBE_TIMEOUT = 60.0  # Seconds. A cold disk takes several for torch or Open3D.
+PROBE_TIMEOUT = 60.0  # Seconds. Importing torch or Open3D from a cold disk takes several seconds.
 _SETUP = "run `make setup` in the checkout, or pip install graspd again"
 _CLOUDS = "only clouds need it: pip install 'graspd[clouds]'"
 # Shared libraries that Open3D loads, and the packages that provide them.
 _SYSTEM_LIBRARIES = {"libusb-1.0.so.0": "libusb-1.0-0", "libGL.so.1": "libgl1", "libgomp.so.1": "libgomp1"}
-# distribution: module
+# Name of each library's distribution, and name of the module to import.
 _LIBRARIES = {
     "numpy": "numpy",
     "scipy": "scipy",
@@ -65,7 +65,7 @@ found = kernel()
 assert found.library, found.reason
 print(f"{found.name}, {found.library.graspd_lanes()} floats at once")
 """
-# Only the ROS package knows how to check ROS.
+# graspd_ros checks ROS, because graspd_core must not import rclpy.
 _ROS = "from graspd_ros.node import probe; print(probe())"
 _HANDS = """
 import torch
@@ -77,9 +77,9 @@ print(", ".join(f"{name} ({len(load_hand(name).joint_names)} joints)" for name i
 
 @dataclass(frozen=True)
 class Check:
-    """The result of one check of a library or part, and whether graspd needs it.
+    """The result of one check of a library or part. `needed` says whether graspd needs the library or part.
 
-    `detail` is a version or a number, after a failure the error in one line. `hint` says what to do after a failure.
+    `detail` is a version or a number. After a failure it is the error in one line, and `hint` says what to do.
     """
 
     name: str
@@ -90,7 +90,7 @@ class Check:
 
 
 def run_checks() -> list[Check]:
-    """Check all dependencies of graspd. This takes a few seconds."""
+    """Check the installation and all dependencies of graspd. This takes a few seconds."""
     probes = [
         ("torch", _TORCH, _SETUP, True),
         ("mujoco", _MUJOCO, _SETUP, True),
@@ -107,7 +107,7 @@ def run_checks() -> list[Check]:
 
 
 def try_code(name: str, code: str, hint: str, needed: bool) -> Check:
-    """Run Python code in a subprocess. The check fails if the code fails. The last output line becomes the detail."""
+    """Run Python code in a subprocess. If the code fails, the check fails. The last output line is the detail."""
     try:
         done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=PROBE_TIMEOUT)
     except subprocess.TimeoutExpired:
@@ -118,7 +118,7 @@ def try_code(name: str, code: str, hint: str, needed: bool) -> Check:
 
 
 def format_checks(checks: Iterable[Check]) -> str:
-    """Return the report as text. Each line has verdict, name and detail. A hint follows each failure."""
+    """Return the report as text. Each line has verdict, name and detail. The hint follows after each failure."""
     lines = []
     for check in checks:
         verdict = "ok  " if check.ok else "FAIL" if check.needed else "-   "
@@ -176,6 +176,6 @@ def _check_cache() -> Check:
         with tempfile.TemporaryFile(dir=path.parent):
             pass
     except OSError as error:
-        hint = "make it writable, set XDG_CACHE_HOME, or GRASPD_CACHE=off; without a cache every start is slow"
+        hint = "make the directory writable, or set XDG_CACHE_HOME or GRASPD_CACHE=off (then every start is slow)"
         return Check("cache", False, str(error), hint, needed=False)
     return Check("cache", True, f"{path.parent} is writable")

@@ -1,10 +1,10 @@
-"""Exceptions for bad input. A run that finds no grasp reports an `Outcome` and raises nothing."""
+"""Define the exceptions for bad input. Planning that finds no grasp raises nothing: its result has an `Outcome`."""
 
 import difflib
 import reprlib
 from collections.abc import Iterable
 
-# Least similarity, from 0 to 1, at which a valid name is suggested for an unknown one.
+# Least similarity, from 0 to 1, of an unknown name to the valid name that is suggested.
 _NEAR = 0.65
 _SHORT = reprlib.Repr()
 _SHORT.maxlevel, _SHORT.maxlist, _SHORT.maxtuple, _SHORT.maxdict, _SHORT.maxset = 3, 6, 6, 6, 6
@@ -12,29 +12,29 @@ _SHORT.maxstring = _SHORT.maxother = 120
 
 
 def short_repr(value: object) -> str:
-    """Return a short text of any value, for messages. The text of a huge value is cut."""
+    """Return the text of any value for a message. The text of a large value is shortened."""
     try:
         return _SHORT.repr(value)
-    # An integer of more than 4300 digits has no decimal form.
+    # Python refuses to print an integer of more than 4300 digits.
     except ValueError:
         return f"a huge {type(value).__name__}"
 
 
 def first_line(error: BaseException) -> str:
-    """Return the first line of a library's error, at most 200 characters, or the error's type if it has no text."""
+    """Return the first line of an error's text, at most 200 characters. Return the error's type if there is no text."""
     return next(iter(str(error).splitlines()), "")[:200] or type(error).__name__
 
 
 def choices(name: object, valid: Iterable[str], more: str = "") -> str:
-    """Return the hint for an unknown name: the most similar valid name, else all valid names followed by `more`."""
+    """Return a hint for an unknown name: the most similar valid name, or if none is similar, all names and `more`."""
     names = [*valid]
-    # A file may hold any value as a name.
+    # In a file, a name may be any value, not only text.
     near = difflib.get_close_matches(name, names, 1, _NEAR) if isinstance(name, str) else ()
     return f"did you mean {near[0]!r}?" if near else f"valid: {', '.join(names)}{more}"
 
 
 class GraspdError(Exception):
-    """Base class of all graspd errors. The message is one line that names the culprit and the valid values."""
+    """Base class of all graspd errors. The message is one line. It names what is wrong, its value and valid values."""
 
 
 class MeshError(GraspdError):
@@ -46,11 +46,11 @@ class CloudError(GraspdError):
 
 
 class NoObjectError(CloudError):
-    """The views of a scene are usable, but do not show the requested object."""
+    """The clouds of a scene are usable, but do not show the requested object."""
 
 
 class BagError(GraspdError):
-    """A bag cannot be read, or does not contain the requested data."""
+    """A bag, which is a ROS recording, cannot be read or does not contain the requested data."""
 
 
 class HandError(GraspdError):
@@ -62,7 +62,7 @@ class ConfigError(GraspdError):
 
 
 class FormatError(GraspdError):
-    """A grasps file has an unknown format or version."""
+    """A file of grasps, results or records is damaged, or has an unknown format or version."""
 
 
 class TransformError(GraspdError):
@@ -78,16 +78,16 @@ class SimulatorError(GraspdError):
 
 
 class Extra:
-    """Context that reports a missing optional library: `with Extra("clouds"): import open3d`.
+    """Context that imports libraries of a pip extra of graspd: `with Extra("clouds"): import open3d`.
 
-    Raises ConfigError: the library is not installed. The message names the command that installs the extra.
+    Raises ConfigError: a library is not installed. The message has the pip command that installs the extra.
     """
 
     def __init__(self, name: str) -> None:
         self.name = name
 
     def __enter__(self) -> None:
-        """Enter the context. Nothing is set up."""
+        """Do nothing. Python requires this method of a context."""
 
     def __exit__(self, kind: object, error: object, trace: object) -> None:
         if isinstance(error, ModuleNotFoundError):

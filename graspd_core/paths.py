@@ -1,4 +1,4 @@
-"""Locations of graspd's configuration files, in a checkout and in an installation."""
+"""Find graspd's configuration files, in a checkout or in an installation."""
 
 from __future__ import annotations
 

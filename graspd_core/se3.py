@@ -1,4 +1,4 @@
-"""Rigid transforms on torch tensors. `T_a_b` maps coordinates in frame b to frame a. Quaternions are wxyz.
+"""Compute with rigid transforms on torch tensors. `T_a_b` maps coordinates in frame b to frame a. Quaternions are wxyz.
 
 Gradients are exact everywhere except in `safe_norm`, whose gradient at zero is defined as zero.
 """
@@ -86,7 +86,7 @@ def axis_rotation(axis: Float[np.ndarray, "3"], angle: float) -> Float[np.ndarra
 def quaternion_between(
     source: Float[np.ndarray, "3"], target: Float[np.ndarray, "3"], *, around: Float[np.ndarray, "3"]
 ) -> Float[np.ndarray, "4"]:
-    """Return the shortest rotation of one unit vector onto another, wxyz. Opposite vectors turn by π about `around`."""
+    """Return the shortest rotation from `source` to `target`, unit vectors, wxyz. Opposites turn π about `around`."""
     quaternion = np.array([1.0 + source @ target, *np.cross(source, target)])
     length = np.linalg.norm(quaternion)
     return quaternion / length if length > EPSILON else np.array([0.0, *around])
@@ -97,7 +97,7 @@ class SE3:
     """Rigid transforms `T_a_b`, one for each entry of the batch.
 
     Attributes:
-        rotation: `R_a_b`.
+        rotation: rotation `R_a_b` from frame b to frame a.
         translation: origin of frame b in frame a [m].
     """
 
@@ -105,7 +105,7 @@ class SE3:
     translation: Float[Tensor, "*batch 3"]
 
     def __getitem__(self, index: Any) -> SE3:
-        """Return the transforms at an index of the batch: `poses[:, links]`."""
+        """Return the transforms at an index of the batch, e.g. `poses[:, links]`."""
         return SE3(self.rotation[index], self.translation[index])
 
     def apply(self, points: Float[Tensor, "*#batch n 3"]) -> Float[Tensor, "*batch n 3"]:
@@ -117,7 +117,7 @@ class SE3:
         return (points - self.translation[..., None, :]) @ self.rotation
 
     def compose(self, other: SE3) -> SE3:
-        """Return `T_a_c`, the product of this `T_a_b` and `other`, `T_b_c`. The batch of `other` may be larger."""
+        """Return `T_a_c`, the product of `T_a_b` and `other`, which is `T_b_c`. The batch of `other` may be larger."""
         turned = (self.rotation @ other.translation[..., None]).squeeze(-1)
         return SE3(self.rotation @ other.rotation, turned + self.translation)
 
@@ -129,7 +129,7 @@ def random_rotations(count: int, generator: torch.Generator, dtype: torch.dtype)
 
 def aligning_rotation(source: Float[Tensor, "3"], targets: Float[Tensor, "batch 3"]) -> Float[Tensor, "batch 3 3"]:
     """Return rotations that turn the unit vector `source` onto each unit vector in `targets`. The roll is arbitrary."""
-    # Two Householder reflections make a rotation. One maps `source` to `middle`, the other `middle` to the target.
+    # Two Householder reflections make a rotation. The first maps `source` to `middle`, the second to the target.
     helper = torch.eye(3, dtype=targets.dtype)[source.abs().argmin()]
     middle = torch.linalg.cross(source, helper)
     middle = middle / middle.norm()
@@ -142,7 +142,7 @@ def reflection_onto(a: Float[Tensor, "batch 3"], b: Float[Tensor, "batch 3"]) ->
     """Return Householder reflections that swap the unit vectors a and b. If a equals b, a stays fixed."""
     v = a - b
     same = v.norm(dim=-1, keepdim=True) < 1e-9
-    # If a equals b, any mirror plane that contains a is valid.
+    # If a equals b, every mirror plane that contains the vector a leaves it fixed.
     fallback = torch.linalg.cross(a, torch.eye(3, dtype=a.dtype)[a.abs().argmin(-1)])
     v = torch.where(same, fallback, v)
     v = v / v.norm(dim=-1, keepdim=True)

@@ -1,4 +1,4 @@
-"""A buffer of time-stamped transforms (/tf and /tf_static) that needs no ROS node.
+"""Keep time-stamped transforms (/tf and /tf_static) in a buffer, without a ROS node.
 
 `T_a_b` maps coordinates in frame b to frame a. Stamps are integer nanoseconds. Between two samples the position is
 interpolated linearly and the rotation spherically, as in tf2. A lookup before the first or after the last sample raises
@@ -38,7 +38,7 @@ class TransformBuffer:
     """A thread-safe buffer that returns the transform between any two connected frames.
 
     Args:
-        history: samples older than the frame's newest sample by more than this are dropped [ns]. None keeps all.
+        history: time before a frame's newest sample for which samples are kept [ns]. None keeps all samples.
     """
 
     def __init__(self, history: int | None = HISTORY) -> None:
@@ -49,10 +49,10 @@ class TransformBuffer:
     def add(
         self, parent: str, child: str, T_parent_child: Float[np.ndarray, "4 4"], stamp: int = 0, static: bool = False
     ) -> None:
-        """Add the pose of `child` in `parent` at `stamp` [ns]. A static transform holds at all times.
+        """Add the pose of `child` in `parent` at `stamp` [ns]. A static transform is valid at all times.
 
-        A child that gets a new parent, or becomes static, loses its earlier poses. Raises TransformError: a frame has
-        no valid name, the frames form a loop, or the transform is not rigid.
+        If a child gets a new parent, or becomes static or moving, its earlier poses are dropped. Raises TransformError:
+        a frame has no valid name, the frames form a loop, or the transform is not rigid.
         """
         parent, child = _name(parent), _name(child)
         pose = _rigid(T_parent_child, parent, child)
@@ -67,7 +67,7 @@ class TransformBuffer:
             self._insert(link, stamp, pose)
 
     def lookup(self, target: str, source: str, stamp: int | None = None) -> Float[np.ndarray, "4 4"]:
-        """Return `T_target_source` at `stamp` [ns]. Without a stamp, use the newest time known for all frames.
+        """Return `T_target_source` at `stamp` [ns]. None is the newest time that all transforms between them cover.
 
         Raises TransformError: a frame is unknown, the frames are not connected, or the time is outside the known span.
         """
@@ -160,7 +160,7 @@ def _inverse(T_a_b: np.ndarray) -> Float[np.ndarray, "4 4"]:
 
 def _rigid(pose: np.ndarray, parent: str, child: str) -> Float[np.ndarray, "4 4"]:
     turn = pose[:3, :3]
-    # This is checked first, because products of NaN, infinite or huge numbers cause NumPy warnings.
+    # Check the size of the numbers first, because products of NaN, infinite or huge numbers cause NumPy warnings.
     fits = (np.abs(turn) < 2).all() and (np.abs(pose[:3, 3]) <= _FARTHEST).all()
     square = fits and np.abs(turn @ turn.T - np.eye(3)).max() < _RIGID and np.linalg.det(turn) > 0
     if not square:
@@ -169,7 +169,7 @@ def _rigid(pose: np.ndarray, parent: str, child: str) -> Float[np.ndarray, "4 4"
 
 
 def _name(frame: str) -> str:
-    # ROS 1 wrote a slash before names, and old drivers still do.
+    # ROS 1 wrote a slash before frame names, and old drivers still write this slash.
     name = frame.removeprefix("/")
     if not name:
         raise TransformError("transform: a frame has no name")

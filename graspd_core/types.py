@@ -1,4 +1,4 @@
-"""Immutable value types that the packages exchange.
+"""Define the immutable value types that the packages exchange.
 
 Units are metres, radians, newtons and kilograms. A transform `T_a_b` maps coordinates in frame b to frame a.
 Quaternions are wxyz. The object frame is the frame of the mesh as loaded (after scaling).
@@ -68,7 +68,7 @@ class Plane:
     Attributes:
         normal: unit normal n, pointing away from the solid side.
         offset: n·x of every point x on the plane [m].
-        margin: least height of the hand above the plane [m]. It is the noise of the camera that saw the plane.
+        margin: least height of the hand above the plane [m], equal to the noise of the camera that saw the plane.
     """
 
     normal: Float[np.ndarray, "3"]
@@ -84,8 +84,8 @@ class Contact:
         link: name of the hand link.
         position: contact point on the object's surface, object frame [m].
         normal: outward unit normal of the object at the contact, object frame.
-        force: planned force of the link on the object when the hand squeezes, object frame [N]. Joints at their effort
-            limits give less. None if unknown.
+        force: planned force of the link on the object when the hand squeezes, object frame [N]. If joints reach their
+            effort limits, the real force is smaller. None if unknown.
     """
 
     link: str
@@ -105,9 +105,9 @@ class TrialResult:
     Attributes:
         name: name of the trial.
         passed: whether the object stayed within the limits.
-        displacement: greatest distance of the object's centre of mass from its expected position [m]. It is measured
-            until the trial ends, which may be before the full length (`early_stop`).
-        rotation: greatest rotation of the object from its start [rad], measured until the trial ends.
+        displacement: greatest distance of the object's centre of mass from its start until the trial ends [m]. In a
+            lift trial, the start rises with the hand. A trial may end early (`early_stop`).
+        rotation: greatest rotation of the object from its start until the trial ends [rad].
         reason: why the trial failed. Empty if it passed.
     """
 
@@ -184,13 +184,13 @@ class Grasp:
         grasp: posture in which the fingers just touch the object.
         squeeze: position targets that press the fingers on the object.
         contacts: one contact per touching link.
-        score: the optimiser's score, larger is better. It ranks grasps before any trial.
+        score: the optimiser's score. A larger score is better. The score ranks grasps before any trial.
         metrics: static quality metrics. None until they are measured.
-        trials: trial results in the order of the trials. The first failure ends the trials.
+        trials: trial results in the order of the trials. No trial runs after a failed trial.
         probability: probability that the grasp holds on the true object (docs/clouds.md). None without camera data.
         arm: arm path to the grasp (docs/arms.md). None without an arm.
         arrival: collision-free open posture at the grasp, for planners that close the fingers only after arriving. None
-            if it was not computed or none was found.
+            if no such posture was computed or found.
     """
 
     pregrasp: Posture
@@ -214,7 +214,7 @@ class Grasp:
 
     @property
     def usable(self) -> bool:
-        """Whether the grasp is verified, or has a contact if no trial was requested."""
+        """Whether the grasp is verified. If it has no trials, whether it has a contact."""
         return self.verdict is Verdict.VERIFIED or bool(not self.trials and self.contacts)
 
     @property
@@ -248,7 +248,7 @@ class Progress:
 
 @dataclass(frozen=True)
 class Snapshot:
-    """Hand poses that a run is working on, object frame: all starts while optimising, the candidates in trials.
+    """Hand poses that a run is working on, object frame: first all starts of the optimiser, then the tried candidates.
 
     Attributes:
         positions: positions of the base links [m].
@@ -296,12 +296,12 @@ class AuditCount:
 class GraspResult:
     """The result of a run: its outcome, a `message` and all tried grasps.
 
-    `tried` holds every tried grasp in rank order, verified ones first. `support` is the plane that the object stands
-    on, None for a floating object. `audits` is always zero, and version 0.3 removes it. `next_view` is
-    `T_object_camera` [m] of a camera pose that shows more of the hidden side. It is set if grasps hold on the likeliest
-    shape but none is verified. `refused` counts the candidates that a restriction refused, by reason. `mass` is the
-    reduced object mass of the trials [kg] if the hand could not hold the assumed mass, else None. `tried_mass` is the
-    object's mass in the trials [kg]. `count` is the requested number of grasps.
+    `tried` holds every tried grasp in rank order, verified grasps first. `support` is the plane on which the object
+    stands, None for a floating object. `audits` is always zero, and version 0.3 removes it. `next_view` is
+    `T_object_camera` [m] of a camera pose that shows more of the hidden side. `next_view` is set only if grasps hold on
+    the likeliest shape but none is verified. `refused` counts the candidates that restrictions refused, by reason.
+    `tried_mass` is the object's mass in the trials [kg]. If the hand could not hold the assumed mass, `mass` equals
+    this lower mass, else None. `count` is the requested number of grasps.
     """
 
     outcome: Outcome
@@ -321,7 +321,7 @@ class GraspResult:
 
     @property
     def grasps(self) -> tuple[Grasp, ...]:
-        """The grasps that did not fail, verified ones first, at most `count`."""
+        """The grasps that did not fail, verified grasps first, at most `count`."""
         return tuple(grasp for grasp in self.tried if grasp.verdict is not Verdict.FAILED)[: self.count]
 
     @property

@@ -1,1 +1,1 @@
-"""Data sets of grasps, made on Ray. Import and export of grasps in formats of other projects."""
+"""Make data sets of grasps on Ray. Import and export grasps in the formats of other projects."""

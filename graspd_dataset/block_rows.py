@@ -1,4 +1,4 @@
-"""Work on a block in this process: prepare the object, plan its grasps, and build the rows of the block's file."""
+"""Make one block, a file of grasps, in this process: prepare the object, plan its grasps, and build the rows."""
 
 from __future__ import annotations
 
@@ -29,15 +29,15 @@ from graspd_dataset.ray_engine import pickled_hand
 from graspd_dataset.record_schema import arrow_schema, object_schema
 from graspd_dataset.run_records import code_version, forget_peak, peak_mb
 
-# Number of scenes and hands that a process keeps, so that consecutive blocks share what was computed for them.
+# Number of unpickled scenes and hands that a process keeps. Consecutive blocks use them again, with their arrays.
 _KEPT = 4
 _loaded: OrderedDict[str, Any] = OrderedDict()
 
 
 def make_ready(thing: DatasetObject, content: bytes | None, config: PlanConfig) -> ReadyObject:
-    """Load an object and prepare it for optimiser and trials.
+    """Load an object, and compute the arrays that the optimiser and the trials need.
 
-    `content` holds the bytes of the object's file if the file is on another machine. Otherwise it is None.
+    `content` is the content of the object's file, if this machine may not have the file. Otherwise it is None.
     Raises GraspdError: the object cannot be read or used.
     """
     _one_thread()
@@ -58,7 +58,7 @@ def make_ready(thing: DatasetObject, content: bytes | None, config: PlanConfig) 
 
 
 def make_block(block: Block, hand: bytes, shared: bytes) -> MadeBlock:
-    """Plan the grasps of a block. `hand` is a pickled HandModel, `shared` comes from `ReadyObject.shared`."""
+    """Plan the grasps of a block. `hand` is a pickled HandModel, `shared` is `ReadyObject.shared` of its object."""
     _one_thread()
     forget_peak()
     began = time.process_time()
@@ -68,7 +68,7 @@ def make_block(block: Block, hand: bytes, shared: bytes) -> MadeBlock:
     request: dict[str, Any] = {"preset": block.config, "verify": block.verify, "measure": block.measure != "none"}
     result = plan_grasps(scene, model, count=block.count, seed=block.seed, **request)
     grasps = result.tried if block.measure != "all" else all_measured(scene, model, result.tried)
-    # If the hand cannot lift the assumed mass, the trials use a smaller one. The rows hold that mass.
+    # If no grasp holds the assumed mass, the trials use a smaller mass. The rows hold the smaller mass.
     target = scene.object if result.mass is None else scene.object.at_mass(result.mass)
     row = {"block": block.key, "asked": block.inputs, "outcome": result.outcome.name, "message": result.message}
     return MadeBlock(
@@ -83,18 +83,18 @@ def make_block(block: Block, hand: bytes, shared: bytes) -> MadeBlock:
 
 
 def all_measured(scene: Scene, hand: HandModel, grasps: Sequence[Grasp]) -> tuple[Grasp, ...]:
-    """Return the grasps with metrics added where they are missing, also for failed grasps."""
+    """Return all grasps with metrics. Measure those that have none, even failed grasps."""
     context = make_metrics_context(scene.object, hand)
     return tuple(grasp if grasp.metrics else replace(grasp, metrics=measure(context, grasp.grasp)) for grasp in grasps)
 
 
 def failure_kind(grasp: Grasp) -> str:
-    """Return the kind of failure of a failed grasp (`kind_of_reason` of its first failed trial)."""
+    """Return why a grasp failed: `kind_of_reason` of its first failed trial."""
     return kind_of_reason(*next((trial.name, trial.reason) for trial in grasp.trials if not trial.passed))
 
 
 def kind_of_reason(trial: str, reason: str) -> str:
-    """Return "trial: reason" without numbers and units, so that equal kinds of failure can be counted."""
+    """Return "trial: reason" without the numbers and units of the reason. Equal texts can then be counted."""
     words = [word for word in reason.split() if not any(sign.isdigit() for sign in word)]
     return f"{trial}: {' '.join(word for word in words if word not in ('cm', 'mm', 'm', 'N'))}"
 
@@ -106,7 +106,7 @@ def _one_thread() -> None:
 
 
 def _kept(key: str, pickled: bytes) -> Any:
-    """Return the unpickled value of a key, each time the same instance, because worlds are cached by scene identity."""
+    """Return the unpickled value of a key. Return the same instance again, because worlds are cached by instance."""
     if key not in _loaded:
         _loaded[key] = pickle.loads(pickled)
     _loaded.move_to_end(key)
@@ -139,7 +139,7 @@ def _table(block: Block, target: ObjectModel, hand: HandModel, grasps: Sequence[
 
 
 def _row(grasp: Grasp, hand: HandModel) -> dict[str, Any]:
-    """Return those columns of a grasp that differ within a block."""
+    """Return the columns of a grasp that differ between the grasps of a block."""
     row: dict[str, Any] = {
         "verdict": str(grasp.verdict),
         "reason": grasp.reason,
@@ -171,7 +171,7 @@ def _object_file(target: ObjectModel) -> bytes:
 
 
 def dry_run(blocks: Sequence[Block], limits: Limits, workers: int | None) -> str:
-    """Make one block of each hand. Return the estimated grasps, CPU hours and megabytes of all blocks as text."""
+    """Make one block of each hand. From these, estimate grasps, CPU hours and megabytes of all blocks, as text."""
     if not blocks:
         return "nothing is missing"
     workers = workers or os.cpu_count() or 1

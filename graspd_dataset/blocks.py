@@ -1,4 +1,4 @@
-"""Blocks of grasps. A data set consists of blocks, and the key of a block is a hash of its request."""
+"""Blocks, the parts of a data set. Each block has its own file, named by the key: a hash of the block's inputs."""
 
 from __future__ import annotations
 
@@ -27,20 +27,20 @@ _DIGITS = 32
 
 
 def content_key(inputs: Any) -> str:
-    """Return the key of JSON-ready values: the first 128 bits of their SHA-256 in hexadecimal."""
+    """Return the key of values that JSON can hold: the first 128 bits of their SHA-256 in hexadecimal."""
     return hashlib.sha256(json.dumps(inputs, sort_keys=True).encode()).hexdigest()[:_DIGITS]
 
 
 @dataclass(frozen=True)
 class DatasetObject:
-    """An object at one scale.
+    """An object at one scale, with mass and friction.
 
     Attributes:
-        source: shape:NAME or a mesh file.
+        source: shape:NAME (a built-in shape) or a mesh file.
         content: hash of the shape's or the file's content.
         scale: factor on the file's coordinates.
-        mass: mass [kg]. If None, the largest plausible mass of its volume.
-        friction: Coulomb coefficient.
+        mass: mass [kg]. If None, the greatest plausible mass for the object's volume.
+        friction: Coulomb coefficient between hand and object.
     """
 
     source: str
@@ -51,28 +51,28 @@ class DatasetObject:
 
     @property
     def inputs(self) -> dict[str, Any]:
-        """Inputs that identify the object, JSON-ready. Names of files are not among them."""
+        """Return the values that identify the object, for JSON. The file's name is not one of them."""
         return {"content": self.content, "scale": self.scale, "mass": self.mass, "friction": self.friction}
 
     @cached_property
     def key(self) -> str:
-        """Key of the object: a hash of `inputs`."""
+        """Return the key of the object: a hash of `inputs`."""
         return content_key(self.inputs)
 
 
 @dataclass(frozen=True)
 class Block:
-    """One call of `plan_grasps`. Its candidates are written to one file.
+    """One call of `plan_grasps`. One file gets all candidates that it tried.
 
     Attributes:
         object: the object to grasp.
         hand: name or path of the hand.
         hand_content: hash of the hand's files.
-        preset: name of the preset.
+        preset: name of the preset, a set of settings.
         config: the settings of the preset.
-        verify: name of the trials.
+        verify: which trials run: a name in `VERIFICATIONS`.
         measure: which grasps get metrics: verified, all or none.
-        seed: random seed of the plan.
+        seed: random seed of `plan_grasps`.
         count: number of verified grasps wanted.
     """
 
@@ -88,12 +88,12 @@ class Block:
 
     @property
     def hand_name(self) -> str:
-        """Name of the hand, as in the folder `hand=NAME` of the data set."""
+        """Return the name of the hand, as in the folder `hand=NAME` of the data set."""
         return object_name(self.hand)
 
     @property
     def inputs(self) -> dict[str, Any]:
-        """All inputs of the rows except the code version, JSON-ready."""
+        """Return all values that the rows depend on, except the code version, for JSON."""
         return {
             "schema": SCHEMA_VERSION,
             "object": self.object.inputs,
@@ -107,7 +107,7 @@ class Block:
 
     @cached_property
     def key(self) -> str:
-        """Key of the block: a hash of `inputs`. The block's file has this name."""
+        """Return the key of the block: a hash of `inputs`. The block's file is named after the key."""
         return content_key(self.inputs)
 
 
@@ -116,18 +116,18 @@ class DatasetRequest:
     """The requested content of a data set.
 
     Attributes:
-        objects: shape:NAME, mesh files, or folders of mesh files.
-        hands: names or paths.
+        objects: built-in shapes (shape:NAME), mesh files, or folders of mesh files.
+        hands: names or paths of the hands.
         per_object: number of verified grasps wanted for every object, scale and hand.
         block: number of verified grasps wanted in one block.
         preset: name or file of the preset.
-        seed: random seed of the first block of every object and hand, and of the random scales.
+        seed: random seed of the random scales, and of the first block of each object and hand. Later blocks add 1 each.
         scales: factors on every object's coordinates.
-        random_scales: number of additional random factors per object, and their least and greatest value. Their
+        random_scales: number of further random factors per object, then the least and the greatest factor. Their
             logarithms are drawn uniformly.
-        mass: mass of every object [kg]. If None, the largest plausible mass of each volume.
-        friction: Coulomb coefficient.
-        verify: name of the trials.
+        mass: mass of every object [kg]. If None, the greatest plausible mass for each object's volume.
+        friction: Coulomb coefficient between hand and object.
+        verify: which trials run: a name in `VERIFICATIONS`.
         measure: which grasps get metrics: verified, all or none.
 
     Raises:
@@ -158,11 +158,11 @@ class DatasetRequest:
             raise ConfigError(f"random-scales: {number} {low:g} {high:g}; valid: N >= 0 and 0 < LOW <= HIGH")
         for name, value in [("scales", s) for s in self.scales] + [("mass", self.mass), ("friction", self.friction)]:
             if value is not None and not (np.isfinite(value) and value > 0):
-                raise ConfigError(f"{name}: {value!r}; it must be a positive number")
+                raise ConfigError(f"{name}: {value!r}; valid: a positive number")
 
 
 def blocks_of(request: DatasetRequest) -> tuple[Block, ...]:
-    """Return the blocks of a data set, grouped by object. Raises GraspdError: no such object, hand or preset."""
+    """Return the blocks of a data set, object by object. Raises GraspdError: no such object, hand or preset."""
     config = load_preset(request.preset)
     hands = {name: hand_hash(name) for name in request.hands}
     preset = Path(request.preset).stem if request.preset.endswith((".yaml", ".yml")) else request.preset
@@ -176,7 +176,7 @@ def blocks_of(request: DatasetRequest) -> tuple[Block, ...]:
 
 
 def by_object(blocks: Sequence[Block]) -> list[tuple[DatasetObject, list[Block]]]:
-    """Group blocks by object. Both the groups and their blocks keep their order."""
+    """Return each object with its blocks. Objects are in the order of their first block."""
     groups: dict[str, tuple[DatasetObject, list[Block]]] = {}
     for block in blocks:
         groups.setdefault(block.object.key, (block.object, []))[1].append(block)

@@ -1,4 +1,4 @@
-"""Completion of imported grasps. Postures that a file lacks are computed as for a planned grasp."""
+"""Complete imported grasps: compute the postures that their files lack, as for planned grasps."""
 
 from __future__ import annotations
 
@@ -22,23 +22,23 @@ from graspd_core.types import Grasp, Posture
 from graspd_dataset.finger_closing import CLOSE_STEPS, make_closing
 from graspd_dataset.foreign_grasps import ImportedGrasp
 
-# Tolerance of joint limits [rad] or [m], because other descriptions of a hand round its limits differently.
+# Joint values may exceed the limits by this much [rad] or [m]. Other descriptions of a hand may round the limits.
 _BEYOND = 1e-3
-# A hand deeper in the object than `_DEEP`, or farther off than `_OFF`, does not grasp it [m]. The frame is doubtful if
-# this is so for `_NEARLY_ALL` of at least `_FEWEST` grasps.
+# A hand does not grasp if it is deeper in the object than `_DEEP` [m], or farther from it than `_OFF` [m]. The frame of
+# at least `_FEWEST` grasps is doubtful if the fraction `_NEARLY_ALL` is too deep, or this fraction is too far.
 _DEEP, _OFF, _NEARLY_ALL, _FEWEST = 0.005, 0.005, 0.8, 5
-# Grasps per batch. Each needs a megabyte of temporary memory.
+# Grasps per batch. Each grasp needs a megabyte of temporary memory.
 _AT_ONCE = 128
 
 
 @dataclass(frozen=True)
 class CompletedGrasps:
-    """Unverified grasps of one object, in the order of their files.
+    """Imported grasps of one object, not yet tried in simulation.
 
     Attributes:
         grasps: the accepted grasps.
-        refused: number of refused grasps by reason.
-        frame_doubt: a warning that the poses seem to be in a wrong frame. Empty if they do not.
+        refused: number of refused grasps for each reason.
+        frame_doubt: a warning that the poses seem to be in a wrong frame. Empty if the frame seems right.
     """
 
     grasps: tuple[Grasp, ...]
@@ -49,11 +49,11 @@ class CompletedGrasps:
 def complete_grasps(
     scene: Scene, hand: HandModel, imported: Sequence[ImportedGrasp], config: PlanConfig
 ) -> CompletedGrasps:
-    """Close the hands without joint values, and compute each missing pregrasp and squeeze.
+    """Close each hand whose file has no joint values. Compute each missing pregrasp and squeeze.
 
-    Postures from a file are kept exactly. Squeezes are targets, so they may exceed the joint limits. A grasp is refused
-    if its file marks it as failed, or if a joint is beyond its limits. It is also refused if the file gives no squeeze
-    and fewer than two links touch the object.
+    Postures from a file are kept exactly. A squeeze has joint targets, so it may exceed the joint limits. A grasp is
+    refused if its file marks it as failed, or if a joint is beyond its limits. Without a squeeze in its file, it is
+    also refused if fewer than two links touch the object.
     """
     faults = [grasp.refused or beyond_limits(grasp, hand) for grasp in imported]
     kept = [grasp for grasp, fault in zip(imported, faults, strict=True) if not fault]
@@ -78,7 +78,7 @@ def complete_grasps(
 
 
 def frame_doubt(scene: Scene, hand: HandModel, postures: Sequence[Posture]) -> str:
-    """Return a warning if 80 % of at least five hands are deep in the object, or 80 % far from it. Otherwise ""."""
+    """Warn if 80 % of the hands are over 5 mm inside the object, or 80 % over 5 mm away. "" if fewer than 5 hands."""
     if len(postures) < _FEWEST:
         return ""
     points = [
@@ -98,7 +98,7 @@ def frame_doubt(scene: Scene, hand: HandModel, postures: Sequence[Posture]) -> s
 
 
 def beyond_limits(grasp: ImportedGrasp, hand: HandModel) -> str:
-    """Return a sentence on the joint farthest beyond its limits at grasp or pregrasp. Empty if all are within."""
+    """Return a sentence on the joint that exceeds its limits most at grasp or pregrasp. Empty if no joint does."""
     for posture in filter(None, (grasp.grasp, grasp.pregrasp)):
         beyond = np.maximum(hand.lower - posture.joint_positions, posture.joint_positions - hand.upper)
         if beyond.max(initial=0.0) > _BEYOND:
@@ -112,7 +112,7 @@ def _poses(problem: Problem, postures: Sequence[Posture]) -> Poses:
 
 
 def _merged(theirs: ImportedGrasp, ours: Grasp) -> Grasp:
-    """Return our grasp with the file's postures in place of ours, unchanged."""
+    """Return the file's grasp `theirs`. Take what it lacks from `ours`, which graspd computed."""
     grasp = theirs.grasp
     if not theirs.closed:
         grasp = replace(grasp, joint_positions=ours.grasp.joint_positions)
@@ -122,7 +122,7 @@ def _merged(theirs: ImportedGrasp, ours: Grasp) -> Grasp:
 
 
 def by_object(imported: Sequence[ImportedGrasp]) -> dict[tuple[str, float], tuple[ImportedGrasp, ...]]:
-    """Group grasps by mesh and scale of their object. Groups are in the order of their first grasp."""
+    """Group grasps by the mesh and scale of their object. Groups are in the order of their first grasp."""
     found: dict[tuple[str, float], list[ImportedGrasp]] = {}
     for grasp in imported:
         found.setdefault((grasp.mesh, grasp.scale), []).append(grasp)

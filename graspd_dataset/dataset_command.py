@@ -1,4 +1,4 @@
-"""The command `graspd dataset`: it makes a data set of grasps on Ray, or inspects one. Runs can be resumed."""
+"""The command `graspd dataset`: make a data set of grasps on Ray, or inspect one. A stopped run can be resumed."""
 
 from __future__ import annotations
 
@@ -34,39 +34,39 @@ def add_command(commands: Any) -> None:
         "words",
         nargs="+",
         metavar="OBJECT",
-        help="shape:NAME, meshes in metres (else --scales) or folders; "
-        "or stats, validate, merge, sample or export and the data sets meant",
+        help="objects: shape:NAME, meshes in metres (otherwise give --scales), folders. "
+        "Or an action (stats, validate, merge, sample, export) and its data sets",
     )
-    parser.add_argument("--out", default="", metavar="DIR|s3://…", help="the data set; of sample a .parquet file")
-    make = parser.add_argument_group("making one")
+    parser.add_argument("--out", default="", metavar="DIR|s3://…", help="data set to write. sample: a .parquet file")
+    make = parser.add_argument_group("making a data set")
     make.add_argument("--hands", nargs="+", default=("allegro_right",), metavar="NAME|PATH")
-    make.add_argument("--per-object", type=int, default=128, metavar="N", help="verified, by object, scale and hand")
-    make.add_argument("--block", type=int, default=128, metavar="N", help="verified grasps of a file (default 128)")
+    make.add_argument("--per-object", type=int, default=128, metavar="N", help="grasps per object, scale and hand")
+    make.add_argument("--block", type=int, default=128, metavar="N", help="verified grasps per file (default 128)")
     add_plugin_option(make)
     make.add_argument("--preset", default="balanced")
     make.add_argument("--seed", type=int, default=0)
     make.add_argument("--scales", nargs="+", type=float, default=(1.0,), metavar="FACTOR", help="default 1")
     make.add_argument("--random-scales", nargs=3, type=float, default=(0, 1, 1), metavar=("N", "LOW", "HIGH"))
-    make.add_argument("--mass", type=float, default=None, metavar="KG", help="by default the heavy end of its volume")
+    make.add_argument("--mass", type=float, default=None, metavar="KG", help="default: the heavy end for the volume")
     make.add_argument("--friction", type=float, default=0.6, metavar="MU", help="default 0.6")
     make.add_argument("--verify", default="standard", metavar="TRIALS")
     make.add_argument("--measure", default="verified", metavar="WHICH", help="verified (default), all, or none")
-    make.add_argument("--dry-run", action="store_true", help="make one block of each hand; say count, hours and bytes")
-    ray = parser.add_argument_group("where it runs")
+    make.add_argument("--dry-run", action="store_true", help="make one block per hand and estimate hours and bytes")
+    ray = parser.add_argument_group("where to run")
     ray.add_argument("--address", default=None, metavar="ray://…", help="a Ray cluster (default: this machine)")
     ray.add_argument("--workers", type=int, default=None, metavar="N", help="on this machine (default: all cores)")
-    ray.add_argument("--ray-dir", type=Path, default=None, metavar="DIR", help="for Ray's own files (default: /tmp)")
-    ray.add_argument("--patience", type=float, default=1800.0, metavar="SEC", help="until a block is called hung")
-    ray.add_argument("--memory", type=float, default=4096.0, metavar="MB", help="that a block may take")
-    ray.add_argument("--retry-failed", action="store_true", help="try blocks and objects again that failed")
-    ray.add_argument("--any-code", action="store_true", help="add to a data set that other code began")
-    parser.add_argument("--count", type=int, default=1000, metavar="N", help="of sample: rows")
-    parser.add_argument("--to", default="isaac", metavar="FORMAT", help="of export: isaac, graspgen or dexgraspbench")
-    parser.add_argument("--verdict", choices=("verified", "failed", "unverified"), default=None, help="of sample")
+    ray.add_argument("--ray-dir", type=Path, default=None, metavar="DIR", help="folder of Ray's files (default: /tmp)")
+    ray.add_argument("--patience", type=float, default=1800.0, metavar="SEC", help="time limit of a block")
+    ray.add_argument("--memory", type=float, default=4096.0, metavar="MB", help="memory limit of a block")
+    ray.add_argument("--retry-failed", action="store_true", help="repeat failed blocks and objects")
+    ray.add_argument("--any-code", action="store_true", help="add to a data set of another code version")
+    parser.add_argument("--count", type=int, default=1000, metavar="N", help="sample: number of rows")
+    parser.add_argument("--to", default="isaac", metavar="FORMAT", help="export: isaac, graspgen or dexgraspbench")
+    parser.add_argument("--verdict", choices=("verified", "failed", "unverified"), default=None, help="sample: verdict")
 
 
 def run(options: argparse.Namespace) -> int:
-    """Run the command. Return the exit status: 0, 1 if blocks failed or a data set has faults, 130 if interrupted."""
+    """Run the command. Return the exit status: 0, 1 if blocks failed or `validate` found faults, 130 if stopped."""
     from graspd_dataset.dataset_store import DatasetStore
 
     action, places = options.words[0], options.words[1:]
@@ -92,7 +92,7 @@ def _make(options: argparse.Namespace) -> int:
     limits = Limits(options.patience, options.memory)
     blocks = blocks_of(request)
     missing = missing_blocks(blocks, store, retry_failed=options.retry_failed)
-    there = f"{len(blocks) - len(missing)} of {len(blocks)} blocks are there or failed before"
+    there = f"{len(blocks) - len(missing)} of {len(blocks)} blocks exist or failed before"
     print_note(there)
     if options.dry_run:
         from graspd_dataset.block_rows import dry_run
@@ -109,7 +109,7 @@ def _make(options: argparse.Namespace) -> int:
     write_run(store, with_unrecorded(store, record))
     _finish(store)
     if interrupt.is_interrupted():
-        print_error(f"interrupted; the same command continues, {store.label} keeps finished blocks")
+        print_error(f"interrupted; {store.label} keeps finished blocks; repeat the command to continue")
         return EXIT_INTERRUPTED
     return EXIT_FAULTS if lines.wrong else EXIT_OK
 
@@ -122,7 +122,7 @@ def _run_missing(
     record: RunRecord,
     interrupt: Interrupt,
 ) -> tuple[Lines, RunRecord]:
-    """Run the missing blocks, and write the run record every 30 s. Return the progress and the updated record."""
+    """Run the missing blocks. Write the run record every 30 s. Return the progress display and the updated record."""
     from graspd_dataset.ray_engine import RayEngine, ray_running
     from graspd_dataset.run_dataset import run_blocks, write_run
 
@@ -138,7 +138,7 @@ def _run_missing(
 
 
 def _finish(store: DatasetStore) -> None:
-    """Write the data card (README.md) of the stored blocks, and print their counts. Do nothing without blocks."""
+    """Write the data card, the README.md of the data set, and print its counts. Do nothing if it has no blocks."""
     from graspd_dataset.inspect_dataset import stats_of, stats_table
     from graspd_dataset.run_dataset import data_card
 
@@ -166,7 +166,7 @@ def _request(options: argparse.Namespace) -> DatasetRequest:
 
 
 class Lines:
-    """Progress over blocks: a bar on a terminal, otherwise a line every 10 s. Failures are printed immediately."""
+    """Display of progress: a bar on a terminal, otherwise a line every 10 s. Failures are printed immediately."""
 
     def __init__(self, blocks: int) -> None:
         self.wrong = 0
@@ -208,7 +208,7 @@ class Lines:
         return f"{text}; {reasons}" if reasons else text
 
     def added_to(self, record: RunRecord, wall: float) -> RunRecord:
-        """Return the record with the work of this session added. `wall` is its duration [s]."""
+        """Return the run record plus the work of this session. `wall` is the session's duration [s]."""
         more = {"done": record.done + self._done, "cpu": record.cpu + self._cpu, "wall": record.wall + wall}
         return replace(record, **more, peak_mb=max(record.peak_mb, self._peak), files=record.files | self._files)
 
@@ -253,7 +253,7 @@ def _merge(options: argparse.Namespace, stores: list[DatasetStore]) -> int:
     out = DatasetStore(options.out)
     with busy("merge"):
         copied, common = merge(stores, out)
-    print(f"{out.label}: {copied} blocks copied, {common} were there or in several")
+    print(f"{out.label}: {copied} blocks copied, {common} were already there")
     _finish(out)
     return EXIT_OK
 

@@ -3,11 +3,11 @@
     grasps/hand=HAND/object=CONTENT/KEY.parquet    one block per file
     objects/SHA256.parquet                         one mesh per file
     failed/KEY.json                                why a block or an object failed
-    runs/KEY.json                                  record of a command: its request and its cost
-    README.md                                      the data card
+    runs/KEY.json                                  run record of a command: the command and its cost
+    README.md                                      the data card: a description of the data set
 
-Every file is written completely or not at all. The same rows give the same bytes. The record of a run holds the SHA-256
-of every file that it wrote, so `graspd dataset validate` finds any changed byte.
+Every file is written completely or not at all. The same rows give the same bytes. A run record holds the SHA-256 of
+every file that the run wrote. So `graspd dataset validate` finds any changed byte.
 """
 
 from __future__ import annotations
@@ -24,12 +24,12 @@ from graspd_core.errors import FormatError, GraspdError
 from graspd_core.runtime.disk_cache import save_bytes
 
 FORMAT, SCHEMA_VERSION = "graspd/dataset", 1
-# Key of graspd's entry in the metadata of a Parquet file.
+# Name of graspd's entry in the metadata of a Parquet file.
 _METADATA = b"graspd"
 
 
 def parquet_bytes(table: Any, metadata: Mapping[str, Any]) -> bytes:
-    """Return the bytes of a Parquet file with a pyarrow table. `metadata` holds JSON-ready values."""
+    """Return the content of a Parquet file with a pyarrow table. `metadata` has values that JSON can hold."""
     import pyarrow.parquet as pq
 
     text = json.dumps({"format": FORMAT, "version": SCHEMA_VERSION, **metadata}, sort_keys=True)
@@ -42,18 +42,18 @@ def parquet_bytes(table: Any, metadata: Mapping[str, Any]) -> bytes:
 def read_parquet(content: bytes, where: str, columns: Sequence[str] | None = None) -> tuple[Any, dict[str, Any]]:
     """Return the pyarrow table and graspd's metadata of a Parquet file. If `columns` is None, read all columns.
 
-    Raises FormatError: the file is not from graspd, has an unknown version, or is damaged. `where` names it.
+    Raises FormatError: the file is not from graspd, has an unknown version, or is damaged. `where` names the file.
     """
     import pyarrow as pa
     import pyarrow.parquet as pq
 
     try:
-        # Use no thread of Arrow and no Python file object. An Arrow thread that still runs when the process ends aborts
-        # the process.
+        # Use no thread of Arrow and no Python file object. If an Arrow thread still runs when the process ends, it
+        # aborts the process.
         file = pq.ParquetFile(pa.BufferReader(content), page_checksum_verification=True, pre_buffer=False)
         table = file.read(columns, use_threads=False)
     except (pa.ArrowException, OSError, ValueError, MemoryError) as error:
-        raise FormatError(f"{where}: not a whole Parquet file: {' '.join(str(error).split())[:200]}") from None
+        raise FormatError(f"{where}: not a complete Parquet file: {' '.join(str(error).split())[:200]}") from None
     try:
         told = json.loads((table.schema.metadata or {})[_METADATA])
     except (KeyError, ValueError):
@@ -67,16 +67,16 @@ T = TypeVar("T")
 
 # Number of attempts of a server request, and the pause before the second attempt [s]. The pause doubles each time.
 _TRIES, _PAUSE = 6, 0.2
-# Digits of an object's hash in the name of its directory.
+# Number of digits of an object's hash in the name of its directory.
 _SHORT = 16
 
 
 class StorageError(GraspdError):
-    """Error: a data set cannot be read or written, because the disk is full or the server does not answer."""
+    """A data set cannot be read or written. For example, the disk is full or the server does not answer."""
 
 
 class DatasetStore:
-    """Files below a directory or an address. Every failure raises a StorageError that names the place and the file."""
+    """Files below a directory or an address. If access fails, every method raises StorageError with place and file."""
 
     def __init__(self, where: str) -> None:
         self.where = str(where).rstrip("/")
@@ -84,13 +84,13 @@ class DatasetStore:
 
     @property
     def label(self) -> str:
-        """The directory, or the address without access keys and options, for messages and records."""
+        """Return the directory, or the address without access keys and options. Messages and records contain it."""
         kind, there, rest = self.where.partition("://")
         return f"{kind}://{rest.partition('?')[0].rpartition('@')[2]}" if there else self.where
 
     @property
     def local(self) -> Path | None:
-        """The directory. None if the data set is at an address."""
+        """Return the directory of the data set. None if the data set is at an address."""
         return None if "://" in self.where else Path(self.where)
 
     def list(self, folder: str) -> list[str]:
@@ -156,7 +156,7 @@ class DatasetStore:
             raise StorageError(f"{self.label}: {path}: {error.strerror or error}") from None
 
     def _tried(self, path: str, work: Callable[[], T]) -> T:
-        """Do a server request. Repeat it, after growing pauses, if it fails."""
+        """Call `work`, a request to the server. Repeat it after growing pauses if it fails."""
         for number in range(_TRIES):
             try:
                 return work()
@@ -169,22 +169,22 @@ class DatasetStore:
 
 
 def block_path(hand: str, object_sha256: str, key: str) -> str:
-    """Return the path of a block's file."""
+    """Return the path of a block's file within the data set."""
     return f"grasps/hand={hand}/object={object_sha256[:_SHORT]}/{key}.parquet"
 
 
 def key_of(path: str) -> str:
-    """Return the key of a block, object or record from the path of its file."""
+    """Return the key of a block, object or record: the name of its file without ending."""
     return PurePosixPath(path).stem
 
 
 def file_hash(content: bytes) -> str:
-    """Return the SHA-256 of a file's content in hexadecimal, as run records hold it."""
+    """Return the SHA-256 of a file's content in hexadecimal, as in run records."""
     return hashlib.sha256(content).hexdigest()
 
 
 def read_record(store: DatasetStore, path: str) -> dict[str, Any]:
-    """Read the record of a run or a failure. Raises FormatError: the file is not a JSON object, or is damaged."""
+    """Read the record of a run or of a failure. Raises FormatError: the file is not a valid record in JSON."""
     try:
         record = json.loads(store.read(path))
     except ValueError:

@@ -1,8 +1,8 @@
 """Export of a data set to isaac_grasp 1.0 (Isaac Sim, Isaac ROS), GraspGen's training JSON, and DexGraspBench.
 
 Poses are those of the hand's base link in the object frame, the frame of the exported mesh. Lengths are in metres.
-DexGraspBench reads one pickled dictionary per grasp and one folder per object. Its Allegro is Menagerie's right hand,
-with our joint order. In the frame of its qpos, the palm has the orientation (0, 1, 0, 1), wxyz before normalisation.
+DexGraspBench reads one pickled dictionary per grasp and one folder per object. Its Allegro hand is the right hand of
+MuJoCo Menagerie, with our joint order. In the hand's root frame, our palm has the orientation (0, 1, 0, 1)/√2, wxyz.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ Row = dict[str, Any]
 
 
 def export(store: DatasetStore, kind: str, out: Path) -> tuple[int, int]:
-    """Write the grasps of every hand and object pair, and the meshes. Return the numbers of pairs and of grasps.
+    """Write the grasps of each hand on each object, and the meshes. Return how many such pairs and grasps there are.
 
     Raises:
         ConfigError: the format `kind` is unknown, or does not support a hand.
@@ -59,7 +59,7 @@ def export(store: DatasetStore, kind: str, out: Path) -> tuple[int, int]:
 
 
 def isaac_grasp(rows: Sequence[Row], mesh: str) -> str:
-    """Return grasps as isaac_grasp 1.0 YAML. The format has no squeeze. The file names the mesh by the path `mesh`."""
+    """Return the isaac_grasp 1.0 YAML of grasps, without squeezes. `mesh` is the mesh's path in the YAML."""
 
     def joints(row: Row, stage: str) -> dict[str, float]:
         return dict(zip(row["joint_names"], row[f"{stage}_joint_positions"], strict=True))
@@ -80,14 +80,14 @@ def isaac_grasp(rows: Sequence[Row], mesh: str) -> str:
 
 
 def graspgen(rows: Sequence[Row], mesh: str) -> str:
-    """Return GraspGen JSON: the pose of every verified and failed grasp, and whether the grasp held."""
+    """Return the GraspGen JSON of grasps: each pose, and whether the grasp was verified. `mesh` is the mesh's path."""
     transforms = [_matrix(row["grasp_position"], row["grasp_quaternion_wxyz"]).tolist() for row in rows]
     held = [row["verdict"] == "verified" for row in rows]
     grasps = {"transforms": transforms, "object_in_gripper": held}
     return json.dumps({"object": {"file": mesh, "scale": 1.0}, "grasps": grasps}) + "\n"
 
 
-# Each format's file ending, the verdicts that it includes, and the function that returns the text of a file.
+# For each format: the file ending, the verdicts of exported grasps, and the function that makes a file's text.
 KINDS: dict[str, tuple[str, tuple[str, ...], Callable[[Sequence[Row], str], str]]] = {
     "isaac": (".yaml", ("verified",), isaac_grasp),
     "graspgen": (".json", ("verified", "failed"), graspgen),
@@ -114,7 +114,7 @@ def _mesh(store: DatasetStore, target: str) -> TriangleMesh:
 
 
 def refuse_hand(name: str) -> None:
-    """Raise ConfigError if we do not know DexGraspBench's model of the hand."""
+    """Raise ConfigError if `PALMS` lacks the hand. Then we do not know the root frame of DexGraspBench's model."""
     if name not in PALMS:
         raise ConfigError(f"to dexgraspbench: hand {name!r}; valid: {', '.join(PALMS)}")
 
@@ -122,9 +122,9 @@ def refuse_hand(name: str) -> None:
 def write_dexgraspbench(
     rows: Sequence[dict[str, Any]], mesh: TriangleMesh, out: Path, *, objects: str = "objects"
 ) -> None:
-    """Write the grasps of one hand on one object, and the object: mesh, convex parts, mass and centre of mass.
+    """Write the grasps of one hand on one object. Also write the object: mesh, convex parts, mass and centre of mass.
 
-    `objects` is the object folder that the grasp files name. DexGraspBench reads it relative to its own code folder.
+    `objects` is the path of the object folder in the grasp files. DexGraspBench looks for it in its code folder.
     """
     name = rows[0]["object_sha256"]
     for number, row in enumerate(rows):
@@ -145,7 +145,7 @@ def write_dexgraspbench(
 
 
 def qpos(row: dict[str, Any], stage: str) -> np.ndarray:
-    """Return a posture as DexGraspBench's qpos: position [m], quaternion wxyz, joints [rad] or [m]."""
+    """Return a posture as DexGraspBench's qpos: position [m], quaternion wxyz, joint values [rad] or [m]."""
     from scipy.spatial.transform import Rotation
 
     palm = Rotation.from_quat(np.roll(PALMS[row["hand_name"]], -1))
@@ -154,6 +154,6 @@ def qpos(row: dict[str, Any], stage: str) -> np.ndarray:
 
 
 def obj_text(mesh: TriangleMesh) -> str:
-    """Return the text of a Wavefront OBJ file, with coordinates at full precision."""
+    """Return a mesh as the text of a Wavefront OBJ file, with coordinates at full precision."""
     lines = [f"v {x!r} {y!r} {z!r}" for x, y, z in mesh.vertices.tolist()]
     return "\n".join([*lines, *(f"f {a + 1} {b + 1} {c + 1}" for a, b, c in mesh.faces.tolist())]) + "\n"

@@ -1,8 +1,8 @@
-"""Closing of a hand until contact: each finger closes at its own rate until one of its links touches something.
+"""Close a hand until contact: each finger closes until one of its links touches the object or another link.
 
-This is a solver for the shared loop, without loss or gradients. The base does not move. Each joint moves towards the
-limit beyond its closed value. A finger's step is halved if it would push a link into the object or into another link.
-Below 1/32 of a step, the joints that move that link stop, and the finger's other joints continue.
+This is a solver for `optimize/loop.py`, without gradients. The base does not move. Each joint moves at its own rate
+towards the limit beyond its closed value. A step that would push a link into something is refused and halved. Below
+1/32 of a step, the joints that move that link stop. The finger's other joints continue.
 """
 
 from __future__ import annotations
@@ -22,13 +22,13 @@ from graspd_core.optimize.grasp_postures import nearest_features
 from graspd_core.optimize.loop import Poses
 from graspd_core.optimize.problem import HandPlacement, Problem, hand_forward
 
-# Steps of a closing from open to closed.
+# Default number of full steps from open to closed.
 CLOSE_STEPS = 60
-# A finger has arrived when its step is halved below this fraction. A full step is the closing travel / `close_steps`.
+# A finger has arrived when its steps are below this fraction of a full step (closing travel / `close_steps`).
 _ARRIVED = 1 / 32
-# Proxy spheres may overlap by this much more than at the start before it counts as self-collision [m].
+# The hand collides with itself if proxy spheres overlap by this much more than before the closing [m].
 _SELF_SLACK = 0.001
-# Joints may pass their closed value: the total travel is up to this multiple of the travel from open to closed.
+# Joints may pass their closed value. They travel at most this multiple of the way from open to closed.
 _OVERTRAVEL = 2.0
 
 
@@ -38,11 +38,11 @@ class ClosingState:
 
     Attributes:
         poses: current poses of the hands, in the object frame.
-        floor: smallest allowed gap of each link, to the object and to the hand itself [m]. Negative if the hand
-            overlapped at the start.
+        floor: smallest allowed gap of each link, to the object and to other links [m]. A link that already overlaps
+            before closing may keep this overlap, so its value is negative.
         stride: fraction of a full step that each joint tries next, equal for the joints of a finger.
-        blamed: links that would have gone below their smallest gap in the last refused step.
-        stopped: joints that have arrived.
+        blamed: links that would have gone below `floor` in the finger's last refused step.
+        stopped: joints that do not move any more, or never moved.
     """
 
     poses: Poses
@@ -54,14 +54,14 @@ class ClosingState:
 
 @dataclass(frozen=True)
 class Closing:
-    """Solver that closes hands until contact, made by `make_closing`. Its loss is the fraction of joints not stopped.
+    """Solver that closes hands until contact (`make_closing`). Its loss is the fraction of joints that still move.
 
     Attributes:
         rate: signed travel of each joint in a full step [rad] or [m]. Zero for joints that do not close.
         target: the limit that each joint moves to [rad] or [m].
-        moves: whether a joint moves a link.
-        finger_links: whether a link belongs to the joint's finger.
-        sphere_links: link of each proxy sphere of the problem.
+        moves: whether each joint moves each link.
+        finger_links: whether each link belongs to the finger of each joint.
+        sphere_links: link index of each proxy sphere. Proxy spheres fill the hand for the self-collision check.
         close_steps: number of full steps from open to closed.
     """
 
@@ -117,12 +117,12 @@ class Closing:
         return state.poses, 1.0 - state.stopped.to(state.stride).mean(-1)
 
     def some(self, flags: Bool[Tensor, "batch n"], of: Bool[Tensor, "m n"]) -> Bool[Tensor, "batch m"]:
-        """Return for each row of `of` whether a flag is set at any of the row's true entries."""
+        """Return, for each row of `of`, whether any flag is set where the row is true."""
         return flags.to(self.rate) @ of.to(self.rate).T > 0
 
 
 def make_closing(problem: Problem, hand: HandModel, close_steps: int) -> Closing:
-    """Build the solver that closes a hand from open to closed posture in `close_steps` full steps."""
+    """Build the solver. A joint goes from its open to its closed value in `close_steps` full steps."""
     device = problem.hand.lower.device
     travel = hand.closed_posture - hand.open_posture
     # A joint with nearly equal values in both postures shapes the hand and does not close it.
@@ -141,7 +141,7 @@ def make_closing(problem: Problem, hand: HandModel, close_steps: int) -> Closing
 
 
 def moved_links(hand: HandModel) -> Bool[np.ndarray, "joints links"]:
-    """Return which links each actuated joint moves, directly or through coupled joints."""
+    """Return a table: whether each actuated joint moves each link, directly or through coupled joints."""
     moved = np.zeros((hand.num_joints, hand.num_links), dtype=bool)
     for link in range(1, hand.num_links):
         moved[:, link] = moved[:, hand.link_parent[link]]
@@ -151,7 +151,7 @@ def moved_links(hand: HandModel) -> Bool[np.ndarray, "joints links"]:
 
 
 def finger_of(hand: HandModel) -> Int[np.ndarray, "joints"]:
-    """Return the finger number of each joint. Joints that move a common link have the same number, transitively."""
+    """Return the finger number of each joint. Joints of a finger move common links, or are connected by such joints."""
     from scipy.sparse import csr_array
     from scipy.sparse.csgraph import connected_components
 
@@ -161,11 +161,11 @@ def finger_of(hand: HandModel) -> Int[np.ndarray, "joints"]:
 
 @torch.no_grad()
 def link_gaps(problem: Problem, poses: Poses, sphere_links: Int[Tensor, "spheres"]) -> Float[Tensor, "batch 2 links"]:
-    """Return the gaps [m] of every link: its signed distance to the object, then its clearance to other links.
+    """Return two gaps of every link [m]: first its signed distance to the object, second its gap to other links.
 
-    The clearance is minus the overlap of proxy spheres, so it is never positive. Adjacent links do not count.
-    The distance is infinite if the link has neither contact candidates nor collision shapes. The clearance is infinite
-    if the link has no proxy spheres.
+    The second gap is minus the greatest overlap of proxy spheres, so it is never positive. Adjacent links do not
+    count. The first gap is infinite if the link has neither contact candidates nor collision shapes. The second is
+    infinite if the link has no proxy spheres.
     """
     placed = hand_forward(problem, problem.hand.fine, poses)
     count = placed.links.translation.shape[1]
@@ -177,7 +177,7 @@ def link_gaps(problem: Problem, poses: Poses, sphere_links: Int[Tensor, "spheres
 
 
 def sphere_overlap(problem: Problem, placed: HandPlacement) -> Float[Tensor, "batch spheres"]:
-    """Return each proxy sphere's greatest overlap with spheres of non-adjacent links [m]. Zero without overlap."""
+    """Return each proxy sphere's greatest overlap with spheres of links that are not adjacent [m]. Zero if none."""
     centers = place_points(problem.hand.spheres.matrix, placed.links)
     reach = problem.hand.spheres.radii[:, None] + problem.hand.spheres.radii[None, :]
     depth = (reach - torch.cdist(centers, centers)).clamp_min(0.0) * (problem.hand.spheres.weight > 0)

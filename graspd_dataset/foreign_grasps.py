@@ -1,10 +1,10 @@
-"""Readers of other projects' grasp files. They return joints in the hand's order and poses of its base link.
+"""Read grasp files of other projects. Joint values get the hand's order, and poses become those of its base link.
 
 DexGraspBench (.npy): one pickled dictionary per grasp. It holds three postures, each as position, quaternion wxyz and
 unnamed joint values. `runtime/inert_pickle` reads the pickle without running code from it.
 
 isaac_grasp 1.0 (.yaml): the gripper's pose, and named joint values at grasp and pregrasp. There is no squeeze. The
-gripper's frame is a link name, or a USD stage path that ends with one. Any other name means the base link.
+gripper's frame is a link name, or a USD stage path that ends with a link name. Any other name means the base link.
 
 GraspGen (.json): poses of the gripper's base and whether each grasp held. There are no joint values.
 `complete_grasps` closes the open hand until it touches the object.
@@ -30,9 +30,9 @@ from graspd_core.hands.model import AT_ORIGIN, HandModel, all_joint_names, all_j
 from graspd_core.runtime.inert_pickle import NUMPY_NAMES, Inert, array_of, load_inert, read_bounded
 from graspd_core.types import Posture
 
-# Tolerances: of a coupled joint around the value that its leader demands [rad] or [m], and of a quaternion's length.
+# Tolerances: of a coupled joint's value, which its leading joint sets [rad] or [m], and of a quaternion's length.
 _COUPLED, _UNIT = 1e-3, 0.01
-# The greatest magnitude of a position, angle or scale. Results computed from such numbers stay finite.
+# The greatest magnitude of a position, angle or scale. With this limit, results stay finite.
 _LARGEST = 1e6
 
 
@@ -41,14 +41,14 @@ class ImportedGrasp:
     """One grasp read from a file.
 
     Attributes:
-        name: the file, and the place of the grasp in it.
+        name: the file, and the grasp's number or name in it. For messages.
         mesh: mesh file of the object, or shape:NAME. Poses are in the frame of the scaled mesh.
         scale: factor on the mesh's coordinates.
         grasp: the touching posture. If the format has no joint values, this is the open hand, still to be closed.
         pregrasp, squeeze: None if the format has no such posture.
         closed: whether the file gives the joint values of `grasp`.
-        squeeze_moved: distance of the squeeze's base from the grasp's base in the file [m]. graspd drops the offset.
-        refused: reason to refuse the grasp, if its file says that it failed. Otherwise empty.
+        squeeze_moved: distance between the base at the squeeze and at the grasp in the file [m]. graspd ignores it.
+        refused: reason to refuse the grasp if its file marks it as failed. Otherwise empty.
     """
 
     name: str
@@ -63,12 +63,12 @@ class ImportedGrasp:
 
 
 def numbers_of(value: Any, shape: tuple[int, ...], where: str) -> np.ndarray:
-    """Return a value as an array of a shape. Raises FormatError: wrong type or shape, NaN, or a magnitude over 1e6."""
+    """Return a value as an array. Raises FormatError: not numbers of this shape, a NaN, or a magnitude over 1e6."""
     try:
         numbers = np.array(value, dtype=np.float64)
     except (TypeError, ValueError, OverflowError):
         numbers = None
-    # Of NaN this is false.
+    # A comparison with NaN is false.
     if numbers is None or numbers.shape != shape or not (np.abs(numbers) <= _LARGEST).all():
         wanted = f"{' x '.join(map(str, shape))} numbers" if shape else "a number"
         wanted += f" of at most {_LARGEST:.0e}"
@@ -96,9 +96,9 @@ def quaternion_of(value: Any, where: str) -> Float[np.ndarray, "4"]:
 
 
 def joints_by_name(values: Any, hand: HandModel, where: str) -> Float[np.ndarray, "joints"]:
-    """Return the actuated joint values [rad] or [m] from named values. Names of coupled joints are allowed.
+    """Return the values of the actuated joints [rad] or [m] from a mapping. It may also contain coupled joints.
 
-    Raises FormatError: a name is unknown, an actuated joint is missing, or a coupled joint contradicts its leader.
+    Raises FormatError: a name is unknown, an actuated joint is missing, or a coupled joint has another value.
     """
     if not isinstance(values, Mapping):
         raise FormatError(f"{where}: {short_repr(values)}; expected joint values by name")
@@ -111,7 +111,7 @@ def joints_by_name(values: Any, hand: HandModel, where: str) -> Float[np.ndarray
     for name, follows in zip(names, all_joint_positions(hand, joints), strict=True):
         given = float(numbers_of(values.get(name, follows), (), f"{where}: {name}"))
         if abs(given - follows) > _COUPLED:
-            raise FormatError(f"{where}: joint {name!r} is {given:.4g}; valid: {follows:.4g}, as it is coupled")
+            raise FormatError(f"{where}: joint {name!r} is {given:.4g}; valid: {follows:.4g}, because it is coupled")
     return joints
 
 
@@ -128,7 +128,7 @@ def checked_order(order: Sequence[str], hand: HandModel) -> tuple[str, ...]:
 
 
 def find_beside(named: Any, file: Path, where: str) -> str:
-    """Return the path of the file `named` in the nearest folder above `file` with it. Raises FormatError: none."""
+    """Search `named` in the folders above `file`, nearest first, and return its path. Raises FormatError: not found."""
     if isinstance(named, str) and named and "\0" not in named:
         for folder in file.resolve().parents:
             if (folder / named).is_file():
@@ -136,21 +136,21 @@ def find_beside(named: Any, file: Path, where: str) -> str:
     raise FormatError(f"{where}: object {short_repr(named)} is in no folder above the file; give --object MESH")
 
 
-# Orientation (wxyz) of our base link, the palm, in the frame of the qpos, for hands that DexGraspBench models with
-# another root frame. Their joint order is ours. For other hands, the qpos frame is the root frame of our hand file.
+# Hands that DexGraspBench models with our joint order but another root frame, and our palm's orientation (wxyz) in
+# that frame. A qpos has the pose of this frame. For other hands, it is the root frame of our hand file.
 PALMS = {"allegro_right": (0.0, 1.0, 0.0, 1.0)}
 STAGES = ("pregrasp", "grasp", "squeeze")
 _WHAT = "file of DexGraspBench"
 
 
 def order_of(hand: HandModel, order: Sequence[str]) -> tuple[str, ...]:
-    """Return the joint order of a qpos: `order`, or the hand's known order if `order` is empty.
+    """Return the joint order of a qpos, a pose with joint values: `order`, or if empty the hand's known order.
 
     Raises ConfigError: the order is not known, or does not fit the hand.
     """
     if not order and hand.name not in PALMS:
         names = ",".join(all_joint_names(hand))
-        raise ConfigError(f"joint order: not known for {hand.name}, and npy files have no names; give one: {names}")
+        raise ConfigError(f"joint order: not known for {hand.name}, and npy files name no joints; give one: {names}")
     return checked_order(order or all_joint_names(hand), hand)
 
 
@@ -161,7 +161,7 @@ def read_dexgraspbench(
 
     Raises:
         ConfigError: the joint order is not known or does not fit the hand.
-        FormatError: the file is no npy of one dictionary, its pickle calls code, or an entry is missing or malformed.
+        FormatError: the file is no npy file with one dictionary, its pickle calls code, or an entry is not valid.
     """
     order = order_of(hand, order)
     values = npy_dictionary(path, content)
@@ -175,7 +175,7 @@ def read_dexgraspbench(
 
 
 def npy_dictionary(path: Path, content: bytes) -> dict[Any, Any]:
-    """Return the dictionary of an npy file. Its values are plain, or `Inert` arrays of numbers.
+    """Return the dictionary of an npy file. Its arrays are `Inert` objects, because no code of the pickle is run.
 
     Raises FormatError: the file is not an npy file with one pickled dictionary.
     """
@@ -195,12 +195,12 @@ def npy_dictionary(path: Path, content: bytes) -> dict[Any, Any]:
     state = held.state if isinstance(held, Inert) else None
     items = state[4] if isinstance(state, tuple) and len(state) == 5 else None
     if not isinstance(items, list) or len(items) != 1 or not isinstance(items[0], dict):
-        raise FormatError(f"{path}: the pickle holds no dictionary; expected one")
+        raise FormatError(f"{path}: the pickle holds no dictionary; expected one dictionary")
     return items[0]
 
 
 def plain_entry(values: dict[Any, Any], key: str, path: Path) -> Any:
-    """Return the text, number or array of numbers under a key. Raises FormatError: missing, or another type."""
+    """Return the text, number or array of numbers of a key. Raises FormatError: the key is missing, or another type."""
     value = entry(values, key, f"{path}")
     if not isinstance(value, Inert):
         return value
@@ -231,9 +231,9 @@ def _posture(
     order: Sequence[str],
     path: Path,
 ) -> Posture:
-    """Return the posture of a stage, as the pose of the hand's base link in the object frame.
+    """Return the hand's posture at `stage`, for example the pregrasp. Its pose is the base link's in the object frame.
 
-    `target` is the object's pose in the file's world frame: position, quaternion wxyz, no joints.
+    `target` is the object's pose in the file's world frame: position, quaternion wxyz, no joint values.
     """
     from scipy.spatial.transform import Rotation
 
@@ -249,12 +249,12 @@ def _posture(
     return Posture(into.apply(position + frame.apply(place) - target[0]), np.roll(base.as_quat(), 1), named)
 
 
-# Tolerance of the entries of R R^T around the identity.
+# Greatest error of a rigid transform: of the entries of R Rᵀ from the identity, and of the last row from 0 0 0 1.
 _ROTATION = 1e-3
 
 
 def read_isaac(path: Path, text: bytes, hand: HandModel, mesh: str | None) -> list[ImportedGrasp]:
-    """Read the grasps of one file. `mesh`, if given, replaces the mesh named in it. Raises FormatError: malformed."""
+    """Read the grasps of one file. `mesh`, if given, replaces the file's mesh. Raises FormatError: malformed file."""
     try:
         _, document = parse_yaml(text.decode())
     except ValueError as error:
@@ -290,7 +290,7 @@ def _grasp_of(values: Any, hand: HandModel, frame: str, mesh: str, where: str) -
 def _base_of(
     hand: HandModel, link: str, joints: np.ndarray, position: np.ndarray, quaternion: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return position and quaternion of the base link from those of another link."""
+    """Return the pose of the base link. `position` and `quaternion` (wxyz) are the pose of `link`."""
     from scipy.spatial.transform import Rotation
 
     rotations, translations = link_poses(hand, joints)
@@ -300,7 +300,7 @@ def _base_of(
 
 
 def read_graspgen(path: Path, text: bytes, hand: HandModel, mesh: str | None) -> list[ImportedGrasp]:
-    """Read the grasps of one file. `mesh`, if given, replaces the mesh named in it. Raises FormatError: malformed."""
+    """Read the grasps of one file. `mesh`, if given, replaces the file's mesh. Raises FormatError: malformed file."""
     try:
         document = json.loads(text)
     except (ValueError, RecursionError) as error:
@@ -316,13 +316,13 @@ def read_graspgen(path: Path, text: bytes, hand: HandModel, mesh: str | None) ->
         where = f"{path}: grasp {number}"
         if not isinstance(good, bool):
             raise FormatError(f"{where}: object_in_gripper: {short_repr(good)}; expected true or false")
-        refused = "" if good else "its file says that it did not hold"
+        refused = "" if good else "its file says that the grasp did not hold"
         found.append(ImportedGrasp(where, mesh, scale, _open_at(pose, hand, where), closed=False, refused=refused))
     return found
 
 
 def _open_at(pose: object, hand: HandModel, where: str) -> Posture:
-    """Return the open hand at a 4 x 4 pose `T_object_hand`. Raises FormatError: it is no rigid transform."""
+    """Return the open hand at a 4 x 4 pose `T_object_hand`. Raises FormatError: the pose is no rigid transform."""
     from scipy.spatial.transform import Rotation
 
     matrix = numbers_of(pose, (4, 4), f"{where}: transform")
@@ -334,7 +334,7 @@ def _open_at(pose: object, hand: HandModel, where: str) -> Posture:
     return Posture(matrix[:3, 3], quaternion, np.clip(hand.open_posture, hand.lower, hand.upper))
 
 
-# Searched in this order. JSON is last, because folders of npy grasps also hold JSON files that describe objects.
+# Formats by file ending, in search order. JSON is last: folders of npy files may also have JSON files of objects.
 FORMATS = {".npy": "dexgraspbench", ".yaml": "isaac", ".yml": "isaac", ".json": "graspgen"}
 
 
@@ -345,8 +345,8 @@ def read_foreign(
 
     Args:
         hand: the hand that the grasps were made for.
-        mesh: mesh of the object. None takes the mesh that each file names.
-        order: joint names in the order of an npy file's joint values. () takes the hand's known order.
+        mesh: mesh of the object. If None, each file names its mesh.
+        order: joint names in the order of an npy file's joint values. If empty, the hand's known order is used.
 
     Raises:
         ConfigError: the joint order is not known, or does not fit the hand.
@@ -366,7 +366,7 @@ def read_foreign(
 
 
 def foreign_files(place: Path) -> tuple[Path, ...]:
-    """Return the grasp files at a path: the file, or all of one format below a folder. Raises FormatError: none."""
+    """Return the grasp file `place`, or all files of one format below this folder. Raises FormatError: none found."""
     endings = ", ".join(FORMATS)
     if place.is_file():
         if place.suffix not in FORMATS:

@@ -1,6 +1,6 @@
-"""Blocks on a Ray worker. A child process with limits does the work, and the worker writes the files.
+"""Make blocks on a Ray worker. A child process with limits plans the grasps, and the worker writes the files.
 
-A block that hangs, crashes or fills the memory harms only the child, and the worker records the failure. The worker
+If a block hangs, crashes or fills the memory, only the child ends. The worker then records the failure. The worker
 imports neither torch nor MuJoCo. It passes pickled values to the child.
 """
 
@@ -17,14 +17,14 @@ from graspd_dataset.dataset_store import DatasetStore, block_path, file_hash
 
 T = TypeVar("T")
 
-# The child is replaced after this many calls, which bounds memory leaks of libraries.
+# A new child replaces the old one after this many calls, because libraries may never free some memory.
 _CALLS = 200
 _KINDS = {TimeoutError: "hung", MemoryError: "memory", ChildProcessError: "died"}
 
 
 @dataclass(frozen=True)
 class Limits:
-    """Limits for making a block or preparing an object: wall time [s] and resident memory [MB]."""
+    """Limits of the child while it makes one block or prepares one object: wall time [s] and resident memory [MB]."""
 
     seconds: float = 1800.0
     most_mb: float = 4096.0
@@ -32,18 +32,18 @@ class Limits:
 
 @dataclass(frozen=True)
 class Report:
-    """Report on a block, or on a prepared object.
+    """What a worker reports about one block or one prepared object.
 
     Attributes:
         key: key of the block or the object.
-        failed: kind of failure (raised, hung, memory, died, lost). Empty on success.
+        failed: kind of failure: raised (an error), hung, memory, died, lost (with its worker). Empty on success.
         error: description of the failure.
-        rows, verified: number of all candidates, and of verified ones.
-        failures: number of failed candidates by trial and kind of reason.
-        size: size of the file [bytes].
+        rows, verified: number of all candidates, and of verified candidates.
+        failures: number of failed candidates for each kind of failure (`failure_kind`).
+        size: size of the block's file [bytes].
         cpu: CPU time of the child [s].
         peak_mb: peak memory of the child [MB].
-        files: SHA-256 of each written file, by path.
+        files: path and SHA-256 of each written file.
     """
 
     key: str
@@ -63,9 +63,9 @@ class ReadyObject:
     """A prepared object, which all blocks of this object share.
 
     Attributes:
-        sha256: hash of its cleaned mesh.
-        file: bytes of its file in `objects/`.
-        shared: pickled scene, and the arrays computed for it, such as its SDF grid and convex parts.
+        sha256: hash of the object's cleaned mesh.
+        file: content of the object's file in `objects/`.
+        shared: the pickled scene, and arrays computed from it, such as the SDF grid and the convex parts.
     """
 
     sha256: str
@@ -79,9 +79,9 @@ class MadeBlock:
 
     Attributes:
         object_sha256: hash of the object's cleaned mesh.
-        file: bytes of the Parquet file.
-        rows, verified: number of all candidates, and of verified ones.
-        failures: number of failed candidates by trial and kind of reason.
+        file: content of the Parquet file.
+        rows, verified: number of all candidates, and of verified candidates.
+        failures: number of failed candidates for each kind of failure (`failure_kind`).
         cpu: CPU time of this process [s].
         peak_mb: peak memory of this process [MB].
     """
@@ -101,8 +101,8 @@ class Job:
 
     Attributes:
         key: key of the block or the object.
-        asked: the request, JSON-ready, for the record of a failure.
-        pickled: the pickled block, or the pickled pair of an object and its settings.
+        asked: what was requested, in values for JSON. A record of a failure contains it.
+        pickled: the pickled block, or the pickled pair of object and settings.
         hand: name of a block's hand. Empty for an object.
     """
 
@@ -113,7 +113,7 @@ class Job:
 
 
 def prepare_object(job: Job, content: bytes | None, store: DatasetStore, limits: Limits) -> tuple[Report, bytes]:
-    """Prepare an object and write its mesh file. Return the report and `ReadyObject.shared`, empty after a failure."""
+    """Prepare an object and write its mesh file. Return the report and `ReadyObject.shared` (empty after a failure)."""
     try:
         ready = call_guarded(limits, ready_of, job.pickled, content)
     except Exception as error:
@@ -124,7 +124,7 @@ def prepare_object(job: Job, content: bytes | None, store: DatasetStore, limits:
 
 
 def run_block(job: Job, hand: bytes, shared: bytes, store: DatasetStore, limits: Limits) -> Report:
-    """Make a block and write its file. Return the report, also after a failure."""
+    """Make a block and write its file, or after a failure write a record of it. Return the report."""
     try:
         made = call_guarded(limits, block_of, job.pickled, hand, shared)
     except Exception as error:
@@ -159,7 +159,7 @@ def block_of(pickled: bytes, hand: bytes, shared: bytes) -> MadeBlock:
 
 
 def failed_report(store: DatasetStore, job: Job, error: BaseException) -> Report:
-    """Write the record of a failure. Return its report."""
+    """Write the record of a failure to `failed/`. Return the report that names the failure."""
     from graspd_dataset.run_records import failure
 
     record = failure(error, _KINDS.get(type(error), "raised"))
@@ -169,7 +169,7 @@ def failed_report(store: DatasetStore, job: Job, error: BaseException) -> Report
 
 
 class _Child:
-    """The child process of this process. The first `call` starts it."""
+    """The child process that does the work of this worker. The first `call` starts it."""
 
     def __init__(self) -> None:
         self._process: WorkerProcess | None = None

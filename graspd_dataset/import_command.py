@@ -1,4 +1,4 @@
-"""The command `graspd import`: it converts grasps of other projects to grasps.json (docs/dataset.md)."""
+"""The command `graspd import`: convert grasps of other projects to grasps.json (docs/dataset.md)."""
 
 from __future__ import annotations
 
@@ -30,14 +30,14 @@ def add_command(commands: Any) -> None:
     parser.add_argument(
         "place", metavar="PATH", type=Path, help="DexGraspBench .npy, isaac_grasp .yaml, GraspGen .json"
     )
-    parser.add_argument("--hand", required=True, metavar="NAME|PATH", help="whose grasps they are")
-    parser.add_argument("--object", default=None, metavar="MESH", help="instead of what the files name")
-    parser.add_argument("--joint-order", default="", metavar="A,B,…", help="of npy files: the names of their joints")
-    parser.add_argument("--preset", default="balanced", help="settings of the squeeze and the pregrasp that are found")
-    parser.add_argument("--mass", type=float, default=None, metavar="KG", help="by default the heavy end of a volume")
+    parser.add_argument("--hand", required=True, metavar="NAME|PATH", help="hand of the grasps")
+    parser.add_argument("--object", default=None, metavar="MESH", help="replaces the mesh that the files name")
+    parser.add_argument("--joint-order", default="", metavar="A,B,…", help="joint names of npy files, in their order")
+    parser.add_argument("--preset", default="balanced", help="settings for pregrasps and squeezes that files lack")
+    parser.add_argument("--mass", type=float, default=None, metavar="KG", help="default: the heavy end for the volume")
     parser.add_argument("--friction", type=float, default=0.6, metavar="MU", help="default 0.6")
-    parser.add_argument("--verify", choices=VERIFICATIONS, default="none", help="try and measure them (default none)")
-    parser.add_argument("--out", type=Path, required=True, metavar="DIR", help="or a .json file for a single object")
+    parser.add_argument("--verify", choices=VERIFICATIONS, default="none", help="trials of the grasps (default none)")
+    parser.add_argument("--out", type=Path, required=True, metavar="DIR", help="folder, or .json file for one object")
 
 
 def run(options: argparse.Namespace) -> int:
@@ -78,7 +78,7 @@ def run(options: argparse.Namespace) -> int:
 
 
 def _result(scene: Scene, hand: HandModel, imported: Sequence[ImportedGrasp], config: Any, verify: str) -> GraspResult:
-    """Return the grasps of one object as a GraspResult. Verified grasps come first unless `verify` is "none"."""
+    """Complete the grasps of one object, and try them unless `verify` is "none". Verified grasps come first."""
     from graspd_core.planning.plan_grasps import on_surface
     from graspd_core.verify.run_clock import result_of
     from graspd_core.verify.verification import verify_grasps
@@ -94,7 +94,7 @@ def _result(scene: Scene, hand: HandModel, imported: Sequence[ImportedGrasp], co
     warnings = [*hand.named_warnings, *filter(None, [completed.frame_doubt])]
     if moved:
         note = f"{len(moved)} squeezes move the base, by up to {max(moved) * 1000:.1f} mm"
-        warnings.append(f"{note}; here the base stays at the grasp's pose")
+        warnings.append(f"{note}; graspd keeps the base at the grasp's pose")
     return result_of(
         grasps,
         len(imported),

@@ -1,4 +1,4 @@
-"""Inspection of a data set: counts of grasps, reasons of failure, damaged files and duplicate grasps."""
+"""Inspect a data set: count its grasps and why they failed, and find damaged files and duplicate grasps."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ _REASONS = 8
 
 @dataclass
 class HandCount:
-    """Counts of one hand: blocks, bytes, grasps by verdict, and the hashes of its objects."""
+    """Counts of one hand: blocks, their size [bytes], grasps of each verdict. Also the hashes of its objects."""
 
     blocks: int = 0
     size: int = 0
@@ -30,13 +30,13 @@ class HandCount:
 
 @dataclass
 class DatasetStats:
-    """Counts of a data set.
+    """Counts of a data set, the code that made it, and its failures.
 
     Attributes:
-        hands: counts by hand name.
-        reasons: number of failed grasps by trial and kind of reason.
+        hands: counts of each hand, by its name.
+        reasons: number of failed grasps for each text of `kind_of_reason`.
         codes: versions of the code that made the rows.
-        failed: records of blocks and objects that failed and have no file.
+        failed: records of failed blocks and objects. Without blocks that were made later.
     """
 
     hands: dict[str, HandCount] = field(default_factory=dict)
@@ -54,7 +54,7 @@ class DatasetStats:
 
 
 def tables_of(store: DatasetStore, columns: Sequence[str] | None = None) -> Iterator[tuple[str, bytes, Any, Any]]:
-    """Yield path, bytes, pyarrow table and metadata of every block, sorted by path.
+    """Yield path, content, pyarrow table and metadata of each block, sorted by path.
 
     Raises FormatError: there is no block, or a block is damaged.
     """
@@ -88,7 +88,7 @@ def stats_of(store: DatasetStore) -> DatasetStats:
 
 
 def stats_table(stats: DatasetStats) -> str:
-    """Return the counts of every hand as a Markdown table."""
+    """Return a Markdown table with a row of counts for each hand."""
     body = [
         (
             name,
@@ -106,7 +106,7 @@ def stats_table(stats: DatasetStats) -> str:
 
 
 def reason_lines(stats: DatasetStats) -> list[str]:
-    """Return one line for each of the 8 most frequent reasons, then one for each failed block or object."""
+    """Return lines: the 8 most frequent reasons why grasps failed, with counts, then each failed block or object."""
     lines = [f"{number} {reason}" for reason, number in stats.reasons.most_common(_REASONS)]
     return lines + [f"{record['failed']}: {record['asked']['object']}: {record['error']}" for record in stats.failed]
 
@@ -116,7 +116,7 @@ _UNIT_TOLERANCE = 1e-3
 
 
 def faults_of_dataset(store: DatasetStore) -> Iterator[str]:
-    """Yield the faults of a data set, one line per fault. Raises FormatError: there is no data set."""
+    """Yield a line for each fault of the files and rows of a data set. Raises FormatError: there is no data set."""
     paths, meshes = store.list("grasps"), {key_of(path) for path in store.list("objects")}
     if not paths:
         raise FormatError(f"{store.label}: no data set; expected .parquet files below grasps/")
@@ -153,7 +153,7 @@ def faults_of_dataset(store: DatasetStore) -> Iterator[str]:
 
 
 def recorded_hashes(store: DatasetStore) -> dict[str, set[str]]:
-    """Return the hashes of files that run records hold, by path. Raises FormatError: a record is damaged."""
+    """Return the SHA-256 hashes of each file in the run records, by path. Raises FormatError: a record is damaged."""
     known: dict[str, set[str]] = {}
     for record in (read_record(store, path) for path in store.list("runs")):
         for path, digest in record.get("files", {}).items():
@@ -163,11 +163,11 @@ def recorded_hashes(store: DatasetStore) -> dict[str, set[str]]:
 
 def _changed(path: str, content: bytes, known: Mapping[str, set[str]]) -> Iterator[str]:
     if path in known and file_hash(content) not in known[path]:
-        yield f"{path}: its content was changed: its SHA-256 is not the recorded one"
+        yield f"{path}: the file was changed: its SHA-256 differs from the recorded SHA-256"
 
 
 def row_digests(table: Any) -> list[bytes]:
-    """Return for every row the SHA-256 of its object, hand and grasp posture, whatever its block."""
+    """Return for each row the SHA-256 of object, hand and grasp posture. It is equal for equal grasps in any block."""
     names = ("object_sha256", "hand_sha256", "grasp_position", "grasp_quaternion_wxyz", "grasp_joint_positions")
     rows = zip(*(table[name].to_pylist() for name in names), strict=True)
     return [hashlib.sha256(repr(row).encode()).digest() for row in rows]
@@ -180,7 +180,7 @@ def count_by_content(store: DatasetStore) -> tuple[int, int]:
 
 
 def _file_faults(path: str, table: Any, header: dict[str, Any], meshes: set[str]) -> Iterator[str]:
-    """Yield the faults of one block. `meshes` are the keys of the meshes in `objects/`."""
+    """Yield the faults of one block's file. `meshes` are the keys of the meshes in `objects/`."""
     import numpy as np
 
     if table.schema.remove_metadata() != arrow_schema():
@@ -188,7 +188,7 @@ def _file_faults(path: str, table: Any, header: dict[str, Any], meshes: set[str]
         yield f"its columns are not those of the schema: {', '.join(sorted(names)) or 'other types'}"
         return
     if content_key(header.get("asked")) != key_of(path) or header.get("block") != key_of(path):
-        yield f"its metadata does not match its name: it is of block {header.get('block')}"
+        yield f"its metadata does not match its name: the metadata names block {header.get('block')}"
     if not table.num_rows:
         return
     hand, target = table["hand_name"][0].as_py(), table["object_sha256"][0].as_py()

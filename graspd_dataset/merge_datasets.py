@@ -1,4 +1,4 @@
-"""Merging of data sets block by block, and random sampling of rows."""
+"""Merge data sets block by block. Draw random rows of a data set."""
 
 from __future__ import annotations
 
@@ -13,16 +13,16 @@ from graspd_dataset.dataset_store import DatasetStore, keys_below, parquet_bytes
 from graspd_dataset.inspect_dataset import tables_of
 from graspd_dataset.record_schema import arrow_schema
 
-# Columns that may differ between two data sets' copies of a block.
+# Columns that may differ between two files of the same block: names, and the code that made the block.
 _NAMES = ("object_source", "preset", "code")
 
 
 def merge(sources: Sequence[DatasetStore], out: DatasetStore) -> tuple[int, int]:
     """Copy all blocks, meshes, and records of failures and runs to `out`.
 
-    Return the numbers of blocks copied, and of blocks already in `out`. Existing blocks are compared and kept, so an
-    interrupted merge can be repeated.
-    Raises FormatError: a file is damaged, or two blocks of the same key have different rows.
+    Return how many blocks were copied, and how many `out` already had. A block that `out` has is compared and not
+    replaced, so an interrupted merge can be repeated.
+    Raises FormatError: a file is damaged, or two blocks with the same key have different rows.
     """
     there = {path.rpartition("/")[2]: path for path in out.list("grasps")}
     copied = common = 0
@@ -55,9 +55,9 @@ def _refuse_conflict(table: Any, out: DatasetStore, path: str, where: str) -> No
 
 
 def sample(store: DatasetStore, count: int, seed: int, verdict: str | None = None) -> tuple[bytes, int]:
-    """Draw up to `count` rows, all equally likely. Return the bytes of a Parquet file and the number of rows.
+    """Draw up to `count` rows at random. Return the content of a Parquet file with them, and their number.
 
-    `verdict` limits the draw to rows with that verdict. The same rows and seed give the same sample.
+    If `verdict` is given, draw only from rows with this verdict. The same rows and seed give the same sample.
 
     Raises:
         ConfigError: `count` is less than 1.

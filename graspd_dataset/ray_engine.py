@@ -1,4 +1,4 @@
-"""Blocks on Ray: a private Ray on this machine, or an existing cluster. Tasks of a lost worker run again."""
+"""Make blocks on Ray: on a private Ray of this machine, or on a cluster. Ray repeats the tasks of a lost worker."""
 
 from __future__ import annotations
 
@@ -20,15 +20,15 @@ from graspd_dataset.blocks import Block, DatasetObject
 from graspd_dataset.dataset_store import DatasetStore
 from graspd_dataset.guarded_calls import Job, Limits, Report, prepare_object, run_block
 
-# Object store of a private Ray [bytes]. A prepared object takes about 2 MB, and few are stored at a time.
+# Size of a private Ray's object store [bytes]. A prepared object takes about 2 MB, and few are stored at a time.
 _OBJECT_STORE = 256 * 2**20
 # Number of times that Ray repeats a task after its worker or node was lost.
 _RETRIES = 4
-# A loopback address. Ray replaces 127.0.0.1 by the machine's address in its network.
+# Address at which a private Ray listens. Ray would replace 127.0.0.1 by the machine's network address.
 _LOOPBACK = "127.0.0.2"
 # Timeout for the connection to a cluster [s].
 _CONNECT = 10.0
-# Prefix of the name of a private Ray's folder. The process id of the driver follows.
+# Prefix of the name of a private Ray's folder. The id of this process follows.
 _FOLDER = "graspd-ray-"
 
 
@@ -36,8 +36,8 @@ _FOLDER = "graspd-ray-"
 def ray_running(address: str | None, workers: int | None, folder: Path | None = None) -> Iterator[Any]:
     """Connect to the cluster at `address`. If None, start a private Ray with `workers` CPUs. Yield the module `ray`.
 
-    A private Ray ends with this context. It has no dashboard, reports no usage, and accepts commands only with a random
-    token. Its files are in `folder`, or in a temporary folder if `folder` is None.
+    A private Ray ends with this context. It has no dashboard and reports no usage. It accepts only connections with a
+    random token. Its files are in `folder`, or in a temporary folder if `folder` is None.
 
     Raises ConfigError: Ray is not installed, or there is no cluster at the address.
     """
@@ -73,7 +73,7 @@ def ray_running(address: str | None, workers: int | None, folder: Path | None = 
 
 
 def _refuse_silent(address: str | None) -> None:
-    """Raise ConfigError if nothing listens at the address. Ray would wait for minutes and then end the process."""
+    """Raise ConfigError if nothing listens at `address`. Without this check, Ray waits minutes and ends the process."""
     host, _, port = (address or "").removeprefix("ray://").partition(":")
     if not port.isdigit():
         return
@@ -123,7 +123,7 @@ class RayEngine:
         ray: the connected module.
         store: the data set that files are written to.
         limits: limits for each block and each object.
-        ship: whether to send the content of mesh files, because nodes of a cluster may not be able to read them.
+        ship: whether tasks contain the mesh files. A cluster needs this, because its nodes may lack the files.
     """
 
     def __init__(self, ray: Any, store: DatasetStore, limits: Limits, *, ship: bool) -> None:
@@ -138,23 +138,23 @@ class RayEngine:
         return max(1, int(self._ray.cluster_resources().get("CPU", 1)))
 
     def submit_object(self, source: DatasetObject, config: PlanConfig) -> tuple[Any, Any]:
-        """Submit an object. Return the handles of its report and of its `ReadyObject.shared`."""
+        """Submit an object to prepare. Return two Ray handles: of its report, and of its `ReadyObject.shared`."""
         shape = source.source.startswith("shape:")
         content = Path(source.source).read_bytes() if self._ship and not shape else None
         return tuple(self._prepare.remote(object_job(source, config), content, self._store, self._limits))
 
     def submit_block(self, block: Block, shared: Any) -> Any:
-        """Submit a block. Return the handle of its report. `shared` is the second handle of `submit_object`."""
+        """Submit a block. Return the handle of its report. `shared` is the second result of `submit_object`."""
         if block.hand_content not in self._hands:
             self._hands[block.hand_content] = self._ray.put(pickled_hand(block))
         return self._run.remote(block_job(block), self._hands[block.hand_content], shared, self._store, self._limits)
 
     def wait(self, handles: Sequence[Any], seconds: float) -> list[Any]:
-        """Wait up to `seconds` until a task has ended. Return the handle of an ended task in a list, empty if none."""
+        """Wait up to `seconds` for a task to end. Return a list with its handle, or an empty list if none ended."""
         return self._ray.wait(list(handles), num_returns=1, timeout=seconds)[0]
 
     def report(self, handle: Any, key: str) -> Report:
-        """Return the report of a handle. Its kind of failure is `lost` if workers were lost on every attempt.
+        """Return the report of a handle. Its kind of failure is `lost` if Ray lost the worker at every attempt.
 
         Raises StorageError: the file could not be written.
         """

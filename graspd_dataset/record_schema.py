@@ -1,4 +1,4 @@
-"""The columns of a data set. The Parquet schema and the table of docs/dataset.md are made from this list."""
+"""The columns of a data set. `columns` defines them for the Parquet schema and the table in docs/dataset.md."""
 
 from __future__ import annotations
 
@@ -14,9 +14,9 @@ class Column:
     """One column of a data set.
 
     Attributes:
-        name: its name.
-        kind: its type: string, int32, int64, double, double[3], double[4], double[], string[], contacts or trials.
-        description: its meaning, with units and frame.
+        name: name of the column.
+        kind: type: string, int32, int64, double, double[3], double[4], double[], string[], contacts or trials.
+        description: meaning of the values, with units and frame.
     """
 
     name: str
@@ -35,14 +35,14 @@ def _posture(stage: str, what: str) -> tuple[Column, ...]:
 _BEFORE = (
     Column("block", "string", "key of the block: the name of its file"),
     Column("row", "int32", "place in the block: verified grasps first"),
-    Column("object_sha256", "string", "content of the cleaned, scaled mesh: the name of its file in `objects/`"),
+    Column("object_sha256", "string", "hash of the cleaned, scaled mesh, and name of its file in `objects/`"),
     Column("object_source", "string", "shape:NAME or the mesh file"),
     Column("scale", "double", "factor on the file's coordinates"),
     Column("mass", "double", "mass of the object [kg]"),
     Column("friction", "double", "Coulomb coefficient between hand and object"),
-    Column("hand_name", "string", "the hand"),
-    Column("hand_sha256", "string", "content of its URDF and description"),
-    Column("joint_names", "string[]", "all joints, coupled ones too"),
+    Column("hand_name", "string", "name of the hand"),
+    Column("hand_sha256", "string", "hash of the hand's URDF and description"),
+    Column("joint_names", "string[]", "names of all joints, coupled joints too"),
     Column("method", "string", "method that found the grasp"),
     Column("preset", "string", "name of the settings; the file's metadata has them all"),
     Column("verify", "string", "the trials: standard, hard, full, hard_full or none"),
@@ -61,7 +61,7 @@ _BEFORE = (
 
 
 def columns() -> tuple[Column, ...]:
-    """Return all columns. The last ones are the metrics of the registry, one column per metric."""
+    """Return all columns. The last columns are the metrics of `METRICS`, one column for each."""
     metrics = (
         Column(f"metric_{row.key}", "double", f"{row.name.replace('_', ' ')} (docs/metrics.md); null: not measured")
         for row in METRICS.values()

@@ -1,6 +1,6 @@
-"""Runs of the blocks that a data set lacks. Objects are prepared in advance, and nothing is done twice.
+"""Make the blocks that a data set lacks. Each object is prepared once, before its blocks.
 
-A run also writes a record of its command and cost, and the data card.
+This module also makes the run record (command, cost, files) and the data card, a README.md about the data set.
 """
 
 from __future__ import annotations
@@ -26,19 +26,19 @@ from graspd_dataset.run_records import code_version, commit
 
 @dataclass(frozen=True)
 class RunRecord:
-    """Record of one command, summed over all its sessions.
+    """Run record: one command, and its work in all sessions. A resumed run is a new session.
 
     Attributes:
         command: the command line, ready to be typed again.
-        code, commit: version of the code that ran.
+        code, commit: version of the code that ran, and its git commit.
         made: date of the first session.
         machine: number of cores, architecture and Python version.
         blocks: number of requested blocks.
         done: number of blocks written.
         cpu: CPU time of the processes that make blocks [s].
-        wall: duration [s].
+        wall: duration of all sessions [s].
         peak_mb: greatest peak memory of a process that makes blocks [MB].
-        files: SHA-256 of each file written, by path.
+        files: path and SHA-256 of each written file.
     """
 
     command: str
@@ -71,7 +71,7 @@ def command_of(request: DatasetRequest, out: str) -> str:
 
 
 def begin_run(store: DatasetStore, request: DatasetRequest, blocks: int, *, any_code: bool = False) -> RunRecord:
-    """Return the record of this command. It continues the record of earlier sessions, if there is one.
+    """Return the run record of this command: the stored record if there is one, otherwise a new one.
 
     Raises ConfigError: another code version made the data set, and `any_code` is false.
     """
@@ -79,7 +79,7 @@ def begin_run(store: DatasetStore, request: DatasetRequest, blocks: int, *, any_
     records = run_records(store)
     others = sorted({record.code for record in records} - {code})
     if others and not any_code:
-        raise ConfigError(f"{store.label}: made by code {others[0]}, this is {code}; to add to it give --any-code")
+        raise ConfigError(f"{store.label}: made by code {others[0]}, not by {code}; give --any-code to add to it")
     machine = f"{os.cpu_count()} cores, {platform.machine()}, Python {platform.python_version()}"
     new = RunRecord(command_of(request, store.label), code, commit(), date.today().isoformat(), machine, blocks)
     return next((replace(record, blocks=blocks) for record in records if record.path == new.path), new)
@@ -98,7 +98,7 @@ def run_records(store: DatasetStore) -> list[RunRecord]:
 
 
 def with_unrecorded(store: DatasetStore, record: RunRecord) -> RunRecord:
-    """Return the record, with hashes of unrecorded files added. Killed sessions and earlier code leave such files."""
+    """Return the record plus hashes of files that no record has. Killed sessions and earlier code leave such files."""
     known = recorded_hashes(store).keys() | record.files.keys()
     paths = [path for folder in ("grasps", "objects") for path in store.list(folder) if path not in known]
     return replace(record, files=record.files | {path: file_hash(store.read(path)) for path in paths})
@@ -120,8 +120,8 @@ def data_card(store: DatasetStore, stats: DatasetStats) -> str:
         "",
         "# Grasps by graspd",
         "",
-        f"{stats.rows} grasps that were tried in MuJoCo, {stats.size / 2**20:.1f} MB. A row is a candidate, failed",
-        "ones included: three postures, contacts, metrics, every trial's figures, the verdict and its reason.",
+        f"{stats.rows} grasps that were tried in MuJoCo, {stats.size / 2**20:.1f} MB. A row is a candidate, verified",
+        "or failed: three postures, contacts, metrics, results of every trial, the verdict and its reason.",
         f"The columns are described in graspd's docs/dataset.md (schema version {SCHEMA_VERSION}).",
         "",
         stats_table(stats),
@@ -139,8 +139,8 @@ def data_card(store: DatasetStore, stats: DatasetStats) -> str:
         "",
         "## What it is not",
         "",
-        "No grasp was tried on a robot. Verified means that it held in simulation, with the mass and friction of",
-        "its row.",
+        "No grasp was tried on a robot. Verified means that the grasp held in simulation, with the mass and friction",
+        "of its row.",
         "",
         "## Licence",
         "",
@@ -151,8 +151,8 @@ def data_card(store: DatasetStore, stats: DatasetStats) -> str:
 
 
 _LICENCE = {
-    True: "Apache-2.0; the objects are shapes of graspd.",
-    False: "The grasps: Apache-2.0. Meshes in `objects/` that are not shapes of graspd: as their owners say.",
+    True: "Apache-2.0. The objects are shapes of graspd.",
+    False: "Grasps and shapes of graspd: Apache-2.0. Other meshes in `objects/`: the licences of their owners.",
 }
 
 
@@ -163,12 +163,12 @@ def _objects(command: str) -> list[Any]:
 
 # Interval at which a run checks whether to stop [s].
 _POLL = 0.5
-# Submitted blocks per slot. A slot then never waits for the next block, and a stop drops few blocks.
+# Submitted blocks per task that can run at a time. So no worker waits for work, and a stop drops few blocks.
 _AHEAD = 2
 
 
 def missing_blocks(blocks: Sequence[Block], store: DatasetStore, *, retry_failed: bool = False) -> list[Block]:
-    """Return the blocks without a file. Skip failed blocks and blocks of failed objects unless `retry_failed`."""
+    """Return the blocks without a file. Skip those that failed, or whose object failed, unless `retry_failed`."""
     there = keys_below(store, "grasps")
     failed = set() if retry_failed else keys_below(store, "failed")
     return [b for b in blocks if b.key not in there and not failed & {b.key, b.object.key}]
@@ -177,9 +177,9 @@ def missing_blocks(blocks: Sequence[Block], store: DatasetStore, *, retry_failed
 def run_blocks(
     blocks: Sequence[Block], engine: RayEngine, stop: Callable[[], bool] = lambda: False
 ) -> Iterator[tuple[Block | DatasetObject, Report]]:
-    """Prepare objects and run their blocks. Yield each object and block with its report when it ends.
+    """Prepare objects and make their blocks. Yield each object and each block, with its report, when its task ends.
 
-    The blocks of a failed object are skipped. Running ends when `stop` returns true.
+    The blocks of a failed object are skipped. The run ends when `stop` returns True.
     Raises StorageError: a file could not be written. Files written before remain.
     """
     waiting = deque(by_object(blocks))

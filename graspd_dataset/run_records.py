@@ -1,4 +1,4 @@
-"""Content of run records: code version, commit, failure, CPU time and peak memory. Also Markdown tables."""
+"""Facts about a run: code version, commit, failures, CPU time and peak memory. Also Markdown tables."""
 
 from __future__ import annotations
 
@@ -18,15 +18,15 @@ from typing import Any
 import graspd_core
 from graspd_core.mesh.mesh_files import MESH_ENDINGS
 
-# Parts of graspd_core that no recorded figure depends on.
+# Parts of graspd_core on which no recorded result depends.
 _BESIDE = ("cli", "io", "doctor.py")
 _STATUS, _CLEAR = Path("/proc/self/status"), Path("/proc/self/clear_refs")
 
 
 class Stopwatch:
-    """Stopwatch that sums CPU and wall time by name [s]. Use `with stopwatch(name):` around the timed code.
+    """Stopwatch that sums CPU and wall time for each name [s]. Use `with stopwatch(name):` around the timed code.
 
-    CPU time is that of the whole process (`time.process_time`). On one thread it does not depend on the machine's load.
+    CPU time counts the whole process (`time.process_time`). On one thread it does not depend on the machine's load.
     """
 
     def __init__(self) -> None:
@@ -44,7 +44,7 @@ class Stopwatch:
 
 
 def forget_peak() -> None:
-    """Reset the process's peak memory. Do nothing if the system cannot (it needs Linux)."""
+    """Reset the process's peak memory. Do nothing on systems other than Linux."""
     try:
         _CLEAR.write_text("5")
     except OSError:
@@ -61,7 +61,7 @@ def peak_mb() -> float:
 
 
 def failure(error: BaseException, kind: str = "raised") -> dict[str, Any]:
-    """Return the record of a failure: its kind (raised, died, hung), the error, and the traceback."""
+    """Return the record of a failure: its kind (raised, hung, memory, died), the error, and the traceback."""
     where = "".join(traceback.format_exception(error))
     message = " ".join(str(error).split())
     return {"failed": kind, "error": f"{type(error).__name__}: {message}", "traceback": where}
@@ -71,8 +71,8 @@ def failure(error: BaseException, kind: str = "raised") -> dict[str, Any]:
 def code_version(sources: tuple[str, ...] = ()) -> str:
     """Return the package's version and a hash of the sources that results depend on.
 
-    These are all Python and C++ sources of graspd_core except `_BESIDE`. `sources` adds files by glob patterns relative
-    to the parent folder of graspd_core.
+    The hash is of all Python and C++ files of graspd_core, except those in `_BESIDE`. `sources` are glob patterns of
+    further files, relative to the parent folder of graspd_core.
     """
     root = Path(graspd_core.__file__).parent
     files = {path for pattern in ("*.py", "*.cpp", "*.h", "*.hpp") for path in root.rglob(pattern)}
@@ -90,7 +90,7 @@ def code_version(sources: tuple[str, ...] = ()) -> str:
 
 @lru_cache
 def commit() -> str:
-    """Return the short hash of the current commit. A plus marks changed files. Empty outside a git clone."""
+    """Return the short hash of the current git commit, with a plus if files differ from it. Empty outside a clone."""
     command = ["git", "describe", "--always", "--dirty=+", "--exclude=*"]
     try:
         done = subprocess.run(command, cwd=Path(__file__).parent, capture_output=True, text=True, timeout=10)
@@ -100,14 +100,14 @@ def commit() -> str:
 
 
 def object_name(source: Any) -> str:
-    """Return a short name: that of a shape, or of a file without its ending. Other values become text."""
+    """Return a short name of an object, hand or other value: without `shape:`, or a file's name without its ending."""
     text = f"{source:g}" if isinstance(source, float) else str(source)
     path = Path(text)
     return path.stem if path.suffix[1:].lower() in (*MESH_ENDINGS, "yaml", "yml") else text.removeprefix("shape:")
 
 
 def finite(value: Any) -> Any:
-    """Return the values with None in place of every NaN or infinity, which JSON cannot hold."""
+    """Replace every NaN or infinity in nested values by None, because JSON cannot hold these."""
     if isinstance(value, dict):
         return {str(key): finite(item) for key, item in value.items()}
     if isinstance(value, list | tuple):

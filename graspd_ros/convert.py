@@ -1,4 +1,4 @@
-"""Conversions between messages and core values, and transforms of results to another frame.
+"""Conversions between messages and values of graspd_core, and transforms of results to another frame.
 
 Only this module converts quaternions between wxyz (core) and xyzw (messages). `T_a_b` maps coordinates in frame b to
 frame a.
@@ -23,8 +23,8 @@ from graspd_ros.error_codes import bad_request
 
 Matrix = Float[np.ndarray, "4 4"]
 
-_FARTHEST = 1e3  # metres. Larger coordinates are a mistake and cost precision
-_ROUNDED = 0.05  # tolerance of a quaternion's length, for quaternions rounded by hand
+_FARTHEST = 1e3  # largest valid coordinate [m]. A larger coordinate is an input mistake and loses precision
+_ROUNDED = 0.05  # largest difference of a quaternion's length from 1. People round quaternions by hand
 
 
 def nanoseconds(stamp: Time | Duration) -> int:
@@ -38,7 +38,7 @@ def set_nanoseconds(stamp: Time | Duration, value: int) -> None:
 
 
 def duration_of(seconds: float) -> Duration:
-    """Return a duration in whole nanoseconds, rounded up, so that a motion is never faster than allowed."""
+    """Return seconds as a duration, rounded up to whole nanoseconds, so that no motion is faster than allowed."""
     whole, rest = divmod(math.ceil(seconds * 1e9), SECOND)
     return Duration(sec=whole, nanosec=rest)
 
@@ -66,13 +66,13 @@ def wxyz_of(turn: Quaternion) -> Float[np.ndarray, "4"]:
 
 
 def pose_of(position: Sequence[float] | np.ndarray, quaternion_wxyz: Sequence[float] | np.ndarray) -> Pose:
-    """Return a position [m] and a quaternion as a message."""
+    """Return the pose message of a position [m] and a quaternion."""
     w, x, y, z = map(float, quaternion_wxyz)
     return Pose(position=point_of(position), orientation=Quaternion(x=x, y=y, z=z, w=w))
 
 
 def pose_of_posture(posture: Posture) -> Pose:
-    """Return the pose of the hand's base link."""
+    """Return the pose message of the hand's base link in a posture."""
     return pose_of(posture.position, posture.quaternion_wxyz)
 
 
@@ -87,12 +87,12 @@ def wxyz_of_matrix(T: Matrix) -> Float[np.ndarray, "4"]:
 
 
 def matrix_of_pose(pose: Pose) -> Matrix:
-    """Return a pose as a matrix. Raises TransformError if it is not finite or its quaternion has not unit length."""
+    """Return a pose as a matrix. Raises TransformError: not finite, or not a unit quaternion."""
     return matrix_of(array_of(pose.position), wxyz_of(pose.orientation))
 
 
 def near(point: Point, name: str, what: str = "") -> Float[np.ndarray, "3"]:
-    """Return a point as an array [m]. Raises RequestError on `name` (part `what`): not finite, or over 1 km away."""
+    """Return a point [m]. Raises RequestError with `name` and `what`: a coordinate is not finite or over 1 km."""
     place = array_of(point)
     if not (np.abs(place) <= _FARTHEST).all():
         raise bad_request(f"{name}: {what}{place.tolist()}; valid: finite, within {_FARTHEST:g} m")
@@ -100,7 +100,7 @@ def near(point: Point, name: str, what: str = "") -> Float[np.ndarray, "3"]:
 
 
 def pose_matrix(pose: Pose, name: str = "object_pose") -> Matrix:
-    """Return a pose as a matrix. A zero quaternion means no rotation. Raises RequestError on field `name`: invalid."""
+    """Return a pose as a matrix. A zero quaternion means no rotation. Raises RequestError: field `name` is invalid."""
     near(pose.position, name, "position ")
     length = float(np.linalg.norm(wxyz_of(pose.orientation)))
     if length == 0:
@@ -111,18 +111,18 @@ def pose_matrix(pose: Pose, name: str = "object_pose") -> Matrix:
 
 
 def matrix_of_transform(transform: Transform) -> Matrix:
-    """Return a transform as a matrix. Raises TransformError as `matrix_of`."""
+    """Return a transform as a matrix. Raises TransformError: not finite, or not a unit quaternion."""
     place, turn = transform.translation, transform.rotation
     return matrix_of((place.x, place.y, place.z), (turn.w, turn.x, turn.y, turn.z))
 
 
 def matrix_of_posture(posture: Posture) -> Matrix:
-    """Return the pose of the hand's base link as a matrix. Raises TransformError as `matrix_of`."""
+    """Return the pose of the hand's base link as a matrix. Raises TransformError if the pose is invalid."""
     return matrix_of(posture.position, posture.quaternion_wxyz)
 
 
 def matrix_of(position: Sequence[float] | np.ndarray, quaternion_wxyz: Sequence[float] | np.ndarray) -> Matrix:
-    """Return position [m] and quaternion as a matrix. Raises TransformError: not finite, or no unit quaternion."""
+    """Return position [m] and quaternion as a matrix. Raises TransformError: not finite, or not a unit quaternion."""
     px, py, pz = map(float, position)
     w, x, y, z = map(float, quaternion_wxyz)
     # Plain numbers are faster than small arrays. Robots send thousands of transforms a second.
@@ -148,7 +148,7 @@ def moved_points(points: Float[np.ndarray, "n 3"], T: Matrix) -> Float[np.ndarra
 
 
 def moved_result(result: GraspResult, T_new_old: Matrix) -> GraspResult:
-    """Return a result with postures, contacts, support plane and next view transformed to another frame."""
+    """Return a result transformed to another frame: postures, contacts, support plane and next camera pose."""
     return replace(
         result,
         tried=tuple(moved_grasp(grasp, T_new_old) for grasp in result.tried),

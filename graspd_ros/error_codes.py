@@ -9,7 +9,7 @@ from graspd_core.errors import GraspdError
 
 
 class ErrorCode(StrEnum):
-    """`error_code` of a GraspArray, and `code` of an error or refusal on `~/status`. Empty if there is no error."""
+    """Values of `error_code` in a GraspArray and of `code` in events on `~/status`. The empty code means no error."""
 
     NONE = ""
     BAD_REQUEST = "BAD_REQUEST"  # a field is out of range or unknown
@@ -17,20 +17,20 @@ class ErrorCode(StrEnum):
     BAD_CLOUD = "BAD_CLOUD"  # the cloud or depth image cannot be read or shows no usable object
     BAD_LIBRARY = "BAD_LIBRARY"  # grasp_library is damaged, of another version, locked or missing
     NO_OBJECT = "NO_OBJECT"  # the scene does not contain the requested object
-    NO_CLOUD = "NO_CLOUD"  # LATEST_CLOUD without a received cloud, or VIEWS without a stored view
+    NO_CLOUD = "NO_CLOUD"  # LATEST_CLOUD before a cloud has arrived, or VIEWS before a view is stored
     STALE_CLOUD = "STALE_CLOUD"  # the cloud is older than cloud_max_age
     NO_TRANSFORM = "NO_TRANSFORM"  # /tf does not connect the frames
-    WRONG_HAND = "WRONG_HAND"  # the request names another hand than the node's
-    NOT_FOUND = "NOT_FOUND"  # a cancel names no waiting or running request
+    WRONG_HAND = "WRONG_HAND"  # the request needs a hand that this node does not plan for
+    NOT_FOUND = "NOT_FOUND"  # a message on ~/cancel names a request that is neither waiting nor running
     DUPLICATE_ID = "DUPLICATE_ID"  # a request with this id is waiting or running
-    BUSY = "BUSY"  # refused under busy_policy, or the queue is full
-    SHUTTING_DOWN = "SHUTTING_DOWN"  # the node is ending
-    CANCELLED = "CANCELLED"  # by ~/cancel, ~/reset, the action's client or the node's end
+    BUSY = "BUSY"  # busy_policy refuses requests while the node is busy, or the queue is full
+    SHUTTING_DOWN = "SHUTTING_DOWN"  # the node is shutting down
+    CANCELLED = "CANCELLED"  # cancelled by ~/cancel, ~/reset, the action's client or the node's shutdown
     SUPERSEDED = "SUPERSEDED"  # a newer request took its place
     DEADLINE = "DEADLINE"  # time_budget passed before enough grasps were found
-    NO_GRASP = "NO_GRASP"  # fewer grasps than requested passed the trials, or none
+    NO_GRASP = "NO_GRASP"  # fewer grasps than requested passed the trials
     OUT_OF_MEMORY = "OUT_OF_MEMORY"
-    INTERNAL = "INTERNAL"  # a fault of graspd: the node's log has the traceback
+    INTERNAL = "INTERNAL"  # a bug in graspd. The node's log has the traceback
 
 
 class RequestError(GraspdError):
@@ -42,7 +42,7 @@ class RequestError(GraspdError):
 
 
 def bad_request(message: str) -> RequestError:
-    """Return the error about a field or a message that is not valid."""
+    """Return the error for an invalid field or message."""
     return RequestError(ErrorCode.BAD_REQUEST, message)
 
 

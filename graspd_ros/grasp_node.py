@@ -1,7 +1,7 @@
-"""The ROS node. Its callbacks pass requests to the worker and publish the worker's reports as messages.
+"""The ROS node. It passes requests to the worker and publishes the worker's reports as messages.
 
 Every request ends in exactly one GraspArray on `~/grasps` and one terminal event on `~/status`. An action goal also
-gets one result. Callbacks run in the executor's thread, heavy work in the worker's. Both threads publish.
+gets one result. Callbacks run in the executor's thread. Heavy work runs in the worker's thread. Both threads publish.
 """
 
 from __future__ import annotations
@@ -55,14 +55,14 @@ from graspd_ros.request import Listener, Request
 from graspd_ros.request_planner import PATIENCE, Planned, Planner, overdue
 from graspd_ros.worker import BusyPolicy, StopHook, Worker
 
-GOAL_PATIENCE = 0.3  # seconds for the executor to end all goals at shutdown
-RESULT_PATIENCE = 0.05  # seconds from then until the last result is sent
+GOAL_PATIENCE = 0.3  # longest wait at shutdown until the executor has ended all goals [s]
+RESULT_PATIENCE = 0.05  # wait after GOAL_PATIENCE, in which the last result is sent [s]
 IMAGES = "depth images"  # key in `missing` for images without a matching CameraInfo. Other keys are topic names
 OVERDUE_PERIOD = 0.25  # seconds between two checks for waiting requests whose deadline passed
-# Even a reliable reader keeps only its newest messages. A burst of requests must fit, or some get no answer.
+# A subscriber's queue keeps only the newest messages. A burst of requests must fit, or some requests get no answer.
 REQUEST_DEPTH = 500
-THINGS_DEPTH = 500  # a planning scene arrives in one burst
-RESULT_TIMEOUT = 60  # seconds for which results are kept for clients. rclpy's 900 s need much memory
+THINGS_DEPTH = 500  # queue of collision objects. A planning scene arrives in one burst
+RESULT_TIMEOUT = 60  # seconds for which clients can fetch a result. rclpy's default of 900 s needs much memory
 
 
 class GraspNode(Node):
@@ -76,7 +76,7 @@ class GraspNode(Node):
         transforms = TransformBuffer()
         self._settings = LiveSettings(self, transforms.frames)
         settings = self._settings.now
-        # Set before the hand is loaded. With more threads loading takes seconds on a busy machine.
+        # Set the threads before the hand is loaded. With more threads, loading takes seconds on a busy machine.
         torch.set_num_threads(settings.torch_threads)
         self._hand = load_hand(settings.hand, prefix=settings.hand_prefix)
         self._on_failure = on_failure
@@ -99,7 +99,7 @@ class GraspNode(Node):
         self._create_inlets(settings.collision_objects)
         self._goals = self._create_actions()
         self._diagnostics = self.create_publisher(DiagnosticArray, "/diagnostics", 10)
-        steady = Clock(clock_type=ClockType.STEADY_TIME)  # health does not stop where simulated time does
+        steady = Clock(clock_type=ClockType.STEADY_TIME)  # diagnostics go on when simulated time stops
         self.create_timer(1.0, self._on_diagnostics_due, clock=steady)
         self.create_timer(1.0, self._watch_sensors, clock=steady)
         late = lambda request: request.time_left() <= 0  # noqa: E731
@@ -145,7 +145,7 @@ class GraspNode(Node):
         return [*servers, GoalServer(self, GraspPlanning, "~/grasp_planning", make, submit, cancel)]
 
     def close(self, timeout: float) -> bool:
-        """Cancel all requests and stop publishing. Return True if the worker ended within `timeout` seconds.
+        """Cancel all requests and stop publishing. Return True if worker and planner ended in time.
 
         The executor must still spin, because it ends the goals.
         """
@@ -157,7 +157,7 @@ class GraspNode(Node):
         self._responses.publishers.close()
         return ended
 
-    # Callbacks: short, in the executor's thread.
+    # Callbacks. They run in the executor's thread, so they must be short.
 
     def _on_mesh(self, message: String) -> None:
         name, builder = self._request_builder.new_id("mesh"), self._request_builder
@@ -183,13 +183,13 @@ class GraspNode(Node):
     def _on_points(self, message: PointCloud2) -> None:
         try:
             self._see(cloud_frame(message, nanoseconds(self._now())))
-        except RequestError as error:  # too large to keep
+        except RequestError as error:  # the cloud is too large
             self._responses.cloud_not_taken(self._request_builder.new_id("cloud"), error)
 
     def _on_depth(self, message: DepthMessage | CameraInfo) -> None:
         try:
             pair = self._pairs.add(message)
-        except CloudError as error:  # no image
+        except CloudError as error:  # the image is broken
             self._responses.cloud_not_taken(self._request_builder.new_id("cloud"), error)
         else:
             if pair is not None:
@@ -198,7 +198,7 @@ class GraspNode(Node):
     def _on_collision_object(self, message: Any) -> None:
         try:
             self._collision_objects = updated_objects(self._collision_objects, message)
-        except Exception as error:  # whatever the message holds, the executor goes on
+        except Exception as error:  # no message may stop the executor
             self._responses.refused("", "collision_objects", code_of(error), sentence_of(error))
 
     def _on_cancel(self, message: String) -> None:
@@ -222,7 +222,7 @@ class GraspNode(Node):
             self._request_builder.add_view(self._settings.now)
             views = self._request_builder.views
             response.success, response.message = True, f"{len(views.clouds)} views in {views.frame!r}"
-        except Exception as error:  # whatever the cloud holds, the executor goes on
+        except Exception as error:  # no cloud may stop the executor
             response.success, response.message = False, sentence_of(error)
         return response
 
@@ -232,10 +232,10 @@ class GraspNode(Node):
         return response
 
     def _watch_sensors(self) -> None:
-        """Log once which sensor topics deliver no messages. Requests for the latest cloud repeat the reason."""
+        """Log once why a sensor topic is silent. Store the reasons, which errors of `RequestBuilder.latest` repeat."""
         before = self._request_builder.missing
         missing = {sensor.name: reason for sensor in self._sensors if (reason := sensor.check())}
-        for name in missing.keys() - before.keys():  # some publish on demand only: no fault by itself
+        for name in missing.keys() - before.keys():  # only a warning, because some cameras publish only on demand
             self.get_logger().warning(missing[name])
         if reason := self._pairs.unpaired():
             missing[IMAGES] = reason
@@ -257,7 +257,7 @@ class GraspNode(Node):
         )
         self._diagnostics.publish(health_message(health, self._now(), resident_memory()))
 
-    # From messages to the worker.
+    # Make requests from messages and submit them to the worker.
 
     def _take_request(self, message: GraspRequest, kind: str, listener: Listener | None) -> str:
         name, builder = message.id or self._request_builder.new_id(kind), self._request_builder
@@ -270,7 +270,7 @@ class GraspNode(Node):
     ) -> None:
         try:
             request = make(self._settings.now)
-        except Exception as error:  # whatever a message holds, the executor goes on
+        except Exception as error:  # no request may stop the executor
             self._responses.not_made(request_id, source, error, listener)
         else:
             self._submit(request)
@@ -291,14 +291,14 @@ class GraspNode(Node):
     def _submit(self, request: Request) -> None:
         if self._collision_objects:
             request = replace(request, collision_objects=self._collision_objects)
-        with self._announcing:  # the worker starts only once the answer is out
+        with self._announcing:  # the worker waits until the admission is published
             admission = self._worker.submit(request, BusyPolicy(request.settings.busy_policy))
             self._responses.admitted(request, admission)
 
     def _now(self) -> Time:
         return self.get_clock().now().to_msg()
 
-    # The worker's side.
+    # Methods that run in the worker's thread.
 
     def _prepare(self) -> None:
         torch.set_num_threads(self._settings.now.torch_threads)
@@ -311,13 +311,13 @@ class GraspNode(Node):
                 from graspd_ros.known_objects import warm_up_library
 
                 warm_up_library(settings, self._hand)
-        except BaseException as error:  # otherwise the node would run on without a worker
+        except BaseException as error:  # an uncaught error would leave a node without a worker
             self._responses.report_error("", "node", error)
             self._on_failure()
             return
         if self._worker.stopping():
             return
-        # The present objects stay alive. Scanning them again would cost 0.2 s in each garbage collection.
+        # The existing objects stay alive. Without this, each garbage collection would take 0.2 s to scan them.
         gc.collect()
         gc.freeze()
         # The first log call takes 0.1 s, because rclpy searches all modules for the caller.
@@ -344,32 +344,32 @@ def _collision_object() -> type:
 
 
 class SynthesizeMessages:
-    """Makes the feedback and result messages of a goal of `~/synthesize`."""
+    """Converter of messages to the feedback and result of a goal of `~/synthesize`."""
 
     def progressed(self, message: GraspProgress) -> SynthesizeGrasps.Feedback:
         return SynthesizeGrasps.Feedback(progress=message)
 
     def found(self, message: Grasp) -> None:
-        """Return None, because the result holds all grasps."""
+        """Return no feedback, because the result holds all grasps."""
 
     def result(self, message: GraspArray) -> SynthesizeGrasps.Result:
         return SynthesizeGrasps.Result(result=message)
 
     def succeeded(self, result: SynthesizeGrasps.Result) -> bool:
-        """Return True, because the answer's status tells how good the answer is."""
+        """Return True, so that the answer's status alone decides whether the goal succeeds."""
         return True
 
 
 class GoalServer:
-    """Action server whose goals are handled like other requests.
+    """Action server that submits its goals as requests.
 
     An invalid goal is accepted and aborted at once, so that the client gets the reason. No method blocks. The worker
-    decides when a goal starts and ends. The executor's thread tells the client.
+    decides when a goal starts and ends. The executor's thread informs the client.
 
     Args:
         make_messages: makes the message converter of a new goal, for example `SynthesizeMessages`.
         submit: submits a goal's request with its listener and returns the request's id.
-        cancel: cancels the request with an id and returns True if there was one.
+        cancel: cancels the request with a given id. Returns True if the request existed.
     """
 
     def __init__(
@@ -415,7 +415,7 @@ class GoalServer:
 
 
 class Goal:
-    """Listen to one request, and send its feedback and result to the action client."""
+    """Listener of one request that sends feedback and result to the action client."""
 
     def __init__(self, node: Node, handle: ServerGoalHandle, messages: Any, on_end: Callable[[], object]) -> None:
         self._node = node
@@ -426,7 +426,7 @@ class Goal:
         self._begun = False
 
     def progressed(self, message: GraspProgress) -> None:
-        """Send feedback. The first message after `queued` sets the goal to executing."""
+        """Send feedback. The first message whose stage is not `queued` sets the goal to executing."""
         if message.stage != "queued":
             self._begin()
         self._feed(self.messages.progressed(message))
@@ -452,7 +452,7 @@ class Goal:
             self._begun = True
             try:
                 self._handle.execute(self._conclude)
-            except RCLError:  # the client cancelled in between. The second call takes this into account
+            except RCLError:  # the client cancelled during this call. A second call notices the cancellation
                 self._handle.execute(self._conclude)
 
     async def _conclude(self, handle: ServerGoalHandle) -> Any:

@@ -1,7 +1,7 @@
 """Requests and answers of the standard action `grasping_msgs/action/GraspPlanning`. Grasps are MoveIt messages.
 
-An object's meshes are used first. Without meshes its primitives are used, and without both its point cluster. The
-support surface is the plane on which the object stands. No hand may pass through it.
+The object's shape comes from its meshes. Without meshes, the primitives are used, and without both, the point cluster.
+The object stands on the support surface, a plane that the hand must not cross.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ from graspd_ros.request import Listener, Request
 
 
 class PlanningMessages:
-    """Makes feedback and result of a goal of GraspPlanning: the grasps found so far, then all grasps."""
+    """Converter of messages for a GraspPlanning goal. Feedback: the grasps found so far. Result: the final grasps."""
 
     def __init__(self, hand: HandModel) -> None:
         self._hand = hand
@@ -36,7 +36,7 @@ class PlanningMessages:
         self._up: tuple[str, tuple[float, float, float]] | None = None
 
     def watching(self, request: Request, goal: Any) -> Request:
-        """Return the goal's request, whose `load` stores the up direction. Store the object that the hand may touch."""
+        """Store the object's name. Return the request with `closes_late` and a `load` that stores the up direction."""
         self._touch = (goal.object.name,) if goal.object.name else ()
 
         def loaded() -> Scene:
@@ -58,16 +58,16 @@ class PlanningMessages:
         return GraspPlanning.Feedback(grasps=list(self._found))
 
     def result(self, message: GraspArray) -> GraspPlanning.Result:
-        """Return the grasps that failed no trial and have an arrival posture, best first."""
+        """Return the grasps that failed no trial and have an arrival posture (fingers not yet closed), best first."""
         good = [grasp for grasp in message.grasps if all(trial.passed for trial in grasp.trials)]
         return GraspPlanning.Result(grasps=[self._grasp(grasp) for grasp in good if grasp.arrival_joints.name])
 
     def succeeded(self, result: GraspPlanning.Result) -> bool:
-        """Return True if there is a grasp. A goal without grasps is aborted."""
+        """Return True if the result has a grasp. A goal without grasps is aborted."""
         return bool(result.grasps)
 
     def _grasp(self, message: Grasp) -> Any:
-        """Return a grasp as a MoveIt message. It retreats upwards, or back along the approach if up is unknown."""
+        """Return a grasp as a MoveIt message. The hand retreats up or, if up is unknown, back along the approach."""
         x, y, z = (array_of(message.pregrasp_pose.position) - array_of(message.grasp_pose.position)).tolist()
         back = (x, y, z) if any((x, y, z)) else (0.0, 0.0, 1.0)
         frame, direction = self._up or (message.header.frame_id, back)
@@ -90,10 +90,10 @@ def request_from_goal(
         return builder.from_loader(request_id, header, settings, load, listener)
     cluster = target.point_cluster
     if not cluster.data:
-        raise bad_message("object", "it has no meshes, primitives or point_cluster; give one of these")
+        raise bad_message("object", "no meshes, no primitives and no point_cluster; give one of these")
     header = cluster.header if cluster.header.frame_id else target.header
     if plane is not None and target.header.frame_id not in ("", header.frame_id):
-        fault = f"surface: frame {target.header.frame_id!r}, but point_cluster has {header.frame_id!r}; give one frame"
+        fault = f"surface: frame {target.header.frame_id!r}, point_cluster: {header.frame_id!r}; give both in one frame"
         raise bad_message("object", fault)
     request = builder.from_cluster(request_id, replace(settings, segment=False), cluster, header, listener)
     return replace(request, load=with_support(request.load, plane))

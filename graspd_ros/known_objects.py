@@ -20,7 +20,7 @@ from graspd_ros.request_planner import unlike
 
 
 def find_entry(known: KnownObject, settings: Settings, hand: HandModel | None) -> LibraryEntry | None:
-    """Return the library's entry for a request, for any hand if `hand` is None. None if an optional entry is missing.
+    """Return the library entry of an object for `hand`, or for any hand if None. Return None if there is no entry.
 
     Raises GraspdError if a required entry is missing or the library cannot be read.
     """
@@ -32,7 +32,7 @@ def find_entry(known: KnownObject, settings: Settings, hand: HandModel | None) -
 
 
 def warm_up_library(settings: Settings, hand: HandModel) -> None:
-    """Read one entry, so that the first request is not slow. Raises FormatError if the library cannot be read."""
+    """Read a library entry, so that the first request is fast. Raises FormatError if the library cannot be read."""
     library = GraspLibrary(Path(settings.grasp_library))
     for entry, _ in library.entries(hand_content=hand_hash(hand))[:1]:
         library.grasps(entry, hand)
@@ -58,9 +58,9 @@ def answer_known(
     restrictions: Sequence[Steering | Reach],
     **plan: Any,
 ) -> tuple[GraspResult, Scene | None]:
-    """Return grasps unlike the `excluded` base-link poses, and the scene (None if not loaded).
+    """Return grasps that are not similar to the `excluded` base-link poses, and the scene (None if not loaded).
 
-    If the library has too few, plan more with the arguments `plan`. Raises GraspdError as `find_entry` and planning do.
+    If the library has too few grasps, plan more with arguments `plan`. Raises the errors of `find_entry` and planning.
     """
     began, settings = time.perf_counter(), request.settings
     count, library = settings.num_grasps, GraspLibrary(Path(settings.grasp_library))

@@ -1,6 +1,6 @@
-"""Process of the node: start, wait for a signal, clean shutdown. Other ROS commands share its code.
+"""Process of the node: start, wait for a signal, clean shutdown. Other ROS commands use `run_command`.
 
-This module handles Ctrl-C and SIGTERM itself, before the slow imports, so that they never cause a traceback. While the
+This module handles Ctrl-C and SIGTERM itself, before the slow imports, so that no signal causes a traceback. While the
 node runs, the main thread only waits, because Python runs signal handlers only in the main thread.
 """
 
@@ -24,7 +24,7 @@ if TYPE_CHECKING:
 
     from graspd_ros.grasp_node import GraspNode
 
-# All of these must come from the same ROS. Packages built for another Python or ROS release cannot be loaded together.
+# Packages of different Python or ROS releases do not work together, so these must come from one installation.
 ROS_PACKAGES = (
     "rclpy",
     "rcl_interfaces",
@@ -36,7 +36,7 @@ ROS_PACKAGES = (
 )
 EXIT_STOPPED, EXIT_FAILED, EXIT_BAD_INPUT = 0, 1, 2
 STOP_TIMEOUT = 2.0  # seconds that a busy worker has to stop
-# Seconds after which Python switches threads (default 5 ms). The executor needs the interpreter often per message.
+# Python's thread switch interval [s] (default 0.005). Each message needs several switches to the executor's thread.
 SWITCH_INTERVAL = 0.001
 
 
@@ -53,14 +53,14 @@ def run_command(
     parse: Callable[[list[str]], argparse.Namespace],
     work: Callable[[argparse.Namespace, threading.Event], None],
 ) -> int:
-    """Run `work` with rclpy initialised. A signal sets the event of `work`. Return 0 when `work` ends, 2 for bad input.
+    """Run `work` with rclpy initialised. A signal sets the event given to `work`. Return 0 at its end, 2 for bad input.
 
-    `args` exclude the program name. None means the arguments of this process. `parse` gets those that are not for ROS.
+    `args` exclude the program name. None means this process's arguments. `parse` gets them without the ROS arguments.
     """
     if conflict := foreign_ros():
         sys.stderr.write(f"{name}: {conflict}\n")
         return EXIT_BAD_INPUT
-    os.environ.setdefault("AMENT_PREFIX_PATH", sys.prefix)  # the wheels leave it unset
+    os.environ.setdefault("AMENT_PREFIX_PATH", sys.prefix)  # the ROS wheels do not set this variable
 
     import rclpy
     from rclpy.signals import SignalHandlerOptions
@@ -82,10 +82,10 @@ def run_command(
 
 
 def foreign_ros() -> str:
-    """Return one line about a ROS that shadows this environment's ROS, or "" if none does."""
+    """Return a message if Python would import another ROS than this environment's, otherwise ""."""
     for package in ROS_PACKAGES:
         own = next((Path(sys.prefix) / "lib").glob(f"python3*/site-packages/{package}/__init__.py"), None)
-        # Find the package without importing it, because one built for another Python would raise.
+        # Find the package without importing it, because importing a package of another Python fails.
         spec = importlib.util.find_spec(package)
         if own is None or spec is None or not spec.origin or Path(spec.origin).resolve() == own.resolve():
             continue
@@ -126,9 +126,9 @@ def main(args: list[str] | None = None) -> int:
     except ConfigError as error:
         sys.stderr.write(f"graspd_node: {error}\n")
         return EXIT_BAD_INPUT
-    # No request is pending yet, and a signal could not interrupt an import or the reading of a hand otherwise.
+    # A signal ends the process at once, because no request is pending and imports cannot be interrupted.
     _on_signal(lambda: os._exit(EXIT_STOPPED))
-    os.environ.setdefault("AMENT_PREFIX_PATH", sys.prefix)  # the wheels leave it unset
+    os.environ.setdefault("AMENT_PREFIX_PATH", sys.prefix)  # the ROS wheels do not set this variable
 
     from graspd_core.runtime.worker_process import limit_malloc_arenas, start_planning_worker
 
@@ -175,7 +175,7 @@ def _refuse_arguments(args: list[str]) -> None:
 
 
 def _spinning(executor: Executor, wake: threading.Event, fail: Callable[[], None]) -> threading.Thread:
-    """Start and return a thread that spins the executor. If it ends before `wake` is set, it calls `fail`."""
+    """Start and return a thread that spins the executor. The thread calls `fail` if it ends before `wake` is set."""
 
     def spin() -> None:
         try:
@@ -183,7 +183,7 @@ def _spinning(executor: Executor, wake: threading.Event, fail: Callable[[], None
         except Exception:
             if not wake.is_set():
                 raise
-            # The shutdown may interrupt a callback.
+            # Ignore the error, because the shutdown may interrupt a callback.
         finally:
             if not wake.is_set():
                 fail()
@@ -219,7 +219,7 @@ def _make_node(args: list[str] | None, on_failure: Callable[[], None]) -> GraspN
 
 
 def log_directory() -> str:
-    """If the default log directory is read-only, set ROS_LOG_DIR to a temporary one. Return a line about it, or ""."""
+    """If the default log directory is read-only, set ROS_LOG_DIR to a temporary one, and return a message. Else ""."""
     if os.environ.get("ROS_LOG_DIR"):
         return ""
     usual = Path(os.environ.get("ROS_HOME") or Path.home() / ".ros") / "log"

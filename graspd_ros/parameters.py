@@ -1,4 +1,4 @@
-"""Parameters of the node. The fields of `Settings` give type, default, range and description of each."""
+"""Parameters of the node. The fields of `Settings` give the type, default, range and description of each parameter."""
 
 from __future__ import annotations
 
@@ -23,11 +23,11 @@ from graspd_ros.worker import BusyPolicy
 
 CLOUD_POLICIES = ("newest", "each", "off")
 MOST_GRASPS = 256
-BUDGETS = (0.1, 3600.0)  # seconds
+BUDGETS = (0.1, 3600.0)  # valid time limits of a request [s]
 SCALES = (1e-6, 1e6)
-MASSES = (1e-6, 100.0)  # kilograms
+MASSES = (1e-6, 100.0)  # valid masses of an object [kg]
 _CORNERS = ("roi_min", "roi_max", "view_point")
-WORKSPACE = 10.0  # metres from the camera. It exceeds the range of depth sensors used for grasping
+WORKSPACE = 10.0  # default limit of the cloud coordinates [m]. Depth sensors for grasping see less far
 
 
 def _setting(
@@ -53,7 +53,7 @@ def _check_device(name: str) -> None:
 
     try:
         torch.empty(0, device=name)
-    except (RuntimeError, AssertionError):  # which of them depends on torch's build
+    except (RuntimeError, AssertionError):  # torch's build decides which error is raised
         valid = ["cpu", *(f"cuda:{index}" for index in range(torch.cuda.device_count()))]
         raise ConfigError(f"{name!r} is not a device of this machine; valid: {', '.join(valid)}") from None
 
@@ -127,7 +127,7 @@ class Settings:
         5.0, "greatest age of clouds and depth images, older ones are refused [s]; 0: any age", low=0.0, high=1e6
     )
     segment: bool = _setting(True, "whether the object is cut out of the cloud; false: clouds show only the object")
-    voxel_size: float = _setting(0.0, "clouds keep one point per cube of this side [m]; 0: all", low=0, high=1)
+    voxel_size: float = _setting(0.0, "clouds keep one point per cube of this side [m]; 0: all points", low=0, high=1)
     roi_min: list[float] = _setting(
         [-WORKSPACE] * 3, "lower corner of the workspace, in the frame of the cloud [m]", check=_check_corner
     )
@@ -161,7 +161,7 @@ class Settings:
         "for meshes are added; empty: no library",
         check=_check_library,
     )
-    fixed_frame: str = _setting("", "frame of the views of ~/add_view, in /tf; empty: that of the first view")
+    fixed_frame: str = _setting("", "frame of the views of ~/add_view, in /tf; empty: the frame of the first view")
     output_frame: str = _setting("", "frame of the results in /tf; empty: the frame of the input")
     num_grasps: int = _setting(8, "number of grasps to find and verify", low=1, high=MOST_GRASPS)
     preset: str = _setting("balanced", "name of a built-in preset, or path of a preset file", check=load_preset)
@@ -169,13 +169,13 @@ class Settings:
     deadline: float = _setting(60.0, "time limit of a request [s]", low=BUDGETS[0], high=BUDGETS[1])
     seed: int = _setting(0, "seed of all random draws", low=0, high=2**63 - 1)
     mass: float = _setting(
-        0.0, "mass of the object [kg]; 0: unknown, the most that its volume makes likely", low=0.0, high=MASSES[1]
+        0.0, "mass of the object [kg]; 0: unknown, the largest likely mass for its volume", low=0.0, high=MASSES[1]
     )
     friction: float = _setting(0.6, "friction coefficient between hand and object", low=0.01, high=5.0)
     mesh_scale: float = _setting(1.0, "metres per unit of a mesh", low=SCALES[0], high=SCALES[1])
-    mesh_frame: str = _setting("object", "frame id of grasps on a mesh, for the mesh's own frame")
+    mesh_frame: str = _setting("object", "frame id of grasps on a mesh if the request gives none: the mesh's frame")
     mesh_roots: list[str] = _setting(
-        [".", "package://graspd_ros"], "directories from which meshes may be read: paths or package://name"
+        [".", "package://graspd_ros"], "directories from which meshes may be read: paths or package://NAME"
     )
     progress_rate: float = _setting(10.0, "greatest rate of progress reports [Hz]", low=0.1, high=10.0)
     joint_speed: float = _setting(
@@ -200,10 +200,10 @@ class Settings:
 
 
 class LiveSettings:
-    """Settings of a node, updated when a parameter changes. `now` has the current values. Doubtful ones are logged.
+    """Settings of a node, updated when a parameter changes. `now` has the current values. Warnings are logged.
 
     `frames` returns the frames in /tf. Raises ConfigError if a start value is not a valid choice, and rclpy's
-    ParameterException if its type is wrong or it is out of range.
+    ParameterException if a value has a wrong type or is out of range.
     """
 
     def __init__(self, node: Node, frames: Callable[[], Sequence[str]] = tuple) -> None:
@@ -244,7 +244,7 @@ class LiveSettings:
 def unknown_names(node: Node) -> list[str]:
     """Return a warning for each unknown parameter name given at the start."""
     found, known = [], [setting.name for setting in dataclasses.fields(Settings)]
-    # rclpy has no public access to start parameters, and does not report undeclared ones.
+    # rclpy has no public function for start parameters, and does not report undeclared parameters.
     for name in getattr(node, "_parameter_overrides", {}):
         if not node.has_parameter(name) and not name.startswith("qos_overrides."):
             near = difflib.get_close_matches(name, known, 1)
@@ -253,7 +253,7 @@ def unknown_names(node: Node) -> list[str]:
 
 
 def parameter_warnings(settings: Settings) -> list[str]:
-    """Return warnings about values under which no request can succeed: an empty workspace or missing mesh roots."""
+    """Return warnings about values that make requests fail: an empty workspace, or mesh roots that do not exist."""
     found = []
     if any(low > high for low, high in zip(settings.roi_min, settings.roi_max, strict=True)):
         found.append(f"roi_min={settings.roi_min} is above roi_max={settings.roi_max}: no point lies in the workspace")
@@ -264,7 +264,7 @@ def parameter_warnings(settings: Settings) -> list[str]:
 
 
 def _unknown_frames(settings: Settings, changed: Collection[str], known: Sequence[str]) -> list[str]:
-    """Return a warning for each changed frame that is not in /tf. If /tf is still empty, there is no warning."""
+    """Return a warning for each changed parameter whose frame is not in /tf. Return none if /tf is still empty."""
     found = []
     for name in ("sensor_frame", "output_frame", "fixed_frame", "arm_base_frame"):
         frame = getattr(settings, name).removeprefix("/")
@@ -274,7 +274,7 @@ def _unknown_frames(settings: Settings, changed: Collection[str], known: Sequenc
 
 
 def _of_their_types(parameters: list[Parameter]) -> list[Parameter]:
-    """Return parameters in their fields' types: floats instead of integers, and `off` instead of YAML's false."""
+    """Return parameters in the types of `Settings`: floats instead of integers, and `off` instead of YAML's false."""
     kept = []
     for parameter in parameters:
         setting = Settings.__dataclass_fields__.get(parameter.name)
@@ -284,7 +284,7 @@ def _of_their_types(parameters: list[Parameter]) -> list[Parameter]:
 
 
 def check_parameters(parameters: list[Parameter]) -> SetParametersResult:
-    """Check that values are valid choices, and return the result. ROS itself refuses wrong types and ranges."""
+    """Return whether all values are valid, and the reason if not. ROS itself checks further types and ranges."""
     try:
         for parameter in parameters:
             _check_value(parameter.name, parameter.value)

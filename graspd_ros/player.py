@@ -1,4 +1,4 @@
-"""`graspd_play BAG`: publish a recording's topics at the recorded times. It replaces a missing `ros2 bag play`.
+"""`graspd_play BAG`: publish a recording's topics at the recorded times. Use it where `ros2 bag play` is missing.
 
 graspd_play BAG [--rate R] [--loop] [--topics NAME ...] [--now] [--wait SEC] [--ros-args -r /recorded:=/wanted]
 """
@@ -20,8 +20,8 @@ from graspd_core.transforms import SECOND
 from graspd_ros.node import Parser, run_command
 
 DEPTH = 10
-SETTLE = 0.3  # seconds after discovery in which the first messages could still be lost
-DELIVERY = 5.0  # seconds for reliable subscribers to confirm the last messages, before the publisher ends
+SETTLE = 0.3  # wait after discovery [s], because the first messages could still be lost
+DELIVERY = 5.0  # longest wait at the end until reliable subscribers have confirmed the last messages [s]
 
 
 def main(args: list[str] | None = None) -> int:
@@ -88,7 +88,7 @@ def _parse(arguments: list[str]) -> argparse.Namespace:
 
 
 def _publishers(node: Any, bag: Path, wanted: Sequence[str]) -> dict[str, tuple[Any, type]]:
-    """Return publisher and message type of each topic whose type is installed. Log a warning for the others."""
+    """Return publisher and message type of each topic whose type is installed. Log a warning about other topics."""
     from rclpy.qos import DurabilityPolicy, QoSProfile
 
     recorded = bag_topics(bag)
@@ -108,7 +108,7 @@ def _publishers(node: Any, bag: Path, wanted: Sequence[str]) -> dict[str, tuple[
         qos = QoSProfile(depth=100 if latched else DEPTH, durability=durability)
         publishers[topic.name] = node.create_publisher(kind, topic.name, qos), kind
     if not publishers:
-        raise BagError(f"{bag}: no topic of a type that is installed here; the bag has: {_types(recorded)}")
+        raise BagError(f"{bag}: no topic has a type that is installed here; the bag has: {_types(recorded)}")
     return publishers
 
 
@@ -144,7 +144,7 @@ def _wait_for_delivery(publishers: dict[str, tuple[Any, type]]) -> None:
 def _shifted(data: bytes, kind: type, start: int, began: int, rate: float) -> Any:
     """Return the message with the stamps of its headers moved to the time of publication.
 
-    The stamp `start` [ns] becomes `began` [ns]. Times after `start` are divided by `rate`. Messages without headers do
+    The stamp `start` [ns] becomes `began` [ns]. Time since `start` is divided by `rate`. Messages without headers do
     not change.
     """
     from rclpy.serialization import deserialize_message

@@ -1,4 +1,4 @@
-"""Requests for the worker: one object to grasp, and all constraints on its grasps."""
+"""Requests for the worker: the object to grasp (or any object seen), and all constraints on the grasps."""
 
 from __future__ import annotations
 
@@ -21,14 +21,14 @@ if TYPE_CHECKING:
     from graspd_ros.inputs.solids import SceneObject
 
 MOST_ID = 128
-# Returns `T_target_source` of two frames. May raise a TransformError.
+# Function that returns `T_target_source` of two frames. May raise a TransformError.
 FrameLookup = Callable[[str, str], Matrix]
-# Returns clouds in one frame, and warnings about them. May raise a GraspdError.
+# Function that returns clouds in one frame, and warnings about the clouds. May raise a GraspdError.
 SeenViews = Callable[[], tuple[tuple[PointCloud, ...], tuple[str, ...]]]
 
 
 class Listener(Protocol):
-    """Receiver of one request's messages, in addition to the topics. It is called in the publishing thread."""
+    """Receiver of the messages that the node publishes for one request. The publishing thread calls it."""
 
     def progressed(self, message: GraspProgress) -> None: ...
     def found(self, message: Grasp) -> None: ...
@@ -49,28 +49,28 @@ class KnownObject:
 
 @dataclass(frozen=True, eq=False)
 class Request:
-    """Request for grasps of one object.
+    """Request for grasps of one object, or of any object that the camera sees.
 
     Attributes:
         source: name of the object's source: cloud, mesh, latest_cloud, views, known or grasp_planning.
-        frame: frame of the results, unless the settings name an `output_frame`.
+        frame: frame of the results if the settings have no `output_frame`.
         stamp: time for which the object's pose is valid.
         settings: the parameters at the time of the request, overridden by the request's own values.
         load: loads the object as a scene. It is slow and may raise a GraspdError.
         T_frame_object: pose of the object's own frame in `frame` [m]. None if both are the same.
-        only_newest: if True, a newer request of this kind replaces this one while it waits.
+        only_newest: if True, a newer `only_newest` request replaces this request while it waits.
         listener: receives the request's messages in addition to the topics. May be None.
         timeless: True if the request has no stamp, so that the newest transforms are used.
-        object_key: key of the object and its measurement, equal for the same object. An empty key equals no other.
-        exclude: ids of grasps. The answer must contain no similar grasp.
-        exclude_poses: frames and base-link poses of grasps to exclude in the same way.
+        object_key: key of the object and its measurement. Equal keys mean the same object. An empty key equals no key.
+        exclude: ids of earlier grasps. The answer must contain no grasp similar to them.
+        exclude_poses: frames and base-link poses of more grasps to exclude.
         known: key of the object in a grasp library. None if no library is used.
         surface: support plane in the object's frame. None if the request gives none.
         steering: makes the steering constraints. It is slow and may raise a GraspdError. None without constraints.
         region_points: returns the points inside `region_mask`, in `frame` [m]. None for sources without an image.
         closes_late: True if the hand closes only after it has arrived, so that grasps need an `arrival` posture.
-        collision_objects: collision objects of the planning scene by id. Empty if the node has no such topic.
-        views: reads the clouds of a request for any object. None for a request for one object.
+        collision_objects: collision objects of the planning scene by id. Empty if the node has no topic for them.
+        views: reads the clouds if the request is for any object. None if it is for one object.
         solids: meshes of `collision_objects` in the object's frame [m]. The worker sets them.
         accepted: time of arrival on the monotonic clock [s].
     """

@@ -1,7 +1,7 @@
 """Processing of one request: load the object, plan, and transform the result to the output frame.
 
-Grasps similar to excluded ones are left out. The answer has the next best grasps of an earlier run on the same
-object, or grasps of a new run.
+If a request excludes grasps, its answer may come from earlier runs on the same object. Otherwise, grasps are planned.
+No grasp of the answer is similar to an excluded grasp.
 """
 
 from __future__ import annotations
@@ -59,27 +59,27 @@ from graspd_ros.worker import Report, WorkerEnding
 if TYPE_CHECKING:
     from graspd_core import Reach
 
-PATIENCE = 0.15  # seconds for a run to end by itself after its request has ended
+PATIENCE = 0.15  # seconds that `plan` waits for a run to end by itself after its request has ended
 _POLL = 0.02  # seconds between two checks of stop and deadline
 MOST_RUNS = 16
 
-# Returns `T_target_source` at a time (0 for the newest). It waits for late transforms until the stop hook returns True,
-# and may raise a TransformError.
+# Function that returns `T_target_source` at a time (0 for the newest). It waits for late transforms until the stop hook
+# returns True, and may raise a TransformError.
 Lookup = Callable[[str, str, Time, StopHook], Matrix]
 
 
 @dataclass(frozen=True)
 class Planned:
-    """Result of a request in the frame of its answer.
+    """Result of a request. Grasps and positions are in the frame of its answer.
 
     Attributes:
         result: the grasps.
-        file: path of the written file. Empty if none was written.
-        worked_on: False if the request ended before any run.
-        mass: object's mass in the trials [kg]. 0 without trials.
+        file: path of the result file. Empty if none was written.
+        worked_on: False if the deadline passed while the request waited in the queue.
+        mass: object's mass for planning and trials [kg]. 0 if unknown.
         mass_assumed: True if the request gave no mass.
-        objects: for a request for any object, the position [m] of each object seen, and why it has no verified grasp.
-            The grasps belong to the first object.
+        objects: for a request for any object, each object's position [m], and the reason if no grasp is verified. The
+            grasps belong to the first object.
         surface: the object's mesh in its own frame [m]. None if it was not loaded.
         held: the object's hull in the base link's frame at the first grasp [m]. None without a usable grasp or mesh.
     """
@@ -121,7 +121,7 @@ class RecentRuns:
     def excluded(self, request: Request, lookup: FrameLookup) -> list[Matrix]:
         """Return the base-link poses that the request excludes by id or pose, in the object's frame [m].
 
-        Raises RequestError for an id that is not among the last runs, and TransformError as `lookup`.
+        Raises RequestError for an id that is not among the last runs, and the errors of `lookup`.
         """
         poses = []
         for name in request.exclude:
@@ -134,9 +134,9 @@ class RecentRuns:
         return poses + [request.to_object(frame, pose, lookup) for frame, pose in request.exclude_poses]
 
     def failures(self, request: Request, excluded: Sequence[Matrix], lookup: FrameLookup) -> list[Failure]:
-        """Return the excluded grasps as failures, with the positions of their objects where known.
+        """Return the excluded grasps as `Failure` values for planning, each with its object's position [m] if known.
 
-        `excluded` are the poses from the method `excluded`. Raises TransformError as `lookup`.
+        `excluded` is the result of the method `excluded`. Raises the errors of `lookup`.
         """
         places: list[Any] = [None] * len(excluded)
         for row, name in enumerate(request.exclude):
@@ -155,7 +155,7 @@ class RecentRuns:
         return run, run.grasps[int(rank)]
 
     def next_best(self, request: Request, excluded: Sequence[Matrix]) -> Planned | None:
-        """Return the remaining good grasps of earlier runs on the same object. None if there are none."""
+        """Return good grasps of earlier runs on the same object, none similar to `excluded`. None if none is left."""
         runs = [run for run in self._runs.values() if run.object_key == request.object_key and request.object_key]
         known = {id(grasp): grasp for run in runs for grasp in run.grasps}
         wanted = Verdict.UNVERIFIED if request.settings.verify == "none" else Verdict.VERIFIED
@@ -164,7 +164,7 @@ class RecentRuns:
         if not left:
             return None
         outcome = Outcome.SUCCEEDED if len(left) >= count else Outcome.TOO_FEW
-        message = f"{min(count, len(left))} grasps of an earlier run, none like the {len(excluded)} excluded"
+        message = f"{min(count, len(left))} grasps of an earlier run, none similar to the {len(excluded)} excluded"
         result = GraspResult(outcome, tuple(left[:count]), Timing(), request.settings.seed, "", message)
         return replace(runs[-1].planned, result=result, file="")
 
@@ -175,7 +175,7 @@ def unlike(grasps: Iterable[Grasp], excluded: Sequence[Matrix]) -> list[Grasp]:
 
 
 def without(result: GraspResult, excluded: Sequence[Matrix], count: int) -> GraspResult:
-    """Return a result with at most `count` good grasps and all failed ones, without grasps similar to `excluded`."""
+    """Drop grasps similar to `excluded`. Of the rest, return at most `count` good grasps and all failed grasps."""
     left = unlike(result.tried, excluded)
     good = [grasp for grasp in left if grasp.verdict is not Verdict.FAILED]
     failed = [grasp for grasp in left if grasp.verdict is Verdict.FAILED]
@@ -205,7 +205,7 @@ class Planner:
         self._runs = RecentRuns()
 
     def plan(self, request: Request, stop: StopHook, report: ProgressHook) -> Planned:
-        """Process one request. Raises the errors of loading, planning and transforms."""
+        """Process one request and return its result. Raises the errors of loading, planning and transforms."""
         left, reporting = threading.Event(), threading.Lock()
 
         def over() -> bool:
@@ -241,7 +241,7 @@ class Planner:
         return self._behind is None or _ended(self._behind, lambda: time.monotonic() > end)
 
     def _run(self, request: Request, stop: StopHook, report: ProgressHook) -> Planned:
-        # Look up the transform first. A run would be lost if it is missing.
+        # Look up the transform first. Without it the grasps of a run would be useless.
         seen = self._lookup_at(Time() if request.timeless else request.stamp, stop)
         T_out_object = request.T_frame_object
         if request.frame_out != request.frame:
@@ -254,7 +254,7 @@ class Planner:
             request = with_collision_objects(request, seen)
         excluded = self._runs.excluded(request, self._lookup_at(Time(), stop))
         # Do not reuse an earlier run if its constraints, arm pose or obstacles may differ. With a library do not reuse
-        # it either, because the library contains those grasps.
+        # a run either, because the library contains its grasps.
         free = request.steering is None and not reach and not request.collision_objects
         known = excluded and free and request.known is None
         planned = self._runs.next_best(request, excluded) if known else None
@@ -283,7 +283,7 @@ class Planner:
         steering = () if request.steering is None else (request.steering(),)
         restrictions = (*steering, *reach)
         plan: dict[str, Any] = {"preset": config, "device": settings.device, "progress": report, "stop": stop}
-        # Another seed makes grasps similar to the excluded ones less likely.
+        # Another seed makes grasps similar to the excluded grasps less likely.
         plan["seed"], objects = settings.seed + len(excluded), ()
         if request.views is not None:
             failures = self._runs.failures(request, excluded, self._lookup_at(Time(), stop))
@@ -310,7 +310,7 @@ class Planner:
         if not settings.output_dir or stop():
             return planned
         path = Path(settings.output_dir) / f"{request.id}.json"
-        # The file has the planning frame. For a mesh this is the mesh's own frame.
+        # Grasps in the file are in the planning frame. For a mesh this is the mesh's own frame.
         frame = request.frame if request.T_frame_object is None else settings.mesh_frame
         seconds, scene = 1e-9 * nanoseconds(request.stamp), scene or request.load()
         save_result(path, result, scene.object, self._hand, config, frame=frame, stamp=seconds)
@@ -320,7 +320,7 @@ class Planner:
 def _any_object(
     request: Request, hand: HandModel, failures: Sequence[Failure], **plan: Any
 ) -> tuple[GraspResult, Scene | None, tuple[tuple[Float[np.ndarray, "3"], str], ...]]:
-    """Plan for any object seen. Return result, scene, and each object's place [m] and why it has no verified grasp."""
+    """Plan for any object seen. Return result, scene, and each object's position [m] with the reason for no grasp."""
     assert request.views is not None
     (views, told), settings = request.views(), request.settings
     about = {"settings": load_scene_config(settings.scene_config) if settings.scene_config else None}
@@ -347,7 +347,7 @@ def _with_found(progress: Progress, change: Callable[[Grasp], Grasp]) -> Progres
 
 
 def _arrivals(scene: Scene, hand: HandModel) -> Callable[[Grasp], Grasp]:
-    """Return a function that adds `arrival` to a grasp unless it failed a trial. Results are cached by posture."""
+    """Return a function that adds the `arrival` posture to grasps that failed no trial. It caches the results."""
     context, known = make_metrics_context(scene.object, hand), dict[bytes, Posture | None]()
 
     def arrived(grasp: Grasp) -> Grasp:

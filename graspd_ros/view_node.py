@@ -75,7 +75,7 @@ class Follower:
         node.create_subscription(PointCloud2, "points", self._on_cloud, qos_profile_sensor_data)
 
     def _on_cloud(self, message: Any) -> None:
-        self._cloud = message  # read only when an answer is shown with it
+        self._cloud = message  # the points are read only when an answer is shown
 
     def _on_progress(self, message: Any) -> None:
         line = f"{message.request_id}: {message.stage} {message.step} of {message.of}, {message.verified} verified"
@@ -143,7 +143,7 @@ def grasp_of(message: Any, joint_names: tuple[str, ...]) -> Grasp:
         return values.x, values.y, values.z
 
     def moved(value: float) -> float:
-        return value if value >= 0 else float("inf")  # −1 where the simulation diverged
+        return value if value >= 0 else float("inf")  # -1 means that the simulation diverged
 
     return Grasp(
         pregrasp=posture(message.pregrasp_pose, message.pregrasp_joints),

@@ -16,7 +16,7 @@ from graspd_ros.error_codes import ErrorCode
 
 
 class BusyPolicy(StrEnum):
-    """What happens to a request that arrives while another one is running."""
+    """What happens to a request that arrives while another request is running."""
 
     REJECT = "reject"
     QUEUE = "queue"
@@ -35,7 +35,7 @@ class WorkerEnding(StrEnum):
 class WorkerRequest(Protocol):
     """Interface of a request.
 
-    `only_newest` requests wait outside the queue, in one slot. A newer request replaces the waiting one.
+    `only_newest` requests wait outside the queue, in one slot. A newer `only_newest` request replaces the old one.
     """
 
     @property
@@ -51,7 +51,7 @@ StopHook = Callable[[], bool]
 
 @dataclass(frozen=True)
 class Admission:
-    """Answer of `submit`. Without `refusal` the request is accepted, and `ahead` requests are before it."""
+    """Answer of `submit`. Without `refusal` the request is accepted, and `ahead` requests are processed before it."""
 
     refusal: ErrorCode | None = None
     reason: str = ""
@@ -60,7 +60,7 @@ class Admission:
 
 @dataclass(frozen=True)
 class Report(Generic[V]):
-    """End of a request, with `error` if it failed, else `value`. The `value` of a stopped request may be partial."""
+    """Outcome of a request. `error` is set if the request failed. After a stop, `value` may be partial or None."""
 
     ending: WorkerEnding
     value: V | None = None
@@ -72,11 +72,11 @@ class Worker(Generic[R, V]):
 
     Args:
         work: processes one request. It must call its stop hook often, and return early if the hook returns True. It
-            may raise anything.
+            may raise any exception.
         finish: called once at the end of each accepted request. It runs in the worker thread, or in the thread that
             ends a waiting request. It must not raise.
         prepare: runs in the worker thread before the first request.
-        queue_size: greatest number of requests that wait behind the running one under the policy `queue`.
+        queue_size: greatest number of requests that wait behind the running request under the policy `queue`.
     """
 
     def __init__(
@@ -141,7 +141,7 @@ class Worker(Generic[R, V]):
         return None
 
     def cancel(self, request_id: str) -> int:
-        """Cancel a waiting or running request by id, or all if the id is empty. Return the number of requests."""
+        """Cancel a waiting or running request by id, or all if the id is empty. Return how many were cancelled."""
         with self._condition:
             dropped = self._take_out(lambda request: request_id in ("", request.id))
             running = self._running is not None and request_id in ("", self._running.id)
@@ -151,7 +151,7 @@ class Worker(Generic[R, V]):
         return len(dropped) + running
 
     def end_waiting(self, which: Callable[[R], bool], report: Report[V]) -> int:
-        """End the waiting requests for which `which` returns True. Return the number of requests."""
+        """End the waiting requests for which `which` returns True. Return their number."""
         with self._condition:
             dropped = self._take_out(which)
         self._end_all(dropped, report)
@@ -165,7 +165,7 @@ class Worker(Generic[R, V]):
         return dropped
 
     def state(self) -> tuple[str | None, int]:
-        """Return the running request's id and the queue's length, in which `only_newest` requests do not count."""
+        """Return the running request's id (or None), and the number of waiting requests without `only_newest` ones."""
         with self._condition:
             running = self._running.id if self._running else None
             return running, len(self._waiting)
@@ -178,7 +178,7 @@ class Worker(Generic[R, V]):
         return self._stopping
 
     def stop(self, timeout: float) -> bool:
-        """Cancel all requests and end the thread. Return True if it ended within `timeout` seconds."""
+        """Cancel all requests and end the thread. Return True if the thread ended within `timeout` seconds."""
         with self._condition:
             self._stopping = True
             self._condition.notify()

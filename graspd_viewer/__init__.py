@@ -1,1 +1,1 @@
-"""Viewer of grasps in a browser."""
+"""Show grasps in a browser, and plan grasps from there."""

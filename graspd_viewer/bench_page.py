@@ -1,7 +1,7 @@
-"""HTML page of a benchmark: charts of speed against accuracy. A click on a point opens its runs and their grasps.
+"""HTML page of a benchmark: charts of speed against accuracy. A click on a point lists its runs and their grasps.
 
-The page is one file without network access or libraries. Results contain metrics of grasps, but no postures. To show
-the grasps of a run, the server plans again with the run's settings and seed. The same code finds the same grasps.
+The page is one file that needs no network. A benchmark stores the metrics of grasps, but no postures. To show the
+grasps of a run, the server plans again with the run's settings and seed. The same code finds the same grasps.
 """
 
 from __future__ import annotations
@@ -42,7 +42,7 @@ from graspd_viewer.session import Session, make_session
 
 ShowProgress = Callable[[str, float], None]
 _TIMES = {"cpu_per_grasp": "CPU seconds per raw grasp", "cpu_per_verified": "CPU seconds per verified grasp"}
-# Figures of a grasp that the page shows: heading, key of the metric, factor, digits.
+# Metrics of a grasp that the page shows: heading, key of the metric, factor on its SI value, decimals.
 _FIGURES = (
     ("penetration mm", "penetration", 1e3, 2),
     ("contact area cm²", "contact_area", 1e4, 1),
@@ -51,9 +51,9 @@ _FIGURES = (
 
 
 def bench_page(folder: Path, *, served: bool = False) -> tuple[str, dict[str, Record]]:
-    """Return the HTML page of a benchmark's folder, and the records of its raw runs by key.
+    """Return the HTML page of a benchmark's folder, and the records of its runs for raw candidates, by key.
 
-    If `served`, the page can ask the server to show the grasps of a run.
+    If `served`, the page has buttons that ask the server to show the grasps of a run.
     Raises FormatError: the folder has no readable results, or no raw grasps of a preset.
     """
     records = read_results(folder / "results.json")
@@ -70,7 +70,7 @@ def bench_page(folder: Path, *, served: bool = False) -> tuple[str, dict[str, Re
 
 
 def page_data(runs: Sequence[Record]) -> dict[str, Any]:
-    """Return the data of the page's script: panels with points, and all runs."""
+    """Return the data for the page's script: charts (`panels`) with a point for each preset, and all runs."""
     presets = by_name(rows(runs))
     panels = [
         {
@@ -85,7 +85,7 @@ def page_data(runs: Sequence[Record]) -> dict[str, Any]:
 
 def _point(point: Point, time: str, group: Sequence[Row]) -> dict[str, Any]:
     method, (low, middle, high) = method_row(point.method), point.x
-    if time == "cpu_per_verified":  # over all objects together, as in the tables
+    if time == "cpu_per_verified":  # the value over all objects together, as in the tables
         middle = per_verified(group)
     x = (low, middle, high)
     return {"name": point.name, "colour": method.colour, "method": method.label, "x": x, "y": point.y}
@@ -101,7 +101,7 @@ def _run(record: Record) -> dict[str, Any]:
 
 
 def _source(record: Record) -> str:
-    # A record stores only the name of a file.
+    # A record stores only the name of a mesh file, not its path.
     return f"{SHAPE_PREFIX}{record['object']}" if record["object"] in SHAPES else record["object"]
 
 
@@ -113,7 +113,7 @@ def _grasp(grasp: dict[str, Any]) -> dict[str, Any]:
 
 
 def plan_again(record: Record, show: Callable[[Session], None], report: ShowProgress, stop: StopHook) -> None:
-    """Repeat the planning of a run, then simulate, measure and show its grasps. `report` receives progress (0 to 1).
+    """Plan a run again. Then simulate, measure and show its grasps. `report` gets lines and the progress, 0 to 1.
 
     Raises GraspdError: the object or the hand of the run is not available.
     """
@@ -134,19 +134,19 @@ def plan_again(record: Record, show: Callable[[Session], None], report: ShowProg
         trials = grasp_trials(worlds, grasp, stop)
         grasps.append(replace(grasp, trials=trials, metrics=measure(context, grasp.grasp)))
     held = sum(grasp.verdict is Verdict.VERIFIED for grasp in grasps)
-    line = f"{held} of {count} held; {record['held']} did in the benchmark, by graspd {record.get('code')}"
+    line = f"{held} of {count} held; {record['held']} held in the benchmark, by graspd {record.get('code')}"
     show(make_session(title, hand, tuple(grasps), scene, config, session.seen, (line,)))
     report(line, 1.0)
 
 
 @contextmanager
 def serve_page(page: str, host: str, port: int, open_run: Callable[[str], int | None]) -> Iterator[str]:
-    """Serve the page at every path until the context ends.
+    """Serve the page until the context ends. Yield its address.
 
     Args:
         page: the HTML text.
         host, port: the address to listen on.
-        open_run: shows the grasps of a run by key. It returns the viewer's port, or None if the key is unknown.
+        open_run: function that shows the grasps of the run with a key. It returns the viewer's port, None if unknown.
 
     Raises:
         ConfigError: the address cannot be listened on.
@@ -155,7 +155,7 @@ def serve_page(page: str, host: str, port: int, open_run: Callable[[str], int | 
     try:
         server = ThreadingHTTPServer((host, port), handler)
     except (OSError, OverflowError) as error:
-        raise ConfigError(f"{host}:{port}: cannot listen ({error}); choose another with --host and --port") from None
+        raise ConfigError(f"{host}:{port}: cannot listen ({error}); change --host or --port") from None
     thread = threading.Thread(target=server.serve_forever, name="graspd-page", daemon=True)
     thread.start()
     try:
@@ -179,7 +179,7 @@ class _OnePage(BaseHTTPRequestHandler):
         self.wfile.write(self._content)
 
     def do_POST(self) -> None:
-        """Show the grasps of a run and redirect the browser to them. Refuse requests from pages of other sites."""
+        """Show the grasps of a run. Redirect the browser to the viewer. Refuse requests from pages of other sites."""
         named = self.headers.get("Host", "")
         allowed = may_connect(self.headers.get("Origin"), named, self._host)
         port = self._open_run(self.path.rpartition("/")[2]) if allowed else None

@@ -1,6 +1,6 @@
-"""Meshes of everything drawn, shared by the browser (`scene_nodes`) and the docs (`benchmarks/pictures.py`).
+"""Make the meshes that the browser (`scene_nodes`) and the pictures of the docs (`benchmarks/pictures.py`) show.
 
-It also computes the disturbance that a grasp resists least, and the hand's postures along its path.
+This module also computes the disturbance that a grasp resists least, and the hand's postures along its path.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ VERDICTS = {
     Verdict.UNVERIFIED: (0.60, 0.62, 0.66),
     Verdict.FAILED: (0.85, 0.20, 0.20),
 }
-# Arrow lengths: contact normal [m], force [m/N], and disturbance [radii of the object] as offset and factor.
+# Arrow lengths: contact normal [m], force [m/N], and disturbance (offset and factor, in radii of the object).
 NORMAL_LENGTH, FORCE_LENGTH, PUSH_LENGTH = 0.02, 0.004, (1.1, 0.7)
 _SHAFT, _SLICE = 0.0012, 96
 
@@ -47,7 +47,7 @@ class Part:
 
 
 def hand_parts(hand: HandModel) -> dict[int, Part]:
-    """Return the collision shapes of each link that has any as one part, by link index, in the link's frame [m]."""
+    """Return the mesh of each link with collision shapes, by link index, in the link's frame [m]."""
     parts = {}
     for link, primitives in enumerate(hand.primitives_of):
         if primitives:
@@ -57,7 +57,7 @@ def hand_parts(hand: HandModel) -> dict[int, Part]:
 
 
 def scene_parts(scene: Scene) -> list[Part]:
-    """Return the object (split into its seen and guessed part for clouds), the support and the obstacles."""
+    """Return meshes of object, support and obstacles. An object from clouds has two: seen and guessed surface."""
     mesh, parts = scene.object.mesh, []
     if scene.confidence is None:
         parts.append(Part("object/known", mesh, OBJECT))
@@ -73,7 +73,7 @@ def scene_parts(scene: Scene) -> list[Part]:
 
 
 def contact_parts(contacts: Sequence[Contact]) -> list[Part]:
-    """Return a part with an arrow per contact along the object's outward normal. No part without contacts."""
+    """Return a mesh of arrows: at each contact, one along the object's outward normal. Empty without contacts."""
     if not contacts:
         return []
     starts = np.array([contact.position for contact in contacts])
@@ -82,13 +82,13 @@ def contact_parts(contacts: Sequence[Contact]) -> list[Part]:
 
 
 def squeeze_parts(contacts: Sequence[Contact]) -> list[Part]:
-    """Return a part with an arrow for the planned force on the object at each contact whose force is known."""
+    """Return a mesh of arrows: at each contact with a planned force, this force on the object. Empty without forces."""
     known = [(contact.position, contact.force) for contact in contacts if contact.force is not None]
     return force_parts(*np.array(known).swapaxes(0, 1)) if known else []
 
 
 def force_parts(positions: Float[np.ndarray, "n 3"], forces: Float[np.ndarray, "n 3"]) -> list[Part]:
-    """Return a part with an arrow for each force on the object above 0.02 N. Arrows end at `positions` [m]."""
+    """Return a mesh of arrows: each force on the object above 0.02 N. An arrow ends at the force's position [m]."""
     strong = np.linalg.norm(forces, axis=1) > 0.02
     if not strong.any():
         return []
@@ -97,7 +97,7 @@ def force_parts(positions: Float[np.ndarray, "n 3"], forces: Float[np.ndarray, "
 
 
 def weakest_parts(push: Float[np.ndarray, "6"], target: ObjectModel) -> list[Part]:
-    """Return parts with arrows for force and torque of the unit disturbance `push`. Leave out components up to 0.05."""
+    """Return arrows for force and torque of the unit disturbance `push`. A norm of at most 0.05 gets no arrow."""
     center, parts = target.center_of_mass, []
     for name, part, colour in (("weakest/force", push[:3], WEAKEST), ("weakest/turn", push[3:], TURN)):
         share = float(np.linalg.norm(part))
@@ -112,8 +112,8 @@ def sdf_slice(
 ) -> tuple[UInt8[np.ndarray, "rows columns 3"], Float[np.ndarray, "3"]]:
     """Return an image of the SDF on a plane normal to `axis`, and the plane's centre [m].
 
-    `share` is the plane's position along the axis, as a fraction of the grid. Blue is inside, red outside, white at the
-    surface. Rows and columns of the image run along `slice_axes`.
+    `share` is the plane's position along `axis`, from 0 to 1 over the grid. Blue is inside, red outside, white at the
+    surface. `slice_axes` has the axes of the row index and the column index.
     """
     sdf = scene.sdf
     low = sdf.origin.double().cpu().numpy()
@@ -132,12 +132,12 @@ def sdf_slice(
 
 
 def slice_axes(axis: int) -> tuple[int, int]:
-    """Return the axes along which the rows and the columns of a slice normal to `axis` run."""
+    """Return the axes of the row index and the column index in a slice normal to `axis`."""
     return (axis + 2) % 3, (axis + 1) % 3
 
 
 def arrows(starts: Float[np.ndarray, "n 3"], ends: Float[np.ndarray, "n 3"], radius: float = _SHAFT) -> TriangleMesh:
-    """Return arrows as one closed mesh [m]. The head has three times the radius of the shaft."""
+    """Return one mesh of all arrows [m]. An arrow's head has three times the radius of its shaft."""
     import trimesh
 
     bodies = []
@@ -156,7 +156,7 @@ def arrows(starts: Float[np.ndarray, "n 3"], ends: Float[np.ndarray, "n 3"], rad
 
 
 def _square(support: Plane, mesh: TriangleMesh) -> TriangleMesh:
-    """Return a square piece of the support below the object, three times as wide as the object."""
+    """Return a square piece of the support below the object. Its side is three times the object's longest side."""
     middle = 0.5 * (mesh.vertices.min(0) + mesh.vertices.max(0))
     middle = middle + (support.offset - support.normal @ middle) * support.normal
     side = perpendicular(support.normal)
@@ -167,9 +167,9 @@ def _square(support: Plane, mesh: TriangleMesh) -> TriangleMesh:
 
 
 def weakest_push(context: MetricsContext, grasp: Grasp) -> Float[np.ndarray, "6"] | None:
-    """Return the unit disturbance (force, torque divided by the object's radius) that the contacts resist least.
+    """Return the unit disturbance that the contacts resist least: a force, and a torque over the object's radius.
 
-    None without force closure, because some disturbance is then not resisted at all.
+    None without force closure. Then the contacts do not resist some disturbances at all.
     """
     return prepare_grasp(context, grasp.grasp).wrench_hull.weakest_push
 
@@ -178,7 +178,7 @@ STAGES = ("retreat", "pregrasp", "grasp", "squeeze")
 
 
 def posture_at(hand: HandModel, grasp: Grasp, at: float) -> Posture:
-    """Return the posture at `at` on the path, from 0 (retreat) to 3 (squeeze), with interpolation between stages."""
+    """Return the hand's posture at `at` on its path: 0 retreat, 1 pregrasp, 2 grasp, 3 squeeze, or between."""
     stages = (retreat_posture(hand, grasp.pregrasp), grasp.pregrasp, grasp.grasp, grasp.squeeze)
     first = min(max(int(at), 0), len(stages) - 2)
     share = min(max(at - first, 0.0), 1.0)
@@ -188,7 +188,7 @@ def posture_at(hand: HandModel, grasp: Grasp, at: float) -> Posture:
 def placed_links(
     hand: HandModel, posture: Posture
 ) -> tuple[Float[np.ndarray, "links 3"], Float[np.ndarray, "links 4"]]:
-    """Return position [m] and quaternion (wxyz) of every link in the object's frame."""
+    """Return the position [m] and the quaternion (wxyz) of each link in the object's frame."""
     rotations, translations = link_poses(hand, posture.joint_positions)
     base = rotation_from_quaternion(torch.as_tensor(posture.quaternion_wxyz).double()).numpy()
     quaternions = quaternion_from_rotation(torch.as_tensor(base @ rotations)).numpy()
@@ -196,7 +196,7 @@ def placed_links(
 
 
 def skeletons(hand: HandModel, seen: Snapshot) -> Float[np.ndarray, "hands bones 2 3"]:
-    """Return each hand as line segments from the origin of a link's parent to the link's origin, object frame [m]."""
+    """Return each hand as line segments: one from each link's parent to the link (their origins), object frame [m]."""
     joints = torch.as_tensor(seen.joint_positions).float()
     links = forward(make_kinematics(hand), joints).translation
     quaternions = torch.as_tensor(seen.quaternions_wxyz).float()

@@ -1,6 +1,6 @@
-"""List of grasps beside the scene: filter, order and values as text and HTML.
+"""List of grasps beside the 3D scene: filter it, sort it, and show values as text and HTML.
 
-Names and reasons may come from untrusted files, so all of them are escaped.
+Names and reasons may come from untrusted files. So they are escaped in HTML.
 """
 
 from __future__ import annotations
@@ -14,13 +14,13 @@ from graspd_core.verify.metrics import METRICS
 from graspd_viewer.drawing import FORCE, GUESSED, HAND, NORMAL, OBJECT, TURN, VERDICTS, WEAKEST
 
 ALL = "all"
-# Label of a grasp that passed on the likeliest shape, but not enough robustness checks to be verified.
+# A grasp that holds on the likeliest shape of the object, but passes too few robustness checks to be verified.
 LESS_SURE = "less sure"
 FILTERS = (ALL, "verified", LESS_SURE, "unverified", "failed")
-# Metrics for which less is better. For all others more is better.
+# Metrics for which less is better. For all other metrics more is better.
 _LESS = ("penetration", "contact_depth", "self_penetration", "intersection_volume", "least_friction")
 ORDERS = ("rank", "score", "probability", "displacement", *METRICS)
-# Columns of the table, and rows shown before and after the selected one.
+# Columns of the table, and number of rows before and after the selected grasp.
 _COLUMNS, _AROUND = ("payload", "penetration", "contact_area"), 2
 BLOCK = "<div style='font-size:0.8em;line-height:1.5;padding:0 0.8em'>"
 _LEGEND = (
@@ -28,22 +28,22 @@ _LEGEND = (
     ("force, 4 mm for a newton", FORCE, "➔"), ("weakest push", WEAKEST, "➔"), ("axis of its turn", TURN, "➔"),
 )  # fmt: skip
 _OTHER_FIGURES = {
-    "score": "the optimiser's own measure, larger is better; it ranks grasps of one file before any trial",
-    "probability": "of holding on the true object, where cameras saw it",
-    "displacement": "farthest that the object's centre of mass moved in the trial, until the answer was known",
-    "rotation": "farthest that the object turned in the trial",
+    "score": "the optimiser's own measure; larger is better; the score ranks grasps of one file before any trial",
+    "probability": "probability of holding on the true object, if cameras saw the object",
+    "displacement": "greatest displacement of the object's centre of mass until the trial ended",
+    "rotation": "greatest rotation of the object until the trial ended",
 }
 
 
 def standing(grasp: Grasp) -> str:
-    """Return the filter that matches a grasp: its verdict, or `LESS_SURE`."""
+    """Return the filter name of a grasp: its verdict, or `LESS_SURE` if it is unverified but was tried."""
     return LESS_SURE if grasp.verdict is Verdict.UNVERIFIED and grasp.trials else str(grasp.verdict)
 
 
 def listed(grasps: Sequence[Grasp], which: str, by: str) -> list[int]:
     """Return the ranks of the grasps that pass filter `which`, sorted by `by`, best first. Missing values come last.
 
-    An unknown filter or order counts as the first one. Only a forged message can contain it.
+    An unknown `which` passes all grasps, and an unknown `by` sorts by rank. Only forged messages have such names.
     """
     ranks = [rank for rank, grasp in enumerate(grasps) if which not in FILTERS[1:] or standing(grasp) == which]
 
@@ -55,7 +55,7 @@ def listed(grasps: Sequence[Grasp], which: str, by: str) -> list[int]:
 
 
 def _value(grasp: Grasp, rank: int, by: str) -> float | None:
-    """Return the sort key of a grasp (smaller is better). None if the grasp lacks the value."""
+    """Return the value of a grasp to sort by (smaller is better). None if the grasp has no such value."""
     if by == "score":
         return -grasp.score
     if by == "probability":
@@ -67,7 +67,7 @@ def _value(grasp: Grasp, rank: int, by: str) -> float | None:
 
 
 def label(grasp: Grasp, rank: int) -> str:
-    """Return the text of a grasp in the dropdown list."""
+    """Return a grasp's text for the dropdown list."""
     said = standing(grasp)
     mark = {"verified": "✓", LESS_SURE: "~", "failed": "✗"}.get(said, "·")
     return f"{mark} #{rank} {said}{_likely(grasp, ', ')}, {len(grasp.contacts)} contacts"
@@ -88,7 +88,7 @@ def legend_html() -> str:
 
 
 def table_html(grasps: Sequence[Grasp], ranks: Sequence[int], chosen: int | None) -> str:
-    """Return counts by filter, and the table's rows around the grasp of rank `chosen`, as HTML."""
+    """Return HTML: the number of grasps of each filter, and a table of the grasps around rank `chosen`."""
     if not ranks:
         return "<i>no grasp passes this filter</i>"
     middle = ranks.index(chosen) if chosen in ranks else 0
@@ -104,7 +104,7 @@ def table_html(grasps: Sequence[Grasp], ranks: Sequence[int], chosen: int | None
 
 
 def figures_html(grasp: Grasp, rank: int) -> str:
-    """Return a table of all values of one grasp. Each has its description as a tooltip."""
+    """Return HTML with all values of one grasp. Each value has its description as a tooltip."""
     r, g, b = (round(255 * channel) for channel in VERDICTS[grasp.verdict])
     reason = f": {html.escape(grasp.reason)}" if grasp.reason else ""
     head = f"<b>#{rank} <span style='color:rgb({r},{g},{b})'>{standing(grasp)}</span></b>{reason}"

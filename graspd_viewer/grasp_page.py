@@ -1,4 +1,4 @@
-"""HTML page and PNG picture of grasps. Both use the view in which object and hand are least hidden."""
+"""Write grasps as an HTML page or a PNG picture. Both use the view in which object and hand are least hidden."""
 
 from __future__ import annotations
 
@@ -25,11 +25,11 @@ from graspd_viewer.drawing import HAND, NORMAL, OBJECT, Colour, contact_parts, h
 from graspd_viewer.grasp_list import label
 
 PREGRASP: Colour = (0.62, 0.66, 0.72)
-# Most grasps of a page, vertical field of view [rad], and size of a picture [pixels].
+# Greatest number of grasps on a page, vertical field of view [rad], and size of a picture [pixels].
 _MOST, _FIELD, _SIZE = 16, 0.7, (960, 720)
-# Candidate views: number of azimuths, elevations [rad], and size of the test images [pixels].
+# Views that `best_view` compares: number of azimuths, elevations [rad], and size of their images [pixels].
 _AZIMUTHS, _ELEVATIONS, _SMALL = 12, (0.2, 0.6, 1.0), (48, 36)
-# Kinds of nodes on a page: key, name in the legend, colour, and whether they are visible at first.
+# What a page shows: key, name in the legend, colour, and whether it is visible at first.
 _LEGEND = (
     ("object", "object", OBJECT, True),
     ("hand", "hand at the grasp", HAND, True),
@@ -47,19 +47,19 @@ def save_view(
     name: str = "object",
     up: Float[np.ndarray, "3"] | None = None,
 ) -> None:
-    """Write an HTML page with the object and the hand. The visitor selects one of the grasps that did not fail.
+    """Write an HTML page with object and hand. Visitors select one of the first 16 grasps that did not fail.
 
     Args:
-        path: path of the page. The file is written atomically.
+        path: path of the page. The file is written completely or not at all.
         object_mesh: mesh in the object's frame [m].
         hand: the hand of the grasps.
         grasps: grasps in rank order. If all failed, the page shows only the object.
         name: name of the object for the page's title.
-        up: up direction in the object's frame. If None, this is the z axis.
+        up: up direction in the object's frame. None: the z axis.
     """
     from trimesh.viewer.notebook import scene_to_html
 
-    # The page stores positions as float32.
+    # The page stores positions as float32, which is too coarse far from the origin.
     far = far_centre(object_mesh.vertices)
     mesh = moved_mesh(object_mesh, -far)
     shown = [(rank, moved_grasp(g, -far)) for rank, g in enumerate(grasps) if g.verdict is not Verdict.FAILED][:_MOST]
@@ -104,9 +104,9 @@ def save_picture(
 def best_view(
     object_mesh: TriangleMesh, hand: TriangleMesh | None, up: Float[np.ndarray, "3"] | None = None
 ) -> tuple[Float[np.ndarray, "3"], Float[np.ndarray, "3"], Float[np.ndarray, "3"]]:
-    """Return eye position, target position [m] and up direction of the best view on object and hand.
+    """Return the camera's position, the point that it looks at [m], and the up direction of the best view.
 
-    A body's visibility is its pixel count divided by its greatest count in any view. The lower of both is maximised.
+    In each view, divide the pixels of object and of hand by their most pixels in any view. Maximise the lower share.
     """
     meshes = [object_mesh] if hand is None else [object_mesh, hand]
     corners = np.concatenate([mesh.vertices for mesh in meshes])
@@ -127,7 +127,7 @@ def best_view(
 
 
 def view_scene(object_mesh: TriangleMesh, hand: HandModel, grasps: Sequence[Grasp]):
-    """Return a `trimesh.Scene` with the object and the hand's links at grasps and pregrasps, object frame [m]."""
+    """Return a `trimesh.Scene` of the object, contacts, and hand links at grasps and pregrasps, object frame [m]."""
     import trimesh
 
     scene = trimesh.Scene()
@@ -171,7 +171,7 @@ def _body(mesh: TriangleMesh, colour: Colour) -> Any:
 
 
 def placed_hand(hand: HandModel, posture: Posture) -> TriangleMesh:
-    """Return the hand's collision surface at a posture, object frame [m]."""
+    """Return the mesh of the hand's collision shapes at a posture, object frame [m]."""
     mesh = hand_mesh(hand, posture.joint_positions)
     rotation = rotation_from_quaternion(torch.as_tensor(posture.quaternion_wxyz)).numpy()
     return TriangleMesh(mesh.vertices @ rotation.T + posture.position, mesh.faces)

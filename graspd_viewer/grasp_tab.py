@@ -1,4 +1,4 @@
-"""Tab of grasps: the list, the hand's path, the drawings of a grasp, and its trial."""
+"""The tab Grasps: the list of grasps, a slider for the hand's path, what is drawn, and the trial of a grasp."""
 
 from __future__ import annotations
 
@@ -17,8 +17,8 @@ from graspd_viewer.session import Session
 from graspd_viewer.trial_controls import TrialControls
 
 _NONE = "no grasp"
-# Delay between the intermediate pose and the slider's pose [s]. The page sends at most 20 slider positions a second.
-# Half of this period makes the motion smoother.
+# When the slider moves, the hand is drawn half-way at once, and at the slider's place after this delay [s]. The page
+# sends at most 20 slider positions a second. The delay is half of this period, for a smoother motion.
 _HALF_PERIOD = 0.025
 _AXES = ("none", "x", "y", "z")
 # Groups of nodes that a visitor may hide, and whether they are visible at first.
@@ -31,7 +31,7 @@ _NAMES = {
 
 
 class GraspTab:
-    """Widgets of the tab and their actions. All drawing runs in the thread of `jobs`."""
+    """Widgets of the tab and their actions. The thread of `jobs` does all drawing."""
 
     def __init__(self, server: Any, jobs: LatestJobs, nodes: SceneNodes) -> None:
         self._server, self._jobs, self._nodes = server, jobs, nodes
@@ -47,7 +47,7 @@ class GraspTab:
 
     def _build(self, gui: Any) -> None:
         self._title = gui.add_markdown("")
-        self._filter = gui.add_dropdown("Show", FILTERS, initial_value=ALL, hint="by what the trials said")
+        self._filter = gui.add_dropdown("Show", FILTERS, initial_value=ALL, hint="by the verdict of the trials")
         self._order = gui.add_dropdown("Sort by", ORDERS, initial_value="rank", hint="best first")
         self._choice = gui.add_dropdown("Grasp", (_NONE,))
         self._step = gui.add_button_group("Keys P, N", ("Previous", "Next"))
@@ -88,9 +88,9 @@ class GraspTab:
             self.step(-1 if self._step.value == "Previous" else 1)
 
     def show(self, session: Session) -> None:
-        """Show another session and select its first grasp. Call it in the drawing thread."""
+        """Show another session and select the first grasp of the list. Call this in the drawing thread."""
         self._session = session
-        # Created for the first selected grasp, because it takes as long as opening the file.
+        # The first selected grasp creates the metrics context, because this takes as long as opening the file.
         self._metrics = None
         notes = "".join(f"\n\n*{_plain(note)}*" for note in session.notes[:6])
         self._title.content = f"**{_plain(session.title)}**, {_plain(session.hand.name)}{notes}"
@@ -101,11 +101,11 @@ class GraspTab:
         self._draw_slice()
 
     def step(self, by: int) -> None:
-        """Select the grasp `by` places further in the list. Negative values go back."""
+        """Select the grasp `by` places further in the list. Negative values go back. After the end comes the start."""
         self._jobs.submit("choose", lambda: self._choose_place(by))
 
     def draw_pose(self, at: float | None = None) -> None:
-        """Pose the hand at the slider's place on the path, or at `at` (0 to 3), and reset the object's pose."""
+        """Pose the hand at `at` on its path (`posture_at`), by default at the slider. Put the object back."""
         self._at = float(self._stage.value) if at is None else at
         grasp = self._grasp()
         if self.trial.stop():
@@ -158,7 +158,7 @@ class GraspTab:
         contacts = grasp.contacts if grasp else ()
         self._nodes.draw("contacts", contact_parts(contacts))
         self._nodes.draw("forces", squeeze_parts(contacts))
-        # Draw this after the pose, for which the visitor waits.
+        # Draw the weakest push after the pose, because the visitor waits for the pose.
         self._nodes.draw("weakest", ())
         self._jobs.submit("weakest", self._draw_weakest, after=0.05)
 

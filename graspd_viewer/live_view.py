@@ -1,4 +1,4 @@
-"""Live view of a run: hands during the optimisation, candidates, and verdicts of the trials."""
+"""Show a run while it plans: the hands of the optimiser, then candidates in the colours of their verdicts."""
 
 from __future__ import annotations
 
@@ -14,18 +14,18 @@ from graspd_viewer.scene_nodes import SceneNodes
 from graspd_viewer.server import LatestJobs
 from graspd_viewer.session import Session
 
-# Least time between two updates [s], and most hands drawn.
+# Least time between two drawings [s], and greatest number of hands drawn.
 INTERVAL, _MOST_HANDS = 0.2, 256
 _WORDS = {Stage.OPTIMISE: "searching", Stage.VERIFY: "trying"}
 
 
 class LiveView:
-    """Hooks for `plan_grasps`. The planning thread passes snapshots, and the drawing thread draws them.
+    """Functions that `plan_grasps` calls (hooks). They pass snapshots of the hands to the drawing thread.
 
     Args:
         jobs: queue of the drawing thread.
         nodes: the page's scene nodes, in which the hands are drawn.
-        show: shows progress as a line and the fraction of the stage that is done.
+        show: function that shows a line of text, and the done fraction of the stage (0 to 1).
     """
 
     def __init__(self, jobs: LatestJobs, nodes: SceneNodes, show: Callable[[str, float], None]) -> None:
@@ -35,23 +35,23 @@ class LiveView:
         self._drawn = -float("inf")
 
     def begin(self, session: Session) -> None:
-        """Start the view of a run with the hand and the origin of a session."""
+        """Start to show a run, with the hand and the origin of `session`."""
         self._origin, self._hand = session.origin, session.hand
 
     def end(self) -> None:
-        """End the view and remove its drawings."""
+        """Stop showing the run, and remove the drawn hands."""
         self._hand = None
         self._jobs.submit("live", lambda: self._nodes.draw_lines(np.zeros((0, 2, 3)), np.zeros((0, 3))))
 
     def progress(self, progress: Progress) -> None:
-        """Show a progress report. This is the progress hook of `plan_grasps`."""
+        """Show a progress report. `plan_grasps` gets this function as `progress`."""
         found = f", {progress.verified} verified" if progress.verified else ""
         line = f"{_WORDS.get(progress.stage, progress.stage)} {progress.step} of {progress.of}{found}"
         share = progress.step / progress.of if progress.of else 0.0
         self._jobs.submit("progress", lambda: self._show(f"{line}, {progress.elapsed:.1f} s", share), self._wait())
 
     def watch(self, seen: Snapshot) -> None:
-        """Draw a snapshot. This is the watch hook of `plan_grasps`. It returns at once."""
+        """Draw a snapshot later, and return at once. `plan_grasps` gets this function as `watch`."""
         hand = self._hand
         if hand is not None:
             self._jobs.submit("live", lambda: self._draw(hand, seen), self._wait())

@@ -1,4 +1,4 @@
-"""Web page with moving parts, camera points and lines of text, for a running simulation."""
+"""Web page that shows a running simulation: moving parts, camera points and lines of text."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ Pose = Float[np.ndarray, "4 4"]
 
 
 class MovingParts:
-    """Web page that shows moving parts. A thread draws the newest state, and drawing methods return at once.
+    """Web page that shows moving parts. A thread draws the newest state. So the methods that draw return at once.
 
     Args:
         parts: moving parts, each in its own frame.
@@ -54,7 +54,7 @@ class MovingParts:
 
     @property
     def url(self) -> str:
-        """Address of the page."""
+        """Return the address of the page."""
         host = f"[{self._host}]" if ":" in self._host else self._host
         return f"http://{host}:{self._server.get_port()}"
 
@@ -65,11 +65,11 @@ class MovingParts:
             time.sleep(0.05)
 
     def place(self, poses: Sequence[Pose]) -> None:
-        """Set the poses of the moving parts, in their order [m]."""
+        """Set the poses of all moving parts, in the order of `parts` [m]."""
         self._jobs.submit("place", lambda: self._nodes.place("moving", poses))
 
     def draw(self, group: str, parts: Sequence[Part]) -> None:
-        """Replace the fixed parts of a group."""
+        """Replace the parts of a group by `parts`, which do not move."""
         self._jobs.submit(group, lambda: self._nodes.draw(group, parts))
 
     def draw_points(self, points: Float[np.ndarray, "n 3"]) -> None:
@@ -77,7 +77,7 @@ class MovingParts:
         self._jobs.submit("points", lambda: self._nodes.draw_points(points))
 
     def write(self, *lines: str) -> None:
-        """Replace the lines of text."""
+        """Replace the shown text by `lines`."""
         text = "<br>".join(map(html.escape, lines))
         self._jobs.submit("text", lambda: setattr(self._text, "content", f"{BLOCK}{text}</div>"))
 

@@ -1,4 +1,4 @@
-"""Tab where visitors plan: object, hand, preset, and the buttons Plan, Stop and Save. All visitors share one run.
+"""The tab Plan: visitors choose object, hand and preset, and plan, stop or save. All visitors share one run.
 
 This module checks every request, because a forged message may contain any value.
 """
@@ -35,7 +35,7 @@ from graspd_viewer.live_view import LiveView
 from graspd_viewer.session import Session, make_session, seen_points
 
 UNITS = {"m": 1.0, "cm": 1e-2, "mm": 1e-3}
-# Sides from which the hand may come, and the direction in which it then moves, in the object's frame.
+# Sides from which the hand may come, with the direction in which it then moves, in the object's frame.
 APPROACHES = {
     "any side": None,
     "above": (0.0, 0.0, -1.0),
@@ -51,30 +51,30 @@ MOST_GRASPS = 64
 
 @dataclass(frozen=True)
 class Upload:
-    """File from a visitor. Its name is only displayed and never used as a path."""
+    """File that a visitor sent. The server shows its name, but never uses it as a path."""
 
     name: str
     content: bytes
 
     @property
     def ending(self) -> str:
-        """File ending in lower case without the dot. Empty if there is none."""
+        """Return the file ending in lower case without the dot. Empty if there is none."""
         return self.name.rpartition(".")[2].lower() if "." in self.name else ""
 
 
 @dataclass(frozen=True)
 class PlanRequest:
-    """Settings of one run.
+    """What a visitor asks for: the settings of one run.
 
     Attributes:
-        shape: name of a built-in shape. It is used if there is no upload.
+        shape: name of a built-in shape, used if there is no upload.
         upload: file of the object, or None.
         units: unit of the file's coordinates, a key of `UNITS`.
         alone: True if the cloud contains only the object.
         hand, preset: names of built-in hands and presets.
         friction: friction coefficient.
         approach: side from which the hand comes, a key of `APPROACHES`.
-        approach_angle: greatest angle between this direction and the grasp's approach [degrees].
+        approach_angle: greatest angle between the hand's approach and the direction in `APPROACHES` [degrees].
         count, seed: arguments of `plan_grasps`.
     """
 
@@ -92,13 +92,13 @@ class PlanRequest:
 
     @property
     def restrictions(self) -> tuple[Steering, ...]:
-        """Restrictions for `plan_grasps`. Raises ConfigError: the angle is out of range."""
+        """Return the approach as restrictions for `plan_grasps`. Raises ConfigError: the angle is out of range."""
         direction = APPROACHES[self.approach]
         return () if direction is None else (Steering(direction, math.radians(self.approach_angle)),)
 
 
 def check(request: PlanRequest) -> None:
-    """Check all fields of a request. Raises ConfigError: a value is invalid. The message names the valid values."""
+    """Check the fields of a request. Raises ConfigError: a value is not valid. The message names the valid values."""
     chosen = (
         ("shape", request.shape, tuple(SHAPES)),
         ("units", request.units, tuple(UNITS)),
@@ -120,9 +120,9 @@ def check(request: PlanRequest) -> None:
 
 
 def load_object(request: PlanRequest) -> tuple[Scene, Any]:
-    """Return the scene of a checked request, and the camera points from which it was made [m].
+    """Return the scene of a checked request, and the points of its cloud [m]. A shape or a mesh has no such points.
 
-    A child process reads the file, so that a crash or an exploit of a reader cannot harm this process.
+    A child process reads the file. So a file that crashes or attacks a reader cannot harm this process.
 
     Raises:
         GraspdError: the object cannot be used. The message contains the visitor's file name.
@@ -147,13 +147,13 @@ _FILE = "the file sent"
 
 
 class PlanTab:
-    """Widgets of the tab, and the planning thread.
+    """Widgets of the tab, and the thread that plans.
 
     Args:
         server: server of the page.
         live: live view of the run.
         show: thread-safe function that shows a session.
-        say: thread-safe function that shows a line and the progress, 0 to 1.
+        say: thread-safe function that shows a line of text and the progress, 0 to 1.
     """
 
     def __init__(self, server: Any, live: LiveView, show: Callable[[Session], None], say: Callable[..., None]) -> None:
@@ -168,14 +168,14 @@ class PlanTab:
     def _build(self, gui: Any) -> None:
         self._object = gui.add_dropdown("Object", tuple(SHAPES), initial_value="mug")
         self._file = gui.add_upload_button("Send a mesh or a cloud", hint=", ".join(ENDINGS))
-        self._units = gui.add_dropdown("Its unit", tuple(UNITS), hint="of the file's coordinates")
+        self._units = gui.add_dropdown("Its unit", tuple(UNITS), hint="unit of the file's coordinates")
         self._alone = gui.add_checkbox("A cloud shows the object alone", False)
         self._hand = gui.add_dropdown("Hand", hand_names(), initial_value="allegro_right")
         self._preset = gui.add_dropdown("Preset", preset_names(), initial_value="fast")
-        self._friction = gui.add_slider("Friction", 0.1, 1.5, 0.05, 0.6, hint="of the object against the hand")
-        self._approach = gui.add_dropdown("The hand comes from", tuple(APPROACHES), hint="in the object's frame")
-        self._angle = gui.add_slider("Within [°]", 5, 180, 5, 30, hint="of that direction")
-        self._count = gui.add_slider("Grasps", 1, MOST_GRASPS, 1, 8, hint="verified grasps wanted")
+        self._friction = gui.add_slider("Friction", 0.1, 1.5, 0.05, 0.6, hint="between object and hand")
+        self._approach = gui.add_dropdown("The hand comes from", tuple(APPROACHES), hint="side in the object's frame")
+        self._angle = gui.add_slider("Within [°]", 5, 180, 5, 30, hint="greatest angle to that direction")
+        self._count = gui.add_slider("Grasps", 1, MOST_GRASPS, 1, 8, hint="number of verified grasps")
         self._plan = gui.add_button("Plan")
         self._halt = gui.add_button("Stop", disabled=True)
         self._save = gui.add_button("Save grasps.json", disabled=True)
@@ -191,15 +191,15 @@ class PlanTab:
                 event.client.send_file_download("grasps.json", self._saved, save_immediately=True)
 
     def show_progress(self, line: str, share: float) -> None:
-        """Show a line and the progress (0 to 1) of a run. Call it in the drawing thread."""
+        """Show a line of text and the progress of a run, 0 to 1. Call this in the drawing thread."""
         self._status.content, self._bar.value = f"{BLOCK}{html.escape(line)}</div>", 100.0 * min(max(share, 0.0), 1.0)
 
     def plan(self) -> None:
-        """Start a run with the values of the widgets, unless a run is in progress."""
+        """Start a run with the values of the widgets. Do nothing if a run is in progress."""
         self.begin(lambda _: self._plan_and_show(self._request()))
 
     def begin(self, work: Callable[[StopHook], None]) -> None:
-        """Call `work` with the stop hook in the planning thread, unless a run is in progress."""
+        """Start a thread that calls `work`. Its argument tells whether to stop. Do nothing if a run is in progress."""
         if not self._busy.acquire(blocking=False):
             return
         self._stop.clear()
@@ -208,7 +208,7 @@ class PlanTab:
         self._thread.start()
 
     def close(self) -> None:
-        """Stop the run in progress, if any, and wait at most 10 s for its end."""
+        """Stop the run in progress, if any. Wait at most 10 s for its end."""
         self._stop.set()
         if self._thread is not None:
             self._thread.join(10.0)
@@ -228,7 +228,7 @@ class PlanTab:
         self._say(f"refused: {reason}")
 
     def _request(self) -> PlanRequest:
-        """Return the checked request of the widgets. Raises ConfigError: a value is invalid."""
+        """Return the request in the widgets, checked. Raises ConfigError: a value is not valid."""
         sent = self._upload if self._object.value == _FILE else None
         try:
             friction, count, angle = float(self._friction.value), int(self._count.value), float(self._angle.value)
@@ -251,7 +251,7 @@ class PlanTab:
             self._refuse(str(error))
         except Exception as error:
             traceback.print_exc(file=sys.stderr)
-            self._refuse(f"a fault of graspd: {type(error).__name__}: {error}")
+            self._refuse(f"a bug in graspd: {type(error).__name__}: {error}")
         finally:
             self._live.end()
             self._plan.disabled, self._halt.disabled, self._save.disabled = False, True, self._saved is None

@@ -1,4 +1,4 @@
-"""3D scene of the page: the meshes of `drawing` as viser nodes. Only the drawing thread uses it."""
+"""The 3D scene of the page: the meshes of `drawing` as nodes of viser. Only the drawing thread changes it."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ PER_METRE, _NEAR = 100.0, 1.01
 
 
 class SceneNodes:
-    """Scene nodes of one server: a hand, an object with its surroundings, arrows, a slice, and lines."""
+    """Nodes of one server's 3D scene: hand, object, support, neighbours, arrows, SDF slice, lines and points."""
 
     def __init__(self, server: Any) -> None:
         self._server = server
@@ -42,7 +42,7 @@ class SceneNodes:
         server.scene.add_light_directional("/light/sun", intensity=1.5, cast_shadow=False, position=(1.0, 1.0, 2.0))
 
     def show(self, session: Session) -> None:
-        """Clear the scene and draw the object, surroundings, points and hand of a session."""
+        """Clear the scene. Draw the object, support, neighbours, camera points and hand of a session."""
         with self._server.atomic():
             for name in list(self._groups):
                 self.draw(name, ())
@@ -57,7 +57,7 @@ class SceneNodes:
         self._aim(session)
 
     def draw(self, group: str, parts: Sequence[Part]) -> None:
-        """Replace the parts of a group."""
+        """Replace the drawn parts of a group."""
         for node in self._groups.pop(group, ()):
             node.remove()
         nodes = [self._mesh(f"/{part.name}", part) for part in parts]
@@ -77,7 +77,7 @@ class SceneNodes:
             self._groups["lines"] = [node]
 
     def draw_slice(self, session: Session, axis: int | None, share: float) -> None:
-        """Replace the SDF slice normal to `axis` at the fraction `share` of the grid. If `axis` is None, remove it."""
+        """Replace the drawn SDF slice. See `sdf_slice` for `axis` and `share`. If `axis` is None, remove the slice."""
         for node in self._groups.pop("slice", ()):
             node.remove()
         if axis is None or session.scene is None:
@@ -94,13 +94,13 @@ class SceneNodes:
         self._groups["slice"] = [node]
 
     def set_visible(self, group: str, visible: bool) -> None:
-        """Show or hide a group, now and in later drawings."""
+        """Show or hide a group. This also applies to parts that are drawn later."""
         (self._hidden.discard if visible else self._hidden.add)(group)
         for node in self._groups.get(group, ()):
             node.visible = visible
 
     def pose_hand(self, hand: HandModel, posture: Posture) -> None:
-        """Set the hand's posture."""
+        """Move the hand to a posture."""
         self.pose_links(*placed_links(hand, posture))
 
     def pose_links(self, positions: Float[np.ndarray, "_ 3"], quaternions: Float[np.ndarray, "_ 4"]) -> None:
@@ -119,7 +119,7 @@ class SceneNodes:
             node.visible = visible
 
     def fade_hand(self, opacity: float) -> None:
-        """Set the hand's opacity (0.05 to 1), now and in later drawings."""
+        """Set the hand's opacity (0.05 to 1). This also applies to hands that are drawn later."""
         self._opacity = min(max(opacity, 0.05), 1.0)
         for node in self._links.values():
             node.opacity = None if self._opacity == 1.0 else self._opacity
@@ -131,7 +131,7 @@ class SceneNodes:
         self.fade_hand(self._opacity)
 
     def place(self, group: str, poses: Sequence[Float[np.ndarray, "4 4"]]) -> None:
-        """Set the poses of the parts of a group, in their order [m]."""
+        """Set the poses of a group's parts, in the order in which they were drawn [m]."""
         for node, pose in zip(self._groups.get(group, ()), poses, strict=True):
             node.position, node.wxyz = PER_METRE * pose[:3, 3], _quaternion(pose[:3, :3])
 
@@ -147,11 +147,11 @@ class SceneNodes:
         self._groups["cloud"] = nodes
 
     def _mesh(self, name: str, part: Part) -> Any:
-        # The inside of a closed body is invisible. Drawing it costs a software renderer a fifth of the frame time.
+        # The inside of a closed body is invisible. Drawing the inside costs a software renderer a fifth of a frame.
         mesh, hand = part.mesh, name.startswith("/hand")
         closed = hand or is_closed(mesh)
-        # Toon shading looks similar on solids and saves a sixth of that time. It has no flat shading, so each face gets
-        # its own vertices.
+        # Toon shading looks similar on solids and saves a sixth of a frame. Toon shading is never flat, so each face
+        # gets its own vertices.
         if hand:
             mesh = TriangleMesh(mesh.vertices[mesh.faces].reshape(-1, 3), np.arange(mesh.faces.size).reshape(-1, 3))
         return self._server.scene.add_mesh_simple(
@@ -161,7 +161,7 @@ class SceneNodes:
         )  # fmt: skip
 
     def _aim(self, session: Session) -> None:
-        """Point every visitor's camera at the object. Up is the support's normal, or z without a support."""
+        """Turn every visitor's camera to the object. Up is the support's normal, or z without a support."""
         middle, size, up = np.zeros(3), 0.1, np.array([0.0, 0.0, 1.0])
         if session.scene is not None:
             corners = session.scene.object.mesh.vertices
@@ -173,7 +173,7 @@ class SceneNodes:
         self.aim(middle + (0.14 + 1.5 * size) * (0.75 * side + 0.55 * np.cross(up, side) + 0.45 * up), middle, up)
 
     def aim(self, eye: Float[np.ndarray, "3"], middle: Float[np.ndarray, "3"], up: Float[np.ndarray, "3"]) -> None:
-        """Point every visitor's camera from `eye` at `middle` [m]."""
+        """Move every visitor's camera to `eye`, looking at the point `middle` [m]."""
         self._server.scene.set_up_direction(up)
         for camera in (self._server.initial_camera, *(c.camera for c in self._server.get_clients().values())):
             camera.position, camera.look_at = PER_METRE * eye, PER_METRE * middle

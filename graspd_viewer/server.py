@@ -1,8 +1,8 @@
-"""Restricted viser server, and the drawing thread.
+"""A viser server with limits, and the drawing thread.
 
-By default viser listens on every interface, lets any web page connect, accepts files of any size, and opens a public
-tunnel for a visitor. This server does none of these. The drawing thread runs only the newest job of each kind, so that
-slider events do not pile up.
+By default viser listens on every network interface, lets any web page connect and accepts files of any size. It also
+opens a public tunnel if a visitor asks. This server does none of these. The drawing thread runs only the newest job of
+each kind. So a moved slider does not leave a queue of drawings.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ Work = Callable[[], object]
 
 
 class LatestJobs:
-    """Thread that runs the newest job of each kind. Replaced jobs never run.
+    """Thread that runs jobs. Of each kind, only the newest waiting job runs.
 
     Args:
         failed: called with the exception of a failed job.
@@ -38,13 +38,13 @@ class LatestJobs:
         self._thread.start()
 
     def submit(self, kind: str, work: Work, after: float = 0.0) -> None:
-        """Submit a job to run after `after` seconds. It replaces a waiting job of its kind."""
+        """Submit a job to run after `after` seconds. The job replaces a waiting job of the same kind."""
         with self._change:
             self._waiting[kind] = time.monotonic() + after, work
             self._change.notify()
 
     def drop(self, kind: str) -> None:
-        """Remove the waiting job of a kind, if any."""
+        """Remove the waiting job of a kind, if there is one."""
         with self._change:
             self._waiting.pop(kind, None)
 
@@ -74,7 +74,7 @@ class LatestJobs:
                 self._failed(error)
 
 
-# Largest file that a visitor may upload [bytes], and most simultaneous uploads of a visitor.
+# Largest file that a visitor may upload [bytes], and greatest number of uploads of a visitor at a time.
 LARGEST_UPLOAD = 64 * 2**20
 _UPLOADS_AT_ONCE = 2
 LOCAL = ("localhost", "127.0.0.1", "::1")
@@ -89,13 +89,13 @@ def start_server(host: str, port: int) -> Any:
     with Extra("view"):
         import viser
     if not 0 <= port < 65536:
-        raise ConfigError(f"port: {port}; valid: 0 to 65535, 0 for any")
+        raise ConfigError(f"port: {port}; valid: 0 to 65535 (0: any free port)")
     try:
         family = socket.AF_INET6 if ":" in host else socket.AF_INET
         with socket.socket(family) as probe:
             probe.bind((host, 0))
     except OSError as error:
-        raise ConfigError(f"host: {host!r}: {error.strerror or error}; use 127.0.0.1 for this machine alone") from None
+        raise ConfigError(f"host: {host!r}: {error.strerror or error}; use 127.0.0.1 for this machine only") from None
     with quiet():
         server = viser.ViserServer(host=host, port=port, label="graspd", verbose=False)
     _refuse_strangers(server, host)
@@ -113,15 +113,15 @@ def name_tab(server: Any, title: str) -> None:
 
 
 def quiet() -> contextlib.AbstractContextManager[Any]:
-    """Return a context that suppresses viser's banners."""
+    """Return a context in which viser prints nothing."""
     return contextlib.redirect_stdout(io.StringIO())
 
 
 def may_connect(origin: str | None, named: str | None, host: str) -> bool:
     """Return True if a client may connect. `origin` and `named` are its Origin and Host headers.
 
-    Pages of another site must not connect. A server on a local `host` must be addressed by a local name. Clients that
-    are no web pages have no origin and may connect.
+    Refuse pages of another site. If `host` is local, refuse clients that address the server by another name. Clients
+    that are no web pages send no Origin, and may connect.
     """
     name = urlsplit(f"//{named or ''}")
     if host in LOCAL and name.hostname not in LOCAL:
@@ -149,7 +149,7 @@ def _refuse_tunnels(server: Any) -> None:
 
 
 def _limit_uploads(server: Any) -> None:
-    """Refuse too large files and more than two uploads at once. End transfers that exceed their stated size."""
+    """Refuse files over 64 MB, and a visitor's third upload at a time. End uploads that exceed their stated size."""
     from viser import _messages
 
     gui = server.gui

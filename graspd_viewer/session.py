@@ -1,4 +1,4 @@
-"""Session of the viewer: grasps, their hand, and the object if available."""
+"""What the viewer shows, a session: grasps, their hand, and the object if it can be loaded."""
 
 from __future__ import annotations
 
@@ -23,16 +23,16 @@ from graspd_core.types import Grasp, TriangleMesh
 
 @dataclass(frozen=True, eq=False)
 class Session:
-    """Content of the viewer.
+    """What the viewer shows at a time.
 
     Attributes:
         title: title of the page.
         hand: the hand of the grasps.
         grasps: grasps in rank order.
-        scene: scene of the object. None if the object is not available. The grasps are still shown.
+        scene: scene of the object. None if the object cannot be loaded. Then only the grasps are shown.
         seen: camera points in the object's frame [m]. Empty for a mesh.
         notes: warnings for visitors, one sentence each.
-        origin: displayed origin in the file's frame [m]. Zero unless the object is far from the file's origin.
+        origin: the session's origin in the file's frame [m]. Zero unless the object is far from the file's origin.
     """
 
     title: str
@@ -51,8 +51,8 @@ def open_grasps(path: Path, *, object_source: str | None = None, hand: str | Non
 
     Args:
         path: path of a file in the format graspd/grasps.
-        object_source: mesh file, cloud file or shape:NAME. If None, the file's object is used.
-        hand: name or path of a hand. If None, the file's hand is used.
+        object_source: mesh file, cloud file or shape:NAME. If None, the object that the file names.
+        hand: name or path of a hand. If None, the hand that the file names.
 
     Raises:
         FormatError: the file cannot be read, or its joints are not those of the hand.
@@ -78,7 +78,7 @@ def make_session(
     seen: Float[np.ndarray, "points 3"],
     notes: tuple[str, ...],
 ) -> Session:
-    """Make a session with its origin near the object. Browsers use float32, which is too coarse far from the origin."""
+    """Make a session. Far from the origin a browser's float32 is too coarse, so a distant object is moved to it."""
     scene, far = planning_scene(scene, config.resolution)
     return Session(title, hand, tuple(moved_grasp(g, -far) for g in grasps), scene, seen - far, notes, far)
 
@@ -86,7 +86,7 @@ def make_session(
 def seen_points(
     source: str | TriangleMesh, scale: float = 1.0, camera: str | Path | None = None
 ) -> Float[np.ndarray, "points 3"]:
-    """Return the points of a cloud file, or of a depth image with its `camera` file [m]. Empty for other sources."""
+    """Return the points of a cloud file, or of a depth image with its `camera` file [m]. Other sources have none."""
     if isinstance(source, TriangleMesh) or (camera is None and not is_cloud_file(source)):
         return np.zeros((0, 3))
     points = np.concatenate([view.points for view in scaled_views(source, camera, scale)])
@@ -98,7 +98,7 @@ def _hand_of(document: dict[str, Any], path: Path, wanted: str | None) -> HandMo
     named = named if isinstance(named, dict) else {}
     source = wanted or (named.get("name") if named.get("name") in hand_names() else named.get("urdf"))
     if not isinstance(source, str):
-        raise FormatError(f"{path}: names no hand; name one with --hand")
+        raise FormatError(f"{path}: names no hand; give the hand with --hand")
     hand = load_hand(source)
     if list(all_joint_names(hand)) != named.get("joint_names"):
         raise FormatError(f"{path}: its joints are not those of {source}; name the hand with --hand")
@@ -108,24 +108,24 @@ def _hand_of(document: dict[str, Any], path: Path, wanted: str | None) -> HandMo
 def _object_of(
     document: dict[str, Any], path: Path, wanted: str | None, config: PlanConfig
 ) -> tuple[Scene | None, Float[np.ndarray, "points 3"], tuple[str, ...]]:
-    """Return the scene, its camera points [m], and notes."""
+    """Return the scene of the file's or the wanted object, its camera points [m], and notes for visitors."""
     told = document.get("object")
     told = told if isinstance(told, dict) else {}
     source = wanted or _beside(str(told.get("source")), path)
     given = {key: told[key] for key in ("mass", "friction", "scale") if isinstance(told.get(key), int | float)}
     try:
-        # The file does not state `alone`. An object without a support was planned with it.
+        # The file does not state `alone`. An object without a support was planned with `alone`.
         alone = told.get("support") is None
         scene = load_scene(source, **given, resolution=config.resolution, alone=alone)
         seen = seen_points(source, given.get("scale", 1.0))
     except GraspdError as error:
         if wanted:
             raise
-        note = f"the object is not shown ({error}); name it with --object"
+        note = f"the object is not shown ({error}); give the object with --object"
         return None, np.zeros((0, 3)), (note,)
     if scene.object.sha256 == told.get("sha256"):
         return scene, seen, scene.object.warnings
-    note = f"{short_repr(source)} is not what these grasps were planned on: contacts may lie off it"
+    note = f"these grasps were planned on another object than {short_repr(source)}: contacts may lie off its surface"
     return scene, seen, (note, *scene.object.warnings)
 
 

@@ -1,6 +1,6 @@
-"""Replay of a grasp's trial up to its end or failure.
+"""Record a grasp's trial, and play it up to its end or failure.
 
-A recording contains the poses of hand and object in MuJoCo and the contact forces. Recording changes neither the
+A recording contains the poses of hand and object in MuJoCo, and the contact forces. Recording changes neither the
 trial's steps nor its result.
 """
 
@@ -37,13 +37,13 @@ FRAME_STEPS = 5
 
 @dataclass(frozen=True)
 class Frame:
-    """State of a trial at one time, in the object's frame at the start. A lift moves hand and object up.
+    """State of a trial at one time, in the frame of the object before the trial. In a lift, hand and object rise.
 
     Attributes:
         stage: name of the current stage.
-        positions, quaternions: poses of the hand's links in their order, then of the object [m], wxyz.
+        positions, quaternions: poses of all links of the hand, in order, then of the object [m], wxyz.
         contacts: contact points between hand and object [m].
-        forces: forces of the hand on the object at these points [N].
+        forces: forces of the hand on the object at the contact points [N].
     """
 
     stage: str
@@ -55,7 +55,7 @@ class Frame:
 
 @dataclass(frozen=True)
 class Recording:
-    """Recorded trial. Frames are `seconds` of simulated time apart. The last frame is the end of the trial."""
+    """Recorded trial. The frames are `seconds` of simulated time apart. The last frame shows the end of the trial."""
 
     result: TrialResult
     frames: tuple[Frame, ...]
@@ -78,7 +78,7 @@ def record_trial(context: TrialContext, grasp: Grasp, name: str) -> Recording:
 
 
 class _Recorder:
-    """Hook that stores every fifth step of a trial and the last one."""
+    """Function that a trial calls after every step. It stores every fifth step and the last step."""
 
     def __init__(self, context: TrialContext, name: str) -> None:
         world = context.around if name == "lift" else context.alone
@@ -92,7 +92,7 @@ class _Recorder:
 
     def __call__(self, data: Any) -> None:
         self._steps += 1
-        # Any step may be the last one, so the newest frame is always kept.
+        # Any step may be the last step, so the newest frame is always kept.
         self._last = None if self._steps % FRAME_STEPS == 0 else self._frame(data)
         if self._last is None:
             self._frames.append(self._frame(data))
@@ -101,7 +101,7 @@ class _Recorder:
         return tuple(self._frames) if self._last is None else (*self._frames, self._last)
 
     def _frame(self, data: Any) -> Frame:
-        # In a lift trial the surroundings sink (lift_trial.py). Relative to them, hand and object rise.
+        # In a lift trial the surroundings sink (lift_trial.py). The page shows hand and object rising instead.
         origin = -data.mocap_pos[1] if len(data.mocap_pos) > 1 else np.zeros(3)
         contacts, forces = _contact_forces(self._world, data)
         return Frame(
@@ -114,7 +114,7 @@ class _Recorder:
 
 
 def _contact_forces(world: World, data: Any) -> tuple[Float[np.ndarray, "n 3"], Float[np.ndarray, "n 3"]]:
-    """Return the contact points of the hand on the object [m] and the forces on the object [N], world frame."""
+    """Return where the hand touches the object [m], and its force on the object at each point [N], world frame."""
     import mujoco
 
     places, forces, wrench = [], [], np.zeros(6)
@@ -126,7 +126,7 @@ def _contact_forces(world: World, data: Any) -> tuple[Float[np.ndarray, "n 3"], 
         if not on_second and not (second in hand and world.model.geom_bodyid[first] == world.object_body):
             continue
         mujoco.mj_contactForce(world.model, data, index, wrench)
-        # The force on the second body, in the contact's axes, which are the rows of its frame.
+        # `wrench` is the force on the second body in the contact's axes. They are the rows of the contact's frame.
         forces.append((1.0 if on_second else -1.0) * wrench[:3] @ contact.frame.reshape(3, 3))
         places.append(contact.pos.copy())
     return np.array(places).reshape(-1, 3), np.array(forces).reshape(-1, 3)
@@ -145,12 +145,12 @@ def _lift_stage(data: Any, protocol: Protocol) -> str:
     return names[int(np.searchsorted(ends + 1e-9, data.time))]
 
 
-# Frames that the page shows per second. Playback runs in real time.
+# Frames that the page shows per second. A trial is played in real time.
 _RATE = 25.0
 
 
 class TrialControls:
-    """Widgets of a trial. All drawing runs in the thread of `jobs`."""
+    """Widgets that run and play a trial. The thread of `jobs` does all drawing."""
 
     def __init__(self, gui: Any, jobs: LatestJobs, nodes: SceneNodes) -> None:
         self._jobs, self._nodes = jobs, nodes
@@ -159,7 +159,7 @@ class TrialControls:
         self._contexts: dict[str, TrialContext] = {}
         self._recording: Recording | None = None
         with gui.add_folder("Its trial, as MuJoCo ran it"):
-            self._name = gui.add_dropdown("Trial", tuple(TRIALS), hint="lift: where there is a support or a neighbour")
+            self._name = gui.add_dropdown("Trial", tuple(TRIALS), hint="lift: if there is a support or a neighbour")
             self._protocol = gui.add_dropdown("Protocol", tuple(PROTOCOLS))
             self._play = gui.add_button("Run and play", hint="key R")
             self._time = gui.add_slider("Moment", 0, 1, 1, 0, disabled=True)
@@ -174,7 +174,7 @@ class TrialControls:
                 self._jobs.submit("frame", lambda: self._draw(int(self._time.value)))
 
     def show(self, session: Session, grasp: Grasp | None) -> None:
-        """Select another grasp and clear the replay. If the grasp failed a trial, preselect this trial."""
+        """Set the grasp whose trial can be played. Remove the recording. Select the trial that it failed, if any."""
         if session is not self._session:
             self._session, self._contexts = session, {}
         self._grasp = grasp
@@ -185,7 +185,7 @@ class TrialControls:
         self._text.content = ""
 
     def stop(self) -> bool:
-        """End the replay. Return True if a trial was shown. Call it in the drawing thread."""
+        """Remove the recording. Return True if there was one. Call this in the drawing thread."""
         self._jobs.drop("play")
         recorded, self._recording, self._time.disabled = self._recording is not None, None, True
         self._nodes.draw("trial", ())
@@ -247,7 +247,7 @@ class TrialControls:
 
 
 def _caption(recording: Recording, index: int, stage: str) -> str:
-    """Return time, stage and the trial's result as HTML."""
+    """Return HTML with the time and stage of a frame, and the trial's result."""
     result, seconds = recording.result, recording.seconds
     end = seconds * (len(recording.frames) - 1)
     line = f"{seconds * index:.2f} s of {end:.2f} s: {html.escape(stage)}"

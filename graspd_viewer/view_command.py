@@ -1,4 +1,4 @@
-"""`graspd view`: shows grasps, a benchmark, or a planning page in a browser."""
+"""The command `graspd view`: show grasps or a benchmark in a browser, or a page that plans grasps."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ if TYPE_CHECKING:
     from graspd_core.perception.scene import Scene
 
 
-# Seconds that a run with --view waits for a first visitor.
+# Time that a run with --view waits for the first visitor [s].
 _PATIENCE = 60.0
 
 
@@ -31,16 +31,16 @@ def add_command(commands: Any) -> None:
     parser.set_defaults(run=run, json=False)
     parser.add_argument(
         "path", metavar="PATH", type=Path, nargs="?", default=None,
-        help="a grasps.json, or the folder of a benchmark; without one, a page to plan on",
+        help="grasps.json or the folder of a benchmark (default: a page for planning)",
     )  # fmt: skip
-    parser.add_argument("--object", default=None, metavar="OBJECT", help="instead of the one that the file names")
-    parser.add_argument("--hand", default=None, metavar="NAME|PATH", help="instead of the one that the file names")
-    parser.add_argument("--html", type=Path, default=None, metavar="page.html", help="of a benchmark: one file")
+    parser.add_argument("--object", default=None, metavar="OBJECT", help="replaces the object that the file names")
+    parser.add_argument("--hand", default=None, metavar="NAME|PATH", help="replaces the hand that the file names")
+    parser.add_argument("--html", type=Path, default=None, metavar="page.html", help="write a benchmark's page")
     add_address(parser)
 
 
 def run(options: argparse.Namespace) -> int:
-    """Serve until Ctrl-C."""
+    """Serve the page until Ctrl-C. With --html, write a benchmark's page instead. Return the exit status 0."""
     import torch
 
     torch.set_num_threads(1)
@@ -66,7 +66,7 @@ def run(options: argparse.Namespace) -> int:
 
 @contextmanager
 def watched(options: argparse.Namespace, scene: Scene, hand: HandModel, config: PlanConfig) -> Iterator[Watched]:
-    """Yield the hooks of a page for a run with --view, when a visitor has opened the page or a minute has passed."""
+    """Open a page for a run with --view. Wait up to a minute for a visitor. Yield the functions that show the run."""
     from graspd_viewer.session import make_session, seen_points
     from graspd_viewer.viewer import Viewer
 
@@ -83,7 +83,7 @@ def watched(options: argparse.Namespace, scene: Scene, hand: HandModel, config: 
         session = make_session(name, hand, (), scene, config, seen, notes)
         viewer.show(session)
         viewer.live.begin(session)
-        print_note(f"{viewer.url} - planning begins when it is open")
+        print_note(f"{viewer.url} - planning begins when the page is open")
         viewer.wait_for_visitor(_PATIENCE)
         yield Watched(viewer.live.watch, viewer.live.progress, show)
     finally:

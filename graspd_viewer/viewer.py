@@ -1,4 +1,4 @@
-"""Page of the viewer: tabs, help, and the drawing thread. It runs until it is closed, for any number of visitors."""
+"""The viewer's page: tabs, help, and the drawing thread. Any number of visitors see the page until `close`."""
 
 from __future__ import annotations
 
@@ -20,26 +20,25 @@ from graspd_viewer.server import LatestJobs, quiet, start_server
 from graspd_viewer.session import Session
 
 _KEYS = """
-**Keys.** N next grasp, P previous grasp, R run and play the trial. Drag turns the scene, the right button moves it, the
-wheel zooms.
+**Keys.** N selects the next grasp, P the previous grasp. R runs and plays the trial. Drag to turn the scene, drag with
+the right button to move the scene, and use the wheel to zoom.
 
-**Colours.** The object is orange; where a camera did not see it and its shape was guessed, mauve. Blue arrows are the
-object's normals at the contacts. Red arrows are forces on the object, 4 mm for a newton: as planned for the squeeze,
-and as MuJoCo measured them while a trial plays. Purple is the push that the grasp resists least, yellow the axis of the
-turn that goes with it. In a slice of the signed distance blue is inside.
+**Colours.** The object is orange. Parts that no camera saw have a guessed shape and are mauve. Blue arrows are the
+object's normals at the contacts. Red arrows are forces on the object, 4 mm for a newton. They are the planned forces of
+the squeeze, or while a trial plays, MuJoCo's forces. The push that the grasp resists least is purple, and the axis of
+its turn is yellow. In a slice of the signed distance, blue is inside.
 
-**Verdicts.** A grasp is *verified* when it passed every physics trial, *failed* when it did not: press R to see when
-and why. One that is *less sure* holds on the likeliest shape of an object that cameras saw, and fails under too
-much else that may be true; the share beside it is how probably it holds. *Unverified* grasps were not tried.
+**Verdicts.** A *verified* grasp passed every physics trial. A *failed* grasp did not: press R to see when and why. A
+*less sure* grasp holds on the likeliest shape of an object that cameras saw, but fails too many robustness checks. The
+number beside a grasp is the probability that it holds. *Unverified* grasps were not tried.
 
-**Trials.** In the hold trial the hand closes on the free object, which is then pulled along six axes. In the lift trial
-it comes from a retreat, closes on the object on its support, and lifts it.
+**Trials.** In the hold trial, the hand closes on the free object. Then the object is pulled along six axes. In the lift
+trial, the hand approaches, closes on the object on its support, and lifts the object.
 
-**While planning.** Every line figure is a hand: blue while it is searched for, grey while it waits for its trial, then
-green or red; one that is less sure stays grey.
+**While planning.** Every line figure is a hand. Hands of the search are blue, and hands that wait for their trial are
+grey. Verified hands turn green, failed hands turn red, and less sure hands stay grey.
 
-**Slow?** A browser that draws without a graphics card does so twice as fast with
-[a quarter of the pixels](/?fixedDpr=0.5).
+**Slow?** A browser without a graphics card draws twice as fast with [a quarter of the pixels](/?fixedDpr=0.5).
 
 **Figures.**
 """
@@ -57,11 +56,11 @@ HOST, PORT = "127.0.0.1", 8080
 
 
 class Viewer:
-    """Web page that shows sessions to all visitors.
+    """Web page that shows all visitors the same session: grasps, their hand and the object.
 
     Args:
         host, port: address to listen on. By default only this machine can connect. A used port is replaced by the next.
-        plan: if True, visitors may plan.
+        plan: if True, the page has a tab where visitors plan.
 
     Raises:
         ConfigError: the address cannot be listened on, or viser is not installed.
@@ -74,7 +73,7 @@ class Viewer:
         self._nodes = SceneNodes(self._server)
         gui = self._server.gui
         self._theme(False)
-        # Dock the panel beside the scene. An overlay would hide part of the scene, which is rendered anyway.
+        # Dock the panel beside the scene. An overlay would hide a part of the scene that is rendered anyway.
         gui.main_panel.dock_right()
         tabs = gui.add_tab_group()
         with tabs.add_tab("Grasps"):
@@ -95,13 +94,13 @@ class Viewer:
 
     @property
     def url(self) -> str:
-        """Address of the page."""
+        """Return the address of the page."""
         host = f"[{self._host}]" if ":" in self._host else self._host
         return f"http://{host}:{self.port}"
 
     @property
     def port(self) -> int:
-        """Port of the page."""
+        """Return the port of the page."""
         return self._server.get_port()
 
     def show(self, session: Session) -> None:
@@ -115,27 +114,27 @@ class Viewer:
             time.sleep(0.05)
 
     def do(self, kind: str, work: Callable[[], None]) -> None:
-        """Submit a job to the drawing thread, which runs the newest job of each kind."""
+        """Submit a job to the drawing thread. It replaces a waiting job of the same kind."""
         self._jobs.submit(kind, work)
 
     def run(self, work: Callable[[StopHook], None]) -> None:
-        """Stop the present run and call `work` in the planning thread. Do nothing if visitors may not plan."""
+        """Stop the run in progress. Start a thread that calls `work`. Do nothing if visitors may not plan."""
         if self._planner is not None:
             self._planner.close()
             self._planner.begin(work)
 
     def say(self, line: str, share: float = 0.0) -> None:
-        """Show a line and the progress (0 to 1) of a run. Thread-safe."""
+        """Show a line of text and the progress of a run, 0 to 1. Thread-safe."""
         self._jobs.submit("progress", lambda: self.show_progress(line, share))
 
     def show_progress(self, line: str, share: float) -> None:
-        """Show a line and the progress (0 to 1) of a run. Call it in the drawing thread."""
+        """Show a line of text and the progress of a run, 0 to 1. Call this in the drawing thread."""
         self._status.content, self._status.visible = f"{BLOCK}{html.escape(line)}</div>", share < 1.0
         if self._planner is not None:
             self._planner.show_progress(line, share)
 
     def close(self) -> None:
-        """End runs, threads and the server."""
+        """Stop the run in progress, the threads and the server."""
         if self._planner is not None:
             self._planner.close()
         self._jobs.close()

@@ -1,7 +1,7 @@
-"""graspd_msgs by pip, against the ROS wheels. colcon reads CMakeLists.txt and never runs this.
+"""Build graspd_msgs with pip, against the ROS wheels. colcon reads CMakeLists.txt and never runs this file.
 
-rosidl's generators turn msg/, srv/ and action/ into C and Python, and the system's compiler turns the C into the
-libraries that a colcon build makes too (the C++ interface excepted: nothing in the wheels' world uses it).
+rosidl's generators make C and Python code from msg/, srv/ and action/. The system's compiler makes the same libraries
+as a colcon build, except for the C++ interface, which no ROS wheel uses.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ MANIFEST = ElementTree.parse(ROOT / "package.xml")
 NAME = MANIFEST.findtext("name", "")
 DEPENDENCIES = [element.text or "" for element in MANIFEST.iterfind("depend")]
 
-# One library each, in an order in which each links to those before it.
+# Each generator makes one library. A library may link to the libraries before it in this order.
 GENERATORS = {
     "rosidl_generator_c": "GenerateC",
     "rosidl_typesupport_introspection_c": "GenerateIntrospectionCTypesupport",
@@ -44,12 +44,12 @@ def fail(message: str) -> NoReturn:
 
 
 def interface_files() -> list[Path]:
-    """Paths below this directory, such as msg/Grasp.msg."""
+    """Return the interface files relative to this directory, such as msg/Grasp.msg."""
     return [path.relative_to(ROOT) for kind in ("msg", "srv", "action") for path in sorted((ROOT / kind).glob("*.*"))]
 
 
 def ros_prefix() -> Path:
-    """Where the ROS wheels are: the environment, or pip's isolated one."""
+    """Return the directory of the ROS wheels: this environment, or pip's isolated build environment."""
     try:
         generator = import_module("rosidl_generator_c")
     except ImportError as error:
@@ -58,7 +58,7 @@ def ros_prefix() -> Path:
 
 
 def compilers() -> tuple[str, str]:
-    """The C and the C++ compiler; refuses what could not build a Python extension."""
+    """Return the commands of the C and C++ compilers. Exit if a compiler or Python.h is missing."""
     cc, cxx = os.environ.get("CC", "cc"), os.environ.get("CXX", "c++")
     for compiler in (cc, cxx):
         if not shutil.which(compiler.split()[0]):
@@ -70,7 +70,7 @@ def compilers() -> tuple[str, str]:
 
 
 def translate(share: Path) -> list[str]:
-    """Write the .idl of every interface file into `share`; gives rosidl's names for them."""
+    """Write an .idl file of every interface file into `share`. Return the .idl files as rosidl names them."""
     for path in interface_files():
         kind = path.parent.name
         convert = getattr(import_module(f"rosidl_adapter.{kind}"), f"convert_{kind}_to_idl")
@@ -79,8 +79,8 @@ def translate(share: Path) -> list[str]:
 
 
 def generate(prefix: Path, share: Path, sources: Path) -> None:
-    """Fill `share` with definitions and hashes, and `sources/<generator>/graspd_msgs` with code."""
-    os.environ["AMENT_PREFIX_PATH"] = str(prefix)  # the generators look their templates up there
+    """Write definitions and hashes into `share`, and code into `sources/<generator>/graspd_msgs`."""
+    os.environ["AMENT_PREFIX_PATH"] = str(prefix)  # the generators search their templates there
     includes = [str(prefix / "share" / name) for name in DEPENDENCIES]
     definitions = translate(share)
     hasher = import_module("rosidl_generator_type_description.cli").HashTypeDescription("hash")
@@ -98,11 +98,11 @@ def run(command: list[str]) -> None:
 
 
 def compile_all(cc: str, cxx: str, prefix: Path, sources: Path) -> None:
-    """An object file beside every C and C++ source."""
+    """Compile every C and C++ source into an object file beside it."""
     import numpy
 
     include = [
-        # First: an installed package of the same name has the headers of its own version.
+        # These come first, because an installed graspd_msgs may have other headers.
         *(sources / kind for kind in GENERATORS),
         prefix / "include",
         *(path for path in (prefix / "include").iterdir() if path.is_dir()),
@@ -115,14 +115,14 @@ def compile_all(cc: str, cxx: str, prefix: Path, sources: Path) -> None:
         compiler = [*cxx.split(), "-std=c++17"] if path.suffix == ".cpp" else cc.split()
         run([*compiler, *flags, "-c", str(path), "-o", f"{path}.o"])
 
-    # The largest first, so that no processor idles at the end.
+    # Compile the largest files first, so that no processor idles at the end.
     files = sorted(sources.rglob("*.c*"), key=lambda path: -path.stat().st_size)
     with ThreadPoolExecutor(os.cpu_count()) as pool:
         list(pool.map(compile_one, files))
 
 
 def link_all(cxx: str, prefix: Path, sources: Path, libraries: Path, package: Path) -> None:
-    """The shared libraries, and the extension modules of the Python package."""
+    """Link the shared libraries and the extension modules of the Python package."""
     libraries.mkdir(parents=True)
     suffix = sysconfig.get_config_var("EXT_SUFFIX")
     theirs = [f"-l{name}__{kind}" for name in DEPENDENCIES for kind in GENERATORS] + [f"-l{name}" for name in RUNTIME]
@@ -150,7 +150,7 @@ def copy_python(sources: Path, package: Path) -> None:
 
 
 def copy_headers(sources: Path, include: Path) -> None:
-    """The C headers, for packages whose messages hold these."""
+    """Copy the C headers, for packages whose messages contain graspd's messages."""
     for kind in GENERATORS:
         generated = sources / kind
         for path in generated.rglob("*.h"):
@@ -160,7 +160,7 @@ def copy_headers(sources: Path, include: Path) -> None:
 
 
 def write_index(share: Path, index: Path) -> None:
-    """What `ros2 interface` and ament look up."""
+    """Write the index files that `ros2 interface` and ament read."""
     definitions = [str(path.relative_to(share)) for path in share.glob("*/*") if path.suffix != ".json"]
     contents = {
         "packages": "",
@@ -173,7 +173,7 @@ def write_index(share: Path, index: Path) -> None:
 
 
 def data_files(tree: Path) -> list[tuple[str, list[str]]]:
-    """Everything in `tree`, for the same place below the installation's prefix."""
+    """Return every file in `tree` as setuptools' data files. Paths below the installation prefix stay the same."""
     directories = {path.parent for path in tree.rglob("*") if path.is_file()}
     return [
         (str(directory.relative_to(tree)), [str(path) for path in sorted(directory.iterdir()) if path.is_file()])
@@ -182,7 +182,7 @@ def data_files(tree: Path) -> list[tuple[str, list[str]]]:
 
 
 class BuildInterfaces(build_py):
-    """Generates, compiles and links instead of copying a package that is there."""
+    """Build step that generates, compiles and links the package. setuptools would only copy an existing package."""
 
     def run(self) -> None:
         cc, cxx = compilers()
@@ -203,16 +203,16 @@ class BuildInterfaces(build_py):
 
 
 class InterfaceDistribution(Distribution):
-    """Compiled, although setuptools sees no extension module."""
+    """Distribution with compiled code, although setuptools finds no extension module."""
 
     def has_ext_modules(self) -> bool:
         return True
 
 
-# Not in the source tree: no left-over of an earlier build can get into a wheel.
+# A folder outside the source tree, so that no file of an earlier build can get into a wheel.
 WORK = Path(tempfile.mkdtemp(prefix=f"{NAME}-"))
 atexit.register(shutil.rmtree, WORK, ignore_errors=True)
-(WORK / NAME).mkdir()  # setuptools asks for it before anything is generated
+(WORK / NAME).mkdir()  # setuptools needs this folder before the code is generated
 
 setup(
     name=NAME,

@@ -1,19 +1,19 @@
-"""A planner after GraspIt!'s eigengrasp planner (Ciocarlie and Allen, IJRR 2009): simulated annealing, then closing.
+"""Planner like GraspIt!'s eigengrasp planner (Ciocarlie and Allen, IJRR 2009): annealing, then closing of the fingers.
 
 Eigengrasps are the principal components of human hand postures. No recordings of postures exist for an arbitrary hand.
-Here the components are those of seeded random postures between open and closed, in which the fingers mostly close
-together. The first component is the closing of the hand, the next ones are differences between fingers.
+Here seeded random postures between open and closed replace the recordings. In them the fingers mostly close together.
+The first component closes the hand. The next components are differences between fingers.
 
-The state of a chain is the base pose and the amplitudes of a few eigengrasps. Its energy is that of GraspIt!, a mean
-over contact locations i on the inside of the hand. A location far from the object, or facing away from it, costs more:
+A chain steps from one hand state to the next. A state is the base pose and the amplitudes of a few eigengrasps.
+GraspIt!'s energy of a state is a mean over contact locations i on the inside of the hand:
 
-    E = mean_i |d_i| + α (1 − n_i · o_i)        α = 50 mm, o_i: unit direction from location i to the object
+    E = mean_i |d_i| + α (1 − n_i · o_i)        α = 50 mm, n_i: outward normal of the hand
 
-States in which the hand collides are rejected. The schedule is GraspIt!'s default: T = 10⁶ exp(−7 k^⅛), k from 30,000
-to 100,000, jumps by Ingber's distribution (1989), energies accepted at T · 10⁶ mm. The best state of each chain is then
-closed until contact, and the best closed grasps by ε are kept. ε is Ferrari and Canny's measure for forces that sum to
-one. It is computed over sampled wrenches instead of the hull's faces, so it is an upper bound. All chains run as one
-batch, without gradients.
+d_i and o_i are distance and unit direction from location i to the object. States in which the hand collides are
+rejected. An increase ΔE is accepted with probability exp(−ΔE / (T · 10⁶ mm)). As in GraspIt!, T is 10⁶ exp(−7 k^⅛), k
+from 30,000 to 100,000. Steps have Ingber's distribution (1989). The fingers of the best states close until contact. The
+grasps with the largest ε are kept. ε is Ferrari and Canny's measure for forces that sum to one. Here it uses sampled
+wrenches, not the faces of the wrench hull, so it is an upper bound. All chains are one batch, without gradients.
 """
 
 from __future__ import annotations
@@ -47,17 +47,17 @@ class AnnealingConfig:
     """Settings of simulated annealing in a low-dimensional space of hand postures, as in GraspIt!.
 
     Attributes:
-        chains_per_grasp: number of chains for each requested grasp. Each chain gives one grasp.
-        keep_per_grasp: number of closed grasps kept for each requested grasp, the best by ε.
+        chains_per_grasp: number of chains for each requested grasp. Each chain gives at most one grasp.
+        keep_per_grasp: number of grasps, those with the largest ε, that are kept for each requested grasp.
         steps: number of states that each chain tries.
         eigengrasps: number of eigengrasps, the dimension of the posture space.
         contacts_per_link: number of contact locations on the inside of each link.
         normal_weight: weight α of a location's orientation in the energy [m].
-        translation_jump: largest translation of the base in one step [m].
-        rotation_jump: largest rotation of the base about each of its axes in one step [rad].
-        posture_jump: largest change of an amplitude in one step, as a fraction of its range.
-        close_steps: steps of the closing of the best states, from open to closed.
-        directions: number of sampled wrenches for ε.
+        translation_jump: largest translation of the base along each axis in one step [m].
+        rotation_jump: largest rotation of the base about each axis of the object frame in one step [rad].
+        posture_jump: largest change of an amplitude in one step, as a fraction of the amplitude's range.
+        close_steps: number of steps in which the fingers close after the annealing.
+        directions: number of sampled wrenches over which ε is computed.
     """
 
     chains_per_grasp: float = 4.0
@@ -73,11 +73,11 @@ class AnnealingConfig:
     directions: int = 256
 
 
-# Number of random postures. Spread of a finger around the common closing (fraction of the travel from open to closed),
-# and of a joint around its finger (fraction of the joint range).
+# Number of random postures. Each has one closing of the hand, from 0 (open) to 1 (closed). A finger deviates from it by
+# up to `_FINGER_SPREAD`. A joint deviates from its finger by up to `_JOINT_SPREAD` of the joint range.
 _POSTURES, _FINGER_SPREAD, _JOINT_SPREAD = 512, 0.3, 0.05
-# A candidate is on the inside of its rigid group if the cosine between its normal and its closing motion is `_FACING`,
-# or the group's greatest cosine if that is smaller. A group whose greatest cosine is below `_LEAST_FACING` has none.
+# A contact candidate is on the inside if the cosine between its normal and its closing motion is at least `_FACING`. If
+# all cosines of a group are smaller, the greatest is on the inside, unless it is below `_LEAST_FACING`.
 _FACING, _LEAST_FACING = 0.85, 0.5
 
 
@@ -86,9 +86,9 @@ class PostureSpace:
     """Space of postures `center + amplitudes @ basis`, clamped to the joint limits.
 
     Attributes:
-        center: mean posture [rad] or [m].
+        center: mean of the random postures [rad] or [m].
         basis: the eigengrasps [rad] or [m]. The rows are orthonormal in units of the joint ranges.
-        low, high: range of each amplitude.
+        low, high: range of each amplitude over the random postures.
     """
 
     center: Float[np.ndarray, "joints"]
@@ -98,7 +98,7 @@ class PostureSpace:
 
 
 def posture_space(hand: HandModel, dimensions: int, seed: int) -> PostureSpace:
-    """Return the space of the first `dimensions` principal components of random postures, fewer if few joints vary."""
+    """Return the space of `dimensions` principal components of random postures, or of all if there are fewer."""
     rng = np.random.default_rng(seed)
     fingers = finger_of(hand)
     span = hand.upper - hand.lower
@@ -108,11 +108,11 @@ def posture_space(hand: HandModel, dimensions: int, seed: int) -> PostureSpace:
     postures += _JOINT_SPREAD * span * rng.uniform(-1.0, 1.0, postures.shape)
     postures = np.clip(postures, hand.lower, hand.upper)
     center = postures.mean(0)
-    # In units of each joint's range, so that metres and radians weigh alike.
+    # Each joint is scaled by its range, so that metres and radians weigh alike.
     scaled = (postures - center) / span
     values, rows = np.linalg.svd(scaled, full_matrices=False)[1:]
     rows = rows[: min(dimensions, int((values > 1e-9 * values[0]).sum()))]
-    # The sign of a component is arbitrary: closing is positive.
+    # The sign of a component is arbitrary. Here a positive amplitude closes the hand.
     sign = np.where(rows @ ((hand.closed_posture - hand.open_posture) / span) < 0, -1.0, 1.0)
     rows = rows * sign[:, None]
     amplitudes = scaled @ rows.T
@@ -120,10 +120,10 @@ def posture_space(hand: HandModel, dimensions: int, seed: int) -> PostureSpace:
 
 
 def inner_contacts(hand: HandModel, per_link: int) -> Int[np.ndarray, "contacts"]:
-    """Choose contact candidates on the inside of the hand. Return their indices, up to `per_link` per rigid group.
+    """Choose up to `per_link` contact candidates on the inside of each rigid group of links. Return their indices.
 
-    The palm's inside faces along the palm's normal. A finger's inside faces along its closing motion. For each group,
-    the first candidate is nearest to the middle of the inside. The next are farthest from those already chosen.
+    Fixed joints connect the links of a group. The inside faces along the palm's normal or a finger's closing motion.
+    First choose the candidate nearest to the middle of the inside, then always the one farthest from those before.
     """
     chosen: list[int] = []
     facing = _facing(hand)
@@ -148,7 +148,7 @@ def inner_contacts(hand: HandModel, per_link: int) -> Int[np.ndarray, "contacts"
 
 
 def _facing(hand: HandModel) -> Float[np.ndarray, "candidates"]:
-    """Return the cosine between each candidate's normal and its closing motion. On the palm use the palm's normal."""
+    """Return the cosine of each candidate's normal with its closing motion, or on the palm with the palm's normal."""
     links = hand.candidate_link
     early, late = (
         link_poses(hand, hand.open_posture + share * (hand.closed_posture - hand.open_posture)) for share in (0.4, 0.6)
@@ -162,16 +162,16 @@ def _facing(hand: HandModel) -> Float[np.ndarray, "candidates"]:
     still = length < 1e-6
     motion = np.where(still[:, None], hand.palm_normal, motion / np.maximum(length, 1e-6)[:, None])
     normals = np.einsum("pij,pj->pi", early[0][links], hand.candidate_normals)
-    # Links that stand still but are not the palm have no inside.
+    # Links that stand still have no inside, except the palm.
     idle = still & (hand.link_group[links] != hand.link_group[0])
     return np.where(idle, 0.0, (normals * motion).sum(1))
 
 
-# GraspIt!'s default schedule: T₀, cooling rate, dimensions, and the first and last of its steps.
+# GraspIt!'s default temperatures: T₀ exp(−rate · k^(1 / dimensions)), where step k runs from `_FIRST` to `_LAST`.
 _T0, _COOLING, _DIMENSIONS, _FIRST, _LAST = 1e6, 7.0, 8, 30_000, 100_000
-# Factor between the temperature and the scale of accepted energy increases [m].
+# An energy increase ΔE [m] is accepted with probability exp(−ΔE / (`_ENERGY_SCALE` · T)).
 _ENERGY_SCALE = 1e3
-# The hand's proxy spheres may overlap by this much more than in the open hand [m].
+# The spheres that stand for the hand's shape may overlap by this much more than in the open hand [m].
 _SELF_SLACK = 0.002
 _FEWEST_CHAINS, _FEWEST_KEPT = 16, 8
 
@@ -181,9 +181,9 @@ class ChainState:
     """Current and best states of a batch of chains.
 
     Attributes:
-        x: current states: base translation [m], base quaternion, amplitudes.
-        energy: current energies [m]. Infinite for a state in collision.
-        best_x, best_energy: best collision-free state so far, and its energy.
+        x: current states: base translation [m], base quaternion (wxyz), amplitudes of the eigengrasps.
+        energy: energies of the current states [m]. Infinite for a state in collision.
+        best_x, best_energy: state of least energy so far in each chain, and its energy [m].
     """
 
     x: Float[Tensor, "batch variables"]
@@ -194,17 +194,17 @@ class ChainState:
 
 @dataclass(frozen=True)
 class Annealing:
-    """Simulated annealing as a solver for the shared loop, built by `make_annealing`.
+    """Simulated annealing as a solver for `minimise`, the loop that all methods share. `make_annealing` builds it.
 
     Attributes:
         config: settings.
         seed: random seed of the jumps.
-        center, basis, low, high: the posture space, see `PostureSpace`.
+        center, basis, low, high: fields of the `PostureSpace`.
         lower, upper: joint limits [rad] or [m].
-        contacts: matrix that places the contact locations, see `hands.kinematics.placement`.
-        normals: matrix that places their outward normals.
-        sphere_links: link of each proxy sphere of the problem.
-        self_overlap: allowed overlap of the hand's proxy spheres [m].
+        contacts: matrix of the contact locations for `hands.kinematics.place_points`.
+        normals: matrix of the outward normals at the contact locations, also for `place_points`.
+        sphere_links: link index of each sphere that stands for a part of the hand in self-collision tests.
+        self_overlap: allowed overlap of two such spheres [m].
     """
 
     config: AnnealingConfig
@@ -259,7 +259,7 @@ class Annealing:
     def neighbour(
         self, x: Float[Tensor, "batch variables"], jumps: Float[Tensor, "batch jumps"]
     ) -> Float[Tensor, "batch variables"]:
-        """Return the states after a jump. `jumps` lie in [-1, 1]: 3 of translation, 3 of rotation, then amplitudes."""
+        """Return the states after a jump. `jumps` are -1 to 1: 3 for translation, 3 for rotation, then amplitudes."""
         config = self.config
         translation = x[:, :3] + config.translation_jump * jumps[:, :3]
         half = 0.5 * config.rotation_jump * jumps[:, 3:6]
@@ -283,7 +283,7 @@ class Annealing:
         return torch.where(legal & torch.isfinite(energy), energy, torch.inf)
 
     def clear(self, problem: Problem, placed: HandPlacement) -> Bool[Tensor, "batch"]:
-        """Return whether the hand collides neither with itself nor with obstacles."""
+        """Return for each state whether the hand hits neither itself nor obstacles."""
         clear = sphere_overlap(problem, placed).amax(-1) <= self.self_overlap
         if problem.obstacles is None:
             return clear
@@ -291,7 +291,7 @@ class Annealing:
 
     @torch.no_grad()
     def pierced(self, problem: Problem, x: Float[Tensor, "batch variables"]) -> Bool[Tensor, "batch"]:
-        """Return whether hand and object overlap, tested with all points of the hand and sharp points of the object."""
+        """Return for each state whether the hand overlaps the object. Test all contact candidates and sharp points."""
         if len(x) == 0:
             return torch.zeros(0, dtype=torch.bool, device=x.device)
         return link_gaps(problem, self.poses(x), self.sphere_links)[:, 0].amin(-1) < 0.0
@@ -328,13 +328,13 @@ def make_annealing(problem: Problem, hand: HandModel, config: AnnealingConfig, s
 
 
 def cooling(progress: float) -> float:
-    """Return the temperature of GraspIt!'s default schedule. `progress` runs from 0 to 1."""
+    """Return the temperature of GraspIt!'s default schedule. `progress` is the fraction of steps done, from 0 to 1."""
     k = _FIRST + progress * (_LAST - _FIRST)
     return _T0 * math.exp(-_COOLING * k ** (1 / _DIMENSIONS))
 
 
 def jump(uniform: Float[Tensor, "*batch"], temperature: float) -> Float[Tensor, "*batch"]:
-    """Map uniform numbers in [0, 1) to jumps in [-1, 1] by Ingber's distribution, mostly of size `temperature`."""
+    """Map uniform numbers in [0, 1) to jumps in [-1, 1] by Ingber's distribution, smaller at low temperature."""
     side = 2 * uniform - 1
     return side.sign() * temperature * ((1 + 1 / temperature) ** side.abs() - 1)
 
@@ -349,10 +349,10 @@ def quaternion_product(a: Float[Tensor, "batch 4"], b: Float[Tensor, "batch 4"])
 def sampled_epsilon(
     problem: Problem, contact_set: ContactSet, directions: Float[Tensor, "directions 6"]
 ) -> Float[Tensor, "batch"]:
-    """Return Ferrari and Canny's ε for hard contacts whose forces sum to one.
+    """Return Ferrari and Canny's ε of each grasp, for contact forces that sum to one.
 
-    For each direction take the greatest support of any contact. ε is the minimum over directions, and zero without
-    force closure. The result is an upper bound, because only the given directions are tested.
+    Take for each direction the support: the most that any single contact contributes along it. ε is the least support
+    of all directions, and zero without force closure. Few directions are tested, so the result is an upper bound.
     """
     batch, slots = contact_set.active.shape
     support = wrench_support(
@@ -366,9 +366,9 @@ def sampled_epsilon(
 
 
 def plan(task: PlannerInput) -> PlannerOutput:
-    """Anneal the chains, close the best state of each until contact, and return the best grasps by ε.
+    """Anneal a batch of hand states, close the fingers of each best state, and return the grasps with the largest ε.
 
-    After a deadline the states reached so far are closed.
+    If a deadline ends the annealing, close the fingers of the best states found so far.
     """
     settings, hooks = task.config.settings, task.hooks
     problem = task.problem

@@ -1,8 +1,8 @@
-"""Random baseline that every method should beat. It approaches from random directions and closes until contact.
+"""Random baseline that every method should beat. The hand approaches from a random direction and closes until contact.
 
 The open hand faces the object's centre of mass from a uniformly random direction, with a random roll. It moves along
-the palm's normal until first contact. Then the fingers close (`finger_closing`). There is no optimisation, and grasps
-are not ranked. The first hands that touch with enough links and keep clear of obstacles are returned.
+the palm's normal until first contact. Then the fingers close (`finger_closing`). There is no optimisation and no
+ranking. The method returns the first hands that touch with enough links and keep clear of other objects.
 """
 
 from __future__ import annotations
@@ -29,9 +29,9 @@ class RandomClosureConfig:
     """Settings of the random baseline.
 
     Attributes:
-        rounds: limit of rounds. A round tries as many approaches as there are requested grasps.
-        touching: number of rigid groups of links that must touch the object.
-        close_steps: steps of the closing, from open to closed.
+        rounds: maximum number of rounds. Each round tries as many approaches as there are requested grasps.
+        touching: number of links that must touch the object. Links connected by fixed joints count as one.
+        close_steps: number of steps in which the fingers close.
     """
 
     rounds: int = 4
@@ -44,7 +44,7 @@ _TOUCHING, _ADVANCES = 0.0003, 60
 
 
 def plan(task: PlannerInput) -> PlannerOutput:
-    """Return up to `count` closed hands from random directions. An interrupted round gives no hand."""
+    """Return up to `task.count` closed hands from random directions. Discard the hands of an interrupted round."""
     settings, hand, count = task.config.settings, task.hand, task.count
     problem = task.problem
     closing = make_closing(problem, hand, settings.close_steps)
@@ -69,7 +69,7 @@ def join(a: Poses, b: Poses) -> Poses:
 
 
 def draw_approaches(problem: Problem, hand: HandModel, count: int, seed: int) -> Poses:
-    """Draw open hands away from the object. The palms face its centre of mass. Directions and rolls are uniform."""
+    """Draw open hands away from the object, with palms towards its centre of mass. Directions and rolls are uniform."""
     generator = torch.Generator().manual_seed(seed)
     rotation = random_rotations(count, generator, torch.float64)
     away = problem.object.length + hand_reach(hand)
@@ -87,7 +87,7 @@ def draw_approaches(problem: Problem, hand: HandModel, count: int, seed: int) ->
 def advance(problem: Problem, closing: Closing, hand: HandModel, poses: Poses) -> Poses:
     """Move the hands along their palm normals until first contact, or until the palm is at the centre of mass.
 
-    This is sphere tracing: each step is the hand's least distance from the object.
+    The method is sphere tracing: each step is as long as the hand's current distance from the object.
     """
     forwards = poses.base.rotation @ torch.as_tensor(hand.palm_normal).to(problem.hand.lower)
     left = torch.full_like(poses.translation[:, 0], problem.object.length + hand_reach(hand))
@@ -104,7 +104,7 @@ def advance(problem: Problem, closing: Closing, hand: HandModel, poses: Poses) -
 def touching_groups(
     problem: Problem, closing: Closing, hand: HandModel, poses: Poses, reach: float
 ) -> Float[Tensor, "batch"]:
-    """Return for each hand how many rigid groups of links are within `reach` [m] of the object."""
+    """Return how many links of each hand are within `reach` [m] of the object. Rigidly joined links count as one."""
     near = link_gaps(problem, poses, closing.sphere_links)[:, 0] <= reach
     groups = torch.as_tensor(hand.link_group, device=near.device)
     found = torch.zeros(len(near), int(groups.max()) + 1, device=near.device, dtype=problem.hand.lower.dtype)
@@ -112,7 +112,7 @@ def touching_groups(
 
 
 def clear_of_obstacles(problem: Problem, poses: Poses) -> Bool[Tensor, "batch"]:
-    """Return which hands penetrate neither the support nor a neighbour."""
+    """Return for each hand whether it penetrates neither the support nor a neighbouring object."""
     if problem.obstacles is None:
         return torch.ones(len(poses.joints), dtype=torch.bool, device=poses.joints.device)
     links = forward(problem.hand.kinematics, poses.joints)

@@ -21,7 +21,7 @@ from graspd_core.verify.world import Protocol
 # pyright: reportAttributeAccessIssue=false, reportCallIssue=false
 
 
-# Time step [s]. With MuJoCo's 4 ms, Bullet's solver lets an object turn by 10° in 2 s in fingers as light as these.
+# Time step [s]. With MuJoCo's 4 ms, Bullet's solver lets an object turn by 10° in 2 s if the fingers are light.
 TIMESTEP = 0.001
 SOLVER_ITERATIONS = 50
 _NAME = "bullet_hold"
@@ -40,7 +40,7 @@ class _Run:
         body: body id of the object.
         hand: body id of the hand.
         joints: joint ids of the hand's actuated joints.
-        worst: greatest displacement [m] and rotation [rad] of the object so far. It is updated in place.
+        worst: greatest displacement [m] and rotation [rad] of the object so far. The array is updated in place.
     """
 
     client: int
@@ -53,10 +53,10 @@ class _Run:
 
 
 def bullet_hold_trial(world: BulletWorld, grasp: Grasp, protocol: Protocol) -> TrialResult:
-    """Run one hold trial in PyBullet. It ends at the first broken limit.
+    """Run one hold trial in PyBullet. The trial ends when the object exceeds a limit of displacement or rotation.
 
     Returns:
-        The result, with the greatest displacement of the object's centre of mass [m] and the greatest rotation [rad].
+        Verdict and reason, greatest displacement of the object's centre of mass [m], greatest rotation [rad].
 
     Raises:
         SimulatorError: the hand has coupled joints.
@@ -90,14 +90,14 @@ def _result(run: _Run, reason: str) -> TrialResult:
 
 
 def _start(client: int, world: BulletWorld, posture: Posture, protocol: Protocol) -> _Run:
-    """Set up the simulation, with the hand at a posture and the object at rest at the origin of the object frame."""
+    """Set up the simulation, with the hand in `posture` and the object at rest at the origin of the object frame."""
     import pybullet
 
     sliding, torsional, _ = protocol.friction
     body = add_object(client, world, world.mass)
     hand, joints = load_hand_urdf(client, world.hand, protocol.armature)
-    # Bullet multiplies the sliding coefficients of a pair, and a body's spinning coefficient with the other's sliding
-    # coefficient. With these values the hand's coefficients apply.
+    # Bullet multiplies the sliding coefficients of a pair. It multiplies a body's spinning coefficient with the sliding
+    # coefficient of the other body. With the values below, the hand's coefficients apply.
     free = {"linearDamping": 0.0, "angularDamping": 0.0, "restitution": 0.0, "rollingFriction": 0.0}
     pybullet.changeDynamics(
         body, -1, lateralFriction=1.0, spinningFriction=0.0, collisionMargin=0.0, **free, physicsClientId=client
@@ -136,7 +136,7 @@ def _start_penetration(run: _Run) -> float:
 
 
 def _move(run: _Run, start: Posture, end: Posture) -> str:
-    """Move base and joint targets linearly to `end`. Return the reason if the trial failed, otherwise ""."""
+    """Move base and joint targets linearly from `start` to `end`. Return why the trial failed, otherwise ""."""
     steps = round(run.protocol.stage_time / TIMESTEP)
     # A quaternion and its negative are the same rotation. The sign makes the base turn the shorter way.
     sign = 1.0 if start.quaternion_wxyz @ end.quaternion_wxyz >= 0 else -1.0
@@ -151,7 +151,7 @@ def _move(run: _Run, start: Posture, end: Posture) -> str:
 
 
 def _pull(run: _Run, posture: Posture, direction: Float[np.ndarray, "3"]) -> str:
-    """Pull at the object's centre of mass for the hold time. Return the reason if the trial failed, otherwise ""."""
+    """Pull at the object's centre of mass for the hold time. Return why the trial failed, or "" if it did not fail."""
     import pybullet
 
     force = (run.protocol.pull * run.world.mass * direction).tolist()
@@ -174,9 +174,9 @@ def _step(run: _Run, step: int) -> str:
 def _drive(run: _Run, target: Float[np.ndarray, "joints"]) -> None:
     """Drive the joints towards `target` [rad] or [m] for one step, by springs with dampers.
 
-    Bullet's motor reaches a target velocity with at most a given force. Here the target velocity is the one at which
-    the damper balances the spring. The maximum force is the current force of spring and damper. The motor thus acts as
-    both and cannot overshoot. Explicit torques on fingers as light as these would need time steps of microseconds.
+    Bullet has a motor that reaches a target velocity with at most a given force. Here the target is the velocity at
+    which the damper balances the spring. The maximum force is the current force of spring and damper. So the motor acts
+    as spring and damper, and cannot overshoot. Explicit torques on light fingers would need time steps of microseconds.
     """
     import pybullet
 
@@ -197,7 +197,7 @@ def _drive(run: _Run, target: Float[np.ndarray, "joints"]) -> None:
 
 
 def _breach(run: _Run) -> str:
-    """Update the greatest displacement and rotation. Return the broken limit, or "" if none is broken."""
+    """Update the greatest displacement and rotation of the object. Return which limit is broken, or "" if none is."""
     import pybullet
 
     position, quaternion = pybullet.getBasePositionAndOrientation(run.body, physicsClientId=run.client)

@@ -1,10 +1,10 @@
 """Hand and object in PyBullet, the second simulator, and the displacement trial.
 
-The URDF of the hand is written from the HandModel and not read from the hand's own file. Both simulators thus use the
+The URDF of the hand is written from the HandModel and not read from the hand's own file. So MuJoCo and PyBullet use the
 same collision shapes, masses and joint frames. The object consists of convex parts.
 
 A BulletWorld is plain data, from which every trial builds its own simulation. Bullet keeps contacts and solver state
-between trials, so with a shared simulation a result would depend on earlier trials.
+between trials. In a shared simulation, a result would depend on earlier trials.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ from graspd_core.verify.hold_trial import DIRECTIONS
 # pyright: reportAttributeAccessIssue=false, reportCallIssue=false
 
 
-# As in the MuJoCo world: the least mass [kg] and the least moment of inertia [kg·m²] of a link.
+# Least mass [kg] and least moment of inertia [kg·m²] of a link, equal to those of the MuJoCo world.
 _LEAST_MASS, _LEAST_LINK_MOMENT = 1e-3, 1e-7
 
 
@@ -44,7 +44,7 @@ def load_hand_urdf(client: int, hand: HandModel, armature: float) -> tuple[int, 
     Args:
         client: id of the PyBullet client.
         hand: a hand without coupled joints.
-        armature: rotor inertia of every joint [kg·m²]. Bullet has no armature, so it is added to the moved link.
+        armature: rotor inertia of every joint [kg·m²]. Bullet has none, so it is added to the moved link.
 
     Raises:
         SimulatorError: the hand has coupled joints.
@@ -54,7 +54,7 @@ def load_hand_urdf(client: int, hand: HandModel, armature: float) -> tuple[int, 
     if hand.mimics:
         names = ", ".join(mimic.name for mimic in hand.mimics)
         raise SimulatorError(
-            f"{hand.name}: PyBullet does not support its coupled joints ({names}); valid: hands without them"
+            f"{hand.name}: PyBullet does not support its coupled joints ({names}); valid: hands without coupled joints"
         )
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder, "hand.urdf")
@@ -80,7 +80,7 @@ def load_hand_urdf(client: int, hand: HandModel, armature: float) -> tuple[int, 
 
 
 def hand_urdf(hand: HandModel, armature: float) -> str:
-    """Return the URDF. Moved links include the `armature` [kg·m²]. Names are link<i>, joint<i> and hull<i>.obj."""
+    """Return the hand's URDF with names link<i>, joint<i>, hull<i>.obj. Add `armature` [kg·m²] to moved links."""
     robot = ET.Element("robot", name=hand.name)
     for link in range(hand.num_links):
         element = ET.SubElement(robot, "link", name=f"link{link}")
@@ -97,7 +97,7 @@ def hand_urdf(hand: HandModel, armature: float) -> str:
 
 def _add_inertia(element: ET.Element, hand: HandModel, link: int, armature: float) -> None:
     inertial = ET.SubElement(element, "inertial")
-    # Bullet's pose of a body is that of its centre of mass, so the base link's centre of mass is put at the base frame.
+    # Bullet measures a body's pose at its centre of mass, so the base link's centre of mass is put at the base frame.
     ET.SubElement(inertial, "origin", xyz=_text(hand.link_com[link] if link else np.zeros(3)))
     ET.SubElement(inertial, "mass", value=str(max(float(hand.link_mass[link]), _LEAST_MASS)))
     moments, axes = np.linalg.eigh(0.5 * (hand.link_inertia[link] + hand.link_inertia[link].T))
@@ -150,12 +150,12 @@ def _text(values: Float[np.ndarray, "n"]) -> str:
 # pyright: reportAttributeAccessIssue=false, reportCallIssue=false
 
 
-# The least principal moment of an object per kilogram [m²], that of a ball of 0.5 mm.
+# Least principal moment of an object per kilogram [m²]: the moment of a ball of 0.5 mm radius.
 _LEAST_MOMENT = 1e-7
 # Settings of the displacement trial.
 SOLVER_ITERATIONS = 150
 HAND_RESTITUTION, OBJECT_RESTITUTION = 0.0, 0.5
-# The single gravity direction of the papers, in the object frame. It is arbitrary, as the orientation of a mesh is.
+# The only gravity direction of the papers, object frame. It is arbitrary, because a mesh's orientation is arbitrary.
 OBMAN = np.array([[0.0, 1.0, 0.0]])
 
 
@@ -165,7 +165,7 @@ class BulletWorld:
 
     Attributes:
         hand: the hand.
-        parts: text of an OBJ file with the convex parts [m], in the frame of centre of mass and principal axes.
+        parts: text of an OBJ file with the convex parts [m], relative to centre of mass and principal axes.
         mass: mass of the object [kg].
         center_of_mass: centre of mass in the object frame [m].
         axes: principal axes of inertia, the rotation `R_object_principal`.
@@ -203,7 +203,7 @@ def build_bullet_world(hand: HandModel, target: ObjectModel, parts: Sequence[Tri
         )
     inertia = 0.5 * (target.inertia + target.inertia.T) / target.mass
     moments, axes = np.diag(inertia), np.eye(3)
-    # If the tensor is diagonal, the axes stay those of the frame. For equal moments `eigh` could return any axes.
+    # If the tensor is diagonal, keep the axes of the object frame. For equal moments `eigh` could return any axes.
     if np.any(inertia != np.diag(moments)):
         moments, axes = np.linalg.eigh(inertia)
     axes[:, 2] *= np.sign(np.linalg.det(axes))
@@ -244,8 +244,8 @@ def simulation(*, timestep: float, solver_iterations: int) -> Iterator[int]:
 def add_object(client: int, world: BulletWorld, mass: float) -> int:
     """Add the object with a given mass [kg] so that the object frame is the world frame. Return its body id.
 
-    Bullet's origin of a body is its centre of mass. Other values are PyBullet's defaults: a collision margin of 1 mm
-    around convex parts, and damping of 4 % per second.
+    Bullet puts the origin of a body at its centre of mass. Collision margin and damping are PyBullet's defaults: 1 mm
+    around convex parts, and 4 % per second.
     """
     import pybullet
 
@@ -267,7 +267,7 @@ def add_object(client: int, world: BulletWorld, mass: float) -> int:
 
 
 def add_frozen_hand(client: int, hand: HandModel, posture: Posture) -> tuple[int, ...]:
-    """Add every collision primitive of a hand in a posture as a fixed body. Return the body ids."""
+    """Add each collision primitive of the hand in `posture` as a fixed body of its own. Return the body ids."""
     import pybullet
 
     kinematics = make_kinematics(hand, "cpu", torch.float64)
@@ -317,7 +317,7 @@ def wavefront(parts: Sequence[TriangleMesh]) -> str:
 
 
 def xyzw(rotation: Float[np.ndarray, "3 3"]) -> list[float]:
-    """Return a rotation matrix as a quaternion in PyBullet's order."""
+    """Convert a rotation matrix to a quaternion in PyBullet's order: x, y, z, w."""
     w, x, y, z = quaternion_from_rotation(torch.as_tensor(np.ascontiguousarray(rotation))).tolist()
     return [x, y, z, w]
 
@@ -327,9 +327,9 @@ def bullet_displacement(
 ) -> float:
     """Return how far gravity moves the object's centre of mass in 35 steps of 1/240 s [m], mean over directions.
 
-    The hand is frozen in its grasp. This is ObMan's protocol (Hasson et al., CVPR 2019), which papers report,
-    implemented from its parameters. docs/metrics.md lists the deviations. An object in free fall moves 10.7 cm, so a
-    result near 10.7 cm only says that the hand does not hold.
+    The hand is frozen in its grasp. The trial is ObMan's (Hasson et al., CVPR 2019), which many papers report. It is
+    written anew from the published parameters. docs/metrics.md lists the deviations. An object in free fall moves 10.7
+    cm, so a result near 10.7 cm only says that the hand does not hold.
     """
     return float(displacements(world, posture, directions).mean())
 
@@ -337,7 +337,7 @@ def bullet_displacement(
 def displacements(
     world: BulletWorld, posture: Posture, directions: Float[np.ndarray, "directions 3"]
 ) -> Float[np.ndarray, "directions"]:
-    """Return the displacement under gravity along each direction [m]. Directions are unit vectors, object frame."""
+    """Return how far gravity along each direction moves the object [m]. Directions are unit vectors, object frame."""
     import pybullet
 
     moved = np.empty(len(directions))

@@ -1,9 +1,9 @@
-"""Noise model of depth cameras: errors that grow with the square of depth, flying pixels, holes and rounding.
+"""Noise model of depth cameras: flying pixels, holes, rounding, and errors that grow with the square of depth.
 
 The random error of stereo depth is z² / (f B) times the error of disparity (Khoshelham and Elberink 2012). Intel's
 tuning guide for the D400 series gives 0.08 pixels for a D415. With f = 616 pixels and a baseline of B = 55 mm, this is
-0.0024 z² [m]. DEFAULT was compared with real D415 frames of a table: 0.9 mm at 0.5 m, 1.3 mm at 0.7 m. Their errors
-correlate by 0.96 between neighbouring pixels and by 0.6 over eight, because stereo matching averages many pixels.
+0.0024 z² [m]. DEFAULT was compared with real D415 frames of a table: they err by 0.9 mm at 0.5 m, 1.3 mm at 0.7 m.
+These errors correlate by 0.96 between neighbours and by 0.6 over eight pixels, as stereo matching averages many pixels.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from graspd_core.perception.cloud.camera import PinholeCamera, camera_rays
 
 Depth = Float[np.ndarray, "height width"]
 
-# A depth step between neighbouring pixels greater than this counts as an edge of an object [m].
+# If the depths of neighbouring pixels differ by more than this, there is an edge of an object [m].
 EDGE = 0.02
 # Blur of the smooth bias, as a fraction of the image height.
 _SLOW = 0.15
@@ -33,16 +33,16 @@ class DepthNoise:
         floor: standard deviation of depth, extrapolated to depth zero [m].
         quadratic: growth of the standard deviation with depth squared [1/m]: σ = floor + quadratic z².
         correlation: standard deviation of the blur that correlates neighbouring errors [pixels].
-        white: uncorrelated share of the variance, 0 to 1.
+        white: share of the error's variance that is uncorrelated between pixels, 0 to 1.
         jitter: standard deviation of the lateral error of a pixel [pixels].
         flying: share of edge pixels with a depth between foreground and background.
         edge_loss: share of edge pixels without depth.
-        loss: share of all pixels without depth. They form patches.
-        grazing: angle between surface and line of sight below which pixels lose depth [rad]. At angle 0 all do.
+        loss: share of all pixels that lose depth. These pixels form patches.
+        grazing: angle between surface and line of sight below which pixels may lose depth [rad]. At angle 0, all do.
         baseline: distance between the two lenses of a stereo camera [m]. A point that one lens cannot see has no depth.
-        step: depth is rounded to multiples of this [m].
-        disparity_step: disparity (focal length x baseline / depth) is rounded to multiples of this [pixels].
-        bias: standard deviation at 1 m of an error that is smooth over the image and grows with depth squared [m].
+        step: depth is rounded to multiples of this unit [m].
+        disparity_step: disparity (focal length x baseline / depth) is rounded to multiples of this unit [pixels].
+        bias: standard deviation, at 1 m, of an error that varies slowly in the image and grows with depth squared [m].
         nearest, farthest: range outside which there is no depth [m].
     """
 
@@ -113,9 +113,9 @@ class DepthCamera:
     noise: DepthNoise
 
 
-# d415 and d435 are stereo cameras with a narrow and a wide lens (Intel's tuning guide: 0.08 pixels). Structured light
-# has disparity in steps of 1/8 pixel (Khoshelham and Elberink 2012). The error of time of flight hardly grows with
-# depth, and edges mix foreground and background (Tölgyessy et al. 2021: 1 to 2 mm up to 1 m).
+# d415 and d435 are stereo cameras with a narrow and a wide lens (Intel's tuning guide: disparity error 0.08 pixels).
+# Structured light has disparity in steps of 1/8 pixel (Khoshelham and Elberink 2012). The error of time of flight
+# hardly grows with depth, and edges mix foreground and background (Tölgyessy et al. 2021: 1 to 2 mm up to 1 m).
 CAMERAS = {
     "d415": DepthCamera(PinholeCamera(640, 480, 616.0, 616.0, 319.5, 239.5), DEFAULT),
     "d435": DepthCamera(
@@ -140,9 +140,9 @@ CAMERAS = {
 
 
 def add_noise(depth: Depth, camera: PinholeCamera, noise: DepthNoise, seed: int) -> Depth:
-    """Add camera noise to a true depth image [m]. The result is 0 where there is no depth.
+    """Add camera noise to a true depth image [m]. The result is 0 at pixels without depth.
 
-    Flying pixels are made before the depth error is added. Holes are made last. The same seed gives the same image.
+    Flying pixels are made before the depth error is added, and holes last. The same seed gives the same image.
     """
     rng = np.random.default_rng(seed)
     true = np.where(np.isfinite(depth) & (depth > 0), depth, 0.0)
@@ -178,7 +178,7 @@ def _around(depth: Depth) -> tuple[Depth, Depth, Bool[np.ndarray, "height width"
 
 
 def _jittered(depth: Depth, pixels: float, rng: np.random.Generator) -> Depth:
-    """Replace each pixel's depth by that of a random pixel nearby (lateral noise). Outlines become ragged."""
+    """Replace each pixel's depth by the depth of a random pixel nearby (lateral noise). Outlines become ragged."""
     if not pixels:
         return depth
     height, width = depth.shape
@@ -190,8 +190,8 @@ def _jittered(depth: Depth, pixels: float, rng: np.random.Generator) -> Depth:
 def _shadow(depth: Depth, camera: PinholeCamera, baseline: float) -> Bool[np.ndarray, "height width"]:
     """Return the pixels that a second lens, `baseline` [m] to the right, cannot see because a nearer point hides them.
 
-    In the second image a point appears f B / z pixels further left. A pixel is hidden if a pixel to its right in its
-    row does not appear to the right of it in the second image.
+    In the second image a point appears f B / z pixels further left. If two pixels of a row thus coincide or change
+    their order, the left pixel of the two is hidden.
     """
     if not baseline:
         return np.zeros(depth.shape, dtype=bool)
@@ -204,7 +204,7 @@ def _shadow(depth: Depth, camera: PinholeCamera, baseline: float) -> Bool[np.nda
 
 
 def _grazing(depth: Depth, camera: PinholeCamera, limit: float, edge: np.ndarray, rng: np.random.Generator):
-    """Draw the pixels that lose depth at grazing angles below `limit` [rad]. Edges have no normal and are exempt."""
+    """Draw which pixels below the grazing angle `limit` [rad] lose depth. Edges are exempt, as they have no normal."""
     if not limit:
         return np.zeros(depth.shape, dtype=bool)
     rays = np.nan_to_num(camera_rays(camera))
@@ -217,7 +217,7 @@ def _grazing(depth: Depth, camera: PinholeCamera, limit: float, edge: np.ndarray
 
 
 def _field(shape: tuple[int, ...], blur: float, white: float, rng: np.random.Generator) -> Depth:
-    """Return noise of unit variance. The share `white` of it is uncorrelated, the rest blurred by `blur` [pixels]."""
+    """Return noise of unit variance. A share `white` of it is uncorrelated, the rest is blurred by `blur` [pixels]."""
     from scipy.ndimage import gaussian_filter
 
     smooth = gaussian_filter(rng.standard_normal(shape), blur, mode="wrap") / _blurred_scale(shape, blur)
@@ -226,7 +226,7 @@ def _field(shape: tuple[int, ...], blur: float, white: float, rng: np.random.Gen
 
 @lru_cache(maxsize=16)
 def _blurred_scale(shape: tuple[int, ...], blur: float) -> float:
-    """Return the standard deviation of blurred white noise. The blur wraps around, so it is the same at all pixels."""
+    """Return the standard deviation of blurred white noise. It is equal at all pixels, as the blur wraps around."""
     from scipy.ndimage import gaussian_filter
 
     impulse = np.zeros(shape)

@@ -1,8 +1,8 @@
-"""Random household objects of irregular shape. No completion rule of the reconstruction describes these shapes.
+"""Random household objects of irregular shape. The reconstruction completes hidden sides by rules that do not fit them.
 
-The mesh of an object is the zero level set of a signed distance on a grid, so it is one watertight body. It consists of
-round cones, ellipsoids, boxes and bodies of revolution, with smooth blends. The mass is drawn from typical densities of
-such objects, full or hollow. The same family and seed give the same object.
+The mesh of an object is the zero level set of a signed distance grid, so it is one watertight body. The body consists
+of round cones, boxes and bodies of revolution, with smooth blends. The density is drawn from a typical range for such
+objects, full or hollow. The same family and seed give the same object.
 """
 
 from __future__ import annotations
@@ -23,9 +23,9 @@ from graspd_core.types import TriangleMesh
 Points = Float[np.ndarray, "n 3"]
 Distance = Float[np.ndarray, "n"]
 Field = Callable[[Points], Distance]
-# Prefix of such objects in a request: family:pear:3 is the pear of seed 3.
+# Prefix of random objects in a request: family:pear:3 is the pear of seed 3.
 PREFIX = "family:"
-# Cells along the longest side, and faces of the mesh.
+# Number of grid cells along the longest side, and number of mesh faces.
 _CELLS, _FACES = 96, 8000
 
 
@@ -75,7 +75,7 @@ def _surface(field: Field, half: Float[np.ndarray, "3"]) -> TriangleMesh:
 
 
 def _cone(*stations: tuple[float, float, float, float]) -> Field:
-    """Return the signed distance of round cones along a polyline of (x, y, z, radius) [m]."""
+    """Return the distance field of round cones along a polyline of (x, y, z, radius) [m]."""
     nodes = np.array(stations)
 
     def field(points: Points) -> Distance:
@@ -99,7 +99,7 @@ def _box(centre: tuple[float, float, float], half: tuple[float, float, float], r
 
 
 def _revolved(profile: list[tuple[float, float]], flat: float = 1.0) -> Field:
-    """Return the distance field of a body revolved about z. `profile` lists (height, radius) [m], `flat` scales y."""
+    """Return the distance field of a body revolved about z. `profile` has (height, radius) [m], `flat` multiplies y."""
     heights, radii = np.array(profile).T
 
     def field(points: Points) -> Distance:
@@ -113,7 +113,7 @@ def _revolved(profile: list[tuple[float, float]], flat: float = 1.0) -> Field:
 
 
 def _blend(*fields: Field, width: float = 0.004) -> Field:
-    """Return the distance field of the smooth union of bodies. Fillets are about `width` [m] wide."""
+    """Return the distance field of a smooth union of bodies. Fillets between them are about `width` [m] wide."""
 
     def field(points: Points) -> Distance:
         joined = fields[0](points)
@@ -130,7 +130,7 @@ def _less(field: Field, hole: Field) -> Field:
     return lambda points: np.maximum(field(points), -hole(points))
 
 
-# A field, the half edges of its bounding box [m], and the range of densities of such objects [kg/m³].
+# Signed distance field of an object, half edges of its bounding box [m], and range of its density [kg/m³].
 Drawn = tuple[Field, tuple[float, float, float], tuple[float, float]]
 
 
@@ -293,4 +293,4 @@ FAMILIES: dict[str, Callable[[np.random.Generator], Drawn]] = {
 """Functions that draw an object, by family."""
 
 OTHERS = {"compound": _compound}
-"""Functions that draw an object that is no household object: two to four solids, joined at random."""
+"""Functions that draw objects of no household kind: two to four solids, joined at random."""

@@ -52,7 +52,7 @@ def look_at(eye: Vector, target: Vector, up: Vector = (0.0, 0.0, 1.0)) -> Float[
 def render_depth(
     mesh: TriangleMesh, camera: PinholeCamera, T_world_camera: Float[np.ndarray, "4 4"]
 ) -> Float[np.ndarray, "height width"]:
-    """Return the depth image of a mesh: distances along the optical axis [m], 0 where a ray hits nothing."""
+    """Return the depth image of a mesh: distances along the optical axis [m], or 0 where a ray hits nothing."""
     distance, _, _ = _cast(mesh, camera, T_world_camera)
     return np.where(np.isfinite(distance), distance, 0.0)
 
@@ -60,7 +60,7 @@ def render_depth(
 def render_scene(
     meshes: Sequence[TriangleMesh], camera: PinholeCamera, T_world_camera: Float[np.ndarray, "4 4"]
 ) -> tuple[Float[np.ndarray, "height width"], Int[np.ndarray, "height width"]]:
-    """Return the depth image of some meshes [m] (0: no hit), and the index of the mesh at each pixel (-1: no hit)."""
+    """Return the depth image of all meshes together [m] (0: no hit), and the mesh index of each pixel (-1: no hit)."""
     distance, face, _ = _cast(joined(*meshes), camera, T_world_camera)
     hit = np.isfinite(distance)
     label = np.full(distance.shape, -1)
@@ -75,7 +75,7 @@ def render_shaded(
     width: int = 640,
     height: int = 480,
 ) -> UInt8[np.ndarray, "height width 3"]:
-    """Return a picture of meshes with RGB colours (0 to 1) on white. Light comes from the camera and from +z."""
+    """Return a picture of meshes with their RGB colours (0 to 1), on white. Light comes from the camera and from +z."""
     together = joined(*(mesh for mesh, _ in meshes))
     colours = np.repeat(np.array([rgb for _, rgb in meshes], dtype=float), [len(m.faces) for m, _ in meshes], axis=0)
     distance, face, normal = _cast(together, camera_of_view(width, height), T_world_camera)
@@ -90,7 +90,7 @@ def render_shaded(
 
 
 def save_png(path: str | Path, image: UInt8[np.ndarray, "height width 3"]) -> None:
-    """Write an RGB picture as a PNG file: one IHDR chunk, one IDAT chunk of unfiltered rows, IEND."""
+    """Write an RGB picture as a PNG file with one IHDR chunk, one IDAT chunk of unfiltered rows, and IEND."""
     height, width, _ = image.shape
     rows = np.concatenate([np.zeros((height, 1), np.uint8), image.reshape(height, width * 3)], axis=1)
 
@@ -133,7 +133,7 @@ def hand_picture(hand: HandModel) -> UInt8[np.ndarray, "height width 3"]:
     eyes = (side + 0.5 * hand.palm_normal + 0.25 * up, hand.palm_normal + 0.15 * side + 0.1 * up)
     rows = []
     for eye in eyes:
-        # The hand is turned so that its fingers point along +z, from where the light comes.
+        # The fingers are turned to +z, because the light comes from there.
         frame = np.column_stack([np.cross(hand.palm_normal, up), hand.palm_normal, up]).T
         pose = look_at(frame @ (2.1 * size * eye / np.linalg.norm(eye)), np.zeros(3), np.array([0.0, 0.0, 1.0]))
         row = []

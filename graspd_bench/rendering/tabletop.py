@@ -1,7 +1,7 @@
 """Synthetic tabletop scenes with known geometry: an object at rest on a table, neighbours, and cameras around it.
 
-World frame: z is up, the table's top is the plane z = 0, and the object is above the origin. Clouds are in this frame
-too, so a grasp planned on a cloud can be tried on `truth` without a transform.
+World frame: z is up, the table's top is the plane z = 0, and the object is above the origin. Clouds are in the world
+frame too. So a grasp planned on a cloud can be tried on the true mesh (`truth`) without a transform.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ CAMERA = PinholeCamera(640, 480, 616.0, 616.0, 319.5, 239.5)
 
 # Built-in shapes that would topple in their own orientation.
 LYING = ("capsule", "hammer")
-# An object stands if the cosine between its own z axis and the vertical exceeds this.
+# An object stands upright if the cosine between its own z axis and the vertical exceeds this value.
 _UPRIGHT = 0.999
 
 
@@ -40,7 +40,7 @@ class TabletopScene:
 
     Attributes:
         truth: mesh of the object to grasp.
-        T_world_object: pose of the object's own frame.
+        T_world_object: pose of the frame in which the object's mesh was given. Identity in scenes of `on_table`.
         obstacles: meshes of the neighbours.
         table: mesh of the table.
         support: the table's top as a half-space.
@@ -67,10 +67,10 @@ def tabletop(
     """Put an object on the table. Return the scene.
 
     Args:
-        shape: name of a built-in shape, or a mesh. A shape keeps its own orientation if it can stand. Otherwise, and
-            for a mesh, the centre of mass is as low as possible.
+        shape: name of a built-in shape, or a mesh. Meshes and the shapes of `LYING` (they would topple) get the pose of
+            `lowest_pose`. Other shapes keep their own orientation.
         yaw: rotation about the vertical [rad].
-        obstacles: shape, x and y [m] of each neighbour.
+        obstacles: shape and position x, y [m] of each neighbour.
 
     Raises:
         MeshError: unknown shape.
@@ -89,7 +89,7 @@ def on_table(target: TriangleMesh, others: Sequence[TriangleMesh] = ()) -> Table
 
 
 def lowest_pose(mesh: TriangleMesh) -> Float[np.ndarray, "4 4"]:
-    """Return the pose on z = 0 with the lowest centre of mass. It is always stable.
+    """Return the pose of a mesh on the plane z = 0 with the lowest centre of mass. This pose is always stable.
 
     The mesh rests on the facet of its convex hull that is nearest to the centre of mass.
     """
@@ -107,20 +107,20 @@ def lowest_pose(mesh: TriangleMesh) -> Float[np.ndarray, "4 4"]:
 def resting_pose(mesh: TriangleMesh, rng: np.random.Generator) -> Float[np.ndarray, "4 4"]:
     """Draw a stable pose of a mesh on z = 0, with a random yaw.
 
-    A mesh that can stand upright does so with a probability of 0.5. Otherwise stable poses are drawn by the probability
-    that a fall from a random orientation ends in them.
+    A mesh that can stand upright stands with a probability of 0.5. Otherwise, any stable pose is drawn. A pose is as
+    likely as a fall from a random orientation is to end in it.
     """
     import trimesh
 
     centre = mass_properties(mesh)[1]
     hull = trimesh.Trimesh(mesh.vertices, mesh.faces).convex_hull
-    # trimesh takes the square root of a rounding error below zero for facets of nearly no area.
+    # For facets of nearly no area, trimesh takes the square root of a negative rounding error.
     with np.errstate(invalid="ignore"):
         given = {"center_mass": centre, "sigma": 0.0, "n_samples": 1, "threshold": 0.01}
         poses, shares = trimesh.poses.compute_stable_poses(hull, **given)
     poses, shares = np.asarray(poses), np.asarray(shares)
     if not len(poses):
-        # A ball rests on any of its many facets.
+        # A ball has no stable poses of its own, because it rests on any of its facets.
         return lowest_pose(mesh)
     standing = np.flatnonzero(poses[:, 2, 2] > _UPRIGHT)
     upright = len(standing) > 0 and rng.random() < 0.5
@@ -132,7 +132,7 @@ def resting_pose(mesh: TriangleMesh, rng: np.random.Generator) -> Float[np.ndarr
 
 
 def crowded(target: TriangleMesh, others: Sequence[TriangleMesh], rng: np.random.Generator) -> tuple[TriangleMesh, ...]:
-    """Return `others` placed at rest around the target, each 2 to 5 cm away from all placed before it."""
+    """Return `others` at rest around the target. Each is 2 to 5 cm from the nearest mesh placed before it."""
     from scipy.spatial import KDTree
 
     placed, begun = [target], rng.uniform(0, 2 * np.pi)
@@ -159,7 +159,7 @@ def ring_poses(
 
     Args:
         count: number of cameras.
-        elevation: angle of the cameras above the horizon, seen from the target [rad].
+        elevation: angle of the cameras above the horizontal plane, seen from the target [rad].
         distance: distance from the target [m].
         azimuth: angle of the first camera, from x towards y [rad].
         target: the point that the cameras look at [m].
@@ -176,7 +176,7 @@ def depth_views(
     noise: DepthNoise = NONE,
     seed: int = 0,
 ) -> tuple[tuple[Float[np.ndarray, "height width"], Int[np.ndarray, "height width"]], ...]:
-    """Return for each pose the noisy depth image [m], and the index in `scene.meshes` of each pixel (-1: none)."""
+    """Return for each pose the noisy depth image [m], and for each pixel the index in `scene.meshes` (-1: no mesh)."""
     images = []
     for index, pose in enumerate(poses):
         depth, label = render_scene(scene.meshes, camera, pose)
@@ -191,7 +191,7 @@ def views_of(
     noise: DepthNoise = NONE,
     seed: int = 0,
 ) -> tuple[PointCloud, ...]:
-    """Return the point cloud of each camera pose, in the world frame. It includes the table."""
+    """Return the point cloud of each camera pose, in the world frame. The clouds include points of the table."""
     images = depth_views(scene, camera, poses, noise, seed)
     return tuple(cloud_from_depth(depth, camera, pose) for (depth, _), pose in zip(images, poses, strict=True))
 

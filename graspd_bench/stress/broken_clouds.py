@@ -46,7 +46,7 @@ def cloud_cases() -> tuple[Case, ...]:
 
 
 def _measured() -> Iterator[Case]:
-    """Yield cases with faults of sensor or scene for which a grasp is still expected."""
+    """Yield cases with faults of sensor or scene that should nevertheless give a verified grasp."""
     cuboid, mug, cylinder, block = (_true(shape) for shape in ("box", "mug", "cylinder", "l_block"))
     seen = (
         ("single-view", "one view of a box on a table", lambda: _views("box", 1), cuboid),
@@ -81,7 +81,7 @@ def _measured() -> Iterator[Case]:
 
 
 def _refused() -> Iterator[Case]:
-    """Yield cases of clouds without an object. No grasp is expected."""
+    """Yield cases of clouds without a usable object. No grasp is expected."""
     refused = (
         ("empty", "no point at all", lambda: [_cloud(np.zeros((0, 3)))], ("CloudError",)),
         ("no-view", "a list of no views", lambda: [], ("CloudError",)),
@@ -100,7 +100,7 @@ def _refused() -> Iterator[Case]:
 
 
 def _special() -> tuple[Case, ...]:
-    """Return cases that need other arguments of `scene_from_views`, or other limits of time and memory."""
+    """Return cases with other arguments of `scene_from_views`, other limits, or more than one valid ending."""
     return (
         _case(
             "lone-object",
@@ -168,7 +168,7 @@ def _flying() -> Views:
 
 
 def bled() -> Views:
-    """Return a view of a mug whose table was cut off a little too low. A patch of table remains around its foot."""
+    """Return a view of a mug, segmented a little too low. A patch of the table remains around the mug's foot."""
     stage = tabletop("mug", yaw=_YAW)
     ((depth, label),) = depth_views(stage, CAMERA, _POSES[:1], DEFAULT)
     (view,) = views_of(stage, CAMERA, _POSES[:1], DEFAULT)
@@ -211,7 +211,7 @@ def _misplaced() -> Views:
 
 
 def _shiny() -> Views:
-    """Return views with a hole of 15 mm radius in the middle of the visible object."""
+    """Return views with a hole of 15 mm radius in the middle of the visible object, as a reflection leaves."""
 
     def burn(view: PointCloud) -> PointCloud:
         above = view.points[:, 2] > 0.01
@@ -277,7 +277,7 @@ def half_out_of_view(shape: str) -> Views:
 
 
 def black_neighbour(shape: str) -> Views:
-    """Return a view with a black neighbour beside the object. All its pixels lack depth."""
+    """Return a view with a black neighbour beside the object. All pixels of the neighbour lack depth."""
     stage = tabletop(shape, yaw=_YAW, obstacles=[("cylinder", 0.13, 0.03)])
     ((depth, label),) = depth_views(stage, CAMERA, _POSES[:1], DEFAULT, _SEED)
     return [cloud_from_depth(np.where(label == 1, 0.0, depth), CAMERA, _POSES[0])]
@@ -306,14 +306,14 @@ def thrice(shape: str) -> Views:
 
 
 def zero_filled(shape: str) -> Views:
-    """Return a view with two thirds of its points at the camera, because drivers fill in zeros for missing depth."""
+    """Return a view with two thirds of its points at the camera, which some drivers write for missing depth."""
     (view,) = _seen(tabletop(shape, yaw=_YAW))
     lost = np.random.default_rng(_SEED).random(len(view.points)) < 2 / 3
     return [replace(view, points=np.where(lost[:, None], view.viewpoint, view.points))]
 
 
 def unequal_pair() -> Views:
-    """Return a view of a box that touches a slab of a third of its height."""
+    """Return a view of a box that touches a slab. The slab is a third as high as the box."""
     stage = tabletop("box", obstacles=[(box((0.08, 0.05, 0.03), (0.0, 0.0, 0.0)), 0.0702, 0.0)])
     return views_of(stage, CAMERA, ring_poses(1, elevation=0.9, azimuth=-1.57), DEFAULT, _SEED)
 

@@ -1,6 +1,6 @@
-"""Stress cases: meshes with faults of scanners, CAD exports and manual edits, and valid objects at extremes.
+"""Stress cases: meshes with faults of scanners, CAD exports and manual edits, and extreme inputs with valid meshes.
 
-The extremes concern friction and mass, invalid numbers and grids, and the abilities of the hand.
+The extreme inputs have large or small friction and mass, unusual SDF values and grids, or objects unfit for the hand.
 """
 
 from __future__ import annotations
@@ -39,12 +39,12 @@ Maker = Callable[[], TriangleMesh]
 
 
 def mesh_cases() -> tuple[Case, ...]:
-    """Return all cases of faulty meshes. Each is written to a file and loaded by `load_scene`."""
+    """Return all cases of faulty meshes. Each mesh is written to a file and loaded by `load_scene`."""
     return (*_whole(), *_broken())
 
 
 def _whole() -> Iterator[Case]:
-    """Yield cases of faulty meshes that still describe a solid."""
+    """Yield cases of faulty meshes that still describe a solid. A verified grasp is expected."""
     whole = (
         ("open-box", "a box without its lid", lambda: _kept("box", lambda corners: corners[..., 2].mean(1) < 0.044)),
         (
@@ -129,7 +129,7 @@ def _case(name: str, about: str, make: Maker, expect: tuple[str, ...] = (GRASP,)
 
 
 def write_obj(mesh: TriangleMesh, path: Path) -> None:
-    """Write a mesh unchanged as an OBJ file, even with NaN. `save_mesh` would refuse or repair it."""
+    """Write a mesh unchanged as an OBJ file, even with NaN. `save_mesh` would refuse or repair the mesh."""
     # One format string for all rows is fast. `np.savetxt` takes four seconds for a million rows.
     vertices = "v %.9g %.9g %.9g\n" * len(mesh.vertices) % tuple(mesh.vertices.ravel().tolist())
     faces = "f %d %d %d\n" * len(mesh.faces) % tuple((mesh.faces + 1).ravel().tolist())
@@ -137,7 +137,7 @@ def write_obj(mesh: TriangleMesh, path: Path) -> None:
 
 
 def box(size: Sequence[float] | np.ndarray, middle: Sequence[float] | np.ndarray = (0.0, 0.0, 0.0)) -> TriangleMesh:
-    """Return a box of edge lengths `size` [m] around `middle`, with as many faces as the built-in box."""
+    """Return a box with edge lengths `size` [m] centred at `middle` [m], with as many faces as the built-in box."""
     unit = make_shape("box").vertices
     return _edited("box", lambda points: points / np.abs(unit).max(0) / 2 * np.asarray(size) + np.asarray(middle))
 
@@ -184,7 +184,7 @@ def _folded() -> TriangleMesh:
 
 
 def _slivers() -> TriangleMesh:
-    """Return a box in which each triangle is replaced by a fan of a hundred thin triangles."""
+    """Return a box in which each triangle is split into a fan of a hundred thin triangles."""
     mesh = make_shape("box")
     pieces = []
     for a, b, c in mesh.vertices[mesh.faces]:
@@ -235,12 +235,12 @@ _NONE = _MAYBE[1:]
 
 
 def extreme_cases() -> tuple[Case, ...]:
-    """Return all cases of the families physics, numbers and hand."""
+    """Return all cases of the families `physics`, `numbers` and `hand`."""
     return (*physics_cases(), *number_cases(), *hand_cases())
 
 
 def physics_cases() -> Iterator[Case]:
-    """Yield cases with friction and mass from small to large, and cases with symmetric objects."""
+    """Yield cases with small to large friction, cases with small to large mass, and cases with symmetric objects."""
     for mu in (0.1, 0.2, 0.3, 0.6, 1.0, 1.5):
         about, expect = f"a box at a friction of {mu:g}", (GRASP,) if mu >= 0.3 else _MAYBE
         yield Case(f"friction-{mu:g}", "physics", about, _shape("box", friction=mu), expect)
@@ -252,7 +252,7 @@ def physics_cases() -> Iterator[Case]:
 
 
 def number_cases() -> tuple[Case, ...]:
-    """Return cases with NaN or infinity in the SDF, with unsuitable grids, and with short deadlines."""
+    """Return cases with bad SDF values, coarse and fine grids, a deadline of 0.2 s, and a request for many grasps."""
     family, box = "numbers", _shape("box")
     coarse, fine = ({"preset": PlanConfig(resolution=nodes)} for nodes in (8, 128))
     return (
@@ -282,7 +282,7 @@ def _shape(name: str, **settings: Any) -> Callable[[Path], Scene]:
 
 
 def _poisoned(channel: int, value: float) -> Callable[[Path], Scene]:
-    """Return a function that loads a scene and sets `value` in `channel` of its SDF, at a grid node on the surface."""
+    """Return a function that loads a scene and sets one SDF channel (0: distance) to `value` at a surface node."""
 
     def scene(folder: Path) -> Scene:
         clean = load_scene("shape:cylinder")

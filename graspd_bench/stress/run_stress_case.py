@@ -1,4 +1,4 @@
-"""Runs of stress cases. A run records how the case ended, its time and memory, and the message to the user.
+"""Runs of stress cases. A run records how the case ended, the time and memory it took, and the message to the user.
 
 Every verified grasp must hold in a second trial. That trial reads the grasps from a saved grasps.json, loads the object
 again, and builds a new world.
@@ -22,9 +22,9 @@ from graspd_dataset.run_records import peak_mb
 
 Family = Literal["mesh", "cloud", "physics", "numbers", "hand"]
 
-# The ending of a case with a verified grasp. Other endings are names of an `Outcome` or a `GraspdError`.
+# The ending of a case with a verified grasp. `StressEnding` lists the other endings.
 GRASP = "grasp"
-# Tolerance of the deadline [s].
+# Planning may end later than its deadline by this time [s].
 GRACE = 0.5
 
 
@@ -34,18 +34,18 @@ class Case:
 
     Attributes:
         name: unique name, words joined by dashes.
-        family: the kind of input that is faulty.
+        family: kind of the faulty input.
         about: the fault, in one line.
         scene: makes the input in a given folder and loads it as a user would. It may raise a GraspdError.
-        expect: valid endings: "grasp", names of `Outcome` ("TOO_FEW"), or names of errors ("MeshError").
-        whole: whether the input describes a graspable object. Only these count in the share of verified grasps.
+        expect: valid endings: "grasp", names of `Outcome` ("TOO_FEW"), or classes of errors ("MeshError").
+        whole: whether the input describes a graspable object. Summaries give the share of these with a verified grasp.
         hand: name or path of the hand.
         deadline: time limit of planning [s].
         loading: time limit of loading [s].
         memory: limit of the process's peak memory, including libraries [MB].
         options: further arguments of `plan_grasps`.
-        told: words that the message to the user must contain.
-        truth: returns the true mesh in the scene frame. None if no camera sees the scene.
+        told: text that the message to the user must contain.
+        truth: returns the true mesh in the scene frame. None: grasps are not tried on a true object.
     """
 
     name: str
@@ -69,14 +69,14 @@ class StressEnding:
 
     Attributes:
         case: name of the case.
-        ending: "grasp", the name of an `Outcome` or a GraspdError, "crash" or "hang".
+        ending: "grasp", the name of an `Outcome`, the class of a GraspdError, "crash" or "hang".
         message: the message to the user.
         loading, planning: duration [s].
         memory: peak memory of the process [MB].
         tried: number of returned grasps.
         verified: number of verified grasps.
         again: number of verified grasps that hold in the second trial.
-        finite: whether all numbers of the result are finite.
+        finite: whether all postures, and all numbers of grasps that did not fail, are finite.
         true: number of verified grasps that hold on the true object. None if the case has no `truth`.
     """
 
@@ -94,7 +94,7 @@ class StressEnding:
 
 
 def faults(case: Case, ending: StressEnding) -> tuple[str, ...]:
-    """Return the faults of an ending, one line per fault. Empty if there is none."""
+    """Return how an ending breaks the expectations and limits of its case, one line per fault. Empty if it does not."""
     wrong = []
     if ending.ending not in case.expect:
         wrong.append(f"ended in {ending.ending}, not in {' or '.join(case.expect)}: {ending.message}")
@@ -155,7 +155,7 @@ def _printed(result: GraspResult, folder: str) -> str:
 
 
 def _hold_again(case: Case, result: GraspResult, scene: Scene, hand: Any, folder: Path, preset: str) -> int:
-    """Save the result, read it back, load the object again, and return how many verified grasps hold again."""
+    """Save the result, read it back, and load the object again. Return how many verified grasps hold again."""
     from graspd_core.io.grasps_json import grasps_of, load_document, save_result
     from graspd_core.optimize.plan_config import load_preset
     from graspd_core.runtime import disk_cache as cache
@@ -188,7 +188,7 @@ def _held(grasps: Sequence[Grasp], target: ObjectModel, hand: Any) -> int:
 
 
 def _finite(result: GraspResult) -> bool:
-    """Return whether all postures, and all numbers of grasps that did not fail, are finite."""
+    """Return True if all postures are finite, and also all numbers in grasps that did not fail."""
     good = [asdict(grasp) for grasp in result.tried if grasp.verdict is not Verdict.FAILED]
     postures = [asdict(posture) for g in result.tried for posture in (g.pregrasp, g.grasp, g.squeeze)]
     try:

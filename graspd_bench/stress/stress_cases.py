@@ -1,4 +1,4 @@
-"""Study `stress`: all stress cases by name, their runs, and the endings as Markdown."""
+"""Study `stress`: all stress cases by name, functions that run them, and Markdown tables of how they ended."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from graspd_core.types import Outcome
 CASES: dict[str, Case] = {case.name: case for case in (*mesh_cases(), *cloud_cases(), *extreme_cases())}
 # Time in addition to the limits of loading and planning, before a process counts as hung [s].
 _PATIENCE = 60.0
-# Families and cases of a quick run. Each case takes a second.
+# Names of families and cases for a quick run. Each case takes about a second.
 _QUICK = ("hand", "nan-vertices", "empty")
 # Messages in the table are cut to this length [characters].
 _MESSAGE = 110
@@ -27,14 +27,14 @@ _HEADINGS = ("case", "what is wrong", "ending", "load s", "plan s", "peak MB", "
 
 @dataclass(frozen=True)
 class StressRun(study.Case):
-    """A stress case, by name, and the preset that it is planned with."""
+    """One run of a stress case: the name of the case, and the preset with which grasps are planned."""
 
     name: str
     preset: str
 
 
 def stress_runs(request: Request) -> tuple[StressRun, ...]:
-    """Return the requested cases or families. Without a request, return all. Raises ConfigError: unknown name."""
+    """Return a run for each requested case, by name or family (default: all). Raises ConfigError: unknown name."""
     families = sorted({case.family for case in CASES.values()})
     names = request.cases or (_QUICK if request.quick else ())
     if unknown := [name for name in names if name not in CASES and name not in families]:
@@ -49,7 +49,7 @@ def run_stress(run: StressRun) -> Record:
 
 
 def stress_patience(run: StressRun) -> float:
-    """Return the seconds until a case counts as hung. Loading counts twice, because the second trial loads again."""
+    """Return the seconds until a case counts as hung. They allow two loadings, because the second trial loads again."""
     case = CASES[run.name]
     return 2 * case.loading + case.deadline + _PATIENCE
 
@@ -62,24 +62,24 @@ def ending_of(record: Record) -> StressEnding:
 
 
 def stress_faults(record: Record) -> tuple[str, ...]:
-    """Return the faults of the ending in a record, one line per fault."""
+    """Return how the ending in a record breaks the expectations of its case, one line per fault."""
     return faults(CASES[record["name"]], ending_of(record))
 
 
 def stress_summary(record: Record) -> str:
-    """Return the ending and its duration, in a few words."""
+    """Return how the case of a record ended, and how long loading and planning took, in a few words."""
     ending = ending_of(record)
     return f"{ending.ending}, {ending.loading + ending.planning:.1f} s"
 
 
 def stress_sections(records: Sequence[Record], chart: Path | None) -> Sections:
-    """Return the section of the summary, and the section of the tables."""
+    """Return a section with the summary of all endings, and a section with a table of endings for each family."""
     endings = {CASES[record["name"]]: ending_of(record) for record in records}
     return {"stress-summary": [summary(endings)], "stress": [stress_table(endings)]}
 
 
 def stress_table(endings: Mapping[Case, StressEnding]) -> str:
-    """Return a table for each family. Unexpected endings are bold."""
+    """Return a table for each family of cases, with one ending per row. Unexpected endings are bold."""
     blocks = []
     for family in dict.fromkeys(case.family for case in endings):
         body = [_line(case, ending) for case, ending in endings.items() if case.family == family]
@@ -88,7 +88,7 @@ def stress_table(endings: Mapping[Case, StressEnding]) -> str:
 
 
 def summary(endings: Mapping[Case, StressEnding]) -> str:
-    """Return how many cases ended in a verified grasp, how many grasps passed the second trial, and all faults."""
+    """Return a text: how many cases end in a verified grasp, how many grasps pass the second trial, and all faults."""
     wrong = [f"* `{case.name}`: {fault}" for case, ending in endings.items() for fault in faults(case, ending)]
     lines = [f"{len(endings)} cases, {len(wrong)} faults."]
     for family in dict.fromkeys(case.family for case in endings):

@@ -1,7 +1,7 @@
 """Study `reach`: inverse kinematics of the arms, and planning with and without the `Reach` restriction.
 
 `Reach` refuses grasps that the arm cannot reach. Objects stand or lie on a table. The arm's base is 40 to 80 cm away,
-in a random direction with a random yaw. Without `Reach`, verified grasps are checked for reachability afterwards.
+in a random direction with a random yaw. After a plan without `Reach`, the study counts the verified grasps in reach.
 """
 
 from __future__ import annotations
@@ -40,11 +40,11 @@ from graspd_core.se3 import SE3, axis_rotation
 from graspd_core.types import ArmPath, Grasp, Plane, Progress, TriangleMesh
 from graspd_dataset.run_records import markdown_table
 
-# Built-in shapes. Each is tried in two scenes.
+# Built-in shapes. Each shape is tried in two random scenes for every arm.
 SHAPES = ("box", "mug", "hammer", "bottle", "torus", "cylinder", "plate", "l_block", "sphere", "bowl")
 POSES = 1000
 NEAREST, FARTHEST = 0.4, 0.8
-# Poses per batch, number of starts for each pose, and steps of each start. A next start follows only after a failure.
+# Poses per batch, maximum number of starts for each pose, and steps of each start. If a start fails, the next is used.
 _BATCH, _STARTS, _STEPS = 256, 12, 16
 # Starts and steps of pytorch-kinematics. Lower numbers reach fewer poses.
 _RETRIES, _ITERATIONS = 20, 50
@@ -52,7 +52,7 @@ _RETRIES, _ITERATIONS = 20, 50
 
 @dataclass(frozen=True)
 class ArmCase(Case):
-    """Inverse kinematics of an arm, for `poses` reachable poses."""
+    """Test of an arm's inverse kinematics on `poses` poses that the arm can reach."""
 
     arm: str
     poses: int
@@ -60,12 +60,12 @@ class ArmCase(Case):
 
 @dataclass(frozen=True)
 class ReachCase(ObjectCase):
-    """A request for `count` grasps of an object on a table, with an arm. The seed determines the poses of both."""
+    """A request for `count` grasps of an object on a table, with an arm. The seed sets the poses of object and arm."""
 
     arm: str = ""
 
     def place(self) -> tuple[HandModel, Scene, Reach]:
-        """Return the hand, the scene with the object standing or lying, and the `Reach` of the arm."""
+        """Return the hand, the scene with the object standing or lying, and the `Reach` of an arm at a random place."""
         rng = np.random.default_rng((self.seed, sum(self.object.encode())))
         hand, scene = self.load()
         side = axis_rotation(np.eye(3)[int(rng.integers(2))], float(rng.choice([0.0, np.pi / 2])))
@@ -83,7 +83,7 @@ class ReachCase(ObjectCase):
 
 
 def reach_cases(request: Request) -> tuple[ArmCase | ReachCase, ...]:
-    """Return an inverse kinematics case for every arm, and a request for every arm, object and seed."""
+    """Return an inverse kinematics case for every arm, and a planning request for every arm, object and seed."""
     arms = [ArmCase(arm, 256 if request.quick else POSES) for arm in arm_names()]
     objects = find_objects(request.objects or [f"shape:{name}" for name in SHAPES])
     seeds = request.seeds or ((0,) if request.objects else (0, 1))
@@ -101,7 +101,7 @@ def run_reach(case: ArmCase | ReachCase) -> Record:
 
 
 def _run_request(case: ReachCase) -> Record:
-    """Plan without and with `Reach`, after a plan that fills caches. Return CPU times [s] and numbers of grasps."""
+    """Plan without and with `Reach`, after a plan that fills caches. Return counts of grasps, and CPU times [s]."""
     hand, scene, reach = case.place()
     request: dict[str, Any] = {"count": case.count, "seed": case.seed, "preset": case.config, "measure": False}
     plan_grasps(scene, hand, count=1, measure=False, restrictions=[reach])
@@ -129,7 +129,7 @@ def _run_request(case: ReachCase) -> Record:
 
 
 class _Found:
-    """Progress hook that records each verified grasp, the CPU time until then, and the restriction's part of it [s]."""
+    """Progress hook. With each verified grasp it records the CPU time so far: total, and of the restriction [s]."""
 
     def __init__(self, seconds: Sequence[float]) -> None:
         self.found: list[tuple[float, float, Grasp]] = []
@@ -142,7 +142,7 @@ class _Found:
 
 @dataclass(frozen=True, eq=False)
 class _Timed(BoundRestriction):
-    """A `Reach` restriction that records the CPU time of each call [s]."""
+    """Restriction that calls `reach` and records the CPU time of each call [s]."""
 
     reach: Any
     seconds: list[float]
@@ -165,14 +165,14 @@ class _Timed(BoundRestriction):
 
 
 def summary(record: Record) -> str:
-    """Return the results of a case, in a few words."""
+    """Return the share of reached poses, or the numbers of grasps in reach, in a few words."""
     if "own" in record:
         return f"{record['own']['reached']:.1%} of the poses reached"
     return f"{record['filtered']['verified']} verified in reach, without the filter {record['plain']['reached']}"
 
 
 def reach_sections(records: Sequence[Record], chart: Path | None) -> Sections:
-    """Return the table of inverse kinematics, and the table and refusals of the requests."""
+    """Return a section with the table of inverse kinematics, and one with the table and refusals of the requests."""
     alone, filtered = ([r for r in records if key in r] for key in ("own", "filtered"))
     return {
         "inverse-kinematics": [_alone_table(alone)] if alone else [],
@@ -213,7 +213,7 @@ def _seconds(ones: Sequence[Record]) -> str:
 
 
 def _reasons(records: Sequence[Record]) -> str:
-    """Return a sentence that counts refused candidates by kind of reason."""
+    """Return a sentence with the number of refused candidates for each kind of reason."""
     kinds: dict[str, int] = {}
     for record in records:
         for reason, count in record["filtered"]["refused"].items():
@@ -223,7 +223,7 @@ def _reasons(records: Sequence[Record]) -> str:
     return f"Refused before any trial: {counts or 'none'}."
 
 
-# Words by which reasons are grouped, whatever link or joint they name. The first that occurs counts.
+# Words by which reasons are grouped, whatever link or joint a reason names. The first word that occurs counts.
 _KINDS = ("limit on the path", "limit", "in the table", "in the object", "against the hand", "against", "jump")
 
 
@@ -260,10 +260,10 @@ def _own(arm: Arm, target: SE3) -> Bool[Tensor, "batch"]:
 
 
 def _library(arm: Arm) -> Callable[[SE3], Bool[Tensor, "batch"]]:
-    """Return a solver by pytorch-kinematics: damped least squares within the joint limits, with the same tolerances."""
+    """Return a pytorch-kinematics solver: damped least squares within joint limits, with the tolerances of graspd."""
     import pytorch_kinematics
 
-    # Its URDF reader does not support capsules.
+    # The URDF reader of pytorch-kinematics does not support capsules.
     text = re.sub(r"<collision>.*?</collision>", "", Path(arm.chain.urdf).read_text(), flags=re.DOTALL)
     tip = arm.chain.link_names[arm.tip]
     chain = pytorch_kinematics.build_serial_chain_from_urdf(text.encode(), tip).to(dtype=torch.float64)

@@ -1,9 +1,8 @@
 """Study `cameras`: single views by four kinds of cameras, of objects at rest, alone or crowded.
 
 An object is of a family of irregular shapes (`rendering/families.py`), a built-in shape of a random size, or a scan.
-Every grasp that is verified on the view is tried on the true object, at 0.1 kg and at the object's own mass. Nothing
-was fitted to these views: the shares in `config/planning_config.py` come from the families and shapes of `CHOSEN_ON`
-with seeds below 100.
+Grasps verified on the view are tried on the true object, at 0.1 kg and at the object's own mass. Nothing was fitted to
+these views. `HeldShares` (`config/planning_config.py`) come from other objects: `CHOSEN_ON` and five scans.
 """
 
 from __future__ import annotations
@@ -39,17 +38,17 @@ from graspd_core.verify.hold_trial import hold_trial, out_of_place
 from graspd_core.verify.world import PROTOCOLS, altered, build_world
 from graspd_dataset.run_records import markdown_table, object_name
 
-# Families and shapes from which the shares of verified grasps were computed, with seeds from 0. This study uses others.
+# Families and shapes on which thresholds and `HeldShares` were chosen. This study plans no grasp for any of them.
 CHOSEN_ON = (
     "pear", "pitcher", "pump", "tool", "plane", "sponge", "jar", "compound", "box", "cylinder", "mug", "l_block",
 )  # fmt: skip
 FIRST_SEED, SEEDS = 100, 4
 SHAPES = ("sphere", "capsule", "bowl", "bottle")
-# Densities of built-in shapes [kg/m³]: of earthenware for `_HOLLOW`, and of all others, hollow or full.
+# Ranges of density [kg/m³]: earthenware for the shapes of `_HOLLOW`, and hollow or full objects for all other shapes.
 _WARE, _OTHER = (1500.0, 2500.0), (150.0, 1100.0)
 _HOLLOW = ("mug", "bowl")
-# Range of a camera's elevation [deg] and distance [m]. In a crowd, camera poses are drawn until one sees more than the
-# share `_SEEN` of the object, at most `_TRIES` times.
+# Range of a camera's elevation [deg] and distance [m]. For a crowd, `_TRIES` camera poses are drawn. The first that
+# sees more than the share `_SEEN` of the object is used.
 _ELEVATION, _DISTANCE, _SEEN, _TRIES = (30.0, 65.0), (0.5, 1.0), 0.6, 20
 # Ways to plan on a view: with or without a given mass, and with graspd's or Open3D's surface reconstruction.
 ASSUMED, GIVEN, OPEN3D = "mass not given", "mass given", "mass not given, Open3D's Poisson"
@@ -64,9 +63,9 @@ class CameraView(Case):
     """A request for `count` grasps on one view of an object.
 
     Attributes:
-        thing: name of a family or a shape, or path of a scan. A stats.csv in the scan's folder gives its mass.
+        thing: name of a family or a shape, or path of a scan. The mass of a scan is in stats.csv in the same folder.
         crowd: whether neighbours stand around the object.
-        way: mass not given (`ASSUMED`) or given (`GIVEN`), or not given with Open3D's Poisson (`OPEN3D`).
+        way: how to plan: `ASSUMED` (mass not given), `GIVEN` (mass given), or `OPEN3D` (not given, Open3D's Poisson).
     """
 
     thing: str
@@ -88,7 +87,7 @@ class CameraView(Case):
 
 
 def camera_cases(request: Request) -> tuple[CameraView, ...]:
-    """Return cases for every object, seed and way, with alternating cameras and crowds. --objects adds scans."""
+    """Return cases for every object, seed and way. Cameras take turns, and half of the views have a crowd."""
     things = (*(name for name in FAMILIES if name not in CHOSEN_ON), *SHAPES)
     things += tuple(find_objects(request.objects)) if request.objects else ()
     seeds = request.seeds or range(FIRST_SEED, FIRST_SEED + SEEDS)
@@ -120,7 +119,7 @@ def object_of(case: CameraView) -> tuple[TriangleMesh, float]:
 
 
 def view_of(case: CameraView) -> tuple[TabletopScene, PointCloud, float, Target | None]:
-    """Return the scene, its view, the object's mass [kg], and in a crowd the target that selects the object."""
+    """Return the scene, its view, the object's mass [kg], and the target that selects the object in a crowd."""
     rng = np.random.default_rng([case.seed, sum(map(ord, object_name(case.thing) + case.camera)), case.crowd])
     mesh, mass = object_of(case)
     target = moved(mesh, resting_pose(mesh, rng))
@@ -143,13 +142,13 @@ def view_of(case: CameraView) -> tuple[TabletopScene, PointCloud, float, Target 
 
 
 def _share_seen(scene: TabletopScene, lens: PinholeCamera, pose: np.ndarray) -> float:
-    """Return the fraction of the object's pixels that its neighbours do not hide, seen from a camera pose."""
+    """Return the fraction of the object's pixels that its neighbours do not hide, as seen from a camera pose."""
     pixels = [(render_scene(some.meshes, lens, pose)[1] == 0).sum() for some in (scene, on_table(scene.truth))]
     return float(pixels[0] / max(pixels[1], 1))
 
 
 def run_view(case: CameraView) -> Record:
-    """Plan on the view, and try the verified grasps on the true object. A GraspdError becomes a `refused` record."""
+    """Plan on the view. Try verified grasps on the true object. A GraspdError ends the case as `refused`."""
     stage, cloud, mass, target = view_of(case)
     hand = load_hand(case.hand)
     surface = ReconstructionConfig(poisson="open3d" if case.way == OPEN3D else "grid")
@@ -186,7 +185,7 @@ def run_view(case: CameraView) -> Record:
 
 
 def camera_sections(records: Sequence[Record], chart: Path | None) -> Sections:
-    """Return a table with a row for each way, camera, crowd and kind, and the calibration of the probability."""
+    """Return a table with rows for ways, cameras, crowds and kinds of objects, and the probability's calibration."""
     usual = [r for r in records if r["way"] == ASSUMED]
     rows = [(way, [r for r in records if r["way"] == way]) for way in (ASSUMED, GIVEN, OPEN3D)]
     for name, told in (("camera", str), ("crowd", lambda some: "crowded" if some else "alone"), ("kind", str)):
@@ -218,7 +217,7 @@ def _row(own: Sequence[Record]) -> list[str]:
 
 
 def _share(own: Sequence[Record], name: str) -> str:
-    """Return how many verified grasps held, with a 90 % interval over resampled views (a view's errors correlate)."""
+    """Describe how many verified grasps held. The 90 % interval resamples views, as errors within a view correlate."""
     pairs = np.array([(r[name], r["verified"]) for r in own])
     if not pairs[:, 1].sum():
         return "–"

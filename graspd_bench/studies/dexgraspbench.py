@@ -2,9 +2,9 @@
 
     graspd bench dexgraspbench FOLDER --python ENVIRONMENT/bin/python
 
-FOLDER is the user's checkout of DexGraspBench with its submodule. ENVIRONMENT is a Python environment with its
-requirements. Its code runs in a child process and is never imported. A temporary folder has our grasps and objects in
-its format, and with `--armature` a changed copy of its Allegro. `inert_pickle` reads results without running code.
+FOLDER is the user's checkout of DexGraspBench with its submodule. ENVIRONMENT is a Python environment with
+DexGraspBench's requirements. The checkout runs in a child process and is never imported. It reads our grasps, our
+objects and a changed Allegro (`--armature`) from a temporary folder. `inert_pickle` reads results without running code.
 """
 
 from __future__ import annotations
@@ -41,27 +41,27 @@ from graspd_dataset.run_records import markdown_table, object_name
 NAME = "dexgraspbench"
 # DexGraspBench's object mass [kg], and its limits of displacement [m] and rotation [deg].
 MASS, _TRAVEL, _TURN = 0.1, 0.05, 15.0
-# The program, its Allegro, and all files of a checkout that a result depends on.
+# Files of a checkout: the program, the MJCF of its Allegro, and all files that a result depends on.
 _MAIN, _ALLEGRO = "src/main.py", "assets/hand/allegro/right_hand.xml"
 _HASHED = ("src/**/*.py", "config/**/*.yaml", _ALLEGRO)
 # Time limits of DexGraspBench [s]: for its start, and for each grasp.
 _START, _GRASP = 120.0, 60.0
 AS_IS, ARMATURE = "as it is", f"armature {Protocol().armature:g}"
 DIFFERENCES = f"""\
-Known differences of its evaluation from our hold trial:
+Known differences between DexGraspBench and our hold trial:
 
-- Its Allegro's joints have no armature, ours {Protocol().armature:g} kg·m². Its links weigh 800 kg/m³.
-  In steps of 4 ms links so light are half of the difference: at 2 ms it has 85 % where it has 76 (80 grasps).
-- Stiffness and softness of a contact are the mean of hand's and object's. Ours are the hand's.
-- A weld holds its hand's base, and gives.
-- No joint has an effort limit.
-- Targets move in ten jumps a stage, each held for 40 ms. Ours move with every step.
-- A pregrasp is refused that overlaps by more than 1 cm. Ours refuses links 2 mm in each other, and deep grasps.
-- The hand closes anew for each of the six pulls. Ours closes once.
-- Limits ({_TRAVEL * 100:g} cm, {_TURN:g}°) are looked at every 0.2 s of a pull, not while the hand closes.
+- Joints of DexGraspBench's Allegro have no armature, ours {Protocol().armature:g} kg·m². Its links weigh 800 kg/m³.
+  With steps of 4 ms, such light links cause half of the difference: 76 % hold, but 85 % at 2 ms (80 grasps).
+- DexGraspBench averages the contact stiffness and softness of hand and object. We use those of the hand.
+- In DexGraspBench a weld holds the hand's base. A weld is not rigid.
+- In DexGraspBench no joint has an effort limit.
+- In DexGraspBench targets move in ten jumps per stage, with 40 ms after each. Our targets move with every step.
+- DexGraspBench refuses a pregrasp with an overlap above 1 cm. We refuse links that overlap by 2 mm, and deep grasps.
+- In DexGraspBench the hand closes anew for each of the six pulls. Our hand closes once.
+- DexGraspBench checks its limits ({_TRAVEL * 100:g} cm, {_TURN:g}°) every 0.2 s of a pull, not during closing.
 
-The object weighs {MASS:g} kg and has friction 0.6 in both. It is written about its centre of mass, of which ours says
-how far it moved."""
+In both, the object weighs {MASS:g} kg and has friction 0.6. The origin of DexGraspBench's object is the centre of mass,
+whose displacement our trial measures."""
 
 
 @dataclass(frozen=True)
@@ -71,8 +71,8 @@ class BenchCase(ObjectCase):
     Attributes:
         checkout: folder of DexGraspBench.
         python: Python program that runs DexGraspBench.
-        armature: whether to also run DexGraspBench's Allegro with our joint armature.
-        grasps: file of our grasps. Empty to plan them.
+        armature: whether to try the grasps also with DexGraspBench's Allegro plus our joint armature.
+        grasps: file of our grasps. If empty, they are planned.
         content: hash of the checkout's code and of the file of grasps.
     """
 
@@ -87,14 +87,14 @@ class BenchCase(ObjectCase):
         return f"{object_name(self.object)} {self.preset} {object_name(self.hand)} seed {self.seed} {self.armature:d}"
 
     def inputs(self) -> Record:
-        """Return all inputs except the code. Files count by content, not by path."""
+        """Return all inputs except the code. Files count by their content, not by their path."""
         return {name: value for name, value in super().inputs().items() if name not in ("checkout", "python", "grasps")}
 
 
 def bench_cases(request: Request) -> tuple[BenchCase, ...]:
     """Return a case for each object and seed.
 
-    Raises GraspdError: there is no checkout, its program does not start, or the request has an unknown name.
+    Raises GraspdError: there is no checkout, DexGraspBench does not start, or the request has an unknown name.
     """
     if not request.checkout:
         raise ConfigError(f"{NAME}: give the folder of a checkout: graspd bench {NAME} FOLDER --python PATH")
@@ -129,7 +129,7 @@ def bench_cases(request: Request) -> tuple[BenchCase, ...]:
 
 
 def run_bench(case: BenchCase) -> Record:
-    """Plan or read grasps, and run DexGraspBench on all of them. Return our verdicts and its results."""
+    """Plan or read grasps, and run DexGraspBench on all of them. Return our verdicts and DexGraspBench's results."""
     config = case.config
     hand = load_hand(case.hand, candidates=config.problem.fine_candidates)
     if case.grasps:
@@ -153,7 +153,7 @@ def run_bench(case: BenchCase) -> Record:
 
 
 def write_grasps(scene: Scene, hand: HandModel, grasps: Sequence[Grasp], out: Path) -> list[Path]:
-    """Write grasps and object for DexGraspBench, with origin at the centre of mass. Return paths relative to `out`."""
+    """Write grasps and object for DexGraspBench, with the centre of mass as origin. Return paths relative to `out`."""
     center, rows = scene.object.center_of_mass, []
     for grasp in grasps:
         row: dict[str, Any] = {"hand_name": hand.name, "object_sha256": scene.object.sha256, "mass": scene.object.mass}
@@ -170,7 +170,7 @@ def write_grasps(scene: Scene, hand: HandModel, grasps: Sequence[Grasp], out: Pa
 
 
 def write_armature(xml: Path, to: Path, armature: float) -> Path:
-    """Write a copy of a hand's MJCF with `armature` [kg·m²] at all joints. It uses the same meshes. Return `to`."""
+    """Write to `to` a copy of a hand's MJCF with `armature` [kg·m²] at all joints and the same meshes. Return `to`."""
     tree = ElementTree.parse(xml)
     for compiler in tree.iter("compiler"):
         compiler.set("meshdir", str((xml.parent / compiler.get("meshdir", ".")).resolve()))
@@ -182,7 +182,7 @@ def write_armature(xml: Path, to: Path, armature: float) -> Path:
 
 
 def evaluate(case: BenchCase, written: Path, xml: Path, paths: Sequence[Path]) -> list[Record]:
-    """Run DexGraspBench on the grasp files `paths` in `written`. Return for each `held`, `travel` [m], `turn` [deg].
+    """Run DexGraspBench on the files `paths` in `written`. Return `held`, `travel` [m], `turn` [deg] of each grasp.
 
     `xml` is the hand's MJCF. Raises ConfigError: DexGraspBench ended with an error, or gave no result for a grasp.
     """
@@ -211,7 +211,7 @@ def evaluate(case: BenchCase, written: Path, xml: Path, paths: Sequence[Path]) -
 
 
 def _run(command: Sequence[str], folder: Path, patience: float) -> str:
-    """Run a command for up to `patience` [s]. Return its last line of output. Raises ConfigError: it failed."""
+    """Run a command for up to `patience` [s]. Return the last line of its output. Raises ConfigError: it failed."""
     kept = {name: value for name, value in os.environ.items() if not name.startswith(("PYTHON", "VIRTUAL_ENV"))}
     try:
         done = subprocess.run(
@@ -236,8 +236,8 @@ def _run(command: Sequence[str], folder: Path, patience: float) -> str:
 
 
 def why_failed(there: Record) -> str:
-    """Return why a grasp with the result `there` did not hold in DexGraspBench, in a few words."""
-    # DexGraspBench reports a refused pregrasp by such values.
+    """Return in a few words why a grasp did not hold in DexGraspBench. `there` is DexGraspBench's result."""
+    # DexGraspBench reports a refused pregrasp by values of 100 or more.
     if there["travel"] >= 100 and there["turn"] >= 100:
         return "refused: the pregrasp overlaps the object, or the hand itself, by more than 1 cm"
     if not np.isfinite([there["travel"], there["turn"]]).all():
@@ -248,13 +248,13 @@ def why_failed(there: Record) -> str:
 
 
 def bench_summary(record: Record) -> str:
-    """Return how many of our verified grasps hold in DexGraspBench."""
+    """Return a text: how many of our verified grasps hold in DexGraspBench."""
     pairs = [pair for pair in _pairs([record], AS_IS) if pair[0]]
     return f"{sum(there['held'] for _, there in pairs)} of {len(pairs)} verified hold there"
 
 
 def _pairs(records: Sequence[Record], variant: str) -> list[tuple[bool, Record]]:
-    """Return for every grasp whether our trial verified it, and DexGraspBench's result with a variant of the hand."""
+    """Return for every grasp our verdict (True: verified), and DexGraspBench's result with a variant of the hand."""
     return [
         (own["verified"], there)
         for record in records
@@ -264,7 +264,7 @@ def _pairs(records: Sequence[Record], variant: str) -> list[tuple[bool, Record]]
 
 
 def bench_sections(records: Sequence[Record], chart: Path | None) -> Sections:
-    """Return a table by object and variant of the Allegro, the reasons of failure, and the known differences."""
+    """Return a table by object and variant of the Allegro, why verified grasps failed there, and known differences."""
     headings = ["object", "its Allegro", "tried", "verified", "held by both", "by ours only", "by theirs only"]
     headings += ["by neither", "of the verified"]
     groups = [(object_name(record["object"]), [record]) for record in records]
@@ -281,5 +281,5 @@ def bench_sections(records: Sequence[Record], chart: Path | None) -> Sections:
     for variant in variants:
         lost = [there for verified, there in _pairs(records, variant) if verified and not there["held"]]
         counts = "; ".join(f"{count}: {why}" for why, count in Counter(map(why_failed, lost)).most_common())
-        reasons.append(f"Held by ours only, {variant}: {counts or 'none'}.")
+        reasons.append(f"Failed only there, {variant}: {counts or 'none'}.")
     return {NAME: [markdown_table(headings, body), "\n".join(reasons), DIFFERENCES]}

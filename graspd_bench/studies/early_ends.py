@@ -1,7 +1,7 @@
 """Study `early`: whether trials that stop early give the same verdict as trials of full length, and the time saved.
 
-The study uses the first grasps of the method's own ranking. No trial filters them. Each goes through the trials of
-`trials_of`, once with early stopping and once at full length.
+The study uses the first grasps of the method's own ranking. No trial filters them. Each grasp goes through the trials
+of `trials_of`, once with early stopping and once at full length.
 """
 
 from __future__ import annotations
@@ -37,7 +37,7 @@ Trial = Callable[[Grasp, bool, Any], Any]
 
 @dataclass(frozen=True)
 class EarlyEnds(ObjectCase):
-    """Grasps of an object. `factors`, if not empty, scale its extents along x, y and z."""
+    """Grasps of an object. `factors` scale the object along x, y and z. If they are empty, it keeps its size."""
 
     factors: tuple[float, ...] = ()
 
@@ -50,7 +50,7 @@ class EarlyEnds(ObjectCase):
 
 
 def early_cases(request: Request) -> tuple[EarlyEnds, ...]:
-    """Return cases of every hand on a few shapes and thin objects."""
+    """Return cases with every built-in hand, each on a few shapes and thin objects, or on the requested ones."""
     things = [(thing, ()) for thing in find_objects(request.objects or SHAPES)]
     hands = (request.hand,) if request.hand else hand_names()
     cases = tuple(
@@ -63,7 +63,7 @@ def early_cases(request: Request) -> tuple[EarlyEnds, ...]:
 
 
 def run_early(case: EarlyEnds) -> Record:
-    """Run every trial of every grasp, once early and once late (at full length). Return one row per trial."""
+    """Run every trial of every grasp twice: early (may stop early) and late (full length). Return one row per trial."""
     hand, scene = case.load()
     grasps = raw_grasps(scene, hand, case.config, case.count, case.seed)
     errors = pose_errors((ERROR_SEED, case.seed), max(len(grasps), 1))
@@ -82,7 +82,7 @@ def run_early(case: EarlyEnds) -> Record:
 
 
 def trials_of(hand: HandModel, scene: Scene) -> Mapping[str, Trial]:
-    """Return the trials by name. "noisy" displaces the hand and has the short pulls of the ranking by robustness."""
+    """Return the trials by name. "noisy" is "displaced" with shorter pulls, as when grasps are ranked by robustness."""
     parts, center = object_parts(scene.object), scene.object.center_of_mass
     standard, hard = PROTOCOLS["standard"], PROTOCOLS["hard"]
     slippery, brief = at_friction(standard, 0.3), replace(standard, hold_time=RobustConfig().hold_time)
@@ -111,7 +111,7 @@ def trials_of(hand: HandModel, scene: Scene) -> Mapping[str, Trial]:
 
 
 def early_sections(records: Sequence[Record], chart: Path | None) -> Sections:
-    """Return a table of disagreements and CPU time by trial, and a list of all disagreements."""
+    """Return a table of disagreements and CPU time by trial, and a list of all cases that disagree."""
     groups: dict[str, list[Record]] = {}
     text = []
     for record in records:
@@ -138,7 +138,7 @@ def _run(trial: Trial, grasp: Grasp, full: bool, error: Any) -> Record:
 
 
 def _figures(rows: Sequence[Record]) -> list[str]:
-    """Return the cells of one trial's row. For a trial that measures a length, give the greatest difference."""
+    """Return a trial's table cells. If it measures a length, they show the greatest difference by stopping early."""
     from scipy.stats import beta
 
     if "figure" in rows[0]["early"]:

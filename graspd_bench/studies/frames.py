@@ -2,7 +2,7 @@
 
     graspd bench frames --objects DIR ...
 
-Every subfolder of DIR with a depth_mm.png is a frame. It also holds camera.json (K, width, height) and
+Every subfolder of DIR with a depth_mm.png is a frame. The subfolder also holds camera.json (K, width, height) and
 object_cloud.xyz, the reference cloud of the object in the camera frame [m].
 """
 
@@ -34,7 +34,7 @@ CUBE = 0.005
 
 @dataclass(frozen=True)
 class Frame(Case):
-    """A folder with one frame, and the request for grasps. `content` is a hash of the folder's files."""
+    """A folder with one frame, and the request for its grasps. `content` is a hash of the files in the folder."""
 
     folder: str
     content: str
@@ -51,17 +51,17 @@ class Frame(Case):
 
 
 def frame_cases(request: Request) -> tuple[Frame, ...]:
-    """Return a case for every frame below the folders, sorted by name. Raises ConfigError: there is no frame."""
+    """Return a case for every frame in the folders `request.objects`, sorted by path. Raises ConfigError: no frame."""
     found = sorted(path.parent for folder in request.objects for path in Path(folder).glob("*/depth_mm.png"))
     if not found:
         folders = ", ".join(request.objects) or "any folder"
-        raise ConfigError(f"objects: no */depth_mm.png in {folders}; give --objects DIR, as in docs/clouds.md")
+        raise ConfigError(f"objects: no */depth_mm.png in {folders}; give --objects DIR (docs/clouds.md)")
     count, hand = request.count or 8, request.hand or "allegro_right"
     return tuple(Frame(str(folder), _content(folder), count, request.preset(), hand) for folder in found)
 
 
 def run_frame(case: Frame) -> Record:
-    """Plan at the view axis. If object and reference have an IoU of at most 0.5, plan at the reference's centre."""
+    """Plan for the object at the view axis, or if its IoU is at most 0.5, at the median of the reference cloud."""
     cloud, reference = read_frame(Path(case.folder))
     hand = load_hand(case.hand)
     target, found = None, {}
@@ -92,13 +92,13 @@ def run_frame(case: Frame) -> Record:
 
 
 def read_frame(folder: Path) -> tuple[PointCloud, np.ndarray]:
-    """Return the cloud of a frame's depth image, and the reference cloud of its object. Camera frame [m]."""
+    """Return the cloud of a frame's depth image, and the reference cloud of its object [m], both in camera frame."""
     view = load_depth_view(folder / "depth_mm.png", folder / "camera.json")
     return view, np.loadtxt(folder / "object_cloud.xyz")
 
 
 def overlap(found: np.ndarray, reference: np.ndarray) -> float:
-    """Return the intersection over union of the 5 mm voxels that two clouds [m] occupy."""
+    """Return the intersection over union (IoU) of the 5 mm voxels that two clouds [m] occupy."""
     a, b = ({tuple(c) for c in np.floor(points / CUBE).astype(int)} for points in (found, reference))
     return len(a & b) / max(len(a | b), 1)
 

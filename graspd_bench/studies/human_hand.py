@@ -2,9 +2,9 @@
 
     graspd bench mano --hand MANO_RIGHT.pkl
 
-The user provides the MANO model (https://mano.is.tue.mpg.de, never shipped). Grasps are planned with rigid flesh and
-with flesh that yields by 1 mm. All go through the hold trial. As in the paper, the two best ranked grasps per object
-are measured. Area and volume are those of the skinned mesh (docs/metrics.md). The trials use convex hulls.
+The user provides the MANO model (https://mano.is.tue.mpg.de), because graspd does not ship it. Grasps are planned with
+rigid flesh and with flesh that yields by 1 mm. All grasps go through the hold trial, in which convex hulls form the
+hand. As in the paper, the two best ranked grasps per object are measured, on the skinned mesh (docs/metrics.md).
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ from graspd_dataset.run_records import markdown_table, object_name
 # Distances within which skin counts as touching [m]: ours, and two that other projects use.
 CONTACT_DISTANCES = (0.002, 0.005, 0.010)
 VOXEL = 0.001
-# About 1 mm between samples on an adult's hand.
+# Number of points sampled on the skin, about 1 mm apart on an adult's hand, and their random seed.
 _SAMPLES, _SEED = 40_000, 7
 
 
@@ -45,8 +45,8 @@ class SkinMetrics:
     """Metrics of a skinned hand mesh on an object.
 
     Attributes:
-        contact_area: area of skin within each of `CONTACT_DISTANCES` of the object's surface, inside or outside [m²].
-        intersection_volume: volume that is inside both meshes, in voxels of 1 mm [m³].
+        contact_area: area of the skin that is near the object's surface [m²], one for each of `CONTACT_DISTANCES`.
+        intersection_volume: volume inside both meshes, counted in voxels of 1 mm [m³].
         penetration: greatest depth of the skin in the object [m].
     """
 
@@ -56,7 +56,7 @@ class SkinMetrics:
 
 
 def measure_skin(query: DistanceQuery, skin: TriangleMesh) -> SkinMetrics:
-    """Measure a closed skin mesh on an object. `query` is the `make_distance_query` of the object. Object frame [m]."""
+    """Measure how a closed skin mesh touches an object, in the object frame [m]. `query` is of the object's mesh."""
     points, _ = surface_samples(skin, _SAMPLES, _SEED)
     distance = signed_distance(query, points, reach=2 * CONTACT_DISTANCES[-1])
     corners = skin.vertices[skin.faces]
@@ -92,7 +92,7 @@ BEST = 2
 # Turpin et al. 2022, table 1, MANO: mean over 57 ShapeNet objects, two best grasps each. The values are contact area
 # [cm²], intersection volume [cm³], their ratio [1/cm] and displacement [cm].
 PAPER = {"Grasp'D": (43.0, 5.70, 7.55, 0.59), "ObMan / GraspIt!": (9.4, 1.28, 7.37, 1.95)}
-# How far flesh yields in planning [m]: not at all, as in the paper, and less than a finger pad does.
+# Depths by which flesh yields in planning [m]: 0 as in the paper, and 1 mm, which is less than a finger pad yields.
 SOFTNESS = (0.0, 0.001)
 # Default preset and seeds.
 _PRESET, _SEEDS = "contact_rich", (0, 1, 2)
@@ -110,7 +110,7 @@ _HEADINGS = [
 
 @dataclass(frozen=True)
 class HumanGrasps(ObjectCase):
-    """Grasps of an object with a MANO model file. `content` is its hash, `softness` how far flesh yields [m]."""
+    """Grasps of an object with a MANO file. `content` is the file's hash. The flesh yields by `softness` [m]."""
 
     content: str = ""
     softness: float = 0.0
@@ -127,7 +127,7 @@ def mano_cases(request: Request) -> tuple[HumanGrasps, ...]:
     """Return a case for each object, seed and softness. Raises ConfigError: the hand is not a file."""
     model = Path(request.hand)
     if not model.is_file():
-        raise ConfigError(f"hand: {request.hand or 'none given'}; valid: MANO_RIGHT.pkl or MANO_LEFT.pkl, as a path")
+        raise ConfigError(f"hand: {request.hand or 'none given'}; valid: the path of MANO_RIGHT.pkl or MANO_LEFT.pkl")
     content = hashlib.sha256(model.read_bytes()).hexdigest()
     request = replace(request, presets=request.presets or (_PRESET,), seeds=request.seeds or _SEEDS)
     cases = object_cases(request, SHAPES, 8)
@@ -135,7 +135,7 @@ def mano_cases(request: Request) -> tuple[HumanGrasps, ...]:
 
 
 def run_mano(case: HumanGrasps) -> Record:
-    """Plan on one object, try every grasp, and measure the best grasps."""
+    """Plan on one object, run the hold trial of every grasp, and measure the two best ranked grasps."""
     config = case.config
     mano = load_mano(Path(case.hand), [], candidates=config.problem.fine_candidates)
     scene = load_scene(case.object, mass=PROTOCOL_MASS, resolution=config.resolution)
@@ -160,7 +160,7 @@ def run_mano(case: HumanGrasps) -> Record:
 
 
 def mano_sections(records: Sequence[Record], chart: Path | None) -> Sections:
-    """Return a table with rows for the objects, their mean, and the results of the paper."""
+    """Return a table: for each softness the objects and their mean, then the published results of the paper."""
     body = []
     for softness in dict.fromkeys(r["softness"] for r in records):
         alike = [r for r in records if r["softness"] == softness]
@@ -173,7 +173,7 @@ def mano_sections(records: Sequence[Record], chart: Path | None) -> Sections:
 
 
 def _row(name: str, softness: float, records: Sequence[Record]) -> list[str]:
-    """Return a row of means over cases. The cells are empty if no grasp was measured."""
+    """Return a table row with means over the measured grasps. Its cells are empty if no grasp was measured."""
     name = f"{name}, {1e3 * softness:g} mm" if softness else f"{name}, rigid"
     held = f"{sum(r['held'] for r in records)}/{sum(r['count'] for r in records)}"
     if not any(r["contact_area_cm2"] for r in records):

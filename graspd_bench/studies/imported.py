@@ -2,8 +2,8 @@
 
     graspd bench --import FOLDER --hand NAME
 
-The study ignores whether a file marks a grasp as failed. Grasps that the import refuses, and grasps that our planner
-does not find, count as failed. Shares refer to all imported grasps of an object, or to the first `--count` of them.
+Grasps that the import refuses, such as those that their file marks as failed, count as failed. So do grasps that our
+planner does not find. Shares refer to all imported grasps of an object, or to the first `--count` of them.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ from graspd_dataset.run_records import markdown_table, object_name
 
 # Sources of grasps, in the order of the table.
 SOURCES = {"imported": "imported", "ranked": "graspd, as ranked", "planned": "graspd, verified"}
-# Headings of trials that a grasp passes or fails. Heading, key and digits of trials that give a figure.
+# `_PASSED`: headings of trials with a verdict. `_FIGURES`: heading, key and digits of trials that measure a number.
 _PASSED = {"standard": "holds", "hard": "holds hard", "bullet": "holds in PyBullet"}
 _FIGURES = {
     "noisy": ("noisy", "share", 2),
@@ -47,9 +47,9 @@ class ImportedCase(ObjectCase):
     """A case of `count` imported grasps of one object.
 
     Attributes:
-        scale: factor on the object's coordinates.
+        scale: factor by which the object's coordinates are multiplied.
         files: paths of the grasp files.
-        mesh: mesh file that replaces the one named in the files. Empty if not given.
+        mesh: mesh file to use instead of the mesh that the grasp files name. Empty to use theirs.
         order: joint names in the order of npy files.
         trials: names of the trials.
         content: hash of the grasp files.
@@ -75,11 +75,11 @@ class ImportedCase(ObjectCase):
 
 
 def imported_cases(request: Request) -> tuple[ImportedCase, ...]:
-    """Return a case for each object and seed. Raises GraspdError: no folder or hand was given, or a malformed file."""
+    """Return a case for each object and seed. Raises GraspdError: folder or hand is missing, or a file is malformed."""
     if not request.imported or not request.hand:
         raise ConfigError("imported: give both --import FOLDER and --hand NAME")
     if len(request.objects) > 1:
-        raise ConfigError(f"objects: {', '.join(request.objects)}; valid: one mesh, which replaces that of the files")
+        raise ConfigError(f"objects: {', '.join(request.objects)}; valid: one mesh, which replaces the files' mesh")
     if unknown := [name for name in request.trials if name not in TRIALS]:
         raise ConfigError(f"trials: {unknown[0]!r}; valid: {', '.join(TRIALS)}")
     hand, mesh = load_hand(request.hand, candidates=1), "".join(request.objects)
@@ -127,7 +127,7 @@ def _theirs(case: ImportedCase, hand: HandModel) -> tuple[ImportedGrasp, ...]:
 
 
 def tried(scene: Scene, hand: HandModel, grasps: Sequence[Grasp], trials: Sequence[str]) -> list[dict[str, Any]]:
-    """Return for every grasp its metrics, and the results of each trial by name."""
+    """Run the trials of every grasp. Return for each grasp its metrics, and the results of each trial by name."""
     context, parts = make_metrics_context(scene.object, hand), object_parts(scene.object)
     results: list[dict[str, Any]] = [{"metrics": dict(measure(context, grasp.grasp))} for grasp in grasps]
     for name in trials if grasps else ():
@@ -138,7 +138,7 @@ def tried(scene: Scene, hand: HandModel, grasps: Sequence[Grasp], trials: Sequen
 
 
 def imported_sections(records: Sequence[Record], chart: Path | None) -> Sections:
-    """Return a table with a row for every object and source, and for all objects together."""
+    """Return a table with a row for every object and source of grasps, and rows for all objects together."""
     trials = [name for name in TRIALS if any(name in record["trials"] for record in records)]
     metrics = [row for row in METRICS.values() if row.measure is not None]
     headings = ["object", "grasps of", "tried", *(_PASSED[name] for name in trials if name in _PASSED)]
@@ -152,7 +152,7 @@ def imported_sections(records: Sequence[Record], chart: Path | None) -> Sections
         for why, count in record["refused"].items():
             whys[why] = whys.get(why, 0) + count
     refused = "; ".join(f"{count} refused: {why}" for why, count in whys.items())
-    note = "Shares are of all grasps of an object, also of those that were refused or not found; others are medians."
+    note = "Shares are of all grasps of an object, also refused grasps and those not found. Other numbers are medians."
     warnings = [f"{_name(record['object'])}: {record['frame_doubt']}." for record in records if _doubted(record)]
     return {"imported": [markdown_table(headings, body), " ".join(filter(None, (note, refused, *warnings)))]}
 

@@ -1,6 +1,6 @@
-"""Study `robust`: verified grasps ranked by score and ranked by the noisy trial, and the cost of the ranking.
+"""Study `robust`: verified grasps ranked by score, the same grasps ranked by noisy trials, and the cost of both.
 
-Both rankings are evaluated by noisy trials with other errors and pulls of 2 s.
+Further noisy trials evaluate both rankings. Their pose errors are used by no plan, and their pulls last 2 s.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ from graspd_core.verify.hold_trial import noisy_share, pose_errors
 from graspd_core.verify.world import PROTOCOLS, at_friction, build_world
 from graspd_dataset.run_records import markdown_table, object_name
 
-# Shapes for which some grasps fail if the hand is displaced by 5 mm and 5°.
+# Shapes for which some grasps fail if the hand is displaced by up to 5 mm and 5°.
 SHAPES = ("shape:box", "shape:plate", "shape:torus", "shape:bottle", "shape:l_block", "shape:hammer")
 # Number of evaluation trials per grasp, and the seed of their errors, which no plan uses.
 EVALUATIONS, EVALUATION_SEED = 16, 977
@@ -37,9 +37,9 @@ def robust_cases(request: Request) -> tuple[ObjectCase, ...]:
 
 
 def run_robust(case: ObjectCase) -> Record:
-    """Plan with and without ranking. Return both CPU times and the figures of each verified grasp.
+    """Plan with and without ranking by noisy trials. Return both CPU times, and three numbers for each verified grasp.
 
-    These are its score, the share of ranking trials that it holds, and the share of further trials that it holds.
+    The numbers are its score, and the shares of the ranking trials and of the evaluation trials that it passes.
     """
     config = case.config
     ranked = replace(config, robust=replace(config.robust, rank=True))
@@ -59,7 +59,7 @@ def run_robust(case: ObjectCase) -> Record:
         "shape": object_name(case.object),
         "plan_cpu_s": between - began,
         "ranked_plan_cpu_s": ended - between,
-        # These lists are in the order of the score, in which the plan without ranking returns the grasps.
+        # The plan without ranking returns grasps in the order of the score. These lists have the same order.
         "score": [g.score for g in verified],
         "ranked_by": [shares[g.score] for g in verified],
         "shares": [noisy_share(world, g, protocol, errors) for g in verified],
@@ -67,7 +67,7 @@ def run_robust(case: ObjectCase) -> Record:
 
 
 def robust_sections(records: Sequence[Record], chart: Path | None) -> Sections:
-    """Return the chart, a table of costs and gains by shape, and the rank correlations."""
+    """Return the chart, a table of planning times and shares held by shape, and the rank correlations."""
     rows = [record for record in records if record["shares"]]
     if not rows:
         return {}
@@ -91,9 +91,9 @@ def robust_sections(records: Sequence[Record], chart: Path | None) -> Sections:
 def orders(
     rows: Sequence[Record],
 ) -> tuple[Float[np.ndarray, "places"], Float[np.ndarray, "places"], Float[np.ndarray, "places"]]:
-    """Return the mean share held at each rank in three orders: by score, by the noisy trial, and by the share itself.
+    """Return the mean share held at each rank in three orders: by score, by noisy trials, and the best possible order.
 
-    There are as many ranks as the shortest plan has grasps. Grasps with equal keys keep the order of the score.
+    There are as many ranks as the shortest plan has grasps. Grasps with equal noisy shares keep the order of the score.
     """
     places = min(len(row["shares"]) for row in rows)
     held = [np.array(row["shares"]) for row in rows]
@@ -104,7 +104,7 @@ def orders(
 
 
 def correlation(rows: Sequence[Record], key: str) -> float:
-    """Return Spearman's correlation of the score `key` and the share held, mean over plans where both vary, or NaN."""
+    """Return Spearman's correlation of `key` and the share held, mean over plans in which both vary, or NaN if none."""
     from scipy.stats import rankdata
 
     found = [
@@ -116,7 +116,7 @@ def correlation(rows: Sequence[Record], key: str) -> float:
 
 
 def draw_robust(rows: Sequence[Record], path: Path) -> Path:
-    """Draw the share held by rank (left), and CPU seconds by shape (right). Return the PNG's path."""
+    """Draw the share held over the rank (left), and planning CPU time by shape (right). Return the PNG's path."""
     with figure(8.0, 3.0, ncols=2) as (made, (gain, cost)):
         by_score, by_noise, best = (100.0 * order for order in orders(rows))
         places = np.arange(1, len(best) + 1)

@@ -37,16 +37,16 @@ from graspd_core.verify.world import PROTOCOLS, build_world
 from graspd_dataset.run_records import markdown_table, object_name
 
 SHAPES = ("sphere", "box", "cylinder", "capsule", "torus", "mug", "bowl", "bottle", "l_block", "hammer")
-# Numbers of cameras. 0 plans on the true mesh.
+# Numbers of cameras. 0 means that grasps are planned on the true mesh.
 VIEWS = (0, 1, 3, 15)
-# Elevations of the camera by seed [deg]: of a camera beside the robot, and of a wrist camera, which looks from above.
+# Elevations [deg] of a camera beside the robot, and of a wrist camera, which looks from above. The seed chooses one.
 ELEVATIONS, ABOVE = (40.0, 50.0, 30.0), (75.0, 88.0, 60.0)
 YAW = 0.3
 # Gap between the object and each neighbour [m].
 CLEAR = 0.04
-# A true point counts as found within this distance of the reconstruction [m]. Number of sampled surface points.
+# A point of the true surface counts as found within `FOUND` [m] of the reconstruction. Number of sampled points.
 FOUND, SAMPLES = 0.005, 20_000
-# Names of the rows by number of views and sight: alone, with neighbours, or seen from above.
+# Values of `Seen.sight`: alone, with neighbours, seen from above. `NAMES` has row names by number of views and sight.
 PLAIN, CROWDED, FROM_ABOVE = "plain", "crowded", "from above"
 NAMES = {
     (1, PLAIN): "1 view", (1, CROWDED): "1 view, crowded", (1, FROM_ABOVE): "1 view, from above", (3, PLAIN): "3 views",
@@ -63,8 +63,8 @@ _HEADINGS = [
 class Seen(ObjectCase):
     """Grasps of an object seen by `views` cameras, or of the true mesh if `views` is 0.
 
-    The seed sets the noise, the planner, and the place of the first camera. If `sight` is `CROWDED`, two neighbours
-    hide a part of the object.
+    The seed sets the noise, the plan, and the place of the first camera. If `sight` is `CROWDED`, two neighbours stand
+    beside the object. If it is `FROM_ABOVE`, the camera is higher.
     """
 
     views: int = 1
@@ -72,7 +72,7 @@ class Seen(ObjectCase):
 
 
 def seen_cases(request: Request) -> tuple[Seen, ...]:
-    """Return cases of every object with every number of views and sight. There are two seeds by default."""
+    """Return cases of each object: all numbers of `VIEWS`, one view crowded, one from above. Default: two seeds."""
     request = request if request.seeds else replace(request, seeds=(0,) if request.quick else (0, 1))
     cases = object_cases(request, [f"shape:{name}" for name in SHAPES], 4)
     seen = [(views, PLAIN) for views in VIEWS[: 2 if request.quick else None]] + [(1, CROWDED), (1, FROM_ABOVE)]
@@ -85,12 +85,12 @@ def seen_seconds(case: Seen) -> float:
 
 
 def run_seen(case: Seen) -> Record:
-    """Run a case. If no scene can be built, the record holds the message as `refused`."""
+    """Reconstruct, plan and try grasps. If no scene can be built, the record holds the error message as `refused`."""
     hand = load_hand(case.hand, candidates=case.config.problem.fine_candidates)
     stage = _stage(case)
     clouds = views_of(stage, CAMERA, camera_poses(case), DEFAULT, 1000 * case.seed) if case.views else []
     _load_libraries()
-    # Without this, the next case of the full mesh would find it in the cache.
+    # The SDF grid of a full mesh must not come from the cache, where an earlier case may have stored the grid.
     disk_cache.forget()
     began = time.perf_counter()
     try:
@@ -108,7 +108,7 @@ def run_seen(case: Seen) -> Record:
 
 
 def _stage(case: Seen) -> TabletopScene:
-    """Return the object on a table. A crowded scene has two neighbours `CLEAR` away, one on the camera's side."""
+    """Return the object on a table. A crowded scene has one neighbour at its +x side and one at its -y side."""
     thing = case.object.removeprefix("shape:") if case.object.startswith("shape:") else load_mesh(case.object)
     alone = tabletop(thing, yaw=YAW)
     if case.sight != CROWDED:
@@ -119,7 +119,7 @@ def _stage(case: Seen) -> TabletopScene:
 
 
 def camera_poses(case: Seen) -> tuple[np.ndarray, ...]:
-    """Return `T_world_camera` of one or three cameras on a ring, or of fifteen on two rings."""
+    """Return `T_world_camera` of up to three cameras on one ring, or of fifteen cameras on two rings."""
     azimuth = np.deg2rad(20.0 + 120.0 * case.seed)
     places = ABOVE if case.sight == FROM_ABOVE else ELEVATIONS
     elevation = np.deg2rad(places[case.seed % len(places)])
@@ -142,7 +142,7 @@ def _true_scene(stage: TabletopScene, source: str) -> Scene:
 
 
 def _grasps(case: Seen, scene: Scene, stage: TabletopScene, hand: HandModel) -> Record:
-    """Plan one grasp and time it, then plan `count` grasps. Try all verified grasps on the true object."""
+    """Time a plan for one grasp, then plan `count` grasps. Try verified and uncertain grasps on the true object."""
     first = plan_grasps(scene, hand, count=1, seed=case.seed, preset=case.preset)
     many = plan_grasps(scene, hand, count=case.count, seed=case.seed, preset=case.preset)
     protocol, truth = PROTOCOLS["standard"], _true_scene(stage, case.object)
@@ -197,7 +197,7 @@ def reconstruction_error(scene: Scene, stage: TabletopScene) -> dict[str, Any]:
 
 
 def rgbd_sections(records: Sequence[Record], chart: Path | None) -> Sections:
-    """Return a table by number of views and sight, a table by object, and the calibration of the probability."""
+    """Return a table by number of views and sight, a table by object, and the calibration of the stated probability."""
     rows = {row: own for row in NAMES if (own := [r for r in records if (r["views"], r["sight"]) == row])}
     full = _share(rows[0, PLAIN], "first_held") if (0, PLAIN) in rows else 0.0
     body = [[NAMES[views], *_row(own, full)] for views, own in rows.items()]
@@ -247,7 +247,7 @@ def _marks(own: Sequence[Record]) -> str:
 
 
 def calibration(stated: Sequence[tuple[float, bool]], where: str = "") -> list[str]:
-    """Return Brier score and share held per tenth of probability. `where` describes the pairs (probability, held)."""
+    """Return the Brier score, and a table of the share held per tenth of probability. `stated`: (probability, held)."""
     if not stated:
         return []
     body = []
@@ -258,7 +258,7 @@ def calibration(stated: Sequence[tuple[float, bool]], where: str = "") -> list[s
             body.append([f"{10 * tenth} to {10 * tenth + 10}%", f"{mean:.0%}", f"{held:.0%} of {len(some)}"])
     brier = float(np.mean([(probability - hold) ** 2 for probability, hold in stated]))
     return [
-        f"Stated probability{where and f', {where}'} against what held on the truth, less sure grasps among them; "
-        f"Brier score {brier:.3f}:",
+        f"Stated probability{where and f', {where}'}, and the share that held on the true object, "
+        f"unverified grasps included. Brier score {brier:.3f}:",
         markdown_table(["stated", "mean", "held"], body),
     ]

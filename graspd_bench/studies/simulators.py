@@ -1,7 +1,7 @@
 """Study `simulators`: hold and displacement trials of the same grasps in MuJoCo and in PyBullet. Do they agree?
 
-The study uses the first grasps of the optimiser's own ranking. No trial filters them. Each is tried a second time with
-the hand displaced by up to 5 mm and 5°, as in the noisy trial. So some grasps fail.
+The study uses the first grasps of the optimiser's own ranking. No trial filters them. Each grasp is also tried with the
+hand displaced by up to 5 mm along each axis and 5°, so that some grasps fail.
 """
 
 from __future__ import annotations
@@ -29,16 +29,16 @@ PULL = 0.5
 def simulator_cases(request: Request) -> tuple[ObjectCase, ...]:
     """Return a case for each shape and seed. Raises ConfigError: PyBullet is not installed."""
     if not bullet_available():
-        raise ConfigError("simulators: PyBullet is not installed; pip install -e '.[bench]', on Python 3.11")
+        raise ConfigError("simulators: PyBullet is not installed; run pip install -e '.[bench]' on Python 3.11")
     return object_cases(request, all_shapes(), 4, 1)
 
 
 def run_simulators(case: ObjectCase) -> Record:
-    """Run the trials of one object's grasps in both simulators."""
+    """Run hold and displacement trials of an object's grasps in both simulators, as planned and displaced."""
     hand, scene = case.load()
     first = raw_grasps(scene, hand, case.config, case.count, case.seed)
     parts, standard = object_parts(scene.object), PROTOCOLS["standard"]
-    # The PyBullet trial accepts all postures, so the MuJoCo trial must, too. Only the physics are compared.
+    # PyBullet's trial does not check penetration of the grasp, nor self-penetration. So MuJoCo's trial must not either.
     standard = replace(standard, max_grasp_penetration=np.inf, max_self_penetration=np.inf)
     short = replace(standard, hold_time=PULL)
     world = build_world(hand, scene.object, parts, standard)
@@ -60,7 +60,7 @@ def run_simulators(case: ObjectCase) -> Record:
 
 
 def simulator_sections(records: Sequence[Record], chart: Path | None) -> Sections:
-    """Return a table of the verdicts, every disagreement with both reasons, and the mean displacements."""
+    """Return a table of verdicts, each disagreement with both results, and mean displacements of both simulators."""
     rows = [(r["object"], trial) for r in records for trial in r["trials"]]
     if not rows:
         return {}
@@ -81,7 +81,7 @@ def simulator_sections(records: Sequence[Record], chart: Path | None) -> Section
         if t["mujoco"]["passed"] != t["bullet"]["passed"]
     ]
     pairs = np.array([[t["sd_bullet"], t["sd_mujoco"]] for _, t in rows]) * 100
-    line = f"**{agreed:.1%}** of {len(rows)} have the same verdict; for {same}, MuJoCo's equals that of full pulls."
+    line = f"**{agreed:.1%}** of {len(rows)} verdicts agree. With full pulls {same} of MuJoCo's verdicts stay the same."
     moved = (
         f"Displacement trial: mean {pairs[:, 0].mean():.2f} cm in PyBullet, {pairs[:, 1].mean():.2f} cm in MuJoCo, "
         f"median {np.median(pairs[:, 0]):.2f} and {np.median(pairs[:, 1]):.2f} cm; within 5 mm of each other on "

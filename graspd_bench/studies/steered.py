@@ -1,7 +1,7 @@
-"""Study `steered`: the same request with and without a steering constraint. Do grasps obey it, and what does it cost?
+"""Study `steered`: requests with and without a steering constraint. Do grasps obey, and what does the constraint cost?
 
 Constraints are drawn at random from the case's seed, object and hand. Some cannot be met, such as an approach cone
-from a side where the object is too wide for the hand. Postures and contacts show here whether grasps obey.
+from a side where the object is too wide for the hand. Obedience is computed here from postures and contacts.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ from graspd_dataset.run_records import markdown_table, object_name
 SHAPES = ("box", "bottle", "mug", "hammer", "torus", "plate", "cylinder", "l_block", "bowl", "capsule")
 HANDS = ("allegro_right", "leap_right", "barrett_like", "parallel_gripper")
 WISHES = ("cone", "cone and roll", "region", "cone and region", "avoid")
-# Ranges of the cones' half-angle [rad] and of a region's share of the object's length. Least breadth of a region [m].
+# Ranges of a cone's half-angle [rad] and of a region's share of the object's length. Least length of this share [m].
 _ANGLES, _SHARES, _BREADTH = (0.35, 0.8), (0.4, 0.7), 0.05
 _ROLL_TOLERANCE = 0.35
 # Share of the object's length in a box to avoid, and how far the box extends beyond the object [m].
@@ -37,13 +37,13 @@ _END, _BEYOND = 0.25, 0.03
 
 @dataclass(frozen=True)
 class SteeredCase(ObjectCase):
-    """A plan with a steering constraint of the kind `wish` (one of `WISHES`), and a plan without it."""
+    """Two plans of the same request: one with a steering constraint of kind `wish` (one of `WISHES`), one without."""
 
     wish: str = "cone"
 
 
 def steered_cases(request: Request) -> tuple[SteeredCase, ...]:
-    """Return a case for each object, hand, kind of constraint and seed."""
+    """Return a case for each object, hand, kind of constraint (`WISHES`) and seed."""
     things = find_objects(request.objects or tuple(f"shape:{s}" for s in SHAPES[: 1 if request.quick else None]))
     hands = (request.hand,) if request.hand else HANDS[: 1 if request.quick else None]
     count, preset = request.count or (2 if request.quick else 4), request.preset()
@@ -57,7 +57,7 @@ def steered_cases(request: Request) -> tuple[SteeredCase, ...]:
 
 
 def drawn_constraint(case: SteeredCase, scene: Scene) -> Steering:
-    """Draw the steering constraint of a case. It depends only on seed, object, hand and kind."""
+    """Draw the steering constraint of a case. The constraint depends only on seed, object, hand and kind."""
     rng = np.random.default_rng([case.seed, zlib.crc32(f"{case.object} {case.hand} {case.wish}".encode())])
     direction, angle = rng.normal(size=3), float(rng.uniform(*_ANGLES))
     vertices = scene.object.mesh.vertices
@@ -75,7 +75,7 @@ def drawn_constraint(case: SteeredCase, scene: Scene) -> Steering:
 def _end_of(vertices: Float[np.ndarray, "n 3"], rng: np.random.Generator, share: float, beyond: float) -> Box:
     """Draw a box around one end of the object, along a random axis.
 
-    The end is `share` of the object's length on this axis. The box extends `beyond` [m] further on every side.
+    The end is `share` of the object's length on this axis. The box extends `beyond` [m] further, but not inwards.
     """
     low, high = vertices.min(0), vertices.max(0)
     axis, side = int(rng.integers(3)), int(rng.integers(2))
@@ -89,7 +89,7 @@ def _end_of(vertices: Float[np.ndarray, "n 3"], rng: np.random.Generator, share:
 
 
 def run_steered(case: SteeredCase) -> Record:
-    """Plan with and without the constraint. Return costs, numbers of verified grasps, and the greatest violations."""
+    """Plan with and without the constraint. Return CPU times, counts of verified grasps, and greatest violations."""
     hand, scene = case.load()
     object_parts(scene.object)
     steering = drawn_constraint(case, scene)
@@ -121,7 +121,7 @@ def _timed(case: SteeredCase, scene: Scene, hand: HandModel, restrictions: Seque
 
 
 def beyond_cone(hand: HandModel, grasp: Grasp, goal: Steering) -> float:
-    """Return the angle by which a grasp's approach direction is outside the cone [rad]. Negative if inside."""
+    """Return by which angle a grasp's approach is outside the cone [rad]. Negative if inside, or if no cone is set."""
     if goal.approach_direction is None:
         return -np.pi
     w, x, y, z = grasp.grasp.quaternion_wxyz
@@ -130,7 +130,7 @@ def beyond_cone(hand: HandModel, grasp: Grasp, goal: Steering) -> float:
 
 
 def beyond_region(grasp: Grasp, goal: Steering) -> float:
-    """Return how far the farthest contact is outside the region [m]. Negative if all are inside."""
+    """Return how far the farthest contact is outside the region [m]. Negative if all are inside or no region is set."""
     if not isinstance(goal.region, Box):
         return -1.0
     beyond = (
@@ -144,7 +144,7 @@ def _in_boxes(hand: HandModel, grasp: Grasp, goal: Steering) -> bool:
 
 
 def steered_sections(records: Sequence[Record], chart: Path | None) -> Sections:
-    """Return a table of success and cost by kind of constraint."""
+    """Return a table with a row for each kind of constraint: success and CPU time with and without it, violations."""
     headings = ["constraint", "requests", "with a verified grasp", "without it", "grasps of those asked for"]
     headings += [
         "without it",

@@ -1,6 +1,6 @@
 """Study `throughput`: verified grasps per second of wall time for a known object, on one and on two threads.
 
-Cases that run at the same time share the cores, so the results are valid only with `--processes 1` on an idle machine.
+Cases that run at the same time share the cores. So the results are valid only with `--processes 1` on an idle machine.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from graspd_core.types import Verdict
 from graspd_dataset.run_records import markdown_table, object_name
 
 THREADS = (1, 2)
-# Grasps of a first plan with another seed. It fills the caches with the object's SDF grid, convex parts and worlds.
+# Grasps of a first plan with another seed. This plan caches the object's SDF grid, convex parts and worlds.
 _WARM_UP = 2
 
 
@@ -32,14 +32,14 @@ class Throughput(ObjectCase):
 
 
 def throughput_cases(request: Request) -> tuple[Throughput, ...]:
-    """Return cases of every shape with three seeds, each on one and on two threads."""
+    """Return cases of every shape with three seeds (by default), each on one and on two threads."""
     request = request if request.seeds or request.quick else replace(request, seeds=(0, 1, 2))
     cases = object_cases(request, [f"shape:{name}" for name in SHAPES], 64)
     return tuple(Throughput(**vars(case), threads=threads) for case in cases for threads in THREADS)
 
 
 def run_throughput(case: Throughput) -> Record:
-    """Plan once without metrics. Return the numbers of grasps, and the wall and CPU time [s]."""
+    """Time a plan without metrics, with caches filled. Return counts of grasps, and the wall and CPU time [s]."""
     hand, scene = case.load()
     before = torch.get_num_threads()
     torch.set_num_threads(case.threads)
@@ -55,7 +55,7 @@ def run_throughput(case: Throughput) -> Record:
 
 
 def throughput_sections(records: Sequence[Record], chart: Path | None) -> Sections:
-    """Return a table of verified grasps per second, and CPU time per grasp, by object and number of threads."""
+    """Return a table of verified grasps per second, and CPU time for each, by object and number of threads."""
     rows = [record for record in records if record["verified"]]
     if not rows:
         return {}
@@ -70,7 +70,7 @@ def throughput_sections(records: Sequence[Record], chart: Path | None) -> Sectio
 
 
 def _figures(rows: Sequence[Record]) -> list[float]:
-    """Return grasps tried per verified grasp, then verified grasps per s and CPU ms per grasp for each thread count."""
+    """Return the ratio of tried to verified grasps. Then per thread count: verified grasps per s, CPU ms for each."""
     found = [sum(row["tried"] for row in rows) / sum(row["verified"] for row in rows)]
     for threads in THREADS:
         here = [row for row in rows if row["threads"] == threads]

@@ -1,1 +1,1 @@
-"""Robot arms: their reach with a hand, their paths, and their collisions (docs/arms.md)."""
+"""Load robot arms, and plan their paths to grasps without collisions (docs/arms.md)."""

@@ -1,10 +1,10 @@
 """Load arms by name, or from an arm description: a YAML file beside a URDF (docs/arms.md).
 
-An arm is a chain of links from its base to the tip link that carries the hand. graspd's URDF reader reads it. Forward
-kinematics and Jacobians come from pytorch-kinematics, which is imported when an arm is used.
+An arm is a chain of links from its base to the tip link that carries the hand. graspd's URDF reader reads the chain.
+Forward kinematics and Jacobians come from pytorch-kinematics, which is imported when an arm is used.
 
-Collision shapes become capsules: all points within a radius of a segment. Spheres and capsules do not change. Any other
-shape is replaced by a larger enclosing capsule. Distances between capsules and to a plane are exact.
+Each collision shape becomes a capsule: all points within a radius of a segment. Spheres and capsules do not change. Any
+other shape is replaced by a larger enclosing capsule. Distances from a capsule to a capsule or to a plane are exact.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ from graspd_core.se3 import SE3, rotation_from_quaternion
 if TYPE_CHECKING:
     from pytorch_kinematics.chain import Chain
 
-# A segment with a smaller squared length is a point [m²].
+# A segment with a squared length up to this counts as a point [m²].
 _POINT = 1e-12
 
 
@@ -54,7 +54,7 @@ class Capsules:
 
 
 def capsules_about(primitives: Sequence[Primitive]) -> Capsules:
-    """Return an enclosing capsule of each primitive. Spheres and capsules are exact."""
+    """Return an enclosing capsule of each primitive. Spheres and capsules are not enlarged."""
     rows = [_about(primitive) for primitive in primitives]
     turned = [
         [primitive.rotation @ point + primitive.translation for point in row[:2]]
@@ -79,14 +79,14 @@ def _about(primitive: Primitive) -> tuple[Float[np.ndarray, "3"], Float[np.ndarr
 
 
 def _about_points(corners: Float[np.ndarray, "n 3"]) -> tuple[Float[np.ndarray, "3"], Float[np.ndarray, "3"], float]:
-    """Return the end points and the radius of a capsule around points. Its axis is the direction of greatest spread."""
+    """Return end points and radius of a capsule around points. The capsule lies along the direction of most spread."""
     center = 0.5 * (corners.min(0) + corners.max(0))
     local = corners - center
     axis = np.linalg.svd(local, full_matrices=False)[2][0]
     along = local @ axis
     away = np.linalg.norm(local - np.outer(along, axis), axis=1)
     radius = float(away.max())
-    # The capsule is as short as possible: its round caps enclose points beyond the end of the segment by `slack`.
+    # Make the capsule as short as possible: a point may lie beyond the end of the segment by `slack`.
     slack = np.sqrt(np.maximum(radius**2 - away**2, 0.0))
     low, high = float((along + slack).min()), float((along - slack).max())
     if low > high:
@@ -112,15 +112,15 @@ def segment_distance(
 ) -> Float[Tensor, "*batch"]:
     """Return the distance [m] between the segments from a to b and from c to d.
 
-    A segment may be a point. Source: C. Ericson, Real-Time Collision Detection, 5.1.9. The nearest points of the lines
-    are clamped to the segments.
+    A segment may be a point. The nearest points of the two lines are clamped to the segments. Source: C. Ericson,
+    Real-Time Collision Detection, 5.1.9.
     """
     along, other, between = b - a, d - c, a - c
     aa, ee = (along * along).sum(-1), (other * other).sum(-1)
     f, cc, bb = (other * between).sum(-1), (along * between).sum(-1), (along * other).sum(-1)
     safe_a, safe_e = aa.clamp_min(_POINT), ee.clamp_min(_POINT)
     denominator = aa * ee - bb * bb
-    # For parallel segments any start value of s is correct.
+    # If the segments are parallel, any value of s gives the correct distance, so begin with s = 0.
     apart = denominator > 1e-9 * aa * ee
     s = torch.where(apart, (bb * f - cc * ee) / torch.where(apart, denominator, 1.0), 0.0).clamp(0.0, 1.0)
     t = torch.where(ee > _POINT, ((bb * s + f) / safe_e), 0.0).clamp(0.0, 1.0)
@@ -130,16 +130,16 @@ def segment_distance(
 
 @dataclass(frozen=True, eq=False)
 class Arm:
-    """A loaded arm, hashed by identity. Joints are those between base and tip, starting at the base.
+    """A loaded arm, hashed by identity. Its joints lie between base and tip. Their order starts at the base.
 
     Attributes:
         name: name of the arm.
         chain: links and joints of the arm. Link 0 is the base, whose frame is the arm's base frame.
         tip: index of the link that carries the hand.
-        lower, upper: joint limits of the URDF or narrower ones [rad] or [m].
-        seed: collision-free joint values, near which the solutions stay if possible [rad] or [m].
+        lower, upper: joint limits of the URDF, or narrower limits of the arm description [rad] or [m].
+        seed: collision-free joint values [rad] or [m]. The planner prefers arm postures near the seed.
         capsules: capsules that enclose the collision shapes of the links.
-        mounts: poses of hands on the tip, by hand name. Other hands use the mount of their own description.
+        mounts: poses of hands on the tip, by hand name. A hand that is not listed uses the mount of its description.
     """
 
     name: str
@@ -178,7 +178,7 @@ def tip_hand(arm: Arm, hand: HandModel) -> SE3:
 # Arms are hashed by identity.
 @lru_cache(maxsize=8)
 def kinematic_chain(arm: Arm) -> Chain:
-    """Build the pytorch-kinematics chain of all links of an arm in float64. The library's URDF reader uses float32."""
+    """Build an arm's pytorch-kinematics chain in float64. The library's own URDF reader would round to float32."""
     from pytorch_kinematics.chain import Chain
     from pytorch_kinematics.frame import Frame, Joint, Link
     from pytorch_kinematics.transforms import Transform3d
@@ -202,7 +202,7 @@ def kinematic_chain(arm: Arm) -> Chain:
 
 
 def arm_links(arm: Arm, q: Float[Tensor, "batch joints"]) -> SE3:
-    """Return `T_base_link` of every link at joint values q [rad] or [m]. The shape is batch by links."""
+    """Return `T_base_link` of every link at joint values `q` [rad] or [m]. The batch shape is (batch, links)."""
     chain = kinematic_chain(arm)
     poses = chain.forward_kinematics_tensor(q.double())[chain.get_frame_indices(*arm.chain.link_names)]
     poses = poses.transpose(0, 1).to(q)
@@ -225,13 +225,13 @@ class ArmFile:
     """The keys of an arm description.
 
     Attributes:
-        urdf: path of the URDF, relative to the description's folder. `robot_description` means the URDF that the caller
-            passes. The URDF may contain more than the arm.
+        urdf: path of the URDF, relative to the description's folder. For `robot_description`, the caller passes the
+            URDF's text. The URDF may contain more than the arm.
         tip: name of the link that carries the hand.
         base: name of the first link of the arm. Empty for the root of the URDF.
         name: name of the arm. Empty for the stem of the file name.
-        seed: joint values by joint name [rad] or [m]. The default is the middle of the limits.
-        limits: narrower limits by joint name: lower and upper [rad] or [m].
+        seed: joint values of `Arm.seed` by joint name [rad] or [m]. The default is the middle of the limits.
+        limits: lower and upper limit by joint name [rad] or [m], within the limits of the URDF.
         mounts: pose on the tip (`_MountEntry`) by hand name. Other hands use the mount of their own description.
     """
 
@@ -265,13 +265,13 @@ def load_arm(name_or_path: str | Path, robot_description: str = "") -> Arm:
     if not from_robot_description(entries):
         return _make_arm(entries, urdf, read_xml(urdf), str(path))
     if not robot_description:
-        hint = "known only to a node with the parameter arm; elsewhere, give the path of a URDF"
+        hint = "known only to a node with the parameter arm; without a node, give the path of a URDF"
         raise ConfigError(f"{path}.urdf: {ROBOT_DESCRIPTION} is {hint}")
     return _make_arm(entries, urdf, parse_xml(urdf, robot_description), str(path))
 
 
 def from_robot_description(entries: ArmFile) -> bool:
-    """Return True if the URDF is the robot description that the caller passes."""
+    """Return True if the caller must pass the text of the URDF, as `robot_description`."""
     return entries.urdf == ROBOT_DESCRIPTION
 
 
@@ -316,7 +316,7 @@ def _make_arm(entries: ArmFile, urdf: Path, root: ET.Element, where: str) -> Arm
 
 
 def _keep_chain(root: ET.Element, base: str, tip: str, where: str) -> None:
-    """Keep only the chain from base to tip, and the links fixed to the chain before the tip."""
+    """Keep only the chain from base to tip, and links that are fixed to a chain link before the tip."""
     links = [str(link.get("name")) for link in root.findall("link")]
     for key, link in (("tip", tip), ("base", base)):
         if link and link not in links:
@@ -342,7 +342,7 @@ def _keep_chain(root: ET.Element, base: str, tip: str, where: str) -> None:
 def _limits(
     chain: HandModel, narrower: Mapping[str, Any], where: str
 ) -> tuple[Float[np.ndarray, "joints"], Float[np.ndarray, "joints"]]:
-    """Return the URDF's joint limits, with the narrower limits of the description."""
+    """Return lower and upper joint limits: the description's limits if given, else the URDF's limits."""
     lower, upper = chain.lower.copy(), chain.upper.copy()
     for joint, given in _by_joint(chain, narrower, f"{where}.limits").items():
         index = chain.joint_names.index(joint)

@@ -1,8 +1,8 @@
 """Check collisions of an arm's capsules with the support, the object, obstacles, the hand, and each other.
 
 The support is a plane. Object and obstacles are signed distance fields, sampled along the segment of each capsule. The
-samples are balls that cover the capsule, larger by less than an eighth. The base is checked against the arm only.
-The first moving link is not checked against the support, because it only turns above the support.
+samples are balls that cover the capsule. Their radii exceed the capsule's radius by less than an eighth. The base is
+checked only against the arm. The first moving link is not checked against the support, above which it only turns.
 """
 
 from __future__ import annotations
@@ -28,8 +28,8 @@ class Hits:
     """Collision depths of an arm.
 
     Attributes:
-        depth: depth of each possible collision [m]. Negative without collision.
-        what: description of each collision, such as "forearm in the table".
+        depth: depth of each possible collision at each arm posture [m]. Negative without collision.
+        what: description of each possible collision, such as "forearm in the table".
     """
 
     depth: Float[Tensor, "batch things"]
@@ -45,7 +45,7 @@ def hits_of_scene(arm: Arm, scene: Scene, base: SE3, links: SE3) -> Hits:
     """Return the collision depths of the arm in the support, the object and the obstacles.
 
     Args:
-        base: a single pose `T_scene_base`.
+        base: pose `T_scene_base` of the arm's base, without batch dimensions.
         links: link poses from `arm_links`.
     """
     solids = [("the object", scene.sdf), *(("an obstacle", obstacle.sdf) for obstacle in scene.obstacles)]
@@ -63,7 +63,7 @@ def hits_of_scene(arm: Arm, scene: Scene, base: SE3, links: SE3) -> Hits:
 def hits_of_support(
     arm: Arm, scene: Scene, base: SE3, ends: tuple[Float[Tensor, "batch n 3"], Float[Tensor, "batch n 3"]]
 ) -> Hits:
-    """Return the depths of capsules in the support. Empty without support. `ends` are segment ends, base frame [m]."""
+    """Return the depths of the arm's capsules in the support, if any. `ends`: both segment ends, base frame [m]."""
     start, end = ends
     if scene.support is None:
         return Hits(start.new_zeros(len(start), 0), ())
@@ -90,7 +90,7 @@ def _worst_of_each(
 
 
 def hits_of_self(arm: Arm, links: SE3) -> Hits:
-    """Return the collision depths between arm links, without neighbours and pairs that touch in the seed posture."""
+    """Return the collision depths of pairs of arm links. Neighbours and links that touch at the seed are left out."""
     start, end, radius = placed(arm.capsules, links)
     first, second = _pairs(arm)
     distance = segment_distance(start[:, first], end[:, first], start[:, second], end[:, second])
@@ -101,10 +101,10 @@ def hits_of_self(arm: Arm, links: SE3) -> Hits:
 
 
 def hits_of_hand(arm: Arm, hand: HandModel, links: SE3, joints: Float[Tensor, "batch hand_joints"]) -> Hits:
-    """Return the collision depths of arm and hand, without pairs that touch in the seed posture."""
+    """Return the collision depths of arm and hand at the hand's `joints`. Links that touch at the seed do not count."""
     own_start, own_end, own_radius = placed(arm.capsules, links)
     start, end, radius = _hand_capsules(arm, hand, links, joints)
-    # Links outside a bounding ball of the hand cannot collide with it.
+    # Arm links outside a bounding ball of the hand cannot collide with the hand.
     center = 0.5 * (start + end).mean(1, keepdim=True)
     ball = torch.maximum((start - center).norm(dim=-1), (end - center).norm(dim=-1)).add(radius).amax(1, keepdim=True)
     near = segment_distance(own_start, own_end, center, center) < own_radius + ball
@@ -132,7 +132,7 @@ def _capsules_of_hand(hand: HandModel) -> Capsules:
 
 @lru_cache(maxsize=8)
 def _pairs(arm: Arm) -> tuple[Int[np.ndarray, "pairs"], Int[np.ndarray, "pairs"]]:
-    """Return the pairs of capsules to check: no neighbours, and no pairs that touch in the seed posture."""
+    """Return the pairs of capsules to check. Neighbouring links and pairs that touch at the seed are left out."""
     group = arm.chain.link_group[arm.capsules.link]
     parent = arm.chain.link_parent[group]
     above = np.where(parent < 0, -1, arm.chain.link_group[parent])
@@ -160,7 +160,7 @@ def _seed_links(arm: Arm) -> SE3:
 
 @lru_cache(maxsize=8)
 def _samples(arm: Arm) -> tuple[Float[Tensor, "points columns"], Float[Tensor, "points"], Int[np.ndarray, "points"]]:
-    """Return sample points of all segments as a `placement` matrix, their padded radii [m], and their capsules."""
+    """Return samples of all segments: points as a matrix for `place_points`, padded radii [m], and capsule indices."""
     points, radii, owner = [], [], []
     for k in range(len(arm.capsules.link)):
         start, end, radius = arm.capsules.start[k], arm.capsules.end[k], arm.capsules.radius[k]

@@ -1,8 +1,8 @@
 """Compute arm paths through grasps: joint values at every waypoint of the hand, or the reason why there is no path.
 
-The hand passes retreat, pregrasp, grasp and lift in closely spaced poses. For each grasp, inverse kinematics finds
-several arm postures from spread starts, so that elbow and wrist vary. All waypoints are solved from each posture. The
-result is the path nearest to the seed posture that keeps the joint limits, has no jump, and is collision-free.
+The hand passes retreat, pregrasp, grasp and lift, with closely spaced waypoints. For each grasp, inverse kinematics
+starts from several arm postures, so that elbow and wrist vary. From each posture found at the grasp, all waypoints are
+solved. The result is the valid path nearest to the arm's seed posture: within limits, without jump or collision.
 """
 
 from __future__ import annotations
@@ -26,17 +26,17 @@ from graspd_core.types import ArmPath, Grasp, Posture
 
 # Height of the lift after the grasp [m].
 LIFT = 0.1
-# Steps from retreat to pregrasp, pregrasp to grasp, grasp to lift: about 2 cm each.
+# Number of steps from retreat to pregrasp, from pregrasp to grasp, and from grasp to lift. A step is about 2 cm.
 STEPS = (5, 2, 5)
 # Indices of the waypoints retreat, pregrasp, grasp and lift.
 STAGE_ROWS = (0, STEPS[0], STEPS[0] + STEPS[1], sum(STEPS))
-# Weights of the four stages (columns) at each waypoint (rows), for linear interpolation between neighbouring stages.
+# `_ALONG`: position of each waypoint, in stages from 0 to 3. `_SHARES`: weights of the stages (columns) at waypoints.
 _ALONG = np.concatenate([[0.0], *(k + np.arange(1, steps + 1) / steps for k, steps in enumerate(STEPS))])
 _SHARES = np.maximum(1.0 - np.abs(_ALONG[:, None] - np.arange(len(STAGE_ROWS))), 0.0)
 
 
 def hand_paths(grasps: Sequence[Grasp], approach: Float[np.ndarray, "3"], up: Float[np.ndarray, "3"]) -> SE3:
-    """Return `T_scene_hand` along the path of each grasp. The shape is grasps by waypoints.
+    """Return `T_scene_hand` at the waypoints of each grasp. The batch shape is (grasps, waypoints).
 
     Args:
         grasps: the grasps. From pregrasp to grasp, the hand moves on a straight line, with the shortest rotation.
@@ -45,7 +45,7 @@ def hand_paths(grasps: Sequence[Grasp], approach: Float[np.ndarray, "3"], up: Fl
     """
     before, there = (_stacked([getattr(grasp, stage) for grasp in grasps]) for stage in ("pregrasp", "grasp"))
     begun = drawn_back(before[0], rotation_from_quaternion(before[1]), torch.as_tensor(approach))
-    # Both signs of a quaternion give the same rotation. The nearer sign is used, for the shortest rotation.
+    # Both signs of a quaternion give the same rotation. The sign nearer to the pregrasp gives the shortest path.
     sign = torch.where((before[1] * there[1]).sum(-1, keepdim=True) < 0, -1.0, 1.0)
     raised = there[0] + LIFT * torch.as_tensor(up)
     corners = torch.stack([begun, before[0], there[0], raised], 1)
@@ -62,14 +62,14 @@ def _stacked(postures: Sequence[Posture]) -> tuple[Float[Tensor, "n 3"], Float[T
     return position, quaternion
 
 
-# Greatest valid motion of a joint between two waypoints [rad].
+# Greatest valid motion of a joint between two waypoints [rad] or [m].
 LARGEST_JUMP = 0.2
-# For each grasp: number of starts, and number of postures whose path is solved. Solver steps for both.
+# Per grasp: number of starts, and of arm postures whose path is solved. Below: solver steps per posture, and per path.
 _STARTS, _FOLLOWED = 8, 2
 _STEPS, _PATH_STEPS = 8, 5
-# Postures count as equal if all joint values differ by less than this [rad].
+# Arm postures count as equal if all joint values differ by less than this [rad] or [m].
 _SAME = 0.1
-# Grasps per batch.
+# Number of grasps that are solved at once.
 _AT_ONCE = 64
 
 
@@ -78,10 +78,9 @@ class ArmTask:
     """An arm with a hand in a scene.
 
     Attributes:
-        arm, hand, scene: arm, hand and scene of the task.
-        base: a single pose `T_scene_base` of the arm's base.
-        usable: True for entries of the arm's start table that do not collide with the support.
-        bounds: `reach_bounds` of the usable entries [m].
+        base: pose `T_scene_base` of the arm's base, without batch dimensions.
+        usable: True for each posture of `start_table` that does not collide with the support.
+        bounds: least and greatest distance of each tip point from the shoulder at usable postures [m] (`reach_bounds`).
     """
 
     arm: Arm
@@ -93,12 +92,12 @@ class ArmTask:
 
     @property
     def up(self) -> Float[np.ndarray, "3"]:
-        """Direction of the lift, scene frame: the support normal, or the z axis of the arm's base without support."""
+        """Direction of the lift, scene frame: the support's normal. Without a support, the z axis of the arm's base."""
         return self.base.rotation[:, 2].numpy() if self.scene.support is None else self.scene.support.normal
 
 
 def make_task(arm: Arm, hand: HandModel, scene: Scene, base: SE3) -> ArmTask:
-    """Build the task. The entries of the start table are checked for collision with the support."""
+    """Build the task. Find the postures of the start table that do not collide with the support."""
     table = start_table(arm)
     hits = hits_of_support(arm, scene, base, (table.start, table.end))
     usable = (hits.depth <= 0).all(-1)
@@ -116,7 +115,7 @@ def tip_poses(task: ArmTask, hand_poses: SE3) -> SE3:
 
 @torch.no_grad()
 def arm_paths(task: ArmTask, grasps: Sequence[Grasp]) -> list[ArmPath | str]:
-    """Return the arm path through each grasp, or the reason why there is none, such as "beyond joint_4's limit"."""
+    """Return the arm path through each grasp. If there is none, return the reason, e.g. "beyond joint_4's limit"."""
     found: list[ArmPath | str] = []
     for first in range(0, len(grasps), _AT_ONCE):
         found += _some_paths(task, grasps[first : first + _AT_ONCE])
@@ -137,7 +136,7 @@ def _some_paths(task: ArmTask, grasps: Sequence[Grasp]) -> list[ArmPath | str]:
 
 
 def _best_of_each(followed: _Followed, owner: Int[Tensor, "postures"], count: int) -> list[int]:
-    """Return the row of each grasp's first posture with a valid path, else of its first posture. -1 for no posture."""
+    """Return the row of each grasp's first valid path. Without one, return its first row, or -1 if it has no row."""
     best = [-1] * count
     for row in reversed(range(len(owner))):
         grasp, good = int(owner[row]), followed.good(row)
@@ -147,7 +146,7 @@ def _best_of_each(followed: _Followed, owner: Int[Tensor, "postures"], count: in
 
 
 def _why_lost(task: ArmTask, paths: SE3, followed: _Followed, best: Sequence[int]) -> dict[int, str]:
-    """Return why grasps have no path, by the index of the grasp."""
+    """Return by grasp index why a grasp has no path. `best`: row of each grasp in `followed`, or -1."""
     reasons: dict[int, str] = {}
     unreached: list[tuple[int, int, Tensor]] = []
     for grasp, row in enumerate(best):
@@ -168,9 +167,9 @@ def _why_lost(task: ArmTask, paths: SE3, followed: _Followed, best: Sequence[int
 
 
 def _postures(task: ArmTask, target: SE3) -> tuple[Float[Tensor, "postures joints"], Int[Tensor, "postures"]]:
-    """Return distinct joint values that reach the targets, nearest to the seed first, and the target index of each.
+    """Return distinct arm postures that reach the targets, and the index of the target of each posture.
 
-    For each target, postures without collision with the support come first. Other collisions are checked later.
+    Postures clear of the support come first, of these the nearest to the seed. Other collisions are checked later.
     """
     arm, table = task.arm, start_table(task.arm)
     starts = nearest_postures(table, target, _STARTS, task.usable)
@@ -184,7 +183,7 @@ def _postures(task: ArmTask, target: SE3) -> tuple[Float[Tensor, "postures joint
     away = (q - torch.as_tensor(arm.seed)).square().sum(-1)
     order = (owner * 1e6 + (hits.depth > 0).any(-1) * 1e5 + away).argsort()
     q, owner = q[order], owner[order]
-    # For each grasp, keep the first `_FOLLOWED` postures that differ from all before them.
+    # For each grasp, keep the first `_FOLLOWED` postures that differ from all earlier postures.
     alike = (owner[:, None] == owner) & ((q[:, None] - q).abs().amax(-1) < _SAME)
     kept = torch.nonzero(~alike.tril(-1).any(1)).flatten()
     place = torch.arange(len(kept)) - torch.searchsorted(owner[kept].contiguous(), owner[kept].contiguous())
@@ -193,7 +192,7 @@ def _postures(task: ArmTask, target: SE3) -> tuple[Float[Tensor, "postures joint
 
 
 def _nearest_turn(arm: Arm, q: Float[Tensor, "batch joints"]) -> Float[Tensor, "batch joints"]:
-    """Add full turns to revolute joints, so that they are as near as possible to the seed within their limits."""
+    """Add full turns to revolute joints, so that each joint is as near to the seed as its limits allow."""
     turns = ((torch.as_tensor(arm.seed) - q) / (2 * np.pi)).round() * (2 * np.pi)
     turned = torch.where(torch.as_tensor(arm.chain.slides), q, q + turns)
     inside = (turned >= torch.as_tensor(arm.lower)) & (turned <= torch.as_tensor(arm.upper))
@@ -205,9 +204,9 @@ class _Followed:
     """Paths, each solved from an arm posture at its grasp.
 
     Attributes:
-        path: joint values at every waypoint.
-        lost: for each path, the unreached waypoint nearest to the grasp. -1 if all are reached.
-        hit: for each path, a phrase about its jump or deepest collision. Empty if there is none.
+        path: joint values at every waypoint [rad] or [m].
+        lost: for each path, the unreached waypoint that is nearest to the grasp. -1 if all waypoints are reached.
+        hit: for each path, a phrase about its jump or deepest collision. Empty without jump and collision.
     """
 
     path: Float[Tensor, "postures way joints"]
@@ -215,14 +214,14 @@ class _Followed:
     hit: list[str]
 
     def good(self, row: int) -> bool:
-        """Return True if a path is valid."""
+        """Return True if the path in `row` reaches all waypoints without jump and collision."""
         return self.lost[row] < 0 and not self.hit[row]
 
 
 def _followed(
     task: ArmTask, paths: SE3, q: Float[Tensor, "postures joints"], joints: Float[Tensor, "postures hand_joints"]
 ) -> _Followed:
-    """Solve each path from the arm posture at its grasp. `joints` are the hand's joint values at the pregrasp."""
+    """Solve each path from the arm posture `q` at its grasp. `joints`: the hand's joint values at the pregrasp."""
     count, length = paths.translation.shape[:2]
     if not count:
         return _Followed(q.new_zeros(0, length, q.shape[1]), [], [])
@@ -243,7 +242,7 @@ def _followed(
 def _hits_on_path(
     task: ArmTask, path: Float[Tensor, "postures way joints"], joints: Float[Tensor, "postures hand_joints"]
 ) -> Hits:
-    """Return the deepest collisions on each path: with the scene at all waypoints, with arm and hand only at stages."""
+    """Return how deep each path collides: with the scene at any waypoint, with arm or hand at any of four stages."""
     count = len(path)
     scene = hits_of_scene(task.arm, task.scene, task.base, arm_links(task.arm, path.flatten(0, 1)))
     links = arm_links(task.arm, path[:, list(STAGE_ROWS)].flatten(0, 1))

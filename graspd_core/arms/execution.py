@@ -2,7 +2,7 @@
 
 The trajectory has gates, at which all joints are at rest. An executor sends the rows up to a gate, checks that the gate
 is reached, and sends the next rows. Between two gates the joints follow the grasp's path with a cubic time law from
-rest to rest. Its greatest speed is 1.5 times the mean speed.
+rest to rest. The greatest speed is 1.5 times the mean speed.
 """
 
 from __future__ import annotations
@@ -21,13 +21,13 @@ from graspd_core.hands.kinematics import RETREAT
 from graspd_core.hands.model import HandModel
 from graspd_core.types import Grasp
 
-# Gates in their order. Before the first, the arm is at rest at the retreat.
+# Gates in their order. The trajectory begins at the retreat, before the first gate.
 GATES = ("pregrasp", "closed", "squeezed", "lifted")
-# For a cubic from rest to rest: greatest speed / mean speed, and greatest acceleration / (travel / time²).
+# A cubic from rest to rest has these ratios: greatest speed / mean speed, greatest acceleration / (travel / time²).
 PEAK_SPEED, PEAK_ACCELERATION = 1.5, 6.0
-# Number of rows of the squeeze.
+# Number of trajectory rows of the squeeze.
 _SQUEEZE_ROWS = 4
-# Number of times at which the speed of a stage is evaluated.
+# Number of points in time at which the speed of a stage is checked.
 _SAMPLES = 200
 _GRAVITY = 9.81
 
@@ -38,10 +38,10 @@ class ExecutionPace:
 
     Attributes:
         finger_speed: greatest speed of the hand's revolute joints [rad/s].
-        base_speed: greatest speed of the hand in approach and lift, and of its prismatic joints [m/s].
-        closing_speed: greatest speed of the hand from the pregrasp to the grasp [m/s].
-        shortest: least time of a stage [s].
-        payload_share: share of the grasp's payload that the object's weight and acceleration may use.
+        base_speed: greatest speed of the hand's base in approach and lift, and of prismatic hand joints [m/s].
+        closing_speed: greatest speed of the hand's base from the pregrasp to the grasp [m/s].
+        shortest: least duration of a stage [s].
+        payload_share: fraction of the grasp's payload that may carry and accelerate the object.
         gentlest, strongest: least and greatest acceleration of the lift [m/s²].
     """
 
@@ -65,13 +65,13 @@ class Execution:
 
     Attributes:
         arm_joints, hand_joints: joint names in column order, without coupled joints.
-        times: time of each row from the start [s]. The first is zero.
+        times: time of each row from the start [s]. The first time is zero.
         arm: joint values of the arm at each row [rad] or [m].
         arm_speed: joint speeds of the arm at each row [rad/s] or [m/s].
         hand: joint targets of the hand at each row [rad] or [m].
         hand_speed: joint speeds of the hand at each row [rad/s] or [m/s].
         efforts: joint efforts of the hand at each row [N·m] or [N]. Zero before the squeeze.
-        gates: row index of each of `GATES`.
+        gates: row index of each gate, in the order of `GATES`.
     """
 
     arm_joints: tuple[str, ...]
@@ -85,7 +85,7 @@ class Execution:
     gates: tuple[int, ...]
 
     def rows_to(self, gate: str) -> slice:
-        """Return the rows from the previous gate to this gate, both included."""
+        """Return the rows from the previous gate to `gate`, including the rows of both gates."""
         place = GATES.index(gate)
         return slice(self.gates[place - 1] if place else 0, self.gates[place] + 1)
 
@@ -101,11 +101,11 @@ def execution_of(
     """Return the timed trajectory of a grasp with an arm path.
 
     Args:
-        grasp: grasp with `Grasp.arm`.
+        grasp: grasp with an arm path (`Grasp.arm`).
         hand: hand of the grasp.
         arm_speeds: greatest speed of each arm joint [rad/s] or [m/s].
-        mass: mass of the object [kg]. If None, the lift has the acceleration `pace.gentlest`.
-        pace: other speed limits.
+        mass: mass of the object [kg]. If it is None, the lift has the acceleration `pace.gentlest`.
+        pace: limits of speed and acceleration. None for the defaults.
 
     Raises:
         ConfigError: the grasp has no arm path.
@@ -144,7 +144,7 @@ def execution_of(
 
 
 def lift_time(grasp: Grasp, mass: float | None, pace: ExecutionPace) -> float:
-    """Return the duration of the lift [s]. The more the grasp's payload exceeds `mass` [kg], the shorter it is."""
+    """Return the duration of the lift [s]. A greater ratio of the grasp's payload to `mass` [kg] shortens the lift."""
     payload = (grasp.metrics or {}).get("payload")
     spare = 0.0 if not payload or not mass else _GRAVITY * (pace.payload_share * payload / mass - 1.0)
     return math.sqrt(PEAK_ACCELERATION * LIFT / min(max(spare, pace.gentlest), pace.strongest))
@@ -153,7 +153,7 @@ def lift_time(grasp: Grasp, mass: float | None, pace: ExecutionPace) -> float:
 def squeeze_efforts(
     grasp: Grasp, hand: HandModel, settings: GraspStagesConfig | None = None
 ) -> Float[np.ndarray, "joints"]:
-    """Return the joint efforts [N·m] or [N] of the squeeze targets if the joints stay at the grasp, within limits."""
+    """Return efforts of joints that stay at the grasp but are driven to the squeeze [N·m] or [N], within limits."""
     settings = settings or GraspStagesConfig()
     gain = np.where(hand.slides, settings.slide_stiffness, settings.stiffness)
     return np.clip(gain * (grasp.squeeze.joint_positions - grasp.grasp.joint_positions), -hand.effort, hand.effort)
@@ -166,9 +166,9 @@ def _both(arm: np.ndarray, hand: np.ndarray) -> np.ndarray:
 def _from_rest_to_rest(
     rows: np.ndarray, limits: np.ndarray, least: float, shortest: float
 ) -> tuple[Float[np.ndarray, "rows"], Float[np.ndarray, "rows joints"]]:
-    """Return times [s] and joint speeds of evenly spaced `rows`, within speed `limits` and least durations [s]."""
+    """Return times [s] and speeds of evenly spaced `rows` within `limits`. Take at least `least` and `shortest` [s]."""
     share = np.linspace(0.0, 1.0, len(rows))
-    # The cubic covers the share 3t² − 2t³ at time t. This is solved for t.
+    # At time t from 0 to 1, the cubic covers the fraction 3t² − 2t³ of the path. Solve for t.
     time = 0.5 - np.sin(np.arcsin(1.0 - 2.0 * share) / 3.0)
     speed = np.gradient(rows, share, axis=0) * (6.0 * time * (1.0 - time))[:, None]
     # A controller's cubic may be faster between the rows than at the rows.

@@ -2,14 +2,13 @@
 
 Tip pose and Jacobian come from pytorch-kinematics. The damping is proportional to the squared error (T. Sugihara,
 Solvability-unconcerned inverse kinematics by the Levenberg-Marquardt method, IEEE T-RO 2011). If a step would move a
-joint beyond its limit, the step is computed without this joint. This solver is five times faster than the library's,
-because its starts are near and it drops poses that are reached (docs/arms.md).
+joint beyond its limit, the step is computed without this joint. This solver is five times faster than that of
+pytorch-kinematics, because it starts near the solution and skips reached poses (docs/arms.md).
 
-The starts are the postures of a table with the nearest tip poses. The table also bounds the distances of the tip, and
-of points fixed to it, from the shoulder. A pose beyond these bounds counts as out of reach. For hands around objects at
-0.3 to 0.95 m, the bounds of graspd's two arms keep 99.3 and 99.7 % of the reachable poses, and 18 and 4 % of others.
-
-If no posture is found, `why_unreached` names the joint whose limit prevents it, or says that the pose is out of reach.
+The starts come from a table of postures: the postures with the nearest tip poses. The table also bounds how far the tip
+and points fixed to it can be from the shoulder. A pose beyond these bounds counts as out of reach. For hands around
+objects at 0.3 to 0.95 m, the bounds of graspd's two arms accept 99.3 and 99.7 % of reachable poses. They accept 18 and
+4 % of unreachable poses. If no posture is found, `why_unreached` says which joint limit is the reason, if any.
 """
 
 from __future__ import annotations
@@ -42,16 +41,16 @@ def tip_chain(arm: Arm, dtype: torch.dtype = torch.float32) -> SerialChain:
     return SerialChain(kinematic_chain(arm), tip, dtype=torch.float64).to(dtype=dtype)
 
 
-# A pose counts as reached within these tolerances [m], [rad].
+# A pose counts as reached if position [m] and rotation [rad] are within these tolerances.
 POSITION_TOLERANCE, ROTATION_TOLERANCE = 1e-4, 1e-3
-# Length that counts as much as one radian [m].
+# In the solver's error, one radian counts as much as this length [m].
 RADIAN = 0.3
 _WEIGHTS = [1.0, 1.0, 1.0, RADIAN, RADIAN, RADIAN]
-# Damping relative to the squared error, and least damping [m²].
+# The damping is `_DAMPING` times the squared error plus `_LEAST_DAMPING` [m²].
 _DAMPING, _LEAST_DAMPING = 0.05, 1e-7
 # Greatest change of a joint in one step [rad].
 _LONGEST_STEP = 0.6
-# Indices of the rotation matrix entries whose differences give the axis, and a sine that may be a rounding error.
+# Rows and columns of the matrix entries whose differences give the rotation axis. A sine below `_TINY` is rounding.
 _ROWS, _COLUMNS, _TINY = [2, 0, 1], [1, 2, 0], 1e-7
 _HALF_TURN = (torch.pi, 0.0, 0.0)
 
@@ -80,13 +79,13 @@ def solve(
 ) -> tuple[Float[Tensor, "batch joints"], Bool[Tensor, "batch"]]:
     """Iterate from each start towards its target `T_base_tip`.
 
-    Return the joint values at the last step [rad] or [m], and whether the tip is within the tolerances of its target.
-    Rows that have reached their target are no longer computed. The solver uses float32. It is a hundred times finer
-    than the tolerances, and takes two thirds of the time of float64.
+    Return the joint values at the last step [rad] or [m], and whether each target is reached within tolerance. A start
+    that has reached its target is no longer computed. The solver uses float32, whose rounding is a hundred times below
+    the tolerances. This takes two thirds of the time of float64.
 
     Args:
         steps: greatest number of steps.
-        limited: keep joints within their limits.
+        limited: whether joints stay within their limits.
     """
     limits = [torch.as_tensor(limit).float() for limit in (arm.lower, arm.upper)]
     target, now, chain = SE3(target.rotation.float(), target.translation.float()), start.float(), tip_chain(arm)
@@ -108,7 +107,7 @@ def solve(
         now = now + _step(jacobian, wrong, now, limits if limited else None)
         now = now.clamp(*limits) if limited else now
     q = q.to(start)
-    # Rounding may exceed a limit.
+    # Conversion from float32 may exceed a limit by rounding.
     q = q.clamp(*map(torch.as_tensor, (arm.lower, arm.upper))) if limited else q
     return q, reached
 
@@ -119,7 +118,7 @@ def _step(
     q: Float[Tensor, "batch joints"],
     limits: Sequence[Tensor] | None,
 ) -> Float[Tensor, "batch joints"]:
-    """Return the step `Jᵀ (J Jᵀ + λ I)⁻¹ e` with J and e = `wrong` weighted, without joints that would leave limits."""
+    """Return the step `Jᵀ (J Jᵀ + λ I)⁻¹ e` with weighted J and e = `wrong`. Joints at a limit do not pass it."""
     weight = wrong.new_tensor(_WEIGHTS)
     jacobian, wrong = jacobian * weight[:, None], wrong * weight
     if limits is not None:
@@ -133,23 +132,23 @@ def _step(
     return change / (change.abs().amax(-1, keepdim=True) / _LONGEST_STEP).clamp_min(1.0)
 
 
-# Number of entries before entries with self-collision are dropped.
+# Number of postures drawn for the start table. Postures with self-collision are then dropped.
 _ENTRIES = 4000
-# Points fixed to the tip whose distances from the shoulder are compared, tip frame [m].
+# Points fixed to the tip whose distances from the shoulder are bounded, tip frame [m].
 _POINTS = [[0, 0, 0], [0, 0, -0.1], [0, 0, -0.2], [0.1, 0, -0.1], [-0.1, 0, -0.1], [0, 0.1, -0.1], [0, -0.1, -0.1]]
-# Length that counts as much as a change of 1 in an entry of the rotation matrix [m]. This is 0.28 m per radian.
+# In `tip_features`, a change of 1 in a rotation matrix entry counts as this length [m]. One radian counts as 0.28 m.
 _PER_ENTRY = 0.2
 
 
 @dataclass(frozen=True)
 class StartTable:
-    """A table of postures, to find the postures whose tip poses are near a given pose.
+    """A table of arm postures without self-collision, to find postures whose tip poses are near a given pose.
 
     Attributes:
-        q: joint values [rad] or [m].
-        features: position and scaled rotation of the tip, base frame [m].
+        q: joint values of each posture [rad] or [m].
+        features: position and scaled rotation matrix of the tip, base frame [m] (`tip_features`).
         shoulder: point of the first joint's axis that is nearest to the second joint, base frame [m].
-        away: distances of points fixed to the tip from the shoulder [m].
+        away: distances from the shoulder to seven points that are fixed to the tip [m].
         start, end: end points of the arm's capsules, base frame [m].
     """
 
@@ -164,7 +163,7 @@ class StartTable:
 # Arms are hashed by identity.
 @lru_cache(maxsize=8)
 def start_table(arm: Arm) -> StartTable:
-    """Return the start table of an arm. It is deterministic and cached."""
+    """Return the start table of an arm. The table is deterministic and cached."""
     q = random_postures(arm, _ENTRIES, torch.Generator().manual_seed(0))
     hits = hits_of_self(arm, arm_links(arm, q))
     q = q[(hits.depth <= 0).all(-1)] if hits.what else q
@@ -200,7 +199,7 @@ def tip_features(tip: SE3) -> Float[Tensor, "batch 12"]:
 def nearest_postures(
     table: StartTable, tip: SE3, count: int, usable: Bool[Tensor, "entries"] | None = None
 ) -> Float[Tensor, "batch count joints"]:
-    """Return the `count` postures nearest to each `T_base_tip`, nearest first. Usable ones only, if there are any."""
+    """Return the `count` nearest postures to each `T_base_tip`, nearest first, of `usable` entries (else of all)."""
     q, features = table.q, table.features
     if usable is not None and usable.any():
         q, features = q[usable], features[usable]
@@ -208,27 +207,27 @@ def nearest_postures(
 
 
 def reach_bounds(table: StartTable, usable: Bool[Tensor, "entries"]) -> Float[Tensor, "2 points"]:
-    """Return the least and the greatest distances of the tip's points from the shoulder in usable postures [m]."""
+    """Return the least and the greatest distance of each tip point from the shoulder [m]. NaN without usable entry."""
     away = table.away[usable] if usable.any() else table.away.new_full((1, len(_POINTS)), torch.nan)
     return torch.stack([away.amin(0), away.amax(0)])
 
 
 def within_reach(table: StartTable, bounds: Float[Tensor, "2 points"], tip: SE3) -> Bool[Tensor, "batch"]:
-    """Return True for each `T_base_tip` within the bounds. All are False if no posture is usable."""
+    """Return True for each `T_base_tip` within the bounds of `reach_bounds`. False for all if no posture is usable."""
     away = _away(tip, table.shoulder)
     return ((away >= bounds[0]) & (away <= bounds[1])).all(-1)
 
 
-# Number of starts of each pose, and number of solver steps.
+# Number of starts per pose in `why_unreached`, and number of solver steps.
 _STARTS, _STEPS = 3, 10
 _TOO_FAR, _NOWHERE = "farther than the arm reaches", "that no posture of the arm reaches"
 
 
 def why_unreached(arm: Arm, target: SE3, start: Float[Tensor, "batch joints"]) -> list[str]:
-    """Return why each pose `T_base_tip` is not reached. The reason is empty if a posture within the limits reaches it.
+    """Return why each pose `T_base_tip` is not reached. The reason is "" if a posture within the limits reaches it.
 
-    The poses are solved without limits, from `start` and from near postures. Of the solutions, the one that exceeds
-    the limits least is chosen. The reason names the joint that exceeds its limit most there.
+    The poses are solved without limits, from `start` and from near postures. Of all solutions, take the solution that
+    exceeds the limits least. The reason names the joint that exceeds its limit most in this solution.
     """
     if not len(start):
         return []

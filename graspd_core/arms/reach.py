@@ -30,11 +30,11 @@ from graspd_core.perception.scene import Scene
 from graspd_core.se3 import SE3, rotation_from_quaternion
 from graspd_core.types import Grasp, Posture
 
-# A base farther away than this is a mistake in the unit [m].
+# Greatest valid coordinate of the arm's base [m]. A larger coordinate is probably in another unit.
 _FARTHEST = 100.0
-# Greatest distance of a fingertip from the base link of a hand [m].
+# Upper bound of the distance of a fingertip from the hand's base link, for all hands [m].
 _HAND_LENGTH = 0.4
-# Number of hands around the object that explain why no start was found.
+# Number of hand poses around the object that are checked to explain why no start was found.
 _PROBES = 64
 
 
@@ -47,7 +47,7 @@ class Reach:
     Attributes:
         arm: arm from `load_arm`.
         position: origin of the arm's base in the object frame [m].
-        quaternion_wxyz: orientation of the arm's base in the object frame, a unit quaternion.
+        quaternion_wxyz: orientation of the arm's base in the object frame, as unit quaternion.
     """
 
     arm: Arm
@@ -55,7 +55,7 @@ class Reach:
     quaternion_wxyz: tuple[float, float, float, float] = (1.0, 0.0, 0.0, 0.0)
 
     def bind(self, scene: Scene, hand: HandModel) -> BoundReach:
-        """Bind the restriction, see `Restriction`. Raises ConfigError: invalid base pose, or hand without mount."""
+        """Bind the restriction to a scene and a hand. Raises ConfigError: invalid base pose, or hand without mount."""
         position, quaternion = (np.asarray(v, dtype=float) for v in (self.position, self.quaternion_wxyz))
         if position.shape != (3,) or not np.isfinite(position).all() or np.abs(position).max() > _FARTHEST:
             raise ConfigError(f"arm base: position {list(self.position)}; valid: three numbers up to {_FARTHEST:g} m")
@@ -69,7 +69,7 @@ class Reach:
 
 @dataclass(frozen=True, eq=False)
 class BoundReach(BoundRestriction):
-    """The reach of an arm in one scene with one hand."""
+    """A `Reach` bound to one hand in one scene."""
 
     task: ArmTask
 
@@ -80,7 +80,7 @@ class BoundReach(BoundRestriction):
 
     @property
     def impossible(self) -> str:
-        """The reason: every posture collides with the support, or the object is too far away. Empty otherwise."""
+        """Why no grasp can exist: all postures collide with the support, or the object is too far. "" otherwise."""
         task, support = self.task, self.task.scene.support
         if support is not None and not task.usable.any():
             table = start_table(task.arm)
@@ -102,7 +102,7 @@ class BoundReach(BoundRestriction):
         )
 
     def why_none(self, others: BoundRestrictions) -> str:
-        """Return a sentence that counts the reasons why the arm cannot reach hand poses around the object."""
+        """Return a sentence that counts why the arm cannot reach hand poses that `others` allow around the object."""
         task = self.task
         starts = draw_starts(task.scene, task.hand, _PROBES, 0, "cpu", torch.float64, restrictions=others)
         rows = zip(*(rows.numpy() for rows in (starts.translation, starts.quaternion, starts.joints)), strict=True)
@@ -113,7 +113,7 @@ class BoundReach(BoundRestriction):
         return f"of {len(paths)} hands around the object: {counts}" if counts else ""
 
     def starts(self, positions: Places, quaternions: Turns, joints: JointRows) -> Allowed:
-        """Return True for each initial pose that is within the arm's reach, also at its retreat and its lift."""
+        """Return for each initial pose whether pose, retreat and lift are all within the arm's reach."""
         task, at = self.task, torch.as_tensor(positions)
         rotation = rotation_from_quaternion(torch.as_tensor(quaternions))
         retreat = drawn_back(at, rotation, torch.as_tensor(task.hand.approach))

@@ -1,4 +1,4 @@
-"""The command line. Each command has its own module and imports heavy libraries only when it runs.
+"""Run the command line. Each command has its own module. Commands import heavy libraries only when they run.
 
 graspd_core provides synthesize, replay, reconstruct, library, hands, methods, presets, metrics, doctor and completion.
 Other packages add commands by entry points of the group `graspd.commands`: view, bench, dataset, import and cell.
@@ -20,14 +20,14 @@ from graspd_core.cli.output import add_output_options, output_of, print_error
 from graspd_core.cli.running import EXIT_BAD_INPUT, EXIT_INTERRUPTED, SIBLINGS, process_began
 from graspd_core.errors import ConfigError, GraspdError, choices
 
-# Number of new objects that starts a garbage collection. Python's default is 700. Collections at import free nothing
-# and take a tenth of the start-up time.
+# A garbage collection starts after this number of new objects. Python's default is 700. Collections during imports free
+# nothing and take a tenth of the start-up time.
 _YOUNG = 20_000
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run the command line. Return 0 for enough grasps, 3 for fewer, 2 for bad input, 130 if interrupted."""
-    # A call with arguments comes from a process that may have started long ago.
+    # With `arguments`, the caller is a process that may have started long ago.
     own_process = arguments is None
     began = process_began() if own_process else time.perf_counter()
     if own_process:
@@ -46,7 +46,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         return EXIT_INTERRUPTED
     finally:
         if own_process:
-            # Without this, the interpreter would collect garbage once more at exit.
+            # Without `freeze`, the interpreter would collect garbage once more at exit.
             gc.freeze()
 
 
@@ -54,7 +54,7 @@ class _Parser(argparse.ArgumentParser):
     """Argument parser that raises a one-line ConfigError instead of printing its usage."""
 
     def error(self, message: str) -> NoReturn:
-        # Unknown options are reported by the top parser, so search the options of all its commands.
+        # The top parser reports unknown options, so search the options of all its commands.
         if (words := message.removeprefix("unrecognized arguments: ")) != message and words.startswith("--"):
             known = [option for below in runnable(self) for option in below._option_string_actions]
             if near := difflib.get_close_matches(words.split()[0].split("=")[0], known, 1):
@@ -101,7 +101,7 @@ _SUMMARIES = {
 
 
 def _overview() -> argparse.ArgumentParser:
-    """Build the parser for `--help` and `--version`. It has only the names and summaries of the commands."""
+    """Build the parser for `--help` and `--version`. The parser knows only names and summaries of the commands."""
     parser = _parser()
     parser.add_argument("--version", action="version", version=f"graspd {version('graspd')}")
     commands = parser.add_subparsers(metavar="COMMAND", dest="command")
@@ -130,7 +130,7 @@ def build_parser(command: str = "") -> argparse.ArgumentParser:
 
 
 def runnable(parser: argparse.ArgumentParser) -> Iterator[argparse.ArgumentParser]:
-    """Yield the parser and its subparsers, as far as they run a command."""
+    """Yield the parser and its subparsers, but only those that run a command."""
     for action in parser._actions:
         for below in action.choices.values() if isinstance(action, argparse._SubParsersAction) else ():
             yield from runnable(below)

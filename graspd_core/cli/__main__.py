@@ -1,4 +1,4 @@
-"""Entry point of `python -m graspd_core.cli`."""
+"""Run the command line for `python -m graspd_core.cli`."""
 
 import sys
 

@@ -3,7 +3,7 @@
     source <(graspd completion bash)          # in ~/.bashrc
     graspd completion zsh > ~/.zfunc/_graspd  # a folder of zsh's fpath
 
-The script lists what is installed when it is printed. Completion itself does not run Python.
+The script lists the hands and presets that are installed when it is printed. Completion then runs without Python.
 """
 
 from __future__ import annotations

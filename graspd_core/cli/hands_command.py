@@ -97,7 +97,7 @@ def _document(hand: HandModel) -> dict[str, Any]:
 
 
 def as_text(hand: HandModel) -> str:
-    """Return a hand as text: link tree, joints, palm, number of self-collision pairs and warnings, in rad and m."""
+    """Return a hand as text in rad and m: link tree, joints, palm, number of self-collision pairs, and warnings."""
     couplings = {mimic.name: mimic for mimic in hand.mimics}
     lines = [
         f"{hand.name}: {hand.num_links} links, {hand.num_joints} actuated joints, {len(couplings)} coupled",

@@ -60,7 +60,7 @@ def _build(options: argparse.Namespace) -> int:
 
 
 def _add_object(options: argparse.Namespace, library: GraspLibrary, source: str, scale: float, *rest: Any) -> int:
-    """Plan the grasps that the library lacks of the object. Return the number that it has then.
+    """Plan the grasps that the library lacks for an object, and add them. Return the object's new number of grasps.
 
     `rest` holds hand, config, request and stop hook.
     """

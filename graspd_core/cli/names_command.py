@@ -47,7 +47,7 @@ def _metrics() -> dict[str, str]:
 
 
 def _first_sentence(text: str) -> str:
-    # A preset's file begins with a comment, perhaps of several lines.
+    # A preset's file begins with a comment, which may have several lines. Join these lines.
     return re.split(r"[.;](?: |$)", re.sub(r"\s*\n[#\s]*", " ", text))[0]
 
 

@@ -1,4 +1,4 @@
-"""Options that several commands share: planning, clouds from files or bags, restrictions. Also summaries of results."""
+"""Define options that several commands share: planning, clouds, bags and restrictions. Also summarise results."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ _FIRST = 3
 
 
 def add_plugin_option(parser: argparse._ActionsContainer) -> None:
-    """Add `--plugin`. The file runs while the options are parsed, so that other options may name its methods."""
+    """Add `--plugin`. The file runs while options are parsed, so that other options may name methods of the file."""
     parser.add_argument(
         "--plugin", type=load_plugin, action="append", metavar="FILE.py",
         help="run a file that registers methods, metrics or trials (repeatable)",
@@ -54,21 +54,21 @@ def add_planning_options(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument(
         "--mass", type=float, default=None, metavar="KG",
-        help="mass of the object; by default the most that an object of its volume may weigh",
+        help="mass of the object (default: the greatest mass that its volume allows)",
     )  # fmt: skip
     parser.add_argument("--friction", type=float, default=0.6, metavar="MU", help="friction coefficient (default 0.6)")
     parser.add_argument(
-        "--deadline", type=float, default=None, metavar="SEC", help="time limit, with loading; keeps the grasps so far"
+        "--deadline", type=float, default=None, metavar="SEC", help="time limit, including loading; found grasps stay"
     )
     parser.add_argument("--verify", choices=VERIFICATIONS, default="standard")
-    parser.add_argument("--robust", action="store_true", help="rank grasps first that hold with a misplaced hand")
+    parser.add_argument("--robust", action="store_true", help="rank grasps by trials with a misplaced hand")
     parser.add_argument("--least-friction", action="store_true", help="measure the least friction for each grasp")
     parser.add_argument("--device", default="cpu", help="torch device of the optimiser")
     parser.add_argument("--threads", type=int, default=1, help="threads of optimiser and trials (default 1)")
 
 
 def planning_options(options: argparse.Namespace) -> tuple[PlanConfig, dict[str, Any]]:
-    """Return the settings and the other arguments of `plan_grasps`, except the deadline. Set torch's threads.
+    """Return the settings and other arguments of `plan_grasps`, without the deadline. Set torch's number of threads.
 
     Raises ConfigError: an option is out of range, or the preset is unknown or malformed.
     """
@@ -101,7 +101,7 @@ def not_loaded(options: argparse.Namespace, config: PlanConfig, began: float) ->
 
 
 def summary(result: GraspResult, wanted: int, different: int) -> str:
-    """Return text about a result: usable grasps of `wanted`, `different` ones (no near-duplicates), times, metrics."""
+    """Return a text about a result. `wanted`: requested grasps. `different`: usable grasps without near-duplicates."""
     from graspd_core.verify.metrics import METRICS
 
     good = good_grasps(result)
@@ -127,18 +127,18 @@ def summary(result: GraspResult, wanted: int, different: int) -> str:
 
 
 def good_grasps(result: GraspResult) -> int:
-    """Return the number of usable grasps (`Grasp.usable`). They come first in the result."""
+    """Return the number of usable grasps (`Grasp.usable`). Usable grasps come first in the result."""
     return sum(grasp.usable for grasp in result.grasps)
 
 
 def exit_status(result: GraspResult) -> int:
-    """Return the exit status of a result: enough grasps, too few, or interrupted."""
+    """Return the exit status of a result: for enough grasps, for too few grasps, or for an interrupted run."""
     if result.outcome is Outcome.CANCELLED:
         return EXIT_INTERRUPTED
     return EXIT_OK if result.outcome is Outcome.SUCCEEDED else EXIT_TOO_FEW
 
 
-# Greatest number of views to fuse without --limit, because all are in memory at once.
+# Greatest number of views to fuse without --limit, because all views are in memory at the same time.
 MOST_VIEWS = 100
 
 
@@ -153,10 +153,7 @@ def add_bag_options(parser: argparse.ArgumentParser) -> None:
 
 
 def add_object_options(parser: argparse.ArgumentParser, *, any_object: bool = False) -> None:
-    """Add the options that choose the object in a cloud, the viewpoint and the scene settings.
-
-    `any_object` adds `--any`.
-    """
+    """Add the options for object, viewpoint and scene settings. With `any_object`, also add `--any`."""
     which = parser.add_mutually_exclusive_group()
     if any_object:
         which.add_argument("--any", action="store_true", help="choose the object with the surest grasp")
@@ -204,11 +201,11 @@ def plan_any_object(
     source: str,
     **request: Any,
 ) -> tuple[GraspResult, Scene, dict[str, Any]]:
-    """Plan for any object in the views (`--any`). Return result, scene, and JSON entries about all objects.
+    """Plan for any object in the views (`--any`). Return result, its scene, and JSON entries about all objects.
 
     Args:
-        source: name of the views in messages.
-        request: keyword arguments of `plan_grasps`.
+        source: name of the views for messages.
+        request: other keyword arguments of `plan_grasps`.
 
     Raises GraspdError: the views are unusable, or show no object.
     """
@@ -233,7 +230,7 @@ def check_bag_options(options: argparse.Namespace) -> None:
 
 
 def bag_views(path: Path, options: argparse.Namespace) -> Iterator[tuple[BagFrame, PointCloud | str]]:
-    """Yield the recorded frames that the options choose, each with its cloud or the reason why it is unusable.
+    """Yield the recorded frames that the options choose, each with its cloud, or with the reason why it has none.
 
     Raises BagError: nothing can be read, or the requested frame is not in the bag.
     """
@@ -262,7 +259,7 @@ def bag_views(path: Path, options: argparse.Namespace) -> Iterator[tuple[BagFram
 
 
 def merged_views(path: Path, options: argparse.Namespace) -> tuple[PointCloud, ...]:
-    """Return the chosen clouds as views of one scene. Print the number of unusable clouds on stderr.
+    """Return the chosen clouds as views of one scene. If clouds are unusable, print their number on stderr.
 
     Raises BagError: nothing can be read, no cloud is usable, the clouds are in several frames, or there are too many
     clouds and no --limit.
@@ -330,9 +327,9 @@ def add_restriction_options(parser: argparse.ArgumentParser) -> None:
 
 
 def restrictions_of(options: argparse.Namespace) -> tuple[Restriction, ...]:
-    """Return the restrictions that the options request: steering and reach of an arm.
+    """Return the restrictions that the options request: steering constraints and the reach of an arm.
 
-    Raises ConfigError: a value is out of range, an option needs another one, or the arm is unknown.
+    Raises ConfigError: a value is out of range, an option needs another option, or the arm is unknown.
     """
     return (*_steering(options), *_reach(options))
 

@@ -1,4 +1,4 @@
-"""Output of commands: results on stdout, messages and progress on stderr. Also the options `--quiet` and `--json`.
+"""Print results on stdout, messages and progress on stderr. Define the options `--quiet` and `--json`.
 
 Output has no colours. Progress bars appear only on a terminal.
 """
@@ -22,7 +22,7 @@ from graspd_core.types import Progress, Stage
 
 T = TypeVar("T")
 _END = object()
-# Time until a progress bar of `busy` appears, and interval between its updates [s].
+# `busy` shows a progress bar after this time, and updates the bar at this interval [s].
 _PATIENCE = 1.0
 
 
@@ -38,8 +38,8 @@ _settings = _OutputSettings()
 
 
 def add_output_options(parser: argparse.ArgumentParser) -> None:
-    """Add `--quiet`, and `--json` unless the parser's default for `json` is False."""
-    # There is no default, because a subcommand's default would overwrite the option given before it.
+    """Add `--quiet`. If the parser has no default for `json`, also add `--json`."""
+    # These options have no default. A default of a subcommand would overwrite an option given before the subcommand.
     parser.add_argument("--quiet", action="store_true", default=argparse.SUPPRESS, help="only errors and the result")
     if parser.get_default("json") is None:
         text = "print the result as one JSON document on stdout"
@@ -48,7 +48,7 @@ def add_output_options(parser: argparse.ArgumentParser) -> None:
 
 @contextmanager
 def output_of(options: argparse.Namespace) -> Iterator[None]:
-    """Apply `--quiet` and `--json` inside the context. With `--json`, stdout gets only JSON, and stderr all else."""
+    """Apply `--quiet` and `--json` inside the context. With `--json`, stdout gets only JSON. Text goes to stderr."""
     global _settings
     quiet, as_json = getattr(options, "quiet", False), getattr(options, "json", False)
     before, _settings = _settings, _OutputSettings(quiet, sys.stdout if as_json else None)
@@ -63,7 +63,7 @@ def output_of(options: argparse.Namespace) -> Iterator[None]:
 def answer(document: Any) -> None:
     """Print the command's result as JSON if `--json` was given."""
     if _settings.document_to is not None:
-        # NaN is not JSON.
+        # NaN is not valid JSON, so refuse to print NaN.
         text = json.dumps(document, indent=1, allow_nan=False, default=_plain)
         print(text, file=_settings.document_to, flush=True)
 
@@ -103,7 +103,7 @@ def _draws() -> bool:
 
 @contextmanager
 def busy(what: str) -> Iterator[None]:
-    """Show on a terminal how long the work inside the context takes, once it takes over 1 s."""
+    """Show on a terminal how long the work inside the context has taken, if it takes more than 1 s."""
     began, ended = time.time(), threading.Event()
     if not _draws():
         yield
@@ -128,7 +128,7 @@ def busy(what: str) -> Iterator[None]:
 
 
 def waiting(items: Iterable[T], what: str, total: int | None = None) -> Iterator[T]:
-    """Yield the items. While an item is awaited, a terminal shows `what` and the item's number."""
+    """Yield the items. While the caller waits for an item, a terminal shows `what` and the item's number."""
     rest, of = iter(items), f"/{total}" if total else ""
     for number in itertools.count(1):
         with busy(f"{what} {number}{of}"):

@@ -45,7 +45,7 @@ from graspd_core.types import GraspResult
 
 @dataclass(frozen=True)
 class _Job:
-    """Views to plan on together. If the cloud is unusable, `refusal` says why and there are no views."""
+    """Views of one scene for one run of the planner. If its cloud is unusable, `views` is empty. `refusal` says why."""
 
     name: str
     label: str
@@ -66,7 +66,7 @@ def add_command(commands: Any) -> None:
 
 
 def run(options: argparse.Namespace) -> int:
-    """Plan on every cloud. Return 0 if all have enough grasps, 3 for fewer, 2 for no usable cloud, 130 if stopped."""
+    """Plan on every cloud. Return 0 if all have enough grasps, 3 if not, 2 without usable cloud, 130 if interrupted."""
     from graspd_core.hands.library import load_hand
     from graspd_core.io.grasps_json import check_writable
 
@@ -85,7 +85,7 @@ def run(options: argparse.Namespace) -> int:
     scenes: list[dict[str, Any]] = []
     with Interrupt() as interrupt:
         for job in waiting(_jobs(options), "read cloud"):
-            # Check here, so that an interrupt also ends a recording in which every cloud is refused.
+            # Check here, so that an interrupt also ends the loop if every cloud is refused.
             if interrupted := interrupt.is_interrupted():
                 break
             try:
@@ -95,7 +95,7 @@ def run(options: argparse.Namespace) -> int:
             except GraspdError as error:
                 print(f"{job.label}: refused: {error}", flush=True)
                 scenes.append({"label": job.label, "refused": str(error)})
-                # An empty table counts as too few grasps. An unusable cloud is bad input.
+                # A cloud without an object counts as too few grasps. An unusable cloud is bad input.
                 statuses.append(EXIT_TOO_FEW if isinstance(error, NoObjectError) else EXIT_BAD_INPUT)
                 continue
             print(_outcome_line(job, result, options.count), flush=True)

@@ -1,4 +1,4 @@
-"""Exit status, deadline and Ctrl-C handling of a running command."""
+"""Handle exit status, deadline and Ctrl-C of a running command."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ _ENDS = (signal.SIGINT, signal.SIGTERM)
 
 
 class Interrupt:
-    """Context for Ctrl-C and SIGTERM. The first signal ends the run and keeps its result. A second ends the process."""
+    """Context for Ctrl-C and SIGTERM. The first signal ends the run with its result. The second ends the process."""
 
     def __init__(self) -> None:
         self._event = threading.Event()
@@ -52,16 +52,16 @@ class Interrupt:
         self._event.set()
 
 
-# Interval between two interruptions of the same work [s].
+# Interval after which `_alarm` raises again if a library caught DeadlinePassed [s].
 _AGAIN = 0.5
 
 
 class DeadlinePassed(BaseException):
-    """Raised when a deadline passes. It is not an Exception, because file readers catch every Exception."""
+    """A deadline has passed. The class is not an Exception, because file readers catch every Exception."""
 
 
 class Deadline:
-    """Deadline `seconds` after `began`, a `time.perf_counter()` value. Without `seconds` it never passes."""
+    """Deadline `seconds` after `began`, a `time.perf_counter()` value. If `seconds` is None, it never passes."""
 
     def __init__(self, seconds: float | None, began: float) -> None:
         self._end = None if seconds is None else began + seconds
@@ -74,8 +74,8 @@ class Deadline:
     def cuts_short(self) -> Iterator[None]:
         """Raise DeadlinePassed inside the context as soon as the deadline has passed.
 
-        A long call into a library ends first. Outside the main thread, DeadlinePassed is raised only after the work,
-        because only the main thread can handle signals.
+        A running call of a compiled library is not interrupted. Outside the main thread, DeadlinePassed is raised only
+        after the work, because only the main thread can handle signals.
         """
         if self._end is None:
             yield
@@ -84,7 +84,7 @@ class Deadline:
             try:
                 yield
             except Exception:
-                # An interrupted library may raise its own error. After the deadline it is ignored.
+                # An interrupted library may raise its own error. Ignore errors after the deadline.
                 if time.perf_counter() < self._end:
                     raise
         if time.perf_counter() >= self._end:
@@ -129,7 +129,7 @@ def process_began() -> float:
 
 @dataclass(frozen=True)
 class Watched:
-    """Hooks that show a run in a browser, the result until Ctrl-C. By default they do nothing."""
+    """Hooks that show a run in a browser. `show` shows the result until Ctrl-C. By default, the hooks do nothing."""
 
     watch: WatchHook | None = None
     progress_hook: ProgressHook | None = None
@@ -143,7 +143,7 @@ class Watched:
         return lambda progress: (reporter(progress), hook(progress))[0]
 
 
-# Package that each command outside graspd_core needs.
+# Commands outside graspd_core, and the package that each command needs.
 SIBLINGS = {"view": "graspd_viewer", "bench": "graspd_bench", "dataset": "graspd_dataset", "import": "graspd_dataset"}
 SIBLINGS |= {"cell": "graspd_cell"}
 

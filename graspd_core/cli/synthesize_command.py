@@ -66,7 +66,7 @@ def run(options: argparse.Namespace) -> int:
     config, request = planning_options(options)
     request["restrictions"] = restrictions_of(options)
     deadline = Deadline(options.deadline, options.began)
-    # Check the output paths first. Otherwise a long run's result could be lost.
+    # Check the output paths before planning, so that the result of a long run is not lost.
     if options.picture and options.picture.suffix.lower() != ".png":
         raise ConfigError(f"--picture {options.picture}; valid: a file name that ends in .png")
     for path in (options.out, options.html, options.picture):
@@ -112,7 +112,7 @@ def run(options: argparse.Namespace) -> int:
 
 
 def _any_object(options: argparse.Namespace, config: PlanConfig, request: dict[str, Any], deadline: Deadline) -> int:
-    """Plan for any object of a cloud. Return the exit status. Raises ConfigError: it is no cloud, or `--view`."""
+    """Plan for any object of a cloud. Return the exit status. Raises ConfigError: no cloud, or `--view` is given."""
     from graspd_core.hands.library import load_hand
     from graspd_core.perception.cloud.cloud_files import is_cloud_file
     from graspd_core.perception.cloud.depth_files import is_depth_image

@@ -1,4 +1,4 @@
-"""Settings that several folders share, as frozen dataclasses. Each method's own settings are in its folder."""
+"""Hold the settings that several folders share, as frozen dataclasses. Each method's folder holds its own settings."""
 
 from __future__ import annotations
 

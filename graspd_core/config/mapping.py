@@ -1,4 +1,4 @@
-"""Reading of config dataclasses from nested mappings and YAML files, with errors that name the key."""
+"""Read config dataclasses from nested mappings and YAML files. Errors name the key."""
 
 from __future__ import annotations
 
@@ -18,15 +18,15 @@ from graspd_core.errors import ConfigError, choices, short_repr
 
 T = TypeVar("T")
 
-# Larger integers do not fit into the 64 bits of the libraries.
+# Greatest integer that fits into the 64 bits of the libraries.
 _LARGEST_INTEGER = 2**63 - 1
 
 
 def from_mapping(cls: type[T], values: Any, where: str = "config", start: T | None = None) -> T:
     """Build a config dataclass from nested mappings.
 
-    Missing values come from `start`, or else from the defaults of the class. Raises ConfigError for an unknown key or a
-    value of the wrong type. The error names the dotted key, which begins with `where`, and the valid choices.
+    Missing values come from `start`. If `start` is None, they are the defaults of the class. Raises ConfigError: a key
+    is unknown, or a value has the wrong type. The error begins with `where` and the dotted key. It names valid choices.
     """
     fields = dataclasses.fields(typing.cast(Any, cls))
     factories = {f.name: f.default_factory for f in fields if f.default_factory is not dataclasses.MISSING}
@@ -38,7 +38,7 @@ def from_mapping(cls: type[T], values: Any, where: str = "config", start: T | No
 def coerced(
     hints: Mapping[str, Any], values: Any, where: str, starts: Mapping[str, Any] = types.MappingProxyType({})
 ) -> dict[str, Any]:
-    """Return a mapping's values, converted to the types in `hints`. Raises ConfigError like `from_mapping`."""
+    """Return a mapping with its values converted to the types in `hints`. Raises ConfigError: see `from_mapping`."""
     if not isinstance(values, Mapping):
         raise ConfigError(f"{where}: expected a mapping of {sorted(hints)}, got {short_repr(values)}")
     if unknown := sorted(set(values) - set(hints), key=short_repr):
@@ -48,10 +48,10 @@ def coerced(
 
 @contextmanager
 def yaml_values(path: Path) -> Iterator[Any]:
-    """Yield the values of a YAML file, an empty mapping for an empty file.
+    """Yield the values of a YAML file. An empty file gives an empty mapping.
 
-    If a ConfigError inside the block begins with a dotted key, the file's path and the key's line are added to it.
-    Raises ConfigError if the file is missing or malformed.
+    If a ConfigError inside the block begins with a dotted key, the error gets the file's path and the key's line.
+    Raises ConfigError: the file is missing or malformed.
     """
     try:
         node, values = parse_yaml(path.read_text(encoding="utf-8"))
@@ -69,7 +69,7 @@ def yaml_values(path: Path) -> Iterator[Any]:
 
 
 def _line_of(node: yaml.Node | None, keys: list[str]) -> int:
-    """Return the line of the innermost of nested keys that the file holds."""
+    """Follow nested `keys` as far as the file holds them. Return the line of the last found key, or 1."""
     line = 1
     for key in keys:
         found = [pair for pair in node.value if pair[0].value == key] if isinstance(node, yaml.MappingNode) else []
@@ -111,7 +111,7 @@ def _tuple(hints: tuple[Any, ...], value: Any, where: str) -> tuple[Any, ...]:
     return tuple(_coerce(hint, given, f"{where}[{k}]", signed=True) for k, (hint, given) in pairs)
 
 
-# Maximum number of entries of a mapping after its `<<` merges. Nested merges can multiply the entries without limit.
+# Maximum number of entries of a mapping after `<<` merges. Nested merges could multiply the entries without limit.
 _MOST_MERGED = 10_000
 
 
@@ -126,15 +126,15 @@ class _Loader(yaml.SafeLoader):
 
 
 def parse_yaml(text: str) -> tuple[yaml.Node | None, Any]:
-    """Return the node tree of a YAML text, whose nodes hold line numbers, and the value of the text.
+    """Return the node tree of a YAML text, with line numbers, and the value of the text.
 
-    Both are None for an empty text. Raises YamlError (a ValueError) if the text is malformed, or a value does not fit
-    its tag or format.
+    Both are None for an empty text. Raises YamlError (a ValueError): the text is malformed, or a value does not fit its
+    tag or format.
     """
     try:
         return yaml.compose(text, Loader=yaml.SafeLoader), yaml.load(text, Loader=_Loader)
-    # Beside its own errors, the library passes on any error of a value that does not fit its tag or format: a date in
-    # month 13, an endless number, `!!timestamp x`.
+    # For a value that does not fit its tag or format, PyYAML may raise any exception: a date in month 13, a number with
+    # too many digits, `!!timestamp x`.
     except Exception as error:
         mark = getattr(error, "problem_mark", None)
         problem = getattr(error, "problem", None) or getattr(error, "reason", None) or type(error).__name__

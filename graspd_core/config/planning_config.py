@@ -1,4 +1,4 @@
-"""Planning settings of all methods, and the certainty required of grasps on objects seen by cameras."""
+"""Hold the planning settings of all methods, and the certainty required of grasps of objects that cameras saw."""
 
 from __future__ import annotations
 
@@ -14,15 +14,15 @@ class ProblemConfig:
     """Settings of the optimisation problem made from scene and hand. All methods rank their grasps by this problem.
 
     Attributes:
-        candidates: number of contact candidates that most steps use.
-        fine_candidates: number of contact candidates that polishing uses.
-        patch_size: number of contact candidates in a patch. Each patch is drawn to the surface separately, so that all
-            of the hand touches. Zero draws only the nearest candidate of each rigid group of links.
+        candidates: number of contact candidates (points on the hand) in most optimiser steps.
+        fine_candidates: number of contact candidates in the last optimiser steps (polishing).
+        patch_size: number of contact candidates in a patch. The optimiser pulls each patch to the surface separately,
+            so that the whole hand touches. With zero, it pulls only the nearest candidate of each rigid group of links.
         softness: depth to which the hand's surface yields, as flesh does [m]. Planning makes the object thinner by this
             depth and ignores the object's sharp points. Trials do not model softness.
-        features: number of sharp object points that polishing uses. Large thin walls get more.
-        directions: number of disturbance wrenches.
-        friction: friction coefficient for planning, below the object's own, so that contacts keep a margin.
+        features: number of sharp object points that polishing uses. Objects with large thin walls get more points.
+        directions: number of disturbance wrenches that a grasp should resist.
+        friction: friction coefficient for planning, below the object's friction, so that contacts keep a margin.
         confidence_floor: weight of a contact on guessed surface, relative to a contact on seen surface.
     """
 
@@ -41,9 +41,9 @@ class GraspStagesConfig:
     """Settings of the pregrasp and squeeze postures.
 
     Attributes:
-        touch_reach: links this near to the object count as touching [m].
-        grip_force: sum of the normal forces of the squeeze, unless `link_force` limits it [N]. Heavy objects get more.
-        link_force: greatest planned normal force of one link [N]. Lower it for delicate objects, or give the mass.
+        touch_reach: a link counts as touching up to this distance from the object [m].
+        grip_force: sum of the normal forces of the squeeze [N]. `link_force` may limit the sum. Heavy objects get more.
+        link_force: greatest planned normal force of one link [N]. For delicate objects, use less, or give the mass.
         stiffness: position gain of the controllers of the hand's revolute joints [N·m/rad].
         slide_stiffness: position gain of the controllers of the hand's prismatic joints [N/m].
         effort_share: fraction of a joint's effort limit that the squeeze may use.
@@ -67,15 +67,15 @@ class GraspStagesConfig:
 
 @dataclass(frozen=True)
 class RoundsConfig:
-    """Settings for rounds of optimisation and trials. If too few grasps held, the next round starts from other poses.
+    """Settings for rounds of optimisation and trials. If too few grasps hold, the next round starts from other poses.
 
     An effort of 1 leaves the method's settings unchanged. An effort below 1 multiplies the number of steps. An effort
     above 1 multiplies the number of starts.
 
     Attributes:
         most: maximum number of rounds.
-        first_budget: effort of the first round for an object of known shape that stands alone. Others get 1.
-        growth: factor on the effort from one round to the next.
+        first_budget: effort of the first round for an object of known shape that stands alone. Other objects get 1.
+        growth: factor between the efforts of a round and the next round.
     """
 
     most: int = 3
@@ -90,7 +90,7 @@ class RobustConfig:
     Attributes:
         rank: whether to run these trials. Grasps that hold in more trials rank higher.
         trials: number of these hold trials for each verified grasp.
-        hold_time: duration of each of a trial's six pulls [s].
+        hold_time: duration of each of the six pulls of a trial [s].
         friction: whether to measure the least friction at which each verified grasp holds.
     """
 
@@ -102,14 +102,14 @@ class RobustConfig:
 
 @dataclass(frozen=True)
 class HeldShares:
-    """Fractions of single-view grasps that hold on the true object with its true mass, by trials (docs/clouds.md).
+    """Fractions of grasps that hold on the true object with its true mass, measured on single views (docs/clouds.md).
 
     Attributes:
-        likeliest: among grasps that hold on the likeliest shape in trials.
-        places: among those that also hold with the hand misplaced.
-        shapes: among those that also hold on two other shapes of the hidden side.
-        fails_places: among grasps that hold on the likeliest shape but not with the hand misplaced.
-        fails_shapes: among grasps that hold with the hand misplaced but not on two other shapes.
+        likeliest: fraction among the grasps that hold on the likeliest shape, the best guess from the view.
+        places: fraction among the grasps that also hold with the hand misplaced.
+        shapes: fraction among the grasps that hold with the hand misplaced and on two other shapes.
+        fails_places: fraction among the grasps that hold on the likeliest shape but not with the hand misplaced.
+        fails_shapes: fraction among the grasps that hold with the hand misplaced but not on two other shapes.
     """
 
     likeliest: float
@@ -120,15 +120,15 @@ class HeldShares:
 
 
 # Measured on 385 grasps planned without a mass and 544 with the true mass, on 76 single views (docs/clouds.md).
-# An assumed mass is the heavy end of what the volume allows, so trials lift more than most objects weigh.
+# An assumed mass is the heavy end, the most that the volume allows. So trials lift more than most objects weigh.
 MASS_ASSUMED = HeldShares(0.85, 0.88, 0.95, 0.77, 0.85)
 MASS_KNOWN = HeldShares(0.80, 0.89, 0.95, 0.61, 0.83)
-# Masses as fractions of the heavy end of the volume, and the fraction of 325 drawn household objects and ten scans that
-# weigh at most this.
+# Masses as fractions of the heavy end, and for each mass the fraction of objects that weigh at most this mass. Counted
+# on 325 drawn household objects and ten scans.
 _MASSES, _LIGHTER = (0.0, 0.25, 0.5, 0.7, 1.0), (0.0, 0.26, 0.64, 0.85, 1.0)
-# With a payload below the heavy end, a grasp is verified only if at least this fraction of objects is lighter than it.
+# A grasp with a payload below the heavy end is verified only if it can lift at least this fraction of objects.
 LEAST_LIGHT = 0.8
-# Fraction of grasps that hold on a doubtful scene, e.g. with a doubtful camera position. Each doubt multiplies by it.
+# Fraction of grasps that hold if the scene has one doubt, e.g. about the camera position. For n doubts, its nth power.
 DOUBTED_SHARE = 0.6
 
 
@@ -144,11 +144,11 @@ def light_end(heavy: float) -> float:
 
 @dataclass(frozen=True)
 class CertaintyConfig:
-    """How certain a grasp of an object seen by cameras must be to count as verified.
+    """The certainty that a grasp needs to count as verified, if cameras saw its object.
 
     Attributes:
-        probability: least probability of holding on the true object, if that weighs no more than in the trials. With 0,
-            only the likeliest shape is tried. Higher values require further trials (docs/clouds.md).
+        probability: least probability that a grasp holds on the true object, if the object weighs no more than in the
+            trials. With 0, only the likeliest shape is tried. Higher values require further trials (docs/clouds.md).
 
     Raises:
         ConfigError: the probability is higher than any trials can ensure.

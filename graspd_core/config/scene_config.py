@@ -1,4 +1,4 @@
-"""Settings for building a scene from point clouds, and the YAML file that holds them."""
+"""Hold the settings for building a scene from point clouds, and read them from a YAML file."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from typing import Any, Literal
 from graspd_core.config.mapping import from_mapping, yaml_values
 from graspd_core.errors import ConfigError
 
-# Least values of some settings. All other numbers must be above zero.
+# Least values of some settings. All numbers that are not listed must be above zero.
 _MINIMA = {"max_voxels": 1000, "neighbours": 4, "max_points": 1000, "max_faces": 100}
 
 
@@ -22,28 +22,28 @@ class SegmentationConfig:
         roi_low: lower corner of the workspace, in the cloud's frame [m]. None means no bound.
         roi_high: upper corner of the workspace, in the cloud's frame [m]. None means no bound.
         max_range: points farther than this from their camera are ignored [m].
-        voxel: side of the voxels that the scene is downsampled to, below half of `gap` [m].
+        voxel: edge length of the voxels to which the scene is downsampled, below half of `gap` [m].
         max_voxels: maximum number of voxels of a scene. Larger scenes get larger voxels, which bounds the time.
-        plane_tolerance: points up to this height above a plane belong to the plane, higher for noisy cameras [m].
-        max_plane_tolerance: greatest value of that height, for the noisiest cameras [m].
-        plane_search_width: largest distance of inliers when a plane is searched, larger for noisy cameras [m].
+        plane_tolerance: points up to this height above a plane belong to the plane [m]. Camera noise increases it.
+        max_plane_tolerance: greatest plane tolerance, for the noisiest cameras [m].
+        plane_search_width: greatest distance of inliers in the search for a plane [m]. Use more for noisy cameras.
         ransac_trials: number of planes that RANSAC tries. Use more if the support is a small part of the scene.
         support_size: least width of the visible part of a support plane [m].
-        support_margin: a flat part is assumed to continue this far beyond its visible part [m].
-        support_area_ratio: least area of a support, divided by the area of the objects on it.
-        contact: largest gap between a support and an object on it, beyond occlusion and noise [m].
+        support_margin: a support is assumed to continue this far beyond its visible part [m].
+        support_area_ratio: least ratio of the area of a support to the area of the objects on the support.
+        contact: largest gap between support and object that neither occlusion nor noise explains [m].
         gap: points at least this far apart belong to two objects [m].
-        max_link: points farther apart than this never belong to one object, however sparse the cloud is [m].
-        neighbour_share: points with fewer neighbours than this fraction of the median are flying pixels.
-        hanging_reach: a piece that ends above the support, such as a handle, belongs to an object this near [m].
-        unsupported_reach: without a support, pieces this near that touch in an image form one object [m].
+        max_link: points farther apart than this never belong to one object, even in a sparse cloud [m].
+        neighbour_share: points with fewer neighbours than this fraction of the median number are flying pixels.
+        hanging_reach: a piece that ends above the support, e.g. a handle, belongs to an object up to this far away [m].
+        unsupported_reach: without a support, pieces at most this far apart that touch in an image form one object [m].
         smallest_object: objects smaller than this are noise [m].
         largest_object: objects larger than this are background: walls, floors, furniture [m].
         min_points: objects with fewer points than this are noise.
-        border_width: objects this near to the image border may continue beyond it, some three pixels [rad].
+        border_width: an object this near to the image border may continue beyond it [rad]. This is about three pixels.
         target_reach: a target point selects an object within this distance [m].
-        target_share: a box or mask that covers this fraction of an object selects all of it.
-        obstacle_range: other objects up to this distance from the object become obstacles [m].
+        target_share: a box or mask that covers this fraction of an object selects the whole object.
+        obstacle_range: other objects up to this distance from the object to grasp become obstacles [m].
         piled: whether objects lie on each other. If so, parts divided by a seam are objects even above the support. A
             grasp of a part that a target point selects is never verified. A heap of any size may stand on the support.
     """
@@ -81,20 +81,20 @@ class ReconstructionConfig:
     """Settings for reconstructing a closed mesh from the views of an object.
 
     Attributes:
-        max_points: maximum number of points used, of all views together, which bounds the time.
-        neighbours: number of points that each local plane is fitted to. More points smooth noise and detail alike.
+        max_points: maximum number of used points, all views together. This bounds the time.
+        neighbours: number of points to which each local plane is fitted. More points smooth both noise and detail.
         stray_distance: points farther than this from their neighbours' plane are flying pixels [m].
-        outline_slack: precision to which cameras see outlines and surfaces [m].
-        surface_tolerance: a guessed point this near to a seen surface confirms the guess [m].
+        outline_slack: error with which cameras see outlines and surfaces [m].
+        surface_tolerance: a guessed point up to this far from a seen surface confirms the guess [m].
         open_share: the hidden side is guessed only if at least this fraction of the surface is missing.
         revolution_share: least fraction of the seen surface that a body of revolution must explain.
-        symmetry_worth: symmetries with a lower score are ignored as chance. The highest score is 2.6.
-        poisson: solver for the surface: "open3d", or "grid", with Open3D as fallback if no grid surface fits.
+        symmetry_worth: least score of a symmetry. Lower scores may be chance. The highest score is 2.6.
+        poisson: solver for the surface: "open3d" or "grid". If no grid surface fits, "grid" also uses Open3D.
         poisson_cell: approximate width of the finest cells of Open3D's solver, twice the camera's noise [m].
-        min_cell: least cell width of the grid that the surface is closed on, also twice the noise [m].
-        fit_distance: a mesh is refused unless 85 % of the seen points are this near to its surface [m].
+        min_cell: least cell width of the grid on which the surface is closed, twice the camera's noise [m].
+        fit_distance: a mesh is refused if fewer than 85 % of the seen points are this near to its surface [m].
         max_faces: maximum number of faces of the mesh.
-        seen_distance: surface this near to a seen point has confidence 1 [m].
+        seen_distance: surface up to this far from a seen point has confidence 1 [m].
         guessed_distance: surface farther than this from all seen points has confidence 0 [m].
     """
 
@@ -142,8 +142,8 @@ class SceneConfig:
 def load_scene_config(path: str | Path) -> SceneConfig:
     """Read the settings of a scene from a YAML file. Missing settings keep their defaults.
 
-    Raises ConfigError for a missing file, malformed YAML, an unknown key or a bad value. The error lists the valid
-    keys.
+    Raises ConfigError: the file is missing, the YAML is malformed, a key is unknown, or a value is not valid. The error
+    lists the valid keys.
     """
     with yaml_values(path := Path(path)) as values:
         config = from_mapping(SceneConfig, values, where=path.name)

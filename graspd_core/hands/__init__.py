@@ -1,1 +1,1 @@
-"""Models of robot hands: readers, kinematics, collision geometry and contact candidates."""
+"""Model robot hands: read their files, compute kinematics, collision geometry and contact candidates."""

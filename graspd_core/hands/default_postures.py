@@ -1,9 +1,9 @@
-"""Guess palm, approach and two postures of a hand whose description does not give them.
+"""Guess the palm, the approach and two postures of a hand whose description does not give them.
 
-A finger is a chain of links up to a last link without children. The palm is the link from which all fingers branch. In
-a human-like hand most fingers bend the same way: the palm normal is the direction in which the fingertips move from
-straight to mid-range. In a gripper the fingers move against each other: the palm normal is along the fingers. A search
-finds the postures: fingertips around a small ball in front of the palm (closed), and around a large one (open).
+A finger is a chain of links that ends in a link without children. All fingers branch from the palm. In a human-like
+hand most fingers bend the same way. Then the palm normal is the direction in which the fingertips move from straight to
+mid-range joints. In a gripper the fingers move against each other. Then the palm normal is along the fingers. A search
+finds the postures: fingertips around a small ball in front of the palm (closed), or a large ball (open).
 """
 
 from __future__ import annotations
@@ -31,8 +31,8 @@ from graspd_core.hands.self_collision import link_overlaps
 from graspd_core.hands.surface_points import dense_samples
 
 _STARTS, _TIP_SPREAD, _STEPS, _RATE = 24, 0.4, 100, 0.08
-# Costs in the search: of one-sided fingertips, of joints away from their rest posture, of the ball away from its wanted
-# place, and of overlap [1/m].
+# Weights of the costs in the search: fingertips all on one side of the ball, joints away from their rest posture, ball
+# away from its wanted place, and overlap of links [1/m].
 _BALANCE, _REST, _PLACE, _OVERLAP = 0.3, 0.08, 0.3, 60.0
 
 
@@ -43,9 +43,9 @@ class FingertipGoal:
     Attributes:
         ball: centre of the ball, base frame [m].
         radius: radius of the ball [m].
-        rest: rest posture, near which the joints stay [rad] or [m].
-        directions: unit vectors from the ball to each fingertip. None if the fingertips only surround it evenly.
-        weights: weights of the fingertips' errors with given directions, with a sum of one. None for equal weights.
+        rest: joint values near which the search stays [rad] or [m].
+        directions: wanted unit vectors from the ball to each fingertip. None to surround the ball evenly.
+        weights: weight of each fingertip's error, used only with `directions`. They sum to one. None for equal weights.
         ball_fixed: True if the search must not move the ball.
     """
 
@@ -63,9 +63,9 @@ def around_ball(
     goal: FingertipGoal,
     surface: tuple[Float[np.ndarray, "samples 3"], Int[np.ndarray, "samples"]],
 ) -> tuple[Float[np.ndarray, "joints"], Float[np.ndarray, "3"]]:
-    """Return a posture with the fingertips around a ball and little overlap of links, and the ball's final centre.
+    """Return a posture with the fingertips around a ball and little overlap of links, and the ball's final centre [m].
 
-    Wrist joints do not move. `surface` holds surface points in link frames [m] and their links, to measure overlap.
+    Wrist joints stay straight. `surface` has surface points in link frames [m] and their links, to measure overlap.
     """
     kinematics = make_kinematics(hand, dtype=torch.float64)
     matrix = placement(hand.num_links, torch.as_tensor(fingers.points), torch.as_tensor(fingers.links))
@@ -109,7 +109,7 @@ def around_ball(
 def _missed(
     fingers: Fingers, goal: FingertipGoal, away: Float[Tensor, "starts tips 3"]
 ) -> tuple[Float[Tensor, "starts"], Float[Tensor, "starts"]]:
-    """Return squared error [finger lengths²] and one-sidedness of fingertips. `away` is from the ball's centre [m]."""
+    """Return how far fingertips miss the goal [finger lengths²], and how one-sided they are. `away`: ball to tip."""
     if goal.directions is not None:
         missed = ((away - goal.radius * torch.as_tensor(goal.directions)) / fingers.length).square().sum(-1)
         mean = missed.mean(-1) if goal.weights is None else missed @ torch.as_tensor(goal.weights)
@@ -123,7 +123,7 @@ def _missed(
 
 
 def side_by_side(fingers: Fingers) -> Float[np.ndarray, "tips 3"]:
-    """Return an offset of the ball for each fingertip [m], so that neighbouring fingers close side by side."""
+    """Return a shift of the ball along the knuckles for each fingertip [m], so that fingers close side by side."""
     aside = np.zeros_like(fingers.roots)
     if fingers.mates.sum() > 1:
         knuckles, row = fingers.roots[fingers.mates], knuckle_row(fingers)
@@ -139,9 +139,9 @@ def _joined_links(hand: HandModel) -> Bool[np.ndarray, "links links"]:
 
 # In finger lengths: radii of the balls of the closed and the open posture, and distance of the ball from the palm.
 _CLOSED, _OPEN, _AHEAD = 0.16, 0.55, 0.4
-# Radius of the spot of the palm's surface that gives the height of the palm centre [m].
+# The palm's surface within this distance of the palm axis gives the height of the palm centre [m].
 _SPOT = 0.02
-# A joint spreads a finger if the cosine between its axis and the finger's direction is at least this.
+# A joint spreads a finger if the cosine between joint axis and finger direction is at least this.
 _SPREAD = 0.7
 
 
@@ -187,7 +187,7 @@ def default_postures(hand: HandModel, which: tuple[str, ...] = ("open", "closed"
 
 
 def _along(hand: HandModel, fingers: Fingers) -> Float[np.ndarray, "3"]:
-    """Return the direction of a gripper's fingers at mid-range, made normal to the plane of their first joints."""
+    """Return a gripper's finger direction at mid-range. If nearly normal to the plane of the joints, make it normal."""
     middle = middle_joints(hand, fingers)
     half_way = placed_tips(hand, fingers, middle) - fingers.roots
     along = units(half_way.mean(0), 1e-6)
@@ -243,9 +243,9 @@ def _balance(directions: Float[np.ndarray, "tips 3"]) -> Float[np.ndarray, "tips
 
 
 def _own_sides(hand: HandModel, fingers: Fingers, normal: Float[np.ndarray, "3"]) -> Float[np.ndarray, "tips 3"]:
-    """Return in which direction of the palm plane each finger of a gripper stands. Zero for a single finger.
+    """Return the palm's side at which each gripper finger is: a unit vector in the palm plane, or zero.
 
-    The side comes from the finger roots, because the tips may cross each other.
+    A single finger has no side. The sides come from the finger roots, because the tips may cross each other.
     """
     middle = middle_joints(hand, fingers)
     plane = np.eye(3) - np.outer(normal, normal)
@@ -253,13 +253,13 @@ def _own_sides(hand: HandModel, fingers: Fingers, normal: Float[np.ndarray, "3"]
         (points - points.mean(0)) @ plane for points in (fingers.roots, placed_tips(hand, fingers, middle))
     )
     aside = np.where(np.linalg.norm(by_root, axis=1, keepdims=True) > 1e-3, by_root, by_tip)
-    # The joints limit the direction: two fingers beside each other move straight away from the third.
+    # The joints limit the direction. So two fingers beside each other move straight away from a third finger.
     travel = plane @ (point_jacobian(hand, middle, fingers.points, fingers.links) * (middle - hand.lower))
     return units((travel @ (travel.transpose(0, 2, 1) @ aside[:, :, None])).squeeze(-1), 1e-12)
 
 
 def _apart(hand: HandModel, fingers: Fingers) -> Float[np.ndarray, "tips 3"]:
-    """Return each finger's opening direction in the palm plane of a human-like hand. The thumb opens the other way."""
+    """Return how each finger of a human-like hand opens: a direction in the palm plane. The thumb's is opposite."""
     plane = np.eye(3) - np.outer(hand.palm_normal, hand.palm_normal)
     straight = (fingers.tips - fingers.roots)[fingers.mates].mean(0) @ plane
     if fingers.mates.sum() > 1:

@@ -12,10 +12,10 @@ from graspd_core.hands.kinematics import LinkNumbers, LinkPoints, LinkPoses, in_
 from graspd_core.hands.model import HandModel
 from graspd_core.hands.surface_points import surface_points
 
-# Fingers bend the same way if the mean of their unit bending directions is longer than this. Three fingers against one
-# give 1/2. Three around a circle, or two against one, give at most 1/3.
+# In a human-like hand, the mean of the fingers' unit bending directions is longer than this. Three fingers against one
+# give 1/2. Three fingers around a circle, or two against one, give at most 1/3.
 _ALIKE = 0.42
-# Two directions count as equal from this cosine on. A thumb's directions differ from those of the fingers.
+# Two directions count as equal if the cosine between them exceeds this. A thumb differs more from the other fingers.
 _SAME_WAY = 0.7
 # A finger stands up from a plane if the cosine between the finger and the plane's normal exceeds this.
 _UPRIGHT = 0.5
@@ -23,15 +23,15 @@ _UPRIGHT = 0.5
 
 @dataclass(frozen=True, eq=False)
 class Fingers:
-    """Geometry of the fingers of a hand whose joints are straight.
+    """Geometry of a hand's fingers, with all joints straight (see `straight_joints`).
 
     Attributes:
         points: fingertips in the frames of their links [m].
         links: link of each fingertip.
         roots: position of each finger's joint at the palm, base frame [m].
         tips: fingertips in the base frame [m].
-        palm: rigid group of links from which all fingers branch.
-        wrist: joints that move the palm.
+        palm: rigid group of links from which all fingers branch, see `HandModel.link_group`.
+        wrist: indices of the actuated joints that move the palm.
         mates: True for fingers of a human-like hand that bend the same way, not for the thumb. All False in a gripper.
         bend: unit direction in which `mates` bend, base frame. Zero in a gripper.
     """
@@ -47,7 +47,7 @@ class Fingers:
 
     @property
     def length(self) -> float:
-        """Mean length of a finger [m]."""
+        """Mean length of the fingers from root to tip [m]. If this is zero, 0.05."""
         return float(np.linalg.norm(self.tips - self.roots, axis=1).mean()) or 0.05
 
 
@@ -56,7 +56,7 @@ class Fingers:
 def find_fingers(hand: HandModel) -> Fingers:
     """Find the fingers: chains that end in a link without children.
 
-    A tip is the far end of the last link of a chain that has a collision shape.
+    A fingertip is the far end of a chain's last link with a collision shape.
     """
     groups = hand.link_group
     heads = np.unique(groups)
@@ -95,7 +95,7 @@ def find_fingers(hand: HandModel) -> Fingers:
 def _far_end(
     reached: Float[np.ndarray, "points 3"], root: Float[np.ndarray, "3"], middle: Float[np.ndarray, "3"]
 ) -> Float[np.ndarray, "3"]:
-    """Return the mean of the points farthest from a finger's root. If it lies near the root, use the palm instead."""
+    """Return the mean of the points farthest from the root. If it is near the root, use the farthest from the palm."""
     for origin in (root, middle):
         distance = np.linalg.norm(reached - origin, axis=1)
         end = reached[distance >= np.quantile(distance, 0.85)].mean(0)
@@ -114,11 +114,11 @@ def _chain(group: int, above: dict[int, int]) -> list[int]:
 def _mates(
     hand: HandModel, points: LinkPoints, links: LinkNumbers, straight: LinkPoints, wrist: list[int]
 ) -> tuple[Bool[np.ndarray, "points"], Float[np.ndarray, "3"]]:
-    """Return a mask of the fingers that point and bend the same way, and their bend. Both are zero for a gripper."""
+    """Return a mask of fingers that point and bend the same way, and their bending direction. A gripper gives zeros."""
     q = straight_joints(hand)
     travel = 0.5 * (hand.lower + hand.upper) - q
     travel[wrist] = 0.0
-    # Joint limits that are meant to be symmetric give a sweep of up to half a millimetre.
+    # Joint limits that are almost symmetric sweep a fingertip by up to half a millimetre, which counts as no sweep.
     sweep = units(point_jacobian(hand, q, points, links) @ travel, 5e-4)
     alike = (sweep @ sweep.T > _SAME_WAY) & (straight @ straight.T > _SAME_WAY)
     mates = alike[alike.sum(1).argmax()]
@@ -129,13 +129,13 @@ def _mates(
 
 
 def _stand_up(roots: Float[np.ndarray, "3 3"], pair: Float[np.ndarray, "2 3"]) -> bool:
-    """Return True if two fingers of directions `pair` leave the plane of all roots. A human-like hand's lie in it."""
+    """Return True if the directions `pair` are nearly normal to the plane of the finger roots, as in a gripper."""
     across = np.cross(roots[1] - roots[0], roots[2] - roots[0])
     return bool(abs(pair.mean(0) @ units(across, 1e-6)) > _UPRIGHT)
 
 
 def palm_points(hand: HandModel, fingers: Fingers) -> Float[np.ndarray, "points 3"]:
-    """Return surface points of the palm, base frame [m]. If it has no collision shape, return the finger roots."""
+    """Return surface points of the palm, base frame [m]. If the palm has no shape, return the finger roots."""
     poses = link_poses(hand, straight_joints(hand))
     found = _group_surface(hand, poses, fingers.palm, 400, np.random.default_rng(0))
     return found if len(found) else fingers.roots
@@ -156,7 +156,7 @@ def placed_tips(hand: HandModel, fingers: Fingers, q: Float[np.ndarray, "joints"
 
 
 def knuckle_row(fingers: Fingers) -> Float[np.ndarray, "3"]:
-    """Return the unit direction along the row of knuckles. There must be at least two mates."""
+    """Return the unit direction along the row of knuckles, the roots of `mates`. There must be at least two."""
     knuckles = fingers.roots[fingers.mates]
     return np.linalg.svd(knuckles - knuckles.mean(0))[2][0]
 

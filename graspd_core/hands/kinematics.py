@@ -1,8 +1,8 @@
 """Compute forward kinematics of a batch of postures, and the mesh of a hand at a posture.
 
-All functions of tensors are differentiable in the joint values with exact gradients. The rotation is Rodrigues' `R = I
-+ sin(q) K + (1 - cos(q)) K²`. It is multiplied into each joint's constant offset in advance. So a link's local
-transform is a weighted sum of constant matrices. Links of equal depth are computed together.
+Functions of tensors are differentiable in the joint values, with exact gradients. A joint rotates by Rodrigues' formula
+`R = I + sin(q) K + (1 - cos(q)) K²`. Each term is multiplied by the joint's constant offset in advance. So the pose of
+a link in its parent is a weighted sum of constant matrices. Links of equal depth are computed together.
 """
 
 from __future__ import annotations
@@ -19,13 +19,13 @@ from graspd_core.hands.model import HandModel, Primitive
 from graspd_core.se3 import SE3, rotation_from_quaternion
 from graspd_core.types import Posture, TriangleMesh, joined
 
-# Joint values of one posture. Points [m] and their links. `T_base_link` of every link: rotations and origins [m].
+# In this order: joint values of one posture, points [m], the link of each point, and `T_base_link` of each link [m].
 JointValues = Float[np.ndarray, "joints"]
 LinkPoints = Float[np.ndarray, "points 3"]
 LinkNumbers = Int[np.ndarray, "points"]
 LinkPoses = tuple[Float[np.ndarray, "links 3 3"], Float[np.ndarray, "links 3"]]
 
-# Distance of the retreat from the pregrasp, straight back along the approach [m].
+# Distance between pregrasp and retreat, straight back against the approach direction [m].
 RETREAT = 0.1
 
 
@@ -36,10 +36,10 @@ class Kinematics:
     Attributes:
         constant, sine, cosine: `T_parent_link = constant + sin(q) sine + cos(q) cosine`, upper three rows.
         slide: translation per metre of a prismatic joint. None if no joint is prismatic.
-        joint: actuated joint of each sorted link. 0 for a fixed link, whose coefficients are zero.
+        joint: actuated joint of each sorted link. 0 for a fixed link, whose sine, cosine and slide are zero.
         multiplier, shift: a coupled joint has the value multiplier · q + shift. None if no joint is coupled.
         level_sizes: number of links at each depth, starting with the base.
-        level_parents: for each depth from 2 on, each link's parent in the level above. None if they match in order.
+        level_parents: index of the links' parents in the level above, from depth 2 on. None if link i has parent i.
         order: position of each link of the hand in the sorted list.
     """
 
@@ -132,7 +132,7 @@ def place_points(matrix: Float[Tensor, "points columns"], links: SE3) -> Float[T
     """Return the points of a `placement` in the base frame [m], at the link poses of `forward`."""
     batch = links.rotation.shape[0]
     poses = torch.cat([links.rotation, links.translation[..., None]], dim=-1)
-    # The sizes are explicit, because −1 cannot be resolved for an empty batch.
+    # The sizes are explicit, because a size of −1 cannot be resolved for an empty batch.
     columns = poses.permute(1, 3, 0, 2).reshape(4 * poses.shape[1], 3 * batch)
     return (matrix @ columns).unflatten(1, (batch, 3)).transpose(0, 1)
 
@@ -149,8 +149,8 @@ def point_jacobian(
 ) -> Float[np.ndarray, "points 3 joints"]:
     """Return the geometric Jacobian of link-frame points at one posture, base frame: `dx = J dq`, `τ = Σ Jᵀ f`.
 
-    A revolute joint with axis a through o moves a point x of a later link by `a × (x − o)`. A prismatic joint moves it
-    by `a`. A coupled joint adds its motion times its multiplier to the column of the actuated joint.
+    A revolute joint with axis a through o moves a point x beyond it by `a × (x − o)`. A prismatic joint moves the
+    point by `a`. A coupled joint adds its motion times its multiplier to the column of the actuated joint.
     """
     rotation, translation = link_poses(hand, q)
     x = in_base((rotation, translation), points, links)

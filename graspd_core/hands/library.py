@@ -1,4 +1,4 @@
-"""Load hands by name, from a hand description (`config/hands/*.yaml`), or from a URDF or MJCF without description."""
+"""Load hands by name, from a hand description (`config/hands/*.yaml`), or from a URDF, MJCF or MANO file."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ from graspd_core.hands.self_collision import adjacent_links
 from graspd_core.hands.surface_points import with_candidates
 from graspd_core.paths import config_dir
 
-# Greatest torque of a revolute joint [N·m] and force of a prismatic joint [N], if neither URDF nor description says it.
+# Greatest torque of a revolute joint [N·m] and greatest force of a prismatic joint [N], if no file gives it.
 DEFAULT_EFFORT, DEFAULT_FORCE = 0.7, 40.0
 
 
@@ -35,8 +35,8 @@ def hand_names() -> tuple[str, ...]:
 def load_hand(name_or_path: str | Path, *, candidates: int = 600, prefix: str = "") -> HandModel:
     """Load a hand by name, or from a description (.yaml), a URDF or MJCF file (.urdf, .xml) or a MANO file (.pkl).
 
-    Without a description, palm and postures are guessed, with a warning in `HandModel.warnings`. `prefix` is put before
-    all joint and link names, because two hands on one robot need different names.
+    Without a description, palm and postures are guessed, with a warning in `HandModel.warnings`. `candidates` is the
+    number of contact candidates. `prefix` is put before all names, because two hands on one robot need different ones.
 
     Raises:
         HandError: the hand or file does not exist or cannot be used. The message names the file and the culprit.
@@ -108,7 +108,7 @@ def _with_effort(hand: HandModel) -> HandModel:
 
 # Greatest plausible effort of a revolute joint [N·m] and of a prismatic joint [N].
 _STRONGEST, _STRONGEST_SLIDE = 100.0, 10_000.0
-# Two axes belong to one linkage from this cosine between them, and up to these distances along and across them [m].
+# Two joints of one linkage: least cosine between their axes, greatest distance along an axis, and total [m].
 _PARALLEL, _LEVEL, _SIDE_BY_SIDE = 0.999, 0.008, 0.04
 # Two branching links are two palms if they are farther apart than this [m].
 _APART = 0.2
@@ -134,7 +134,7 @@ def _strong_joints(hand: HandModel) -> tuple[str, ...]:
 def _open_linkages(
     hand: HandModel, rotations: Float[np.ndarray, "links 3 3"], translations: Float[np.ndarray, "links 3"]
 ) -> tuple[str, ...]:
-    """Return a warning of an open linkage: two free joints side by side on a link, one of which moves only one link."""
+    """Return a warning if two uncoupled joints lie side by side on a link, and only one carries further joints."""
     parents = {link: int(hand.link_group[hand.link_parent[link]]) for link in np.flatnonzero(hand.link_joint >= 0)}
     coupled = {mimic.link for mimic in hand.mimics}
     free = [link for link in parents if link not in coupled and hand.joint_kind[link] == "revolute"]
@@ -148,13 +148,13 @@ def _open_linkages(
             beside = abs(apart @ axis) < _LEVEL and 0.0 < np.linalg.norm(apart) < _SIDE_BY_SIDE
             if abs(axis @ along) > _PARALLEL and beside:
                 names = " and ".join(repr(hand.link_joint_names[link]) for link in (other, one))
-                fault = "look like those of a closed linkage, but move independently"
-                return (f"joints {names} {fault}; couple such joints with <mimic>",)
+                fault = "look like parts of a closed linkage, but move independently"
+                return (f"joints {names} {fault}; couple these joints with <mimic>",)
     return ()
 
 
 def _palms(hand: HandModel, translations: Float[np.ndarray, "links 3"]) -> tuple[str, ...]:
-    """Return a warning if there are two palms: links far apart with several children each, neither above the other."""
+    """Return a warning if there are two palms: distant links with several fingers each, neither above the other."""
     counts = Counter(int(hand.link_parent[link]) for link in np.flatnonzero(hand.link_joint >= 0))
     branches = sorted(link for link, count in counts.items() if count > 1)
 

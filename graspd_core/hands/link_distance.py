@@ -1,12 +1,12 @@
 """Compute signed distances of points to the collision primitives of links [m], negative inside.
 
 Distances to boxes, spheres, capsules and cylinders are exact. Their gradients are exact where they exist. On a centre
-or an axis the gradient is zero (see `se3.safe_norm`). There are two approximations. Inside a union, the greatest depth
-in a single primitive is a lower bound. The distance to a hull is the greatest distance to its face planes. It is exact
-inside, and a lower bound outside near edges and corners.
+or an axis the gradient is zero (see `se3.safe_norm`). There are two approximations. Inside a union, the result is the
+greatest depth in a single primitive, which may be too small. For a hull, the result is the greatest distance to its
+face planes. It is exact inside the hull, and may be too small outside near edges and corners.
 
 `CollisionTensors` hold all primitives of a hand except hulls, to compute the distance of object points to every link.
-Hulls are tested by their contact candidates.
+For hulls, the hand's contact candidates are tested instead.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ from graspd_core.se3 import SE3, safe_norm
 
 # Points and their distances [m].
 _Places, _Distances = Float[Tensor, "*batch 3"], Float[Tensor, "*batch"]
-# Number of primitives whose planes and bounds are cached. It is enough for the hand with the most primitives.
+# Planes and bounds of this many primitives are cached. No hand may have more primitives.
 _MOST = 2048
 
 
@@ -45,7 +45,7 @@ def primitive_sdf(primitive: Primitive, points: _Places) -> _Distances:
 
 
 def core_of(primitive: Primitive) -> tuple[tuple[float, ...], float]:
-    """Return a primitive as a core and the radius that grows it (see `CollisionTensors`) [m]. Zeros for a hull."""
+    """Return a core [m], and a radius [m] by which it grows to the primitive (`CollisionTensors`). Zeros for a hull."""
     size = primitive.size
     if primitive.kind == "hull":
         return (0.0, 0.0, 0.0), 0.0
@@ -102,17 +102,17 @@ def hull_planes(primitive: Primitive) -> tuple[Float[np.ndarray, "planes 3"], Fl
     keep = area > 1e-14
     normals = cross[keep] / area[keep, None]
     planes = np.column_stack([normals, (normals * primitive.vertices[primitive.faces[keep, 0]]).sum(1)])
-    # Coplanar triangles give one plane. They are compared after rounding to 1e-9, far below a mesh file's resolution.
+    # Coplanar triangles give one plane. Planes are compared after rounding to 1e-9, far below a mesh file's resolution.
     planes = planes[np.unique(np.round(planes, 9), axis=0, return_index=True)[1]]
     return planes[:, :3], planes[:, 3]
 
 
 def corner_sdf(past: Float[Tensor, "*batch n"]) -> _Distances:
-    """Return the signed distance [m] to a corner of `n` orthogonal faces. `past` has the distance to each face [m]."""
+    """Return the signed distance [m] to a corner where `n` orthogonal faces meet. `past`: distance to each face [m]."""
     return safe_norm(past.clamp_min(0.0)) + past.amax(-1).clamp_max(0.0)
 
 
-# Distances computed at once on a CPU and on an accelerator. Each needs some hundred bytes of memory.
+# Number of distances computed at once on a CPU and on an accelerator. Each distance needs a few hundred bytes.
 _AT_ONCE, _AT_ONCE_ELSEWHERE = 2**21, 2**25
 
 
@@ -171,7 +171,7 @@ def solid_distance(
 def solid_bound(
     solids: CollisionTensors, links: SE3, points: Float[Tensor, "batch points 3"]
 ) -> Float[Tensor, "batch points solids"]:
-    """Return a cheap lower bound of `solid_distance` [m]: the largest offset from the solid's box along its axes."""
+    """Return a cheap lower bound of `solid_distance` [m]: the greatest signed distance to a face of a solid's box."""
     box = solids.core + solids.radius[:, None]
     return _in_parts(solids, links, points, lambda local: (local.abs() - box).amax(-1))
 
@@ -179,7 +179,7 @@ def solid_bound(
 def _in_parts(
     solids: CollisionTensors, links: SE3, points: Tensor, measure: Callable[[Tensor], Tensor]
 ) -> Float[Tensor, "batch points solids"]:
-    """Return a measure of the points in the frame of every primitive, for a part of the batch at a time."""
+    """Apply `measure` to the points in the frame of every primitive. Large batches are split to save memory."""
     at_once = _AT_ONCE if points.device.type == "cpu" else _AT_ONCE_ELSEWHERE
     most = max(1, at_once // max(1, len(solids.link) * points.shape[1]))
     if len(points) <= most:

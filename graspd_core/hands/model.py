@@ -1,4 +1,4 @@
-"""The hand model: a tree of links with joints, masses, collision primitives and contact candidates.
+"""Define the hand model: a tree of links with joints, masses, collision primitives and contact candidates.
 
 Link frames are those of the URDF. The base frame is the frame of `base_link`. Units are m, rad, kg, N, N·m.
 """
@@ -17,9 +17,9 @@ from graspd_core.types import TriangleMesh
 PrimitiveKind = Literal["box", "sphere", "capsule", "cylinder", "hull"]
 JointKind = Literal["revolute", "prismatic", "fixed"]
 
-# Pose of the base link if the file does not give one.
+# Pose of the base link if the file gives none.
 AT_ORIGIN = ((0.0, 0.0, 0.0), (1.0, 0.0, 0.0, 0.0))
-# Travel of a prismatic joint that counts as one radian [m]. A fingertip at 50 mm moves as far in one radian.
+# Travel of a prismatic joint that counts as one radian [m]. One radian moves a fingertip at 50 mm by this length.
 METRES_PER_RADIAN = 0.05
 
 
@@ -53,7 +53,7 @@ class Mimic:
     Attributes:
         name: name of the coupled joint.
         link: link that the coupled joint moves.
-        joint: index of the actuated joint, also if there are other coupled joints in between.
+        joint: index of the actuated joint, also if the coupling leads through other coupled joints.
         multiplier: travel of the coupled joint per radian or metre of the actuated joint.
         offset: value of the coupled joint when the actuated joint is at zero [rad] or [m].
     """
@@ -84,14 +84,14 @@ class Mount:
 class HandModel:
     """A loaded hand. Links and joints are in depth-first order. Link 0 is `base_link`.
 
-    Joint arrays contain the actuated joints. Coupled joints follow from them (`mimics`). Only the outputs of graspd,
-    files and messages, list coupled joints too (`all_joint_names`).
+    Joint arrays contain the actuated joints. Coupled joints follow from the actuated joints (`mimics`). Only output
+    files and ROS messages also list the coupled joints (`all_joint_names`).
 
     Attributes:
         name: name of the hand.
         urdf: path of the loaded URDF or other hand file.
-        link_names: all links, also those behind fixed joints.
-        joint_names: actuated joints.
+        link_names: names of all links, also of links behind fixed joints.
+        joint_names: names of the actuated joints.
         lower, upper: joint limits [rad] or [m].
         effort: greatest joint torque [N·m] or force [N].
         velocity: greatest joint speed [rad/s] or [m/s]. Infinite if the file gives none.
@@ -104,14 +104,14 @@ class HandModel:
         link_offset_rotation, link_offset_translation: `T_parent_link` at joint value zero [m].
         joint_axis: unit axis of the joint between link and parent, link frame. Zero for a fixed joint.
         joint_kind: kind of the joint between link and parent.
-        link_group: number of the rigid group of each link. Fixed joints connect the links of a group.
+        link_group: rigid group of each link, numbered by its first link. Fixed joints connect the links of a group.
         link_mass: mass of each link [kg]. Zero if the file gives none.
         link_com: centre of mass, link frame [m].
         link_inertia: inertia about the centre of mass, in link axes [kg·m²].
         primitives: convex collision shapes.
         adjacent: True for pairs of links that are never checked for collision. Symmetric, True on the diagonal.
         candidate_points: contact candidates, in the frames of their links [m].
-        candidate_normals: outward unit normals at the candidates.
+        candidate_normals: outward unit normals at the candidates, in the frames of their links.
         candidate_link: link of each candidate.
         warnings: guesses and doubtful values, found while loading.
         base_place: pose of the base link in the frame of its file: position [m] and quaternion wxyz.
@@ -171,7 +171,7 @@ class HandModel:
 
     @property
     def num_links(self) -> int:
-        """Number of links, also of those behind fixed joints."""
+        """Number of links, including links behind fixed joints."""
         return len(self.link_names)
 
     @cached_property
@@ -201,7 +201,7 @@ class HandModel:
 
     @cached_property
     def link_multiplier(self) -> Float[np.ndarray, "links"]:
-        """Motion of each link's parent joint per unit motion of `link_joint`. 1 if the parent is actuated."""
+        """Motion of the joint above each link per unit motion of `link_joint`. 1 if the joint above is not coupled."""
         multiplier = np.ones(self.num_links)
         for mimic in self.mimics:
             multiplier[mimic.link] = mimic.multiplier
@@ -209,7 +209,7 @@ class HandModel:
 
     @cached_property
     def link_shift(self) -> Float[np.ndarray, "links"]:
-        """Value of the joint above each link when `link_joint` is at zero [rad] or [m]."""
+        """Value of the joint above each link when `link_joint` is at zero [rad] or [m]. 0 if not coupled."""
         shift = np.zeros(self.num_links)
         for mimic in self.mimics:
             shift[mimic.link] = mimic.offset
@@ -232,7 +232,7 @@ class HandModel:
 
 
 def all_joint_names(hand: HandModel) -> tuple[str, ...]:
-    """Return the names of all actuated and coupled joints, depth-first, as in files and messages."""
+    """Return the names of all actuated and coupled joints, depth-first, as in output files and ROS messages."""
     return tuple(name for name in hand.link_joint_names if name)
 
 

@@ -1,13 +1,13 @@
 """Fill links with spheres for a differentiable self-collision term, and measure overlaps of links and primitives.
 
-The spheres extend beyond the flat faces of long boxes, by up to a fifth of the half thickness, and beyond thin shapes.
+The spheres extend beyond the flat faces of long boxes by up to a tenth of the thickness, and beyond very thin shapes.
 Metrics use signed distances instead. The term tests every pair of spheres, so the number of spheres is limited. If a
-hand has too many, the spheres that extend farthest are kept.
+hand has too many, the spheres that extend farthest beyond the others are kept.
 
 The overlap of two primitives is found by the separating axis test. A separating axis of two boxes is a face normal or
-a cross product of two edges. For boxes the least overlap along these fifteen directions is the exact depth. Round ones
-need three more directions. If an edge meets a rim, the depth is slightly too large. Hulls are excluded. Gradients are
-exact if a single direction has the least overlap.
+a cross product of two edges. For boxes the least overlap along these fifteen directions is the exact depth. Round
+primitives need three more directions. If an edge meets a rim, the depth is slightly too large. Hulls are excluded.
+Gradients are exact if a single direction has the least overlap.
 """
 
 from __future__ import annotations
@@ -25,12 +25,12 @@ from graspd_core.hands.model import HandModel, Primitive
 from graspd_core.hands.surface_points import dense_samples, kept, parent_groups
 from graspd_core.se3 import SE3
 
-# Greatest number of spheres of a rigid group, and of a hand. A hand with more groups has one sphere per group.
+# Greatest number of spheres of a rigid group, and of a hand. If a hand has more groups, each has one sphere.
 MOST_OF_GROUP, MOST_OF_HAND = 64, 160
-# Least radius of the spheres in a box, unless the box is smaller, and least step along capsules and cylinders [m].
+# Least radius of the spheres in a box, except in a smaller box. Least step along capsules and cylinders [m].
 _FINEST = 0.003
-# A dropped sphere may extend beyond the kept ones by `_BARE` [m]. A cylinder is filled like a box if its radius exceeds
-# its half length by more than `_RIM` [m].
+# A dropped sphere may extend beyond the kept spheres by `_BARE` [m]. A cylinder is filled like a box if its radius
+# exceeds its half length by more than `_RIM` [m].
 _BARE, _RIM = 0.001, 0.01
 
 
@@ -61,7 +61,7 @@ def _spread(
 
     This is farthest-point sampling (Gonzalez 1985).
     """
-    # More than 1e3 m marks a sphere whose group has no chosen sphere yet.
+    # A value above 1e3 m marks a sphere whose group has no chosen sphere yet.
     bare = 1e3 + radii
     chosen: list[int] = []
     while bare.max() > _BARE and (len(chosen) < MOST_OF_HAND or bare.max() > 1e3):
@@ -76,7 +76,7 @@ def _spread(
 
 
 def _fill(primitive: Primitive) -> tuple[Float[np.ndarray, "spheres 3"], float]:
-    """Return sphere centres in the primitive's frame and their common radius [m]."""
+    """Fill a primitive with spheres. Return their centres in its frame [m] and their common radius [m]."""
     size = primitive.size
     if primitive.kind == "sphere":
         return np.zeros((1, 3)), size[0]
@@ -153,7 +153,7 @@ def deepest_overlap(hand: HandModel, q: Float[np.ndarray, "postures joints"]) ->
 def adjacent_links(hand: HandModel) -> Bool[np.ndarray, "links links"]:
     """Return the pairs of links that are never checked for collision. The result is cached on disk by hand content.
 
-    These are links of one rigid group, links one joint apart, and links two joints apart that never overlap by much.
+    Adjacent are links of one rigid group, links one joint apart, and links two joints apart that never overlap by much.
     Pairs that overlap in the open posture or in every sampled posture are adjacent too.
     """
     shapes = {"adjacent": (hand.num_links,)}
@@ -175,14 +175,14 @@ def _adjacent_links(hand: HandModel) -> Bool[np.ndarray, "links links"]:
     return same | one | one.T | grazing | (overlap[0] > _TOUCH) | (overlap[1:] > _TOUCH).all(axis=0)
 
 
-# Least sine of the angle between two edges that give a direction, and least length of other directions [m].
+# Least length of a cross product of unit edges, and of the directions added for round primitives [m].
 _PARALLEL, _SHORTEST = 1e-3, 1e-6
-# An edge direction is chosen only if its depth is less than that of every face by this [m]. It avoids rounding effects.
+# Prefer face directions: the depth along any other direction is increased by this [m]. This avoids rounding effects.
 _RATHER_FACES = 1e-6
 
 
 def solid_pairs(hand: HandModel) -> Int[np.ndarray, "pairs 2"]:
-    """Return the index pairs of primitives whose links are not adjacent. Hulls are left out and not counted."""
+    """Return the index pairs of primitives whose links are not adjacent. Hulls are skipped in the numbering."""
     link = np.array([p.link for p in hand.primitives if p.kind != "hull"], dtype=np.int64)
     return np.argwhere(np.triu(~hand.adjacent[np.ix_(link, link)], 1))
 

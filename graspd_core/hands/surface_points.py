@@ -1,7 +1,7 @@
 """Sample the hand's outer surface: contact candidates for the optimiser, dense samples for the metrics.
 
-Points inside another primitive of the rigid group are left out. Points that are inside the next link at every joint
-value are left out too. Random points are uniform by area. Feature points lie on edges, corners and rims.
+Points inside another primitive of their rigid group are left out. Points that lie inside a neighbouring link at every
+joint value are left out too. Random points are uniform by area. Feature points lie on edges, corners and rims.
 """
 
 from __future__ import annotations
@@ -55,7 +55,7 @@ def surface_points(primitive: Primitive, count: int, rng: np.random.Generator) -
 
 
 def feature_points(primitive: Primitive, spacing: float) -> tuple[Points, Points, Bool[np.ndarray, "points"]]:
-    """Return points on edges and rims at most `spacing` [m] apart, mean normals, and True for each corner."""
+    """Return points on edges and rims at most `spacing` [m] apart, their mean normals, and True for corners."""
     if primitive.kind == "box":
         points, normals, corner = _box_edges(np.asarray(primitive.size), spacing)
     elif primitive.kind == "cylinder":
@@ -72,7 +72,7 @@ def feature_points(primitive: Primitive, spacing: float) -> tuple[Points, Points
 
 def outermost(points: Float[np.ndarray, "_ 3"], count: int) -> Float[np.ndarray, "_ 3"]:
     """Return the points that are extreme along `count` evenly spread directions."""
-    # Computing by parts limits the memory, because a fine mesh has a hundred thousand points.
+    # Computing in parts limits the memory, because a fine mesh has a hundred thousand points.
     parts = np.array_split(even_directions(count), -(-count // 64), axis=1)
     return points[np.unique(np.concatenate([(points @ part).argmax(0) for part in parts]))]
 
@@ -153,7 +153,7 @@ def _rims(radius: float, half: float, spacing: float) -> tuple[Points, Points]:
 _BESIDES = {"name", "urdf", "warnings", "mount", "base_place", "adjacent"}
 _BESIDES |= {"candidate_points", "candidate_normals", "candidate_link"}
 _CONTENT = {item.name for item in fields(HandModel)} - _BESIDES
-# Points within a tenth of this of another solid's surface count as on that surface [m].
+# A point counts as on another solid's surface if it is closer than a tenth of this [m].
 _STEP = 1e-6
 # A point counts as covered if it is still near another solid of its group after this step along its normal [m]. In a
 # crease the hand cannot touch anything.
@@ -170,7 +170,7 @@ _TIP_WEIGHT, _EDGE_WEIGHT, _BACK_WEIGHT = 2.0, 1.25, 0.5
 
 @dataclass(frozen=True, eq=False)
 class _Pool:
-    """Surface points in link frames [m]. `source` has each point's primitive, `areas` the area it represents [m²]."""
+    """Surface points in link frames [m]. `source` has the primitive of each point, `areas` the area per point [m²]."""
 
     points: Float[np.ndarray, "points 3"]
     normals: Float[np.ndarray, "points 3"]
@@ -185,7 +185,7 @@ class _Pool:
 
 @lru_cache(maxsize=8)
 def with_candidates(hand: HandModel, count: int) -> HandModel:
-    """Return the hand with `count` contact candidates, or the same hand if it has them. Raises HandError: count < 1."""
+    """Return the hand with `count` contact candidates. Unchanged if it has as many. Raises HandError: count < 1."""
     if count < 1:
         raise HandError(f"candidates: {count}; valid: 1 or more")
     if count == len(hand.candidate_link):
@@ -198,8 +198,8 @@ def candidates(hand: HandModel, count: int, seed: int) -> tuple[Points, Points, 
     """Return evenly spread contact candidates: points [m] and outward normals in link frames, and their links.
 
     Corners that face the grasp are chosen first. Then farthest-point sampling (Gonzalez 1985) runs within each rigid
-    group. It is denser on fingertips and sparser on backs (`_weights`). The first n candidates cover the hand evenly
-    too. If a link has a skin, its candidates lie on the skin.
+    group. Candidates are denser on fingertips and sparser on the hand's back (`_weights`). The first n candidates cover
+    the hand evenly too. If a link has a skin, its candidates lie on the skin.
     """
     rng = np.random.default_rng(seed)
     features = _exposed(hand, _feature_pool(hand))
@@ -293,7 +293,7 @@ def _feature_pool(hand: HandModel) -> _Pool:
     parts = [feature_points(p, spacing=0.004) for p in hand.primitives]
     corner = np.concatenate([part[2] for part in parts])
     pool = _pool(hand, parts, np.zeros(len(corner)), corner)
-    # If there are too many points, evenly spaced ones are taken, so that every solid keeps its share.
+    # If there are too many points, every n-th point is taken, so that every solid keeps its share.
     total = len(pool.points)
     return pool if total <= _MOST_FEATURES else pool.take(np.linspace(0, total - 1, _MOST_FEATURES).astype(int))
 
@@ -303,7 +303,7 @@ def _exposed(hand: HandModel, pool: _Pool) -> _Pool:
     pool = pool.take(~_covered_in_group(hand, pool))
     groups, above = hand.link_group[pool.links], parent_groups(hand)
     always = np.ones(len(pool.points), dtype=bool)
-    # Neighbouring groups have one joint between them. So moving all joints together covers the range of each.
+    # Neighbouring groups have one joint between them. So moving all joints together covers the range of each joint.
     for share in np.linspace(0.0, 1.0, 5):
         poses = link_poses(hand, hand.lower + share * (hand.upper - hand.lower))
         placed = in_base(poses, pool.points, pool.links)
@@ -319,7 +319,7 @@ def _exposed(hand: HandModel, pool: _Pool) -> _Pool:
 
 
 def _covered_in_group(hand: HandModel, pool: _Pool) -> Bool[np.ndarray, "points"]:
-    """Return True for points in another primitive of their group, right in front of its surface, or flush with it."""
+    """Return True for points in, on or just in front of another primitive of their rigid group."""
     poses = link_poses(hand, hand.open_posture)
     placed = in_base(poses, pool.points, pool.links)
     raised = in_base(poses, pool.points + _CREASE * pool.normals, pool.links)
@@ -356,7 +356,7 @@ def _distance(poses: LinkPoses, primitive: Primitive, points: Points) -> Float[n
 def parent_groups(hand: HandModel) -> Int[np.ndarray, "links"]:
     """Return for each group its nearest ancestor group with primitives, -1 for none.
 
-    Groups without them are skipped, because a joint with several axes is a chain of hinges with massless links.
+    Groups without primitives are skipped, because a joint with several axes is a chain of hinges with massless links.
     """
     parent = hand.link_parent
     above = np.where(parent >= 0, hand.link_group[np.maximum(parent, 0)], -1)
@@ -372,7 +372,7 @@ def _weights(hand: HandModel, pool: _Pool) -> tuple[Float[np.ndarray, "points"],
     """Return the density of candidates around each point, and True for each point that faces the grasp.
 
     A point on a finger faces the grasp if closing the hand moves it outwards along its normal. The palm faces along the
-    palm normal. A fingertip is the outer half of the last rigid group of a finger.
+    palm normal. Density is higher on fingertips: the outer half of a finger's last rigid group.
     """
     poses = rotations, origins = link_poses(hand, hand.open_posture)
     groups = hand.link_group[pool.links]

@@ -1,1 +1,1 @@
-"""Readers and writers of grasps files and recordings."""
+"""Read and write grasps files, and read recordings."""

@@ -1,6 +1,6 @@
-"""Reader of rosbag2 recordings (mcap and sqlite3). It uses the rosbags library and needs no ROS installation.
+"""Read rosbag2 recordings (mcap and sqlite3) with the rosbags library, without a ROS installation.
 
-Messages keep the order of the recording, so that a bag gives the same clouds every time.
+Messages keep the order of the recording, so that a bag gives equal clouds every time.
 """
 
 from __future__ import annotations
@@ -45,7 +45,7 @@ class BagFrame:
         frame: frame id of the header.
         topic: topic of the message.
         message: a PointCloud2, a depth Image, or a CompressedImage with depth.
-        info: CameraInfo of a depth image. None for a cloud.
+        info: last CameraInfo before the depth image, else the first of the recording. None for a cloud.
     """
 
     index: int
@@ -58,13 +58,13 @@ class BagFrame:
     def view(
         self, transforms: TransformBuffer | None = None, target: str | None = None, place: CameraPlace = ORIGIN
     ) -> PointCloud:
-        """Return the point cloud, in the message's frame or in `target`. `place` is the camera's position for a cloud.
+        """Return the point cloud, in the message's frame or in `target`. For a cloud, `place` locates its camera.
 
         Raises:
             CloudError: the message is broken or has no usable point.
             TransformError: the transform from the message's frame to `target` is not known at the stamp.
         """
-        # Some drivers leave the stamp at zero. Then the newest transform is used.
+        # Some drivers leave the stamp at zero. Then use the newest transform.
         lookup = no_lookup if transforms is None else lambda to, of: transforms.lookup(to, of, self.stamp or None)
         if self.info is None:
             cloud = place.cloud(self.message, lookup)
@@ -120,7 +120,7 @@ def read_frames(
     Args:
         path: a rosbag2 directory, or one of its storage files (.mcap, .db3).
         topic: topic of clouds or depth images. None takes the only cloud topic, else the only depth topic.
-        info_topic: CameraInfo topic of the depth images. None takes `camera_info` beside the images, else the only one.
+        info_topic: CameraInfo topic. None takes `camera_info` beside the depth images, else the only CameraInfo topic.
         every: yield every n-th message only.
         limit: greatest number of messages to yield. None means no limit.
 
@@ -152,7 +152,7 @@ def read_frames(
 
 
 def read_raw(path: str | Path, topics: tuple[str, ...] = ()) -> Iterator[tuple[BagTopic, int, bytes]]:
-    """Yield raw messages (CDR) of the given topics, or of all, each with its topic and receive time [ns].
+    """Yield raw messages (CDR), each with its topic and receive time [ns]. Without `topics`, all topics are read.
 
     Raises BagError: the path is no bag, or the bag is broken or lacks a topic.
     """
@@ -187,7 +187,7 @@ def _opened(path: str | Path) -> Iterator[Any]:
         kinds = "a directory of rosbag2, or a file ending in " + " or ".join(f".{e}" for e in BAG_ENDINGS)
         raise BagError(f"{path}: not a bag; a bag is {kinds}")
     if path.is_dir() and not (path / "metadata.yaml").exists():
-        # The recorder was killed before it wrote the metadata. Its storage file may still be complete.
+        # The recorder was killed before it wrote the metadata. The storage file may still be complete.
         files = _storage_files(path)
         if len(files) > 1:
             raise BagError(f"{path}: no metadata.yaml, but {len(files)} storage files; give one of the files")
@@ -196,7 +196,7 @@ def _opened(path: str | Path) -> Iterator[Any]:
     try:
         reader = AnyReader([path], default_typestore=jazzy_types())
         reader.open()
-    # For a broken file the library raises many kinds of errors, such as struct, sqlite3, yaml and assertion errors.
+    # For a broken file, rosbags raises many kinds of errors, such as struct, sqlite3, yaml and assertion errors.
     except Exception as error:
         raise BagError(f"{path}: not a readable bag, or cut short ({first_line(error)})") from error
     try:
@@ -221,7 +221,7 @@ def _messages(path: str | Path, reader: Any, connections: list[Any]) -> Iterator
 
 
 def _decode(path: str | Path, reader: Any, connection: Any, raw: Any) -> Any:
-    """Decode a message with Jazzy's definition of its type. If there is none, use the bag's own definition."""
+    """Decode a message with Jazzy's definition of its type. If Jazzy has none, use the definition in the bag."""
     kind, known = connection.msgtype, jazzy_types()
     types = known if kind in known.fielddefs else reader.typestore
     try:
@@ -250,7 +250,7 @@ def _choose(path: str | Path, reader: Any, name: str | None) -> BagTopic:
         if found is None:
             raise BagError(f"{path}: no clouds or depth images on {name!r}; valid topics: {offered}")
         return found
-    # A compressed image next to a raw one shows the same. The raw one is preferred.
+    # A compressed image topic repeats the raw image topic beside it, so prefer raw images.
     candidates = clouds or images or packed
     if not candidates:
         have = ", ".join(f"{t.name} ({t.type.rsplit('/', 1)[-1]})" for t in topics) or "none"

@@ -1,4 +1,4 @@
-"""Files of the format `graspd/grasps` (docs/format.md). Writes version 2, reads versions 1 and 2."""
+"""Write files of the format `graspd/grasps` in version 2, and read versions 1 and 2 (docs/format.md)."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ _LIBRARIES = ("graspd", "torch", "mujoco", "open3d", "numpy")
 
 
 def result_document(result: GraspResult, target: ObjectModel, hand: HandModel, config: PlanConfig) -> dict[str, Any]:
-    """Return a result as JSON-ready values, in m, rad and N unless a key names another unit."""
+    """Return a result as JSON-ready values, in m, rad and N. Values in other units have the unit in their key."""
     return {
         "format": FORMAT,
         "version": VERSION,
@@ -78,7 +78,7 @@ def _hand(hand: HandModel) -> dict[str, Any]:
 def check_writable(path: Path) -> None:
     """Check before long work that a file can be written. Make missing directories.
 
-    Raises ConfigError: the path is a directory, or its directory cannot be made or written to.
+    Raises ConfigError: the path is a directory, or its parent directory cannot be made or cannot be written to.
     """
     if path.is_dir():
         raise ConfigError(f"{path}: is a directory; give the name of a file to write")
@@ -100,11 +100,11 @@ def save_result(
     frame: str = "",
     stamp: float | None = None,
 ) -> None:
-    """Write a result to a file atomically. `frame` and `stamp` [s] are the frame and time of the poses."""
+    """Write a result to a file atomically. `frame` is the frame of all poses, and `stamp` is their time [s]."""
     document = result_document(result, target, hand, config)
     document |= {"frame": frame} if frame else {}
     document |= {"stamp": stamp} if stamp is not None else {}
-    # NaN is not valid JSON, so a document with NaN must not be written.
+    # NaN is not valid JSON, so refuse to write a document with NaN.
     save_text(Path(path), json.dumps(document, indent=1, allow_nan=False) + "\n")
 
 
@@ -147,8 +147,8 @@ def _arm(path: ArmPath) -> dict[str, Any]:
 def grasp_figures(grasp: Grasp) -> dict[str, Any]:
     """Return metrics and trials of a grasp as JSON-ready values.
 
-    Values that were not measured or are not finite are None. Every metric of the registry has a key that names its
-    unit. Trials are in [m] and [rad].
+    Values that were not measured or are not finite are None. The key of every metric names its unit. The values of
+    trials are in [m] and [rad].
     """
     metrics = grasp.metrics or {}
     return {
@@ -182,7 +182,7 @@ def load_grasps(path: str | Path) -> tuple[Grasp, ...]:
     """Read the grasps of a file that `save_result` wrote, in rank order.
 
     Raises:
-        FormatError: the file is missing, has another format or version, or a grasp in it is malformed.
+        FormatError: the file is missing, has another format or version, or holds a malformed grasp.
     """
     return grasps_of(load_document(path))
 
@@ -207,12 +207,12 @@ def load_document(path: str | Path) -> dict[str, Any]:
 def grasps_of(document: dict[str, Any]) -> tuple[Grasp, ...]:
     """Return the grasps of a document that `load_document` read, in rank order.
 
-    The squeeze gets the base pose of the grasp. Postures hold actuated joints only. Unknown metrics are ignored.
-    Raises FormatError: a grasp lacks a key, or a value has the wrong type or is not finite.
+    The squeeze posture gets the base pose of the grasp posture. Postures hold actuated joints only. Unknown metrics are
+    ignored. Raises FormatError: a grasp lacks a key, or a value has the wrong type or is not finite.
     """
     try:
         hand = document["hand"]
-        # Older files, from before coupled joints, do not have this key.
+        # Files from before coupled joints do not have the key "mimic".
         coupled = {mimic["joint"] for mimic in hand.get("mimic", ())}
         actuated = np.array([name not in coupled for name in hand["joint_names"]], dtype=bool)
         upgrade = _from_version_1 if document.get("version") == 1 else dict
@@ -242,9 +242,9 @@ def _grasp_of(values: dict[str, Any], actuated: Bool[np.ndarray, "movable"]) -> 
         score=float(_numbers_of(values, "score")),
         metrics=_metrics_of(values["metrics"]),
         trials=tuple(_trial_of(trial) for trial in values["trials"]),
-        # Older files, from before probabilities, do not have this key.
+        # Files from before probabilities do not have the key "probability".
         probability=_scaled({"probability": None, **values}, "probability", 1.0),
-        # Older files, from before arms, do not have this key.
+        # Files from before arms do not have the key "arm".
         arm=_arm_of(values["arm"]) if values.get("arm") is not None else None,
     )
     if values["verdict"] != grasp.verdict:
@@ -253,8 +253,8 @@ def _grasp_of(values: dict[str, Any], actuated: Bool[np.ndarray, "movable"]) -> 
 
 
 def _from_version_1(values: dict[str, Any]) -> dict[str, Any]:
-    """Convert a grasp from version 1 to version 2. The grasp's `reason` goes to its last trial."""
-    # Older files, from before the lift trial, do not have this key.
+    """Convert a grasp from version 1 to version 2. The grasp's `reason` becomes the reason of its last trial."""
+    # Files from before the lift trial do not have the key "lift".
     tried = {name: values["metrics"].get(name) for name in ("hold", "lift")}
     tried = {name: trial for name, trial in tried.items() if trial is not None}
     trials = [
@@ -279,7 +279,7 @@ def _metrics_of(values: dict[str, Any]) -> GraspMetrics | None:
 def _trial_of(values: dict[str, Any]) -> TrialResult:
     if not isinstance(values["passed"], bool):
         raise ValueError(f"passed: {short_repr(values['passed'])}; expected true or false")
-    # Values that are not finite were written as null.
+    # `save_result` writes values that are not finite as null.
     moved = [_scaled(values, key, 1.0) for key in ("displacement", "rotation")]
     displacement, rotation = (math.inf if value is None else value for value in moved)
     return TrialResult(str(values["name"]), values["passed"], displacement, rotation, str(values["reason"]))

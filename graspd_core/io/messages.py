@@ -1,4 +1,4 @@
-"""Conversion of ROS messages to arrays. Messages may be live, recorded, or other objects with the same attributes."""
+"""Convert ROS messages to arrays. Messages may be live, recorded, or any objects with the attributes of a message."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ from graspd_core.perception.cloud.point_cloud import PointCloud
 from graspd_core.perception.cloud.viewpoint_check import seen_from
 from graspd_core.transforms import SECOND, TransformBuffer
 
-# Least mean cosine between an axis and the directions to the points, if the camera looks along this axis.
+# The camera looks along an axis if the mean cosine between the axis and the directions to the points is at least this.
 _AHEAD = 0.8
 # Type numbers of sensor_msgs/PointField, with their names and NumPy types.
 FIELD_TYPES = {
@@ -37,10 +37,10 @@ FIELD_TYPES = {
     7: ("FLOAT32", "f4"),
     8: ("FLOAT64", "f8"),
 }
-# Count of numbers that are checked for the byte order.
+# About this many numbers of a cloud are checked for the byte order.
 _SOME_NUMBERS = 5000
-# A `compressedDepth` CompressedImage begins with its format as int32 and two quantisation numbers as float32. A PNG
-# begins with 8 fixed bytes, and its width and height are at byte 16.
+# The data of a `compressedDepth` image begins with its format as int32 and two quantisation numbers as float32. Then a
+# PNG follows. A PNG begins with 8 fixed bytes, and its width and height are at byte 16.
 _QUANTISED = struct.Struct("<iff")
 _PNG, _PNG_SIZES = b"\x89PNG\r\n\x1a\n", struct.Struct(">II")
 _MOST_PIXELS = 2**26
@@ -55,16 +55,16 @@ def stamp_of(message: Any) -> int:
 def points_from_message(message: Any) -> Float[np.ndarray, "n 3"]:
     """Return the finite points of a sensor_msgs/PointCloud2, in row order, in the message's frame and unit.
 
-    The cloud may be organised or not, padded, of float32 or float64, in either byte order, with fields at any offset.
+    The cloud may be organised and padded. Coordinates may be float32 or float64, in either byte order, at any offset.
     Raises CloudError: no point is finite, x, y or z is missing or not a float, or the sizes contradict each other.
     """
     return finite_points(pixels_from_message(message))
 
 
 def finite_points(pixels: Float[np.ndarray, "height width 3"]) -> Float[np.ndarray, "n 3"]:
-    """Return the finite points of an organised cloud, in row order. Raises CloudError if there are none."""
+    """Return the finite points of an organised cloud, in row order. Raises CloudError: no point is finite."""
     points = pixels.reshape(-1, 3)
-    # Computed column by column, which is three times as fast as `isfinite(points).all(1)`.
+    # Check column by column, which is three times as fast as `isfinite(points).all(1)`.
     finite = np.isfinite(points[:, 0]) & np.isfinite(points[:, 1]) & np.isfinite(points[:, 2])
     kept = points[finite] if not finite.all() else points
     if len(kept) == 0:
@@ -73,16 +73,16 @@ def finite_points(pixels: Float[np.ndarray, "height width 3"]) -> Float[np.ndarr
 
 
 def pixels_from_message(message: Any) -> Float[np.ndarray, "height width 3"]:
-    """Return all points of a PointCloud2 as an image, even NaN. Raises CloudError: the cloud is empty or malformed."""
+    """Return all points of a PointCloud2 as an image, with NaN. Raises CloudError: the cloud is empty or malformed."""
     width, height, data = message.width, message.height, memoryview(message.data)
     if width == 0 or height == 0:
         raise CloudError(f"the cloud is empty: width={width}, height={height}")
     strides = (_row_step(message, data.nbytes), message.point_step)
-    # Fields are checked before memory is allocated, because a message's sizes can ask for any amount of it.
+    # Check the fields before allocating memory, because the sizes in a broken message can ask for too much memory.
     places = [_place_of(message, name) for name in "xyz"]
     points = np.empty((height, width, 3))
     for axis, (dtype, offset) in enumerate(places):
-        # Signalling NaNs stay NaN. NumPy would warn of them.
+        # Without `errstate`, NumPy would warn of signalling NaNs. They stay NaN.
         with np.errstate(invalid="ignore"):
             points[..., axis] = np.ndarray((height, width), dtype, data, offset, strides)
     _check_order(message.is_bigendian, places[0][0], points)
@@ -90,9 +90,9 @@ def pixels_from_message(message: Any) -> Float[np.ndarray, "height width 3"]:
 
 
 def _row_step(message: Any, size: int) -> int:
-    """Return the bytes from one row to the next. Some drivers set `row_step` to 0, or to the size of all rows.
+    """Count the bytes from one row to the next. Some drivers set `row_step` to 0, or to the size of all rows.
 
-    Raises CloudError if the sizes contradict each other. `size` is the number of bytes of the data.
+    `size` is the number of bytes of the data. Raises CloudError: the sizes contradict each other.
     """
     width, height, step, row_step = message.width, message.height, message.point_step, message.row_step
     row = width * step
@@ -110,7 +110,7 @@ def _row_step(message: Any, size: int) -> int:
 
 
 def _place_of(message: Any, name: str) -> tuple[np.dtype, int]:
-    """Return the NumPy type and the byte offset of a coordinate within a point."""
+    """Return the NumPy type of a coordinate, and its byte offset within a point."""
     fields = {field.name: field for field in message.fields}
     if name not in fields:
         raise CloudError(f"the cloud has no field {name!r}; it has: {', '.join(fields) or 'none'}")
@@ -127,7 +127,7 @@ def _place_of(message: Any, name: str) -> tuple[np.dtype, int]:
 
 
 def _check_order(is_bigendian: bool, dtype: np.dtype, points: Float[np.ndarray, "height width 3"]) -> None:
-    """Raise CloudError if the numbers of a cloud are plausible lengths only in the other byte order."""
+    """Raise CloudError if the coordinates of a cloud are plausible lengths only in the other byte order."""
     some = points.reshape(-1)[:: 1 + points.size // _SOME_NUMBERS]
     if _odd_share(some) < 0.5:
         return
@@ -148,8 +148,8 @@ def _odd_share(numbers: Float[np.ndarray, "n"]) -> float:
 class CameraPlace:
     """Position of a cloud's camera. The default is the origin of the cloud's frame.
 
-    `view_point` is the position in the cloud's frame [m]. Without it, the camera is at the origin of `sensor_frame`.
-    The camera looks along z if the name of this frame ends in optical_frame (REP 103).
+    `view_point` is the position in the cloud's frame [m]. If it is None, the camera is at the origin of `sensor_frame`,
+    by default the cloud's frame. If this frame's name ends in optical_frame, the camera looks along z (REP 103).
     """
 
     view_point: tuple[float, float, float] | None = None
@@ -159,7 +159,7 @@ class CameraPlace:
         """Return the cloud of a sensor_msgs/PointCloud2 with its viewpoint. `lookup` returns `T_target_source` [m].
 
         Raises:
-            CloudError: see `points_from_message`, or the pixels show that the camera was at another position.
+            CloudError: see `points_from_message`. Also if the pixels show that the camera was at another position.
             TransformError: the pose of the camera's frame is not known.
         """
         T, frame = np.eye(4), message.header.frame_id
@@ -178,14 +178,14 @@ ORIGIN = CameraPlace()
 
 
 def no_lookup(target: str, source: str) -> Float[np.ndarray, "4 4"]:
-    """Raise TransformError. This is the lookup function if there are no transforms."""
+    """Raise TransformError. Callers without transforms use this as lookup function."""
     raise TransformError(f"transform {source} -> {target}: no transforms are given")
 
 
 def frame_fault(frame: str, points: Float[np.ndarray, "n 3"]) -> str:
-    """Return a warning if the camera's viewing direction contradicts the frame's name, else an empty text.
+    """Return a warning if the camera's viewing direction contradicts the frame's name, else "".
 
-    The camera is at the frame's origin. By REP 103 it looks along z in optical frames and along x in body frames.
+    The camera is at the frame's origin. By REP 103, cameras look along z in optical frames and along x in body frames.
     """
     named = "z" if "optical" in frame else "x" if frame.endswith(("_link", "_frame")) else ""
     reach = np.linalg.norm(points, axis=1)
@@ -207,7 +207,7 @@ def camera_from_message(info: Any, *, rectified: bool = False) -> PinholeCamera:
     """Return the camera of a sensor_msgs/CameraInfo: K and distortion for a raw image, P for a rectified image.
 
     The camera includes binning and region of interest, so it fits the image as sent. Raises CloudError: the camera is
-    not calibrated, or the distortion model is unknown.
+    not calibrated, or the distortion model is unknown, or a number is not finite.
     """
     # Drivers of cameras without distortion often leave P empty.
     by_projection = rectified and info.p[0] > 0
@@ -219,7 +219,7 @@ def camera_from_message(info: Any, *, rectified: bool = False) -> PinholeCamera:
     filled[:2, 2] -= roi.x_offset, roi.y_offset
     filled[:2] /= bins[:, None]
     width, height = image_size(info)
-    # A rectified image needs no distortion model, so an unknown model, such as that of a fisheye lens, is ignored.
+    # A rectified image needs no distortion model. So ignore an unknown model, e.g. the model of a fisheye lens.
     distortion, model = ([], "") if rectified else (list(info.d), info.distortion_model)
     return camera_from_calibration(int(width), int(height), filled.ravel().tolist(), distortion, model)
 
@@ -238,9 +238,9 @@ def image_size(message: Any) -> tuple[int, int]:
 
 
 def depth_from_message(image: Any) -> DepthImage:
-    """Return the depth [m] of an Image or CompressedImage, 0 for no depth. Rows may be padded.
+    """Return the depth [m] of an Image or CompressedImage, 0 where there is no depth. Rows may be padded.
 
-    Raises CloudError if the encoding holds no depth, the image is empty or broken, or its sizes disagree.
+    Raises CloudError: the encoding holds no depth, the image is empty or broken, or its sizes disagree.
     """
     if hasattr(image, "format"):
         return _depth_from_compressed(memoryview(image.data), image.format)
@@ -261,7 +261,7 @@ def depth_from_message(image: Any) -> DepthImage:
 
 
 def _size_of_compressed(data: memoryview, told: str) -> tuple[int, int]:
-    """Return width and height [pixels] of the PNG in a CompressedImage. Raises CloudError if there is no usable PNG."""
+    """Return width and height [pixels] of the PNG in a CompressedImage. Raises CloudError: there is no usable PNG."""
     at = _png_begins(data, told) + 16
     if len(data) < at + _PNG_SIZES.size:
         raise CloudError(f"depth image: its PNG is cut off, the message has {len(data)} bytes")
@@ -274,8 +274,8 @@ def _size_of_compressed(data: memoryview, told: str) -> tuple[int, int]:
 def _depth_from_compressed(data: memoryview, told: str) -> DepthImage:
     """Return depth [m] of a sensor_msgs/CompressedImage of `compressedDepth`, or of a plain PNG of 16 bits.
 
-    For 32FC1, pixels v hold quantised inverse depth. Depth is a / (v - b), with a and b stored before the PNG. `told`
-    is the message's `format`: an encoding and "compressedDepth png".
+    For 32FC1, a pixel v holds quantised inverse depth. The depth is a / (v - b). The numbers a and b are stored before
+    the PNG. `told` is the message's `format`: an encoding and "compressedDepth png".
     """
     from PIL import Image
 
@@ -286,7 +286,7 @@ def _depth_from_compressed(data: memoryview, told: str) -> DepthImage:
     try:
         with Image.open(io.BytesIO(data[begins:])) as picture:
             mode, pixels = picture.mode, np.asarray(picture)
-    except Exception as error:  # for a broken file, the library may raise any exception
+    except Exception as error:  # For a broken file, Pillow may raise any exception.
         raise CloudError(f"depth image: its PNG is broken ({error})") from None
     if not mode.startswith("I"):
         raise CloudError(f"depth image: format {told[:64]!r} holds a PNG of mode {mode}; valid: 16 bits a pixel")
@@ -308,12 +308,12 @@ def _png_begins(data: memoryview, told: str) -> int:
 
 
 def depth_and_camera(image: Any, info: Any, *, rectified: bool = False) -> tuple[DepthImage, PinholeCamera]:
-    """Return the depth image [m], 0 for no depth, and its camera from a sensor_msgs/CameraInfo.
+    """Return the depth image [m], 0 where there is no depth, and its camera from a sensor_msgs/CameraInfo.
 
     Args:
         image: a sensor_msgs/Image with a depth encoding, or a CompressedImage of `compressedDepth`.
         info: calibration of the camera, for an image of the same size.
-        rectified: whether the image is rectified, that is, without distortion.
+        rectified: whether the image is rectified. A rectified image has no distortion.
 
     Raises:
         CloudError: the image is no depth image, is broken, or has another frame than the calibration.
@@ -326,9 +326,9 @@ def depth_and_camera(image: Any, info: Any, *, rectified: bool = False) -> tuple
 
 
 def cloud_from_depth_message(image: Any, info: Any, *, rectified: bool = False) -> PointCloud:
-    """Return the point cloud of a depth image, in the camera's optical frame. See `depth_and_camera` for arguments.
+    """Return the point cloud of a depth image, in the camera's optical frame. Arguments as for `depth_and_camera`.
 
-    Raises CloudError: see `depth_and_camera`, or the image has no depth or does not fit the calibration.
+    Raises CloudError: see `depth_and_camera`. Also if no pixel has a depth, or the image does not fit the calibration.
     """
     depth, camera = depth_and_camera(image, info, rectified=rectified)
     cloud = cloud_from_depth(depth, camera)
@@ -350,7 +350,7 @@ def add_transforms(buffer: TransformBuffer, message: Any, *, static: bool) -> tu
 
 
 def _pose(transform: Any) -> Float[np.ndarray, "4 4"]:
-    """Return the matrix of a geometry_msgs/Transform. Its rotation is NaN if the quaternion has not unit length."""
+    """Return a geometry_msgs/Transform as matrix. The rotation is NaN if the quaternion does not have length 1."""
     from scipy.spatial.transform import Rotation
 
     turn, move = transform.rotation, transform.translation

@@ -1,1 +1,1 @@
-"""A library of verified grasps of known objects, kept in a file."""
+"""Keep verified grasps of known objects in a library file, and find them again."""

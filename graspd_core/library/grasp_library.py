@@ -1,8 +1,8 @@
-"""Store verified grasps in an SQLite file, with one transaction per record.
+"""Store verified grasps in an SQLite file. Each entry is one record, written in one transaction.
 
-The key of an entry is a hash of the mesh, the hand and the physics of the trials. A write-ahead log lets
-readers work while another process writes. A killed writer loses only its own record. Each call opens and closes the
-file.
+The key of an entry is a hash of the mesh, the hand and the physics of the trials. A write-ahead log lets other
+processes read while a process writes. A killed writer loses only the record that it was writing. Each call opens and
+closes the file.
 """
 
 from __future__ import annotations
@@ -30,9 +30,9 @@ from graspd_core.perception.scene import ObjectModel
 from graspd_core.runtime.disk_cache import digest
 from graspd_core.types import Grasp, GraspResult, Outcome, Timing, Verdict
 
-# Strictness of each kind of verification. Grasps that passed stricter trials are valid for less strict ones.
+# Strictness of each kind of trials. A grasp that passed stricter trials is also valid for less strict trials.
 STRICTNESS = {"none": 0, "standard": 1, "full": 1, "hard": 2, "hard_full": 2}
-# Fields that are not part of a hand's content: names, mount, and contact candidates, which each plan draws anew.
+# Fields that `hand_hash` leaves out: names, mount, and contact candidates, which are drawn anew for each plan.
 _NO_CONTENT = {"name", "urdf", "link_names", "joint_names", "warnings", "mount", "mimics", "base_place"}
 _NO_CONTENT |= {"candidate_points", "candidate_normals", "candidate_link"}
 
@@ -42,14 +42,14 @@ class LibraryEntry:
     """The object, hand and physics of stored grasps.
 
     Attributes:
-        name: name of the object. The default is the file's name, with the scale if it is not 1.
+        name: name of the object. The default is the file's name, followed by the scale if the scale is not 1.
         source: absolute path of the mesh file, or shape:NAME. Empty for a mesh without a file.
         file_sha256: hash of the file's content. Empty for a mesh without a file.
         mesh_sha256: hash of the cleaned mesh in metres.
         scale: metres per unit of the file.
         mass: mass of the object [kg].
-        friction: Coulomb coefficient.
-        verify: name of the trials that the grasps passed, one of `STRICTNESS`.
+        friction: Coulomb friction coefficient.
+        verify: name of the trials that the grasps passed, a key of `STRICTNESS`.
         hand: name of the hand.
         hand_content: hash of the hand's kinematics and collision shapes.
     """
@@ -92,12 +92,12 @@ def entry_of(target: ObjectModel, hand: HandModel, verify: str, name: str = "") 
 
 
 def absolute(source: str) -> str:
-    """Return a source with an absolute path. shape:NAME does not change."""
+    """Return the absolute path of a mesh file. Return shape:NAME unchanged."""
     return source if source.startswith(SHAPE_PREFIX) else str(Path(source).resolve())
 
 
 def source_hash(source: str) -> str:
-    """Return the hash of the content of a mesh file or a shape. Raises MeshError: the file cannot be read."""
+    """Return the hash of a mesh file's content, or of a shape's mesh. Raises MeshError: the file cannot be read."""
     if source.startswith(SHAPE_PREFIX):
         return content_hash(make_shape(source.removeprefix(SHAPE_PREFIX)))
     try:
@@ -115,16 +115,16 @@ def _file_hash(path: str, changed: int, size: int) -> str:
 
 @lru_cache(maxsize=8)
 def hand_hash(hand: HandModel) -> str:
-    """Return the hash of all hand data that grasps and trials depend on. Names do not count."""
+    """Return the hash of all hand data that grasps and trials depend on. Names are left out."""
     mimics = tuple((m.link, m.joint, m.multiplier, m.offset) for m in hand.mimics)
     content = (getattr(hand, item.name) for item in fields(hand) if item.name not in _NO_CONTENT)
     return digest((*content, mimics))
 
 
 VERSION = 1
-# Application id in SQLite's header ("grsp"). It identifies the file as a library of graspd.
+# Application id in SQLite's header ("grsp"). It marks the file as a library of graspd.
 _APPLICATION = 0x67727370
-# Greatest number of grasps of a record. A request may not ask for more.
+# Greatest number of grasps in a record. No request may ask for more grasps.
 MOST_GRASPS = 1024
 # Greatest time that a writer waits for another writer [s].
 _PATIENCE = 30.0
@@ -143,7 +143,7 @@ class GraspLibrary:
     """A library of grasps in a file. Call `checked` to verify the file.
 
     Attributes:
-        path: path of the file. While the file is open, SQLite keeps two files beside it, ending in -wal and -shm.
+        path: path of the file. While it is open, SQLite keeps two more files beside it, ending in -wal and -shm.
     """
 
     path: Path
@@ -159,7 +159,7 @@ class GraspLibrary:
             base.executescript(f"BEGIN IMMEDIATE; {head} {_SCHEMA} COMMIT;")
 
     def checked(self) -> GraspLibrary:
-        """Check the file and return this library. Raises FormatError: it is missing, damaged, or of another version."""
+        """Check the file and return the library. Raises FormatError: no file, a damaged file, or another version."""
         with self._reading() as base:
             (state,) = base.execute("PRAGMA quick_check(1)").fetchone()
         if state != "ok":
@@ -167,7 +167,7 @@ class GraspLibrary:
         return self
 
     def entries(self, **wanted: str | float) -> list[tuple[LibraryEntry, int]]:
-        """Return entries with the wanted column values and their numbers of grasps. Entries are sorted by name."""
+        """Return the entries whose fields have the `wanted` values, sorted by name, each with its number of grasps."""
         where = " AND ".join(f"{column} = ?" for column in wanted) or "1"
         question = f"SELECT {', '.join(_COLUMNS)}, grasps FROM records WHERE {where} ORDER BY name, hand"
         with self._reading() as base:
@@ -180,16 +180,16 @@ class GraspLibrary:
             return [name for (name,) in base.execute("SELECT DISTINCT name FROM records ORDER BY name")]
 
     def of_mesh(self, wanted: LibraryEntry, *, any_mass: bool = False) -> list[LibraryEntry]:
-        """Return entries at least as strict as `wanted`, strictest first.
+        """Return the entries with mesh, hand, friction and mass of `wanted`. With `any_mass`, the mass may differ.
 
-        They have its mesh, hand, friction and mass. With `any_mass`, the mass may differ.
+        Their trials are at least as strict as those of `wanted`. The strictest entries come first.
         """
         names = ("mesh_sha256", "hand_content", "friction", *(() if any_mass else ("mass",)))
         same = {name: getattr(wanted, name) for name in names}
         return strict_enough([entry for entry, _ in self.entries(**same)], wanted.verify)
 
     def grasps(self, entry: LibraryEntry, hand: HandModel) -> tuple[Grasp, ...]:
-        """Return the verified grasps of an entry in the object frame, none for an unknown entry.
+        """Return the verified grasps of an entry, object frame. Return no grasps for an unknown entry.
 
         Raises FormatError: the library or the record is damaged.
         """
@@ -200,10 +200,10 @@ class GraspLibrary:
     def add(
         self, entry: LibraryEntry, target: ObjectModel, hand: HandModel, config: PlanConfig, grasps: Sequence[Grasp]
     ) -> int:
-        """Append grasps, found with `config` and in the object frame, to an entry of `target` and `hand`.
+        """Append the verified grasps, object frame, to an entry of `target` and `hand`. Ignore all other grasps.
 
-        Grasps that are not verified are ignored. Return the new number of grasps of the entry. Raises FormatError: the
-        library cannot be read or written.
+        `config` holds the settings that found the grasps. Return the new number of grasps of the entry. Raises
+        FormatError: the library cannot be read or written.
         """
         new = [replace(grasp, arm=None) for grasp in grasps if grasp.verdict is Verdict.VERIFIED]
         with self._reading(write=True) as base:
@@ -212,7 +212,7 @@ class GraspLibrary:
             result = GraspResult(Outcome.SUCCEEDED, kept, Timing(), 0, config.method)
             document = result_document(result, target, hand, config) | {"link_names": hand.link_names}
             packed = zlib.compress(json.dumps(document, allow_nan=False).encode())
-            # Entries of an earlier content of the same file are no longer valid.
+            # The mesh file may have changed. Then delete the entries of its earlier content.
             other = (entry.source, entry.file_sha256)
             base.execute("DELETE FROM records WHERE source != '' AND source = ? AND file_sha256 != ?", other)
             marks = ", ".join("?" * (len(_COLUMNS) + 3))
@@ -226,7 +226,7 @@ class GraspLibrary:
             document = json.loads(zlib.decompress(packed))
             grasps = grasps_of(document)
             names = dict(zip(document["link_names"], hand.link_names, strict=True))
-            # The hand may now have another prefix of its names than when the record was written.
+            # The hand's link names may have another prefix now than when the record was written.
             contacts = [tuple(replace(c, link=names[c.link]) for c in grasp.contacts) for grasp in grasps]
         except (zlib.error, ValueError, KeyError, TypeError, FormatError) as error:
             raise self._torn(f"record {entry.name} for {entry.hand}: {error}") from None
@@ -234,7 +234,7 @@ class GraspLibrary:
 
     @contextmanager
     def _reading(self, write: bool = False) -> Iterator[sqlite3.Connection]:
-        """Open the file and check its version. With `write` the body runs in a transaction."""
+        """Open the file, check its version, yield the connection. With `write`, the work inside is one transaction."""
         if not self.path.is_file():
             raise FormatError(f"{self.path}: no such file; `graspd library build --out {self.path}` creates a library")
         with self._own_errors(), _opened(self.path, "rw" if os.access(self.path, os.W_OK) else "ro") as base:
@@ -256,10 +256,10 @@ class GraspLibrary:
 
     @contextmanager
     def _own_errors(self) -> Iterator[None]:
-        """Convert SQLite's errors to FormatError."""
+        """Convert errors of SQLite and of the file system to FormatError."""
         try:
             yield
-        # Another process locks the file for long, the disk is full, or the file is read-only.
+        # Causes: another process locks the file for long, the disk is full, or the file is read-only.
         except sqlite3.OperationalError as error:
             raise FormatError(f"{self.path}: the library cannot be used: {error}") from None
         except sqlite3.DatabaseError as error:
@@ -275,7 +275,7 @@ class GraspLibrary:
 
 
 def strict_enough(entries: Sequence[LibraryEntry], verify: str) -> list[LibraryEntry]:
-    """Return entries at least as strict as `verify`, strictest first. Raises ConfigError: `verify` is unknown."""
+    """Return entries of trials no less strict than `verify`, strictest first. Raises ConfigError: unknown `verify`."""
     if verify not in STRICTNESS:
         raise ConfigError(f"verify: {verify!r}; valid: {', '.join(STRICTNESS)}")
     enough = [entry for entry in entries if STRICTNESS[entry.verify] >= STRICTNESS[verify]]
@@ -284,7 +284,7 @@ def strict_enough(entries: Sequence[LibraryEntry], verify: str) -> list[LibraryE
 
 @contextmanager
 def _opened(path: Path, mode: str) -> Iterator[sqlite3.Connection]:
-    # In a read-only folder there is no log beside the file, and no other process writes.
+    # In a read-only folder SQLite cannot keep its log beside the file. No other process writes, so none is needed.
     still = "&immutable=1" if mode == "ro" and not os.access(path.parent, os.W_OK) else ""
     base = sqlite3.connect(
         f"file:{quote(str(path.absolute()))}?mode={mode}{still}", uri=True, timeout=_PATIENCE, isolation_level=None

@@ -1,7 +1,7 @@
 """Find stored grasps of a known object for the present scene. Missing grasps are planned and added to the library.
 
-A name or a mesh file identifies the object. If the library lacks the object, the error lists others. A stored
-grasp is refused if the hand would collide with support or obstacles. If the hand comes near them, the trials are
+A name or a mesh file identifies the object. If the library lacks the object, the error lists valid names. A stored
+grasp is refused if the hand would collide with support or obstacles. If hand or object is near them, the trials are
 repeated. Otherwise the stored trials remain valid.
 """
 
@@ -48,7 +48,7 @@ _MOST_NAMED = 8
 
 @dataclass(frozen=True)
 class Physics:
-    """Conditions of the trials: mass [kg] and friction of the object, and name of the trials. None means any mass."""
+    """Conditions of trials: the object's mass [kg] (None for any mass), its friction, and the `--verify` name."""
 
     mass: float | None
     friction: float
@@ -59,7 +59,7 @@ class Physics:
         return f"{mass}, friction {self.friction:g}, {self.verify} trials"
 
     def of(self, entries: Iterable[LibraryEntry]) -> list[LibraryEntry]:
-        """Return the entries of this mass and friction, heaviest first."""
+        """Return the entries with this mass and friction, heaviest first."""
         same = [e for e in entries if e.friction == self.friction and self.mass in (None, e.mass)]
         return sorted(same, key=lambda entry: -entry.mass)
 
@@ -67,10 +67,10 @@ class Physics:
 def entry_by_name(library: GraspLibrary, hand: HandModel | None, name: str, physics: Physics) -> LibraryEntry:
     """Return the entry of the object with this name, for this hand (None for any hand).
 
-    If all entries of the object have the same mass and friction, those of `physics` do not count.
+    If all entries of the object have one mass and friction, the mass and friction of `physics` may differ.
 
     Raises:
-        ConfigError: the name is unknown, has no entry for this hand or physics, or is not unique.
+        ConfigError: the name is unknown, has no entry for this hand or physics, or several objects have this name.
         MeshError: the object's file has changed since the entry was made.
     """
     called = [entry for entry, _ in library.entries(name=name)]
@@ -102,7 +102,7 @@ def entry_by_file(
     *,
     required: bool = True,
 ) -> LibraryEntry | None:
-    """Return the entry of a mesh file, or of shape:NAME, at a scale. None if the entry is missing and not required.
+    """Return the entry of a mesh file, or of shape:NAME, at a scale. None if there is none and `required` is False.
 
     Raises:
         ConfigError: the library has no entry of this content, scale, hand and physics.
@@ -157,9 +157,9 @@ def _changed(library: GraspLibrary, entry: LibraryEntry) -> MeshError:
     )
 
 
-# A grasp is tried again if hand or object is nearer than this to an obstacle [m].
+# A stored grasp is tried again if hand or object is nearer than this to an obstacle [m].
 NEAR = 0.03
-# A hand deeper than this in an obstacle is refused [m]. The search allows the same depth.
+# A stored grasp is refused if the hand is deeper than this in an obstacle [m]. The search allows equal depth.
 _DEEP = 0.005
 
 Wanted = Callable[[Sequence[Grasp]], Sequence[Grasp]]
@@ -179,12 +179,12 @@ def known_grasps(
     """Return at most `count` verified grasps of the scene's object from the library, none for an unknown object.
 
     Args:
-        library: from `GraspLibrary(path).checked()`.
-        scene: scene with the object. Its mesh, friction and given mass identify the entry.
-        hand: grasping hand. Its content identifies the entry, not its name.
+        library: library from `GraspLibrary(path).checked()`.
+        scene: scene with the object. The object's mesh, friction and mass (unless assumed) identify the entry.
+        hand: grasping hand. Its `hand_hash` identifies the entry. Its name does not.
         count: greatest number of grasps.
-        restrictions: as for `plan_grasps`.
-        verify: trials that the grasps must have passed. Stricter trials count too.
+        restrictions: further conditions on grasps, as for `plan_grasps`.
+        verify: name of the trials that the grasps must have passed. Stricter trials count too.
         wanted: function that filters the stored grasps.
         stop: stop hook. The trials end when it returns True.
 
@@ -213,7 +213,7 @@ def known_grasps(
 
 
 def library_result(library: GraspLibrary, grasps: Sequence[Grasp], count: int, seconds: float) -> GraspResult:
-    """Return grasps of a library as the result of a request for `count` grasps that took `seconds` [s]."""
+    """Return the result of a request for `count` grasps, answered with `grasps` of a library in `seconds` [s]."""
     timing = Timing(first_verified=seconds if grasps else None, total=seconds)
     message = f"{len(grasps)} grasps of the library {library.path.name}"
     return result_of(grasps, count, method="library", timing=timing, message=message)
@@ -233,11 +233,11 @@ def known_or_planned(
     name: str = "",
     **request: Any,
 ) -> GraspResult:
-    """Return grasps from the library, and plan more if there are fewer than `count`.
+    """Return grasps from the library. If there are fewer than `count`, plan more.
 
-    Planned grasps that are verified are added to the library. `wanted` filters the grasps, stored and
-    planned. `name` is the object's name in the library. The other arguments are as for `plan_grasps`. If the library
-    cannot be written, the result has a warning.
+    Planned grasps that are verified are added to the library. `wanted` filters both stored and planned grasps. `name`
+    is the object's name in the library. The other arguments are as for `plan_grasps`. If the library cannot be written,
+    the result has a warning.
     """
     began, deadline, stop = time.perf_counter(), request.pop("deadline", None), request.get("stop")
     left = lambda: None if deadline is None else deadline - (time.perf_counter() - began)  # noqa: E731
@@ -249,7 +249,7 @@ def known_or_planned(
         return known
     config = load_preset(preset) if isinstance(preset, str) else preset
     rest = None if deadline is None else max(left() or 0.0, 1e-3)
-    # The seed that found the stored grasps would find them again, so another seed is used.
+    # The seed that found the stored grasps would find them again, so use another seed.
     options |= {"count": count - found, "seed": seed + found, "preset": config, "deadline": rest}
     planned = plan_grasps(scene, hand, **options, **request)
     warnings = planned.warnings
@@ -262,7 +262,7 @@ def known_or_planned(
     if outcome in (Outcome.SUCCEEDED, Outcome.NO_CANDIDATES) and found + len(new):
         outcome = Outcome.SUCCEEDED if found + len(new) >= count else Outcome.TOO_FEW
     counts = f"{found} grasps of the library {library.path.name}, {len(new)} planned"
-    # The message is used only if it is more than the name of the outcome.
+    # Use the planner's message only if it says more than the outcome.
     why = planned.message if planned.message != planned.outcome.value else ""
     return replace(
         planned,
@@ -284,9 +284,9 @@ def add_planned(
     verify: str,
     name: str = "",
 ) -> int:
-    """Add the verified grasps of a run to the library, with their hold trials only.
+    """Add the verified grasps of a run to the library. Of their trials, keep only the hold trials.
 
-    Returns the new number of grasps of the entry. Raises FormatError: the library cannot be written.
+    Return the new number of grasps of the entry. Raises FormatError: the library cannot be written.
     """
     if verify == "none":
         return 0
@@ -302,7 +302,7 @@ def add_planned(
 def _held(
     scene: Scene, hand: HandModel, grasps: Sequence[Grasp], verify: str, stop: StopHook
 ) -> Iterable[tuple[Grasp, str]]:
-    """Yield each grasp and the reason for refusing it (empty if accepted). Grasps near obstacles are tried again."""
+    """Yield each grasp and why it is refused, "" if it is accepted. Try grasps near support or obstacles again."""
     scene, far = near_scene(scene)
     near = [moved_grasp(grasp, -far) for grasp in grasps]
     gaps = clearance(scene, hand, near)
@@ -325,7 +325,7 @@ def _held(
 
 
 def clearance(scene: Scene, hand: HandModel, grasps: Sequence[Grasp]) -> Float[np.ndarray, "grasps"]:
-    """Return per grasp the hand's least distance [m] to support or obstacles, pregrasp to squeeze, inf without both."""
+    """Return the hand's least distance to support and obstacles from pregrasp to squeeze [m], infinity without any."""
     obstacles = make_obstacle_tensors(scene, hand, "cpu", torch.float64)
     if obstacles is None or not grasps:
         return np.full(len(grasps), np.inf)

@@ -1,8 +1,8 @@
-"""Reader of the surfaces in COLLADA (.dae) files. It needs no COLLADA library.
+"""Reader of the surfaces in COLLADA (.dae) files, without a COLLADA library.
 
-It reads the triangles, strips, fans, polylists and polygons of every geometry that the visual scene uses. It applies
-the node transforms, and converts lengths to metres by the file's `<unit>`. Polygons are split into fans, which is exact
-for convex ones. The up axis is ignored, as in ROS viewers. Format: COLLADA 1.4.1, Khronos Group, 2008.
+The reader takes the triangles, strips, fans, polylists and polygons of the visual scene, or of all geometries if there
+is no scene. It applies the node transforms, and converts lengths to metres by `<unit>`. Fans replace polygons, which
+is exact for convex polygons. The up axis is ignored, as in ROS viewers. Format: COLLADA 1.4.1, Khronos Group, 2008.
 """
 
 from __future__ import annotations
@@ -16,8 +16,8 @@ from jaxtyping import Float, Int
 from graspd_core.se3 import axis_rotation
 from graspd_core.types import TriangleMesh
 
+# Greatest numbers of nodes and of faces. A few nodes can instance the same geometry very many times.
 _MOST_NODES = 4000
-# A few nodes can instance the same geometry very many times.
 _MOST_FACES = 20_000_000
 _FACES = ("triangles", "tristrips", "polylist", "polygons", "trifans")
 
@@ -42,7 +42,7 @@ def read_dae(path: Path) -> TriangleMesh:
 
 
 class _Builder(ET.TreeBuilder):
-    """A tree builder that refuses document type declarations in any encoding."""
+    """An XML tree builder that refuses document type declarations in any encoding."""
 
     def doctype(self, *_: object) -> None:
         raise ValueError("a document type declaration is not allowed; remove it")
@@ -151,7 +151,7 @@ def _surface(
             sides = np.array((element.findtext("vcount") or "").split(), dtype=np.int64)
         else:
             sides = np.array([len(loop) for loop in loops], dtype=np.int64)
-        # Each count is checked alone, because the sum of absurd counts could overflow to a small number.
+        # Each count is checked separately, because the sum of absurd counts could overflow to a small number.
         few = not (sides < 0).any() and (sides <= len(indices)).all() and sides.sum() <= len(indices)
         if not few or (len(indices) and not 0 <= indices.min() <= indices.max() < available):
             raise ValueError(f"<{element.tag}> names vertices that the file does not hold")

@@ -15,16 +15,16 @@ from graspd_core.mesh.surface_queries import make_surface, surface_distance, win
 from graspd_core.mesh.topology import scaled_normals
 from graspd_core.types import TriangleMesh
 
-# A piece is tiny if its extent is below this fraction of the extent of the piece with the most area. Nothing is dropped
-# unless the other pieces hold at least this fraction of all area, so a mesh of loose triangles stays whole.
+# A piece is tiny if its extent is below this fraction of the extent of the piece with the most area. If the other
+# pieces hold less than STAYS of all area, nothing is dropped. So a mesh of loose triangles stays whole.
 TINY, STAYS = 0.05, 0.98
 
 
 def drop_small_components(mesh: TriangleMesh) -> tuple[TriangleMesh, int]:
-    """Return the mesh without its small floating pieces, and the number of dropped pieces.
+    """Return the mesh without its tiny floating pieces, and the number of dropped pieces.
 
-    A dropped piece has under 5 % of the extent of the piece with the most area, and is farther from the rest than its
-    own extent. Pieces with such extents all stay if they hold over 2 % of the area.
+    A piece is tiny if it has under 5 % of the extent of the piece with the most area. Tiny pieces are dropped if they
+    are farther from the rest than their own extent. If the tiny pieces hold over 2 % of the area, all of them stay.
     """
     piece = face_components(mesh)
     count = int(piece.max()) + 1
@@ -64,17 +64,17 @@ def _extents(corners: Float[np.ndarray, "faces 3 3"], piece: Int[np.ndarray, "fa
     return np.linalg.norm(high - low, axis=1)
 
 
-# Pieces nearer to each other than this fraction of the mesh's extent form one body. Parts that were modelled one by one
-# touch, overlap, or miss each other by little.
+# Pieces nearer to each other than this fraction of the mesh's extent form one body. Parts that were modelled separately
+# touch, overlap, or have small gaps.
 _APART = 0.05
-# Sample points that represent the surface beside its vertices. Neighbouring samples are at most half of that apart.
+# Number of points that represent the surface, besides its vertices. Their spacing is at most about half of `_APART`.
 _SAMPLES = 4096
 
 
 def bodies_apart(mesh: TriangleMesh) -> tuple[int, float]:
     """Return the number of separate bodies, and the gap [m] from the largest to the nearest other body.
 
-    For one body the gap is infinite. Pieces inside the largest body belong to it, such as the inner side of a wall.
+    For one body, the gap is infinite. Pieces inside the largest body, such as the inner side of a wall, belong to it.
     """
     pieces = face_components(mesh)
     if not pieces.any():
@@ -114,7 +114,7 @@ def _grown(
     among: Bool[np.ndarray, "points"],
     reach: float,
 ) -> Bool[np.ndarray, "points"]:
-    """Return which points in `among` are on the longest piece, or linked to it by gaps below `reach` [m]."""
+    """Return which points of `among` are on its longest piece, or on pieces linked to it by gaps below `reach` [m]."""
     low, high = np.full((2, int(owner.max()) + 1, 3), np.inf)
     np.minimum.at(low, owner[among], points[among])
     np.minimum.at(high, owner[among], -points[among])

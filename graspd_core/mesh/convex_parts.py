@@ -21,13 +21,13 @@ from graspd_core.mesh.sdf import GridSDF
 from graspd_core.types import TriangleMesh
 
 SURFACE_POINTS = 6000
-# Numbers of points and of hull samples that a bulge is measured on. The parts themselves are hulls of all their points.
+# How many points and hull samples measure a bulge during cutting. The final parts are hulls of all their points.
 TRIAL_POINTS, TRIAL_SAMPLES = 320, 100
-# Candidate cuts lie between this many slices of equal thickness. They are compared on segments between pairs of points,
-# and the best ones then by their hulls. Roberts' sequence spreads the pairs, as fractions of the list of points.
+# Candidate cuts lie between this many slices of equal thickness. Segments between pairs of points score the cuts. Hulls
+# then decide between the best cuts. Roberts' sequence spreads the pairs, as fractions of the list of points.
 SLICES, SHORTLIST = 12, 3
 PAIRS = np.modf(np.arange(1, 2001)[:, None] * [0.7548776662, 0.5698402910])[0]
-# The bulge of two joined clusters is estimated on segments between all pairs of this many points of each.
+# The bulge of two joined clusters is estimated on segments between all pairs of this many points of each cluster.
 PAIRED_POINTS, PAIRED_QUANTILE = 12, 0.95
 # Cutting continues to this many times `max_parts`, because many parts are joined again.
 SURPLUS = 1.5
@@ -36,9 +36,9 @@ SHARES = (np.arange(TRIAL_SAMPLES) + 0.5) / TRIAL_SAMPLES
 _root, _along = np.sqrt(np.modf(SHARES * TRIAL_SAMPLES * 0.618034)[0]), SHARES
 SPOTS = np.stack([1 - _root, _root * (1 - _along), _root * _along], 1)
 
-# Parts overlap by twice this [m], so that nothing slips between them.
+# Neighbouring parts overlap by twice this [m], so that nothing slips between them.
 OVERLAP = 0.0005
-# Least and most vertices of one part, and vertices of all parts together.
+# Limits for the number of vertices of a part. The parts share `ALL_VERTICES` equally between these limits.
 FEWEST_VERTICES, MOST_VERTICES, ALL_VERTICES = 48, 256, 1536
 # Points of a large hull that are considered for each vertex of its simplified hull.
 CHOICE = 12
@@ -47,7 +47,7 @@ CHOICE = 12
 Points = Float[np.ndarray, "_ 3"]
 
 
-# The direction and offset of a plane. It splits points by whether `points @ direction` is below or above the offset.
+# Direction and offset of a plane. A point p lies below the plane if p @ direction is at most the offset, else above.
 _Cut = tuple[Float[np.ndarray, "3"], float]
 
 
@@ -111,11 +111,11 @@ def _best_cut(sdf: GridSDF, cluster: Points) -> _Cut | None:
 
 
 def _promising_cuts(sdf: GridSDF, cluster: Points) -> list[_Cut]:
-    """Return the best cut across each coordinate axis and each principal axis, at most `SHORTLIST` cuts, best first.
+    """Return at most `SHORTLIST` cuts, best first. Each is the best across one coordinate axis or principal axis.
 
-    Segments between points of a cluster lie in its hull. So the bulge is sampled by how far their midpoints lie outside
-    the object. After a cut, only segments with both ends on one side remain. The mean of these distances times the
-    number of points on that side estimates the bulge's volume. One set of segments scores all cuts without any hull.
+    Segments between points of a cluster lie in its hull. So the bulge is measured by how far their midpoints lie
+    outside the object. After a cut, only segments with both ends on one side remain. On each side, their mean distance
+    times the number of points estimates the bulge's volume. So one set of segments scores all cuts without any hull.
     """
     pairs = (PAIRS * len(cluster)).astype(int)
     outside = (_outside(sdf, cluster[pairs].mean(1)) - _blur(sdf, cluster)).clip(0)
@@ -131,7 +131,7 @@ def _promising_cuts(sdf: GridSDF, cluster: Points) -> list[_Cut]:
     share = np.arange(1, SLICES) / SLICES
     # If no segment is outside the object, cuts near the middle are preferred.
     left = left_below / np.maximum(below, 1) + left_above / np.maximum(above, 1) + 1e-9 * np.abs(share - 0.5)
-    # Fewer than four points span no hull. A side thinner than the overlap would get the points of the other side back.
+    # Fewer than four points span no hull. A side thinner than the overlap would get the other side's points again.
     thin = span[:, None] * np.minimum(share, 1 - share) < 2 * OVERLAP
     left[(below < 4) | (above < 4) | thin] = np.inf
     best = left.argmin(1)
@@ -144,7 +144,7 @@ def _sums_below(
 ) -> Float[np.ndarray, "directions cuts"]:
     directions = slices.shape[1]
     flat = (slices + SLICES * np.arange(directions)).ravel()
-    # Without any weights, NumPy returns integers.
+    # For empty weights, NumPy returns integers.
     sums = np.bincount(flat, np.repeat(weights, directions), minlength=SLICES * directions).astype(float, copy=False)
     return np.cumsum(sums.reshape(directions, SLICES), axis=1)[:, :-1]
 
@@ -157,7 +157,7 @@ def _bulge_left(sdf: GridSDF, points: Points, cut: _Cut) -> float:
 
 
 def _join(sdf: GridSDF, clusters: list[Points], tolerance: float, most: int) -> list[Points]:
-    """Join touching pairs, least bulge first, within `tolerance` [m] or while over `most` remain. Return clusters."""
+    """Join touching clusters, least bulge first, within `tolerance` [m] or while more than `most` clusters are left."""
     alive = dict(enumerate(clusters))
     boxes = {name: (cluster.min(0), cluster.max(0) + OVERLAP) for name, cluster in alive.items()}
     heap: list[tuple[float, bool, int, int]] = []
@@ -223,9 +223,9 @@ def _hull(points: Points) -> ConvexHull | None:
 
 
 def _hull_samples(hull: ConvexHull) -> Float[np.ndarray, "_ 3"]:
-    """Return points spread evenly over the hull's area. This is faster than `surface_samples`."""
+    """Return points spread evenly over the hull's area, faster than `surface_samples` does."""
     a, b, c = hull.points[hull.simplices].transpose(1, 0, 2)
-    # Twice the area. `np.cross` would take as long as the whole rest of the function.
+    # The sums are of twice the area. `np.cross` would take as long as the rest of the function.
     (ux, uy, uz), (vx, vy, vz) = (b - a).T, (c - a).T
     total = np.cumsum(np.sqrt((uy * vz - uz * vy) ** 2 + (uz * vx - ux * vz) ** 2 + (ux * vy - uy * vx) ** 2))
     chosen = np.minimum(np.searchsorted(total, SHARES * total[-1]), len(total) - 1)

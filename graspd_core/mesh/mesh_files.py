@@ -27,12 +27,12 @@ from graspd_core.types import TriangleMesh
 
 # A mesh's longest side must lie in this range [m]. Outside it, the unit of the file is wrong.
 SMALLEST, LARGEST = 0.002, 2.0
-# A size outside this range [m] is accepted with a warning.
+# A longest side outside this range [m] is accepted with a warning.
 SMALL, LARGE = 0.008, 0.5
-# Usual size of a graspable object [m], and the largest usual ratio between an object's size and that.
+# Usual size of a graspable object [m], and the largest usual factor between an object's size and the usual size.
 USUAL, SPREAD = 0.12, 6.0
 
-# Scales that may turn a file's coordinates into metres: as users pass them, and as a factor.
+# Scales that may turn a file's coordinates into metres: as words for users, and as a factor.
 REMEDIES = {
     "scale 0.001 (from mm)": 1e-3,
     "scale 0.01 (from cm)": 1e-2,
@@ -47,7 +47,7 @@ def unit_advice(size: float, scale: float = 1.0) -> str:
     Args:
         scale: the scale that `size` already includes. The advised scales replace it.
     """
-    # Limited, so that the ratio of absurd numbers does not overflow.
+    # The size is limited, so that the ratio of absurd numbers does not overflow.
     given = min(max(size / scale, 1e-200), 1e200)
     remedies = REMEDIES if scale == 1 else {"scale 1": 1.0} | REMEDIES
     likely = sorted(remedies, key=lambda option: _strangeness(given * remedies[option]))
@@ -86,7 +86,7 @@ _HEADER, _TRIANGLE, _MOST_TRIANGLES = 84, 50, 10**8
 
 
 def refuse_broken(path: Path) -> None:
-    """Raise MeshError if a file is empty or another kind of file, or if it is an STL or OBJ that is cut off."""
+    """Raise MeshError if a file is empty, is another kind of file, or is an STL or OBJ file that is cut off."""
     with path.open("rb") as file:
         head = file.read(_LOOK)
         size = file.seek(0, os.SEEK_END)
@@ -133,8 +133,8 @@ def _is_number(word: str) -> bool:
 
 MESH_ENDINGS = ("dae", "glb", "obj", "off", "ply", "stl")
 
-# Points that sample the volume of a mesh that is not one closed body, to about 1 % of volume in 0.3 s. They are a Sobol
-# sequence, because a lattice aligned with a wall miscounts its layers. Powers of two spread most evenly.
+# Number of sample points that measure a mesh that is not one closed body, to about 1 % of volume in 0.3 s. The points
+# are a Sobol sequence, because a lattice parallel to a wall misjudges the wall. Powers of two spread most evenly.
 SPREAD_POINTS = 2**15
 
 
@@ -189,14 +189,14 @@ def save_mesh(path: str | Path | TriangleMesh, mesh: TriangleMesh | str | Path) 
 def check_mesh(
     mesh: TriangleMesh, source: str, most_faces: int | None = None, *, scale: float = 1.0, dusty: bool = False
 ) -> tuple[TriangleMesh, tuple[str, ...]]:
-    """Clean a mesh. Return it with warnings about its defects, one sentence each.
+    """Clean a mesh. Return the clean mesh, and warnings about the defects, one sentence each.
 
     Cleaning drops unused vertices, merges coincident vertices, drops degenerate and repeated faces, and makes the
     winding consistent. It does not move or scale the mesh.
 
     Args:
         most_faces: meshes with more faces are simplified to about this many. None never simplifies.
-        scale: factor that the file's coordinates were multiplied by. Advice on the unit refers to it.
+        scale: factor by which the file's coordinates were already multiplied. Advice on the unit replaces this factor.
         dusty: whether to drop tiny pieces that touch nothing else.
 
     Raises:
@@ -210,13 +210,13 @@ def check_mesh(
         warnings.append(f"{source}: dropped {dropped} faces without area")
     if repeated:
         warnings.append(f"{source}: dropped {repeated} repeated faces")
-    # Simplified before any check of neighbours, because each check takes seconds for a million faces.
+    # Meshes are simplified before any check of neighbours, because each check takes seconds for a million faces.
     given = mesh
     if most_faces is not None and len(mesh.faces) > most_faces:
         warnings.append(f"{source}: simplified from {len(mesh.faces)} to {most_faces} faces")
         mesh, _, _ = _distinct(simplify(mesh, most_faces), source)
     if dusty:
-        # Dropped first, because the size and the holes reported below could be those of the small pieces.
+        # Tiny pieces are dropped first. Otherwise, the size and the holes reported below could be theirs.
         mesh, small = drop_small_components(mesh)
         if small:
             warnings.append(f"{source}: dropped {small} tiny pieces that touch nothing else")
@@ -233,7 +233,7 @@ def check_mesh(
 
 
 def simplify(mesh: TriangleMesh, faces: int, *, aggressiveness: int = 7) -> TriangleMesh:
-    """Reduce a mesh to about `faces` faces by quadric edge collapse. Low `aggressiveness` is slow but tears less."""
+    """Reduce a mesh to about `faces` faces by quadric edge collapse. Low `aggressiveness` is slower but tears less."""
     import fast_simplification
 
     if len(mesh.faces) <= faces:
@@ -255,8 +255,8 @@ def content_hash(mesh: TriangleMesh) -> str:
 def mass_properties(mesh: TriangleMesh) -> tuple[float, Float[np.ndarray, "3"], Float[np.ndarray, "3 3"]]:
     """Return the enclosed solid's volume [m³], centre of mass [m], and inertia [m⁵] about that centre at unit density.
 
-    One closed, consistently wound body is computed exactly, other surfaces by sample points to about 1 % of volume. A
-    surface that encloses nothing counts as its solid bounding box.
+    The result is exact for one closed, consistently wound body. For other surfaces, sample points give the result, with
+    errors of about 1 % of the volume. A surface that encloses nothing counts as its solid bounding box.
     """
     far = topology.far_centre(mesh.vertices)
     if far.any():
@@ -282,7 +282,7 @@ def surface_samples(
     rng = np.random.default_rng(seed)
     cross = topology.scaled_normals(mesh.vertices, mesh.faces)
     area = np.linalg.norm(cross, axis=1)
-    # One point per equal slice of the total area: as random as needed, with far fewer gaps than independent draws.
+    # Each of `count` equal slices of the total area gets one random point. Independent draws would leave more gaps.
     slices = (np.arange(count) + rng.random(count)) / count * area.sum()
     chosen = np.minimum(np.searchsorted(np.cumsum(area), slices), len(area) - 1)
     root, along = np.sqrt(rng.random((count, 1))), rng.random((count, 1))
@@ -300,7 +300,7 @@ def _read(path: Path):
         mesh = read_dae(path) if collada else trimesh.load_scene(path, process=False).to_mesh()
     except (MemoryError, KeyboardInterrupt):
         raise
-    # The readers behind trimesh raise whatever their format's parser does, from KeyError to struct.error.
+    # The readers behind trimesh may raise any exception, from KeyError to struct.error.
     except Exception as error:
         reason = str(error).splitlines()[0] if str(error) else type(error).__name__
         if isinstance(error, IndexError) and "out of bounds" in reason:
@@ -322,7 +322,7 @@ def _refuse_path(path: Path) -> None:
 
 
 def _without_strays(mesh: TriangleMesh, source: str) -> tuple[TriangleMesh, tuple[str, ...]]:
-    """Drop vertices that no face uses. Return mesh and warnings. Raises MeshError: empty, bad index, not finite."""
+    """Drop unused vertices, with a warning. Raises MeshError if the mesh is empty, or an index or a vertex is bad."""
     if len(mesh.vertices) == 0 or len(mesh.faces) == 0:
         raise MeshError(f"{source}: empty mesh ({len(mesh.vertices)} vertices, {len(mesh.faces)} faces)")
     if mesh.faces.min() < 0 or mesh.faces.max() >= len(mesh.vertices):
@@ -352,7 +352,7 @@ def _doubted_size(mesh: TriangleMesh, source: str, scale: float) -> list[str]:
 
 
 def _distinct(mesh: TriangleMesh, source: str) -> tuple[TriangleMesh, int, int]:
-    """Merge coincident vertices. Return the mesh, and the numbers of degenerate and of repeated faces dropped."""
+    """Merge coincident vertices. Return the mesh, and how many degenerate and how many repeated faces were dropped."""
     vertices, faces = topology.merge_vertices(mesh)
     distinct = topology.drop_degenerate(vertices, faces)
     unique = topology.drop_repeated(distinct)
@@ -367,7 +367,7 @@ def _solid_moments(mesh: TriangleMesh) -> tuple[float, Float[np.ndarray, "3"], F
     sixfold = np.einsum("fi,fi->f", corners[:, 0], np.cross(corners[:, 1], corners[:, 2]))
     total, middle = sixfold.sum(), corners.sum(1)
     centre = sixfold @ middle / (4 * total)
-    # The second moment of a tetrahedron at zero: det/120 · (Σ c cᵀ + (Σ c)(Σ c)ᵀ), c its other corners.
+    # A tetrahedron with corners c and a corner at zero has the second moment det/120 · (Σ c cᵀ + (Σ c)(Σ c)ᵀ).
     second = np.einsum("f,fki,fkj->ij", sixfold, corners, corners) + np.einsum("f,fi,fj->ij", sixfold, middle, middle)
     spread = np.sign(total) * (second / 120 - total / 6 * np.outer(centre, centre))
     # Rounding noise is set to zero. Otherwise it would choose the principal axes of a symmetric body.

@@ -2,7 +2,7 @@
 
 Distances are in metres, negative inside. Autograd of `sample_sdf` gives the derivative of the interpolated distance,
 which jumps between cells. The returned normal is interpolated from exact directions and is smoother. Beyond the grid,
-distance and normal refer to one extrapolated surface point. No gradient flows through `build_sdf`.
+distance and normal are extrapolated (`sample_sdf`). No gradient flows through `build_sdf`.
 """
 
 from __future__ import annotations
@@ -21,20 +21,20 @@ from graspd_core.mesh.topology import is_closed
 from graspd_core.se3 import EPSILON, safe_norm
 from graspd_core.types import TriangleMesh
 
-# One vector, and one length, for each node [m].
+# One vector for each node, and one length for each node [m].
 _Vectors, _Lengths = Float[np.ndarray, "3 x y z"], Float[np.ndarray, "x y z"]
 
-# Within this fraction of a cell, the direction to the surface is rounding noise, so the face's normal replaces it.
+# Nearer to the surface than this fraction of a cell, the direction to the surface is noise. The face's normal is used.
 NEAR_SURFACE = 1e-3
 
-# Free space around the object that the grid covers [m]. Beyond it distances are extrapolated. Near hollow objects they
-# are too long by 0.5 mm on average at 5 cm (10 mm at worst), and by 1.3 mm at 8 cm (20 mm at worst). No contact happens
-# there, and fewer cells outside mean finer cells at the surface.
+# Free space around the object that the grid covers [m]. Farther away, distances are extrapolated. Near hollow objects,
+# they are too long by 0.5 mm on average at 5 cm (10 mm at worst), and by 1.3 mm at 8 cm (20 mm at worst). No contact
+# happens there, and fewer cells outside mean finer cells at the surface.
 PADDING = 0.015
 
-# Nodes within this many cells of the surface are exact. So are all eight nodes of every cell that the surface crosses.
+# Nodes within this many cells of the surface are exact. This includes all eight nodes of each crossed cell.
 BAND = 3**0.5
-# Nodes per side of a block, whose middle node is exact. Sweeps in which nodes try the closest points of neighbours.
+# Nodes per side of a block (its middle node is exact), and sweeps in which nodes try their neighbours' closest points.
 _BLOCK, _SWEEPS = 3, 3
 
 
@@ -46,7 +46,7 @@ class GridSDF:
         field: signed distance φ [m] and unit normal ∇φ at each node.
         origin: position of the first node [m].
         spacing: side of a cubic cell [m], a scalar tensor.
-        half: half the side lengths of the box [m]. Stored so that sampling sends no node counts to the GPU.
+        half: half the side lengths of the box [m]. They are stored, so that sampling sends no node counts to the GPU.
     """
 
     field: Float[Tensor, "4 x y z"]
@@ -66,16 +66,16 @@ def build_sdf(
 
     The generalised winding number gives the sign, so open, overlapping, doubled and inverted surfaces are allowed. If a
     surface encloses nothing, φ ≥ 0 everywhere (see `is_solid`). Distances up to √3 cells (`BAND`) are exact. Farther
-    away, a node may use a surface point that is not its closest, so |φ| can be too large but never too small. The error
-    is at most 0.5 cells and 0.03 on average on the built-in shapes, and 0.43 and 0.02 on ten scans.
+    away, a node may use a surface point that is not its closest, so |φ| can be too large but never too small. On the
+    built-in shapes, the error is at most 0.5 cells, 0.03 on average. On ten scans, it is at most 0.43, 0.02 on average.
 
     Args:
-        resolution: nodes per side for a cubic object. Other objects get as many nodes in all, and finer cells.
+        resolution: nodes per side for a cubic object. Other objects get almost as many nodes in total, in finer cells.
         padding: free space around the bounding box [m], limited to half the object's extent.
     """
     counts, origin, spacing = grid_layout(mesh, resolution, padding)
     centre = (mesh.vertices.min(0) + mesh.vertices.max(0)) / 2
-    # About the centre: far from the origin, differences lose digits.
+    # The mesh is moved to its centre, because differences lose digits far from the origin.
     centred = TriangleMesh(mesh.vertices - centre, mesh.faces)
     axes = [x + spacing * np.arange(n) for x, n in zip(origin - centre, counts, strict=True)]
     nodes = np.stack(np.meshgrid(*axes, indexing="ij"))
@@ -90,9 +90,9 @@ def build_sdf(
 def grid_layout(
     mesh: TriangleMesh, resolution: int, padding: float = PADDING
 ) -> tuple[tuple[int, int, int], Float[np.ndarray, "3"], float]:
-    """Return the grid of finest cubic cells that covers the padded bounding box with at most `resolution`³ nodes.
+    """Return the finest grid of cubic cells that covers the padded bounding box with at most `resolution`³ nodes.
 
-    The grid is given by its number of nodes along each axis, its first node and the side of a cell [m].
+    Return the number of nodes along each axis, the position of the first node [m], and the side of a cell [m].
     """
     low, high = mesh.vertices.min(0), mesh.vertices.max(0)
     extent = float((high - low).max())
@@ -113,8 +113,8 @@ def sample_sdf(
 ) -> tuple[Float[Tensor, "*batch"], Float[Tensor, "*batch 3"]]:
     """Return signed distance [m] and outward unit normal at points [m] in the object frame. Both are differentiable.
 
-    Outside the grid, c = b − φ(b) n(b) replaces the closest surface point, where b is the point clamped to the grid.
-    This is continuous at the border.
+    Outside the grid, c = b − φ(b) n(b) replaces the closest surface point, where b is the point clamped to the grid. So
+    distance and normal are continuous at the border.
     """
     half = sdf.half
     unit = points / half - (sdf.origin / half + 1)
@@ -133,15 +133,15 @@ def sample_sdf(
 
 
 def is_solid(sdf: GridSDF) -> bool:
-    """Return True if a node lies inside the object. Open sheets and walls far thinner than a cell contain no node."""
+    """Return True if a node lies inside the object. Open sheets, and walls far thinner than a cell, contain no node."""
     return bool((sdf.field[0] < 0).any())
 
 
 def _closest_to_nodes(surface: Surface, nodes: _Vectors, spacing: float) -> tuple[_Vectors, _Vectors]:
-    """Return a surface point for each grid node and its face normal. Within `BAND`, it is exactly the closest point.
+    """For each node, return a surface point and its face normal. Up to `BAND` cells away, it is the closest point.
 
-    Beyond `BAND`, normals are zero. The exact distance of the middle node of each block of nodes gives lower bounds for
-    the others. Nodes beyond `BAND` by this bound get the middle node's point, or a nearer one of neighbours (`_sweep`).
+    In each block of nodes, the middle node's exact distance gives lower bounds for the other nodes. A node with a bound
+    above `BAND` cells gets a zero normal, and the middle node's point or a neighbour's point (`_sweep`).
     """
     counts = nodes.shape[1:]
     middles = [np.minimum(np.arange(_BLOCK // 2, n + _BLOCK // 2, _BLOCK), n - 1) for n in counts]
@@ -164,9 +164,9 @@ def _closest_to_nodes(surface: Surface, nodes: _Vectors, spacing: float) -> tupl
 
 
 def _sweep(nodes: _Vectors, closest: _Vectors, squared: _Lengths) -> None:
-    """Give nodes a neighbour's surface point if it is nearer. Update `closest` and `squared` distances in place."""
+    """Give nodes a neighbour's surface point if it is nearer. Change `closest` and the `squared` distances in place."""
     for axis in range(3):
-        # These are views with this axis first, so writing to them changes the arrays.
+        # All three are NumPy views with this axis first, so writing to them changes the arrays.
         at, to, best = np.moveaxis(nodes, axis + 1, 1), np.moveaxis(closest, axis + 1, 1), np.moveaxis(squared, axis, 0)
         for here, there in ((slice(1, None), slice(-1)), (slice(-1), slice(1, None))):
             offered = to[:, there]
@@ -178,11 +178,11 @@ def _sweep(nodes: _Vectors, closest: _Vectors, squared: _Lengths) -> None:
 
 
 def _inside(mesh: TriangleMesh, nodes: _Vectors, distance: _Lengths, spacing: float) -> Bool[np.ndarray, "x y z"]:
-    """Return which nodes lie inside.
+    """Return which nodes lie inside the mesh.
 
-    Around a closed surface the winding number is constant in each region without surface. Two neighbouring nodes that
-    are both over half a cell from the surface have none between them, so one query answers for a region. Around an open
-    surface the number also changes in free space, so every node is queried.
+    Around a closed surface, the winding number is constant in each region without surface. Between two neighbouring
+    nodes that are both over half a cell from the surface, there is no surface. So one query answers for a region.
+    Around an open surface, the winding number changes in free space too, so every node is queried.
     """
     from scipy.ndimage import label
 
@@ -203,15 +203,15 @@ def _inside(mesh: TriangleMesh, nodes: _Vectors, distance: _Lengths, spacing: fl
 def _field(
     offset: _Vectors, normals: _Vectors, inside: Bool[np.ndarray, "x y z"], spacing: float
 ) -> Float[np.ndarray, "4 x y z"]:
-    """Return the signed distance φ [m] and its unit gradient at each node, from its nearest point of the surface.
+    """Return the signed distance φ [m] and its unit gradient at each node.
 
-    `offset` is the node minus that point. The gradient is offset/φ, or the face's outward normal near the surface.
+    `offset` is the node minus its nearest surface point. The gradient is offset/φ, or at the surface the face's normal.
     """
     distance = _length(offset)
     phi = np.where(inside, -distance, distance)
     far = distance > NEAR_SURFACE * spacing
     direction = offset / np.where(far, phi, 1.0)
-    # In an inverted mesh, most face normals point against the gradient at the nodes off the surface.
+    # In an inverted mesh, most face normals point against the gradient. The nodes away from the surface decide.
     agree = np.sign((direction * normals).sum(0)[far].sum()) or 1.0
     return np.concatenate([phi[None], np.where(far, direction, agree * normals)])
 

@@ -1,7 +1,7 @@
 """Built-in objects of graspable size, e.g. a sphere, a mug and a hammer.
 
-Curved surfaces are tessellated with vertices on the true surface, so a mesh has up to 1 % less volume. The mug (cup and
-handle) and the hammer (shaft and head) are overlapping closed bodies. The winding number inside them is never zero.
+The vertices of curved surfaces lie on the true surface, so meshes lose up to 1 % of the volume. The mug (cup, handle)
+and the hammer (shaft and head) are overlapping closed bodies. The winding number inside these bodies is never zero.
 """
 
 from __future__ import annotations
@@ -19,8 +19,8 @@ from graspd_core.errors import MeshError, choices
 from graspd_core.mesh.mesh_files import MESH_ENDINGS, content_hash
 from graspd_core.types import TriangleMesh, joined
 
-SEGMENTS = 64
-
+SEGMENTS = 64  # straight segments that replace a circle
+# Dimensions of the shapes [m].
 SPHERE_RADIUS = 0.035
 BOX_HALF = (0.03, 0.03, 0.045)
 CYLINDER_RADIUS, CYLINDER_HALF = 0.033, 0.055
@@ -113,7 +113,7 @@ def _box(half: tuple[float, float, float], centre: tuple[float, float, float] = 
 
 
 def _revolve(profile, closed: bool = False) -> TriangleMesh:
-    """Revolve an (r, z) profile about z. It rises from axis to axis, or is a counter-clockwise loop (`closed`)."""
+    """Revolve an (r, z) profile about z. The profile rises from axis to axis, or is a `closed` anticlockwise loop."""
     profile = np.asarray(profile, dtype=float)
     if not closed:
         profile[[0, -1], 0] = 0.0
@@ -132,7 +132,7 @@ def _ribbon(outer: Float[np.ndarray, "n 2"], inner: Float[np.ndarray, "n 2"], ha
 
 
 def _stitch(rings: Float[np.ndarray, "rows columns 3"], wrap_rows: bool) -> TriangleMesh:
-    """Join each closed ring to the next by triangles, with `wrap_rows` the last to the first. Point rings are poles."""
+    """Join each closed ring to the next by triangles. A ring may be a point. `wrap_rows` joins last to first ring."""
     rows, columns = rings.shape[:2]
     index = np.arange(rows * columns).reshape(rows, columns)
     low = index if wrap_rows else index[:-1]

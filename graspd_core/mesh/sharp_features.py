@@ -1,6 +1,6 @@
 """Sample points on the sharp convex parts of a surface: edges, corners, rims, thin walls.
 
-Hand samples are millimetres apart, so an object's edge can penetrate the hand between them. These points detect it.
+Points on a hand are millimetres apart, so an object's edge can enter between them. Points on the edge detect this.
 """
 
 from __future__ import annotations
@@ -17,27 +17,27 @@ from graspd_core.types import TriangleMesh
 
 Points = Float[np.ndarray, "n 3"]
 
-# Depth of the probe below the surface [m]. Fraction by which the surface must be nearer than that to count as sharp.
+# Depth of the probe below a point [m]. The point is sharp if the surface is nearer to the probe by this fraction.
 _PROBE, _SHARP = 0.003, 0.15
-_POOL = 6000
-# Cosine of half the angle at which an edge is no longer flat.
+_POOL = 6000  # candidates at vertices, and as many on edges
+# An edge is flat if its face normals differ by less than 20°. This is the cosine of half that angle.
 _FLAT_EDGE = float(np.cos(np.deg2rad(10.0)))
 # Fraction of thin surface from which an object counts as thin-walled.
 THIN_WALLED = 0.6
 # A finger can pass through a thin wall between sparse points. So a thin-walled object gets one point for each area of
-# this size [m²], up to this many times the requested points.
+# this size [m²], but at most this many times the requested number of points.
 _AREA_OF_POINT, _MOST = 5e-5, 16
 
 
 def sharp_points(mesh: TriangleMesh, count: int, seed: int = 0, *, pool: int = _POOL) -> tuple[Points, float]:
     """Return evenly spread points [m] on edges, corners and thin walls, where little material lies below the surface.
 
-    A probe is placed 3 mm below each candidate. Under a flat surface its distance to the surface is 3 mm. Under an edge
-    or in a thin wall it is less. There are at most `count` points, more on thin-walled objects, fewer or none on smooth
-    ones. They are in farthest-point order, so the first k points are evenly spread for every k.
+    A probe is placed 3 mm below each candidate. Under a flat surface, the probe is 3 mm from the surface. Under an edge
+    or in a thin wall, it is nearer. Thin-walled objects get more than `count` points, smooth objects fewer or none. The
+    points are in farthest-point order, so the first k points are evenly spread for every k.
 
     Args:
-        pool: number of candidates at vertices and on edges each. Half as many lie on faces.
+        pool: number of candidates at vertices, and number of candidates on edges. Half as many lie on faces.
 
     Returns:
         The points, and the fraction of the surface with less than 6 mm of material below it. The fraction is near one
@@ -83,7 +83,7 @@ def crease_points(mesh: TriangleMesh, count: int, seed: int) -> Float[np.ndarray
 
 
 def farthest_points(points: Points, count: int) -> np.ndarray:
-    """Return the indices of at most `count` points by farthest-point sampling, starting from the first."""
+    """Return the indices of at most `count` points by farthest-point sampling, which starts at the first point."""
     if len(points) == 0:
         return np.zeros(0, dtype=int)
     columns = np.ascontiguousarray(points.T)
@@ -102,14 +102,14 @@ def farthest_first(
     distances: Callable[[int], np.ndarray],
     mates: Callable[[int], np.ndarray | slice] = lambda _: slice(None),
 ) -> Int[np.ndarray, "count"]:
-    """Return indices of points, each the farthest from all points chosen before it (Gonzalez 1985).
+    """Return indices of points. Each is the farthest from all points chosen before (Gonzalez 1985).
 
     Args:
         size: number of points.
         count: maximum number of indices to return. All of `chosen` are returned even if they are more.
         chosen: indices of the first points.
-        distances: returns the distances of a chosen point to its mates, in any unit that grows with distance.
-        mates: returns the points that a chosen point is compared with. All others count as infinitely far from it.
+        distances: returns a chosen point's distances, or numbers that grow with them, to the points of `mates`.
+        mates: returns the points that a chosen point is compared with. All other points count as infinitely far away.
     """
     picked, gap = [int(index) for index in chosen], np.full(size, np.inf)
     for number in range(max(min(count, size), len(picked))):
@@ -123,7 +123,7 @@ def farthest_first(
 def neighbours_together(points: Points) -> Int[np.ndarray, "n"]:
     """Return an order of the points in which neighbours are close, by recursive halving along the widest side.
 
-    Counted from the first, each block of sixteen points is compact, and so is each block of eight or four.
+    From the first point on, each block of sixteen points is compact, and so is each block of eight or four.
     """
     if len(points) <= 4:
         return np.arange(len(points))
@@ -147,7 +147,7 @@ def _pool(mesh: TriangleMesh, seed: int, size: int) -> tuple[Points, Points]:
     along = rng.choice(len(edges), size=size, p=lengths / lengths.sum())
     a = rng.random((size, 1))
     start, end = edges[along].T
-    # An edge point's normal blends those of both ends. On a sharp edge it is the bisector, on a flat one the face's.
+    # An edge point's normal blends the normals of both ends: the bisector on a sharp edge, the face's on a flat edge.
     on_edges = (1 - a) * mesh.vertices[start] + a * mesh.vertices[end]
     edge_normals = (1 - a) * vertex_normals[start] + a * vertex_normals[end]
     edge_normals /= np.maximum(np.linalg.norm(edge_normals, axis=-1, keepdims=True), 1e-20)

@@ -1,8 +1,8 @@
 """Exact distance and inside queries on a triangle mesh by libigl, in float64, without a grid or gradient.
 
 Signed distances are negative inside. The generalised winding number (Barill et al. 2018) defines the inside, also of
-open, overlapping, doubled and inverted surfaces. Only ray casting uses Open3D (Embree), which takes half a second to
-import. Planning on a mesh casts no rays.
+open, overlapping, doubled and inverted surfaces. Only ray casting uses Open3D (Embree), whose import takes half a
+second. Planning on a mesh casts no rays.
 """
 
 from __future__ import annotations
@@ -45,12 +45,12 @@ def signed_distance(
     return np.where(is_inside(tree, points), -distance, distance)
 
 
-# Points per call. libigl holds Python's global lock during a call, so this limits the wait of other threads (to 2 ms).
+# Points per call. libigl holds Python's global lock during a call, so other threads wait up to 2 ms.
 _POINTS_AT_ONCE = 256
-# Accuracy scales of the tree. The coarse one costs a quarter of the fine one, and its numbers are off by up to 0.3.
+# Accuracy scales of the tree. The coarse scale takes a quarter of the time, and its winding numbers err by up to 0.3.
 _COARSE, _FINE = 1.0, 2.0
-# Coarse numbers this near to one half are computed again at the fine scale. Far from holes the true number is whole, so
-# a wrong answer would need an error of 0.8.
+# Coarse numbers this near to one half are computed again at the fine scale. Far from holes, the true winding number is
+# an integer, so a wrong answer would need an error of 0.8.
 _DOUBT = 0.3
 
 
@@ -76,7 +76,7 @@ def make_winding_tree(mesh: TriangleMesh) -> WindingTree:
 
     low, high, centre = mesh.vertices.min(0), mesh.vertices.max(0), mesh.vertices.mean(0)
     # The mesh is centred, because the tree's expansion loses digits far from the origin. Long faces are cut, because
-    # the tree sums every face that is long for its distance, which makes slivers ten times slower.
+    # the tree sums such faces one by one at short distances. Slivers would take ten times as long.
     cut = cut_long_faces(TriangleMesh(mesh.vertices - centre, mesh.faces), float((high - low).max()) / 10)
     tree = igl.FastWindingNumberBVH()
     tree.init(np.asarray(cut.vertices, dtype=float), np.asarray(cut.faces, dtype=np.int64))
@@ -149,9 +149,9 @@ def closest_points(
     return np.where(found[:, None], closest, np.nan), np.where(found[:, None], normals, np.nan)
 
 
-# Faces within this distance of a point [m] contribute to its normal: the two of an edge, or the many of a rounding.
+# Faces within this distance of a point [m] contribute to its normal: two at an edge, or many at a rounded edge.
 _ABOUT = 3e-4
-# Maximum rounds of adjusting the weights of these faces, and the change of a weight below which they end.
+# Maximum number of rounds that adjust the weights of these faces. They end if no weight changes by more than this.
 _SWEEPS, _SETTLED = 100, 1e-7
 # Directions in which these faces are searched: towards the corners and face centres of a cube.
 _AROUND = np.array(
@@ -165,12 +165,12 @@ def pressed_points(
 ) -> tuple[Float[np.ndarray, "n 3"], Float[np.ndarray, "n 3"]]:
     """Return the closest surface points [m], and the outward unit normals there that are nearest to `normals`.
 
-    On a face this is the face's normal. On an edge or a corner, any direction between the normals of its faces counts.
+    On a face, the face's normal is returned. On an edge or a corner, any direction between the face normals is valid.
     """
     closest, own = closest_points(surface, points)
     around = closest_points(surface, (closest[:, None] + _ABOUT * _AROUND).reshape(-1, 3))[1]
     between = np.concatenate([own[:, None], around.reshape(len(points), -1, 3)], 1)
-    # Fit `normals` by a sum of face normals with weights of at least zero, one weight after the other.
+    # Fit `normals` by a weighted sum of face normals. No weight is negative, and one weight is fitted after the other.
     weights, rest = np.zeros(between.shape[:2]), np.array(normals)
     for _ in range(_SWEEPS):
         before = weights.copy()
@@ -187,7 +187,7 @@ def pressed_points(
 def first_hits(
     mesh: TriangleMesh, directions: Float[np.ndarray, "*batch 3"]
 ) -> tuple[Float[np.ndarray, "*batch"], Integer[np.ndarray, "*batch"], Float[np.ndarray, "*batch 3"]]:
-    """Cast rays from the origin. Return distances as factors on `directions` (inf: no hit), faces and unit normals."""
+    """Cast rays from the origin. Return distances divided by ray lengths (inf: no hit), hit faces and unit normals."""
     with Extra("clouds"):
         import open3d as o3d
 

@@ -17,7 +17,7 @@ def packed_rows(rows: Int[np.ndarray, "n k"]) -> Int[np.ndarray, "n"]:
     """
     if not len(rows):
         return np.zeros(0, dtype=np.int64)
-    # Computed column by column, because NumPy takes seven times as long for the minimum of many short rows.
+    # The minimum is computed by columns, because NumPy takes seven times as long for many short rows.
     columns = tuple(column - column.min() for column in rows.T)
     sides = tuple(int(column.max()) + 1 for column in columns)
     if math.prod(sides) < 2**63:
@@ -34,7 +34,7 @@ def voxel_keys(points: Float[np.ndarray, "n k"], size: float) -> Int[np.ndarray,
 Vertices = Float[np.ndarray, "vertices 3"]
 Faces = Int[np.ndarray, "faces 3"]
 
-# Vertices nearer than this [m] are merged. It is far below any scanner's noise, and far above float32 rounding at 2 m.
+# Vertices in one lattice cell of this side [m] are merged. Scanner noise is larger, float32 rounding at 2 m is smaller.
 MERGE_DISTANCE = 1e-6
 
 
@@ -47,7 +47,7 @@ def merge_vertices(mesh: TriangleMesh) -> tuple[Vertices, Faces]:
 
 
 def drop_strays(mesh: TriangleMesh) -> tuple[TriangleMesh, int]:
-    """Return the mesh without the vertices that no face uses, and their number.
+    """Return the mesh without the vertices that no face uses, and the number of dropped vertices.
 
     Degenerate faces, which repeat a vertex, do not count as using vertices. They stay in the mesh and stay degenerate.
     """
@@ -67,7 +67,7 @@ def scaled_normals(vertices: Vertices, faces: Faces) -> Float[np.ndarray, "faces
 
 
 def drop_degenerate(vertices: Vertices, faces: Faces) -> Int[np.ndarray, "kept 3"]:
-    """Return the faces with an area: their height is above 1e-9 of their longest side."""
+    """Return the faces with an area. A face has one if its height is above 1e-9 of its longest side."""
     a, b, c = vertices[faces].transpose(1, 0, 2)
     area = np.linalg.norm(scaled_normals(vertices, faces), axis=1)
     longest = np.max([np.einsum("ij,ij->i", e, e) for e in (b - a, c - b, a - c)], axis=0)
@@ -75,13 +75,13 @@ def drop_degenerate(vertices: Vertices, faces: Faces) -> Int[np.ndarray, "kept 3
 
 
 def drop_repeated(faces: Faces) -> Int[np.ndarray, "kept 3"]:
-    """Return the faces without repetitions. Faces on the same three vertices are the same, whatever their winding."""
+    """Return the faces without repetitions. Faces on the same three vertices are equal, whatever their winding."""
     _, first = np.unique(packed_rows(np.sort(faces, axis=1)), return_index=True)
     return faces[np.sort(first)]
 
 
 def face_edges(faces: Faces) -> Int[np.ndarray, "edges 2"]:
-    """Return the edges of all faces in the direction of their winding: all first edges, then all second, all third."""
+    """Return the edges of all faces in winding direction: first edges of all faces, then second, then third edges."""
     return np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]])
 
 
@@ -130,7 +130,7 @@ def cut_long_faces(mesh: TriangleMesh, longest: float) -> TriangleMesh:
         which = lengths.argmax(1)
         long = lengths.max(1) > longest
         done.append(corners[~long])
-        # Turn each face so that its longest edge is a-b, then halve that.
+        # Rotate the corners of each face so that a-b is the longest edge, and halve this edge.
         order = (which[long, None] + np.arange(3)) % 3
         a, b, c = np.take_along_axis(corners[long], order[..., None], axis=1).transpose(1, 0, 2)
         middle = (a + b) / 2
@@ -139,7 +139,7 @@ def cut_long_faces(mesh: TriangleMesh, longest: float) -> TriangleMesh:
     return TriangleMesh(soup.reshape(-1, 3), np.arange(3 * len(soup)).reshape(-1, 3))
 
 
-# A mesh is far if its distance is this many times its size. There float32 still resolves 1e-5 of the size.
+# A mesh is far if its distance is over this many times its size. At this distance, float32 resolves 1e-5 of the size.
 _FAR = 100.0
 
 

@@ -35,12 +35,12 @@ from graspd_core.types import Contact, Grasp, Posture
 _DEEPEST = 0.0015
 # Poses per batch in `assemble` on the CPU. Each pose needs about a megabyte of memory.
 _AT_ONCE = 128
-# Subtracted from the score if the approach from the retreat sweeps the object. Such candidates are tried last.
+# Subtracted from the score if the hand hits the object between retreat and pregrasp. Such grasps are tried last.
 _KNOCK_COST = 100.0
 # Every usable candidate scores above this. A dropped candidate has a score of −inf.
 _WORST = -1e3
 # The search is repeated if the ranking expects less than this share of the requested grasps to hold.
-# The seed step differs from that between two rounds, so that no seed is used twice.
+# The seed step between searches differs from that between rounds, so that no seed is used twice.
 _LEAST_EXPECTED, _SEED_STEP = 0.9, 15_485_863
 
 
@@ -81,7 +81,7 @@ class PlannerOutput:
 
     Attributes:
         poses: hand poses in any order, at most a few times the requested count.
-        interrupted: why the method ended early: "cancelled" or "deadline". Empty if it did not.
+        interrupted: why the method ended early: "cancelled" or "deadline". Empty for a full run.
     """
 
     poses: Poses
@@ -97,11 +97,11 @@ class Candidates:
 
 
 def find_candidates(task: PlannerInput, *, searches: int | None = None) -> Candidates:
-    """Run the configured method and return its ranked candidates, perhaps fewer than `count`.
+    """Run the configured method and return its ranked candidates, perhaps fewer than `task.count`.
 
-    If the ranking expects too few grasps to hold, the search is repeated from new starts. This helps on small, large
-    and long objects. There are at most `searches` searches. None takes the method's setting. Restrictions act here
-    only on the starts. The caller checks the candidates against them.
+    If too few candidates are expected to pass the hold trial, the search is repeated from new starts. This helps on
+    small, large and long objects. `searches` limits the number of searches. None takes the limit of the method's
+    settings. Restrictions act here only on the starts. The caller must check the candidates against them.
     """
     config, count = task.config, task.count
     found = _searched(task)
@@ -132,14 +132,14 @@ def _best_first(grasps: Iterable[Grasp]) -> tuple[Grasp, ...]:
 def assemble(
     problem: Problem, hand: HandModel, poses: Poses, config: PlanConfig, stop: Callable[[], bool] = lambda: False
 ) -> tuple[Grasp, ...]:
-    """Return grasps with three postures and a score, best first.
+    """Turn poses into grasps with pregrasp, grasp and squeeze posture. Return them with their scores, best first.
 
     Poses that penetrate an obstacle at the grasp or on the approach path are dropped. Poses whose fingers penetrate the
     object deeply are kept, because some methods produce such poses and their grasps hold.
     """
     grasps: list[Grasp] = []
     device, total = poses.translation.device, len(poses.translation)
-    # On an accelerator one pose takes as long as all of them, so all form one batch.
+    # On an accelerator one pose takes as long as all poses, so all poses form one batch.
     at_once = _AT_ONCE if device.type == "cpu" else max(total, 1)
     for first in range(0, total, at_once):
         rows = torch.arange(first, min(first + at_once, total), device=device)
@@ -149,7 +149,7 @@ def assemble(
 
 
 def finished(problem: Problem, hand: HandModel, some: Staged) -> list[Grasp]:
-    """Return a grasp with its score for each pose that `staged` has prepared (`some`), in the same order."""
+    """Return a scored grasp for each pose of the batch `some`, in the same order. `staged` makes such a batch."""
     scores = score(problem, some)
     if problem.obstacles is not None:
         depth = -gap_on_path(problem.obstacles, problem.hand.kinematics, some.opened, some.poses)
@@ -161,7 +161,7 @@ def finished(problem: Problem, hand: HandModel, some: Staged) -> list[Grasp]:
 def staged(
     problem: Problem, hand: HandModel, poses: Poses, config: PlanConfig, stop: Callable[[], bool] = lambda: False
 ) -> Staged:
-    """Compute contacts, squeeze and pregrasp of every pose. The caller must choose batches that fit in memory."""
+    """Reduce penetration (`settle`), then compute contacts, squeeze and pregrasp. The batch must fit in memory."""
     poses = settle(problem, poses, stop)
     contact_set = find_contacts(problem, poses, config.grasp_stages.touch_reach)
     effort = torch.as_tensor(hand.effort).to(problem.hand.lower)

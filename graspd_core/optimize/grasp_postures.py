@@ -33,7 +33,7 @@ from graspd_core.optimize.problem import (
 )
 from graspd_core.se3 import SE3, rotation_from_quaternion
 
-# Contacts of one link in addition to its nearest candidate.
+# Number of contacts of a link in addition to its nearest candidate.
 _SPREAD = 2
 # Fractions of the path from pregrasp to grasp at which the hand is kept clear of the object.
 _PATH = (0.0, 0.4, 0.8)
@@ -41,29 +41,29 @@ _PATH = (0.0, 0.4, 0.8)
 _JOINT_COST, _BASE_COST = 0.1, 2e3
 # Weight of the hand's self-collision at the pregrasp [1/mm²].
 _SELF_WEIGHT = 10.0
-# Settings of `settle`. Contact candidates nearer than `clearance` [m] are kept at their distance, with weight `keep`.
+# Settings of `settle`. Candidates within `clearance` [m] of the object are kept from moving away, with weight `keep`.
 _SETTLING = structs.Pregrasp(
     0.001, 0.003, 0.0003, joint_cost=1.0, base_cost=1e4, self_collision=1.0, keep=0.03, steps=30
 )
 _CONE_EDGES = 8
 # Weights relative to force balance: of an even load on the contacts, and of normal forces that sum to one.
 _RIDGE, _SUM = 0.5, 10.0
-# Least sum of the normal forces per mass, times the friction [N/kg]: about six times what two opposing contacts need.
+# For heavy objects: sum of normal forces times friction, per mass [N/kg]. Two opposing contacts need a sixth of it.
 _GRIP = 60.0
-# Newton's method ends at this squared slope. It takes at most ten steps, unless a value is NaN.
+# Newton's method ends at the squared slope `_CONVERGED`, within ten steps. With NaN it ends after `_NEWTON_STEPS`.
 _CONVERGED, _NEWTON_STEPS = 1e-22, 60
 
 
 @dataclass(frozen=True)
 class ContactSet:
-    """Contacts of a batch of hands: a few slots for every link. Only active slots are contacts.
+    """Contacts of a batch of hands: a few slots (possible contacts) for every link. Only active slots are contacts.
 
     Attributes:
         link: link of each slot.
         position: point on the object, object frame [m].
         normal: outward unit normal of the object at `position`.
         distance: signed distance between hand and object at `position` [m].
-        active: whether the slot is a contact.
+        active: True if the slot is a contact.
     """
 
     link: Int[Tensor, "slots"]
@@ -75,9 +75,9 @@ class ContactSet:
 
 @torch.no_grad()
 def find_contacts(problem: Problem, poses: Poses, reach: float) -> ContactSet:
-    """Find the contacts of every link: its nearest candidate, two others far apart, and the nearest sharp point.
+    """Return contacts at three candidates of each link, and at the object's sharp point nearest to each primitive.
 
-    Slots within `reach` [m] of the surface are active.
+    The three candidates of a link are far apart. A contact is active within `reach` [m] of the object's surface.
     """
     points = problem.hand.fine
     placed = hand_forward(problem, points, poses)
@@ -95,7 +95,7 @@ def find_contacts(problem: Problem, poses: Poses, reach: float) -> ContactSet:
     slots = torch.stack(chosen, -1).flatten(1)
     gap, n = distance[rows, slots], normal[rows, slots]
     own_link = points.links[slots] == links.repeat_interleave(_SPREAD + 1)
-    # If all contacts of a link are within 4 mm, only the nearest counts.
+    # A further candidate counts only if it is more than 4 mm from the nearest candidate of its link.
     apart = [torch.ones_like(chosen[0], dtype=torch.bool)]
     apart += [(placed.points[rows, c] - placed.points[rows, chosen[0]]).norm(dim=-1) > 0.004 for c in chosen[1:]]
     found = ContactSet(
@@ -109,7 +109,7 @@ def find_contacts(problem: Problem, poses: Poses, reach: float) -> ContactSet:
 
 
 def _with_features(problem: Problem, poses: Poses, found: ContactSet, reach: float) -> ContactSet:
-    """Add a slot for each primitive of the hand: the object's sharp point nearest to it, with its inward normal."""
+    """Add a slot for each hand primitive at the object's nearest sharp point. Its normal points into the primitive."""
     pick, nearest, outward = nearest_features(problem, poses)
     return ContactSet(
         torch.cat([found.link, problem.hand.solids.link]),
@@ -123,7 +123,7 @@ def _with_features(problem: Problem, poses: Poses, found: ContactSet, reach: flo
 def nearest_features(
     problem: Problem, poses: Poses
 ) -> tuple[Int[Tensor, "batch solids"], Float[Tensor, "batch solids"], Float[Tensor, "batch solids 3"]]:
-    """Return the sharp point nearest to each primitive of the hand: index, signed distance [m] and its gradient."""
+    """Return for each hand primitive its nearest sharp point's index, signed distance [m] and distance gradient."""
     solids = problem.hand.solids
     if (compiled := problem.compiled) is not None:
         x = pack(poses).contiguous()
@@ -157,11 +157,11 @@ def self_overlap(problem: Problem, joints: Joints) -> Values:
 def find_pregrasp(
     problem: Problem, poses: Poses, config: GraspStagesConfig, stop: Callable[[], bool] = lambda: False
 ) -> tuple[Poses, Values]:
-    """Find a nearby pregrasp, from which the hand closes without sweeping the object. The base shifts, never turns.
+    """Find a nearby pregrasp, from which the hand closes without pushing the object. The base shifts, never turns.
 
-    The path to the grasp is straight in joint space. At a fraction a of the path, every contact candidate shall be
-    (1 − a) times the clearance away from the object. So all contacts arrive together. The whole path also avoids
-    obstacles, and the pregrasp avoids self-collision.
+    The path to the grasp is straight in joint space. After the fraction a of the path, every contact candidate shall
+    be at least (1 − a) times the clearance away from the object. So all contacts arrive together. The whole path
+    also avoids obstacles, and the pregrasp avoids self-collision.
 
     Returns:
         The pregrasps, and the fraction of the wanted clearance that each path keeps (1 if it keeps all).
@@ -185,7 +185,7 @@ def _find_pregrasp(
     with torch.no_grad():
         reached = hand_distance(problem, poses.base, poses.joints)
     remaining = torch.tensor([1.0 - a for a in _PATH], dtype=start.dtype, device=start.device)[:, None, None]
-    # If the grasp itself penetrates the object, the path starts from that depth.
+    # If the grasp penetrates the object, the path may end at this depth.
     wanted = (reached.clamp(max=0.0) * (1 - remaining) + remaining * config.clearance).flatten(0, 1)
 
     def path_to(x: Rows) -> Float[Tensor, "way_batch variables"]:
@@ -252,7 +252,7 @@ def _settle(problem: Problem, poses: Poses, stop: Callable[[], bool]) -> Rows:
 
 
 def _sunk_surface(on_surface: Problem, placed: HandPlacement, poses: Poses, x: Rows) -> Values:
-    """Return the sum, over the hand's primitives, of the squared depth of the deepest object point inside [mm²]."""
+    """Find the object's deepest surface point in each hand primitive. Return the sum of the squared depths [mm²]."""
     solids, features = on_surface.hand.solids, on_surface.object.features
     if not len(features) or not len(solids.link):
         return x.new_zeros(len(x))
@@ -272,7 +272,7 @@ def _pregrasp_settings(config: GraspStagesConfig) -> structs.Pregrasp:
 def _rates_and_costs(
     problem: Problem, settings: structs.Pregrasp
 ) -> tuple[Float[Tensor, "variables"], Float[Tensor, "variables"]]:
-    """Return the step sizes and the costs per squared travel, for base translation and joints."""
+    """Return the step size and the cost per squared travel of each variable: base translation, then joints."""
     rates = problem.hand.lower.new_full((3 + len(problem.hand.lower),), settings.joint_rate)
     rates[3:] *= problem.hand.joint_scale
     rates[:3] = settings.base_rate
@@ -309,7 +309,7 @@ def _descended(
 def approach_depth(problem: Problem, obstacles: ObstacleTensors, pregrasp: Poses) -> Values:
     """Return how deep the hand penetrates the object on the straight path from the retreat to the pregrasp [m].
 
-    The depth is 0 if the path is collision-free. The path is sampled at `RETREAT_SHARES`, without the pregrasp.
+    0 if the path is free. The retreat is the pregrasp drawn back. The samples (`RETREAT_SHARES`) exclude it.
     """
     rotation = rotation_from_quaternion(pregrasp.quaternion)
     begun = [drawn_back(pregrasp.translation, rotation, obstacles.approach, RETREAT * s) for s in RETREAT_SHARES]
@@ -341,9 +341,9 @@ class Squeeze:
 def squeeze(
     problem: Problem, poses: Poses, contact_set: ContactSet, effort: Float[Tensor, "joints"], config: GraspStagesConfig
 ) -> Squeeze:
-    """Compute balanced contact forces F by non-negative least squares, and joint targets offset by JᵀF / kp.
+    """Compute balanced contact forces F by non-negative least squares, and joint targets offset by JᵀF / stiffness.
 
-    The heavier the object, the larger the forces. A joint whose torque JᵀF exceeds its effort limit gives this limit.
+    Heavier objects get larger forces. The torque JᵀF of each joint is limited to the share `effort_share` of `effort`.
     """
     unit_forces, imbalance = balanced_forces(
         (contact_set.position - problem.object.center).double().cpu().numpy(),
@@ -364,7 +364,7 @@ def squeeze(
 
 
 def by_link(contact_set: ContactSet, values: Float[Tensor, "batch slots n"]) -> Float[Tensor, "batch links n"]:
-    """Return the sum of the values over the slots of each link. Links after the last one with a slot are left out."""
+    """Return the sum of the values over the slots of each link. The result ends at the last link with a slot."""
     links = int(contact_set.link.max()) + 1
     return values.new_zeros(len(values), links, values.shape[-1]).index_add(1, contact_set.link, values)
 
@@ -372,7 +372,7 @@ def by_link(contact_set: ContactSet, values: Float[Tensor, "batch slots n"]) -> 
 def joint_torques(
     problem: Problem, poses: Poses, contact_set: ContactSet, forces: Float[Tensor, "batch slots 3"]
 ) -> Joints:
-    """Return τ = JᵀF [N·m] or [N], the gradient of Σ F·x(q) over the hand's contact points."""
+    """Return the joint torques τ = JᵀF [N·m] or [N]: the gradient of Σ F·x(q) over the contact points x."""
     base = poses.base
     x = base.apply_inverse(contact_set.position)
     joints = poses.joints.detach().requires_grad_(True)
@@ -396,7 +396,7 @@ def balanced_forces(
     Args:
         arms: contact points relative to the centre of mass [m].
         normals: outward unit normals.
-        active: which slots are contacts.
+        active: True for slots that are contacts.
         length: length that torques are divided by [m].
         friction: Coulomb coefficient of the cones.
 
@@ -437,9 +437,9 @@ def _balancing_weights(
 ) -> Float[np.ndarray, "batch edges"]:
     """Return the x ≥ 0 that minimises ‖W x‖² + 10² (Σ x − 1)² + ridge² ‖x‖². W has the `allowed` `wrenches` as columns.
 
-    Let G have the six wrench components and the sum as rows, and t = (0, …, 0, 10). The unknown of the dual is the
-    residual r = t − G x, which has seven components. It minimises ‖r‖²/2 + ‖max(Gᵀr, 0)‖² / 2 ridge² − t·r. Then
-    x = max(Gᵀr, 0) / ridge². Newton's method with halved steps needs few steps: the function is piecewise quadratic.
+    Let G be W with a seventh row of tens, and t = (0, …, 0, 10). The unknown of the dual is the residual r = t − G x.
+    The dual minimises ‖r‖²/2 + ‖max(Gᵀr, 0)‖² / 2 ridge² − t·r. Then x = max(Gᵀr, 0) / ridge². The dual is
+    piecewise quadratic. So Newton's method with step halving needs few steps.
     """
     batch, count, _ = wrenches.shape
     g = np.concatenate([wrenches, np.full((batch, count, 1), _SUM)], -1) * allowed[..., None]

@@ -30,14 +30,14 @@ from graspd_core.types import TriangleMesh
 _TILT, _PALM_STANDOFF = 0.35, (0.005, 0.05)
 # Starts with fingertips: range of the closing fraction (0 open, 1 closed), and of the distance to the object [m].
 _SHARE_CLOSED, _TIP_STANDOFF = (0.2, 0.8), (-0.01, 0.01)
-# Poses drawn per start, points to measure the object's width, and scale of the preference for narrow widths [m].
+# Poses drawn per start, points that measure the width, half width that makes a pose e times less likely [m].
 _POOL, _SPAN_POINTS, _SPAN_SCALE = 6, 400, 0.012
 # Among obstacles: poses drawn for each start kept, the depth in an obstacle that makes a pose e times less likely [m],
 # and the greatest lift off the support [m].
 _POOL_AMONG_OBSTACLES, _DEPTH_SCALE, _HIGHEST_LIFT = 18, 0.005, 0.03
 # With restrictions: the greatest number of pools, and the seed step between two pools.
 _MOST_POOLS, _POOL_SEED_STEP = 20, 7_919
-# Half breadth and depth of the slab of the object that a hand closes around [m].
+# A hand closes around a slab of the object: the slab's half breadth, and depth from the grip [m].
 _SLAB_HALF_BREADTH, _SLAB_DEPTH = 0.05, 0.09
 # Joint noise as a share of the range, and radius around the palm's axis in which the palm avoids the surface [m].
 _JOINT_NOISE, _PALM_RADIUS = 0.1, 0.04
@@ -50,13 +50,13 @@ class StartPool:
     """Hand poses in the object frame, from which the starts are chosen.
 
     Attributes:
-        grip: point of the hand that faces the object, base frame [m]: middle of the palm or of the fingertips.
+        grip: point that faces the object: middle of the palm, or middle between the fingertips, base frame [m].
         standoff: distance of the grip from the object [m].
-        middle: position of the grip [m].
+        middle: position of the grip, object frame [m].
         rotation: orientation of the base.
-        translation: origin of the base [m].
+        translation: origin of the base, object frame [m].
         joints: joint values [rad] or [m].
-        depth: distance from the first surface in front of the palm to the wanted place [m]. 0 without a wanted place.
+        depth: how far a wanted place lies behind the first surface in front of the palm [m]. 0 without wanted places.
     """
 
     grip: Float[Tensor, "batch 3"]
@@ -87,8 +87,8 @@ def draw_starts(
     As in Grasp'D, the palm faces a random surface point with a random roll. Points are on the hull, so that no palm
     starts inside a hollow. Narrow cross-sections are preferred. A share `fingertips` of the starts has half-closed
     fingers, with the fingertips at the point, because an open hand does not reach small or low objects. Poses are
-    rarely drawn if the hand, or its retreat, penetrates an obstacle. With restrictions, at most `_MOST_POOLS` pools are
-    drawn. If they hold too few allowed poses, fewer than `count` starts are returned, perhaps none.
+    rarely drawn if the hand, or its retreat, penetrates an obstacle. With restrictions, poses are drawn in at most
+    `_MOST_POOLS` pools. If these contain too few allowed poses, fewer than `count` starts are returned, perhaps none.
     """
     generator = torch.Generator().manual_seed(seed)
     obstacles = make_obstacle_tensors(scene, hand, "cpu", torch.float64)
@@ -108,7 +108,7 @@ def draw_starts(
         drawn = replace(drawn, middle=drawn.middle + raised - drawn.translation, translation=raised)
 
     half_width = half_widths(surface, drawn.middle, drawn.rotation, hand)
-    # With Gumbel noise, the best `count` are a random draw without replacement, with weights exp(−half width / scale).
+    # With Gumbel noise, the best poses are a random draw without replacement, with weights exp(−half width / scale).
     gumbel = -torch.log(-torch.log(_uniform(1e-12, 1.0, len(drawn.joints), generator)))
     preference = gumbel - (half_width + drawn.depth) / _SPAN_SCALE - blocked / _DEPTH_SCALE
     chosen = preference.topk(min(count, len(preference))).indices
@@ -156,8 +156,8 @@ def _aimed(
 ) -> StartPool:
     """Turn and move the hands of a pool so that they meet `aim`. The joints do not change.
 
-    The grip of each hand faces a random place of `aim`, or a random `surface` point [m] if `aim` has no places. It
-    keeps its standoff from the outermost surface in front of that point.
+    The grip of each hand faces a random place of `aim`, or a random `surface` point [m] if `aim` has no places. The
+    grip keeps its standoff from the first surface that the palm meets on its way to that point.
     """
     count, rotation = len(pool.joints), pool.rotation
     if aim.direction is not None:
@@ -206,9 +206,9 @@ def _allowed(draw: Callable[[int], StartPool], wanted: int, seed: int, restricti
 
 
 def raise_clear(obstacles: ObstacleTensors, base: SE3, links: SE3) -> tuple[Positions, Values]:
-    """Lift hands off the support by at most `_HIGHEST_LIFT`. `links` are the link poses in the base frame.
+    """Lift hands out of the support by at most `_HIGHEST_LIFT`. `links` are the link poses in the base frame.
 
-    Returns the lifted base origins [m], and each hand's greatest depth in obstacles at start or retreat [m].
+    Returns the lifted base origins [m], and how deep each lifted hand or its retreat penetrates obstacles [m].
     """
     translation = base.translation
     if obstacles.normal is not None:
@@ -220,7 +220,7 @@ def raise_clear(obstacles: ObstacleTensors, base: SE3, links: SE3) -> tuple[Posi
 
 
 def depth_of_starts(scene: Scene, hand: HandModel, count: int, restrictions: BoundRestrictions) -> float:
-    """Return how deep the best of `count` starts, or its retreat, penetrates the obstacles [m]. 0 without obstacles."""
+    """Return how deep the best of `count` starts, or its retreat, penetrates obstacles [m]. 0 without obstacles."""
     obstacles = make_obstacle_tensors(scene, hand, "cpu", torch.float64)
     if obstacles is None:
         return 0.0
@@ -232,9 +232,9 @@ def depth_of_starts(scene: Scene, hand: HandModel, count: int, restrictions: Bou
 def half_widths(
     surface: Float[Tensor, "points 3"], middle: Positions, rotation: Float[Tensor, "batch 3 3"], hand: HandModel
 ) -> Values:
-    """Return the object's greatest distance from the grip, measured along the closing direction of the fingers [m].
+    """Return how far the object extends from the grip along the closing direction of the fingers [m].
 
-    Only points between the fingers count, in a slab as wide as a hand. Infinite if the slab has no point.
+    Only points between the fingers count, in a slab as wide as a hand. If the slab is empty, the result is infinite.
     """
     normal = torch.as_tensor(hand.palm_normal)
     closing = torch.as_tensor(closing_axis(hand))
@@ -255,7 +255,7 @@ def closing_axis(hand: HandModel) -> Float[np.ndarray, "3"]:
 
 
 def between_fingertips(hand: HandModel, joints: Joints) -> Positions:
-    """Return the middle between the fingertips of the two closing sides, base frame [m]."""
+    """Return the middle between the fingertips that close from one side and those from the other, base frame [m]."""
     fingers = find_fingers(hand)
     travel = placed_tips(hand, fingers, hand.closed_posture) - placed_tips(hand, fingers, hand.open_posture)
     along = torch.as_tensor(travel @ closing_axis(hand))

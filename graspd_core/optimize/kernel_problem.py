@@ -43,7 +43,7 @@ class Arrays:
     kept: list[object] = field(default_factory=list)
 
     def floats(self, values: np.ndarray | Tensor) -> int:
-        """Copy the values to aligned float32 memory, followed by a vector of zeros, and return the address."""
+        """Copy the values to aligned float32 memory, with zeros behind the last value. Return the address."""
         return self._keep(values, np.float32)
 
     def ints(self, values: np.ndarray | Tensor) -> int:
@@ -51,7 +51,7 @@ class Arrays:
         return self._keep(values, np.int32)
 
     def rows(self, columns: np.ndarray, width: int) -> int:
-        """Copy an (n, k) array to k rows of `width` floats, padded by zeros, and return the address."""
+        """Copy the k columns of an (n, k) array to rows of `width` floats, padded by zeros. Return the address."""
         padded = np.zeros((columns.shape[1], width), dtype=np.float32)
         padded[:, : len(columns)] = columns.T
         return self.floats(padded)
@@ -67,7 +67,7 @@ class Arrays:
 
 @dataclass(frozen=True, eq=False)
 class KernelProblem:
-    """A problem in the kernel's memory layout. `struct` points into `arrays`. Get it from `Problem.compiled`."""
+    """A problem in the kernel's memory layout. `struct` points into `arrays`. See `Problem.compiled`."""
 
     struct: structs.Problem
     arrays: tuple[Arrays, ...]
@@ -78,7 +78,7 @@ class KernelProblem:
         Args:
             function: name of the function.
             arguments: tensors are passed as addresses of their values and must be contiguous.
-            watch: called in this thread every few milliseconds with the number of steps done. True ends the call.
+            watch: called in this thread every few milliseconds with the sum of steps of all rows. True ends the call.
 
         Raises:
             MemoryError: the threads need more memory than there is.
@@ -86,7 +86,7 @@ class KernelProblem:
         failures: list[BaseException] = []
 
         def poll(done: int) -> int:
-            # An exception, such as Ctrl-C, cannot pass through C++. It ends the call and is raised afterwards.
+            # An exception, such as Ctrl-C, cannot pass through C++. So it ends the call, and is raised afterwards.
             try:
                 return bool(watch and watch(done))
             except BaseException as failure:
@@ -135,7 +135,7 @@ def _hand(hand: HandTensors) -> tuple[dict[str, Structure], Arrays]:
     order = np.argsort(links.numpy(), kind="stable")
     width = _padded(len(order))
     weight = np.zeros((len(order), width))
-    # Each pair is stored once, above the diagonal. Sorting the spheres by link may move a pair below it.
+    # Each pair is stored once, above the diagonal. Sorting the spheres by link may move a pair below the diagonal.
     both = hand.spheres.weight + hand.spheres.weight.T
     weight[:, : len(order)] = np.triu(both.numpy()[np.ix_(order, order)], 1)
     centers = _points(spheres.numpy()[order], links.numpy()[order], arrays)

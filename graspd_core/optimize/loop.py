@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     from graspd_core.optimize.problem import Problem
 
 # Arrays with one row per start: a value, the solver's variables, base position [m], joints [rad] or [m], hand points
-# [m], and distances of the points [m].
+# [m], and distances of the points from the object [m].
 Values = Float[Tensor, "batch"]
 Rows = Float[Tensor, "batch variables"]
 Positions = Float[Tensor, "batch 3"]
@@ -43,7 +43,7 @@ class Poses:
 
     @property
     def base(self) -> SE3:
-        """`T_object_base`."""
+        """Pose of the base, `T_object_base`."""
         return SE3(rotation_from_quaternion(self.quaternion), self.translation)
 
     def __getitem__(self, rows: Tensor) -> Poses:
@@ -67,13 +67,13 @@ def moved_along(poses: Poses, point: Float[Tensor, "*batch 3"]) -> Poses:
 
 
 S = TypeVar("S")
-# Adam's decay rates of the running means of the gradient and of its square.
+# Adam: decay rates of the running means of the gradient and of its square, and a number that prevents division by 0.
 _BETA1, _BETA2, _EPSILON = 0.9, 0.98, 1e-8
 
 
 @runtime_checkable
 class Solver(Protocol[S]):
-    """An optimiser: a frozen object with its hyper-parameters. `minimise` runs `steps` steps of it."""
+    """An optimiser: a frozen object with its hyper-parameters. `minimise` runs `steps` steps of the optimiser."""
 
     @property
     def steps(self) -> int: ...
@@ -87,7 +87,7 @@ class Solver(Protocol[S]):
         ...
 
     def best(self, state: S) -> tuple[Poses, Values]:
-        """Return the best iterate of each start so far and its loss."""
+        """Return the best iterate of each start so far, and the loss of each best iterate."""
         ...
 
 
@@ -116,7 +116,7 @@ class Solution:
 
     Attributes:
         poses: best iterate of every start that was kept.
-        loss: loss of that iterate. Infinite if the start had no finite iterate.
+        loss: loss of each best iterate. Infinite if the start had no finite iterate.
         steps: number of steps done.
         interrupted: why the run ended early: "cancelled" or "deadline". Empty for a full run.
     """
@@ -129,7 +129,7 @@ class Solution:
 
 @dataclass
 class Follow:
-    """Progress of a run of `steps` steps, reported to the hooks. `reported` is a `time.perf_counter()` value."""
+    """Progress of a run of `steps` steps, reported to the hooks. `reported` is the time of the last report."""
 
     hooks: Hooks
     steps: int
@@ -146,7 +146,7 @@ class Follow:
         return bool(self.interrupted)
 
     def report(self, done: int, best: Callable[[], tuple[Poses, Values]]) -> None:
-        """Report that `done` steps are done, if `interval` has passed since the last report or all are done."""
+        """Report `done` steps if `interval` has passed since the last report, or if all steps are done."""
         now = time.perf_counter()
         if now - self.reported < self.hooks.interval and done != self.steps:
             return

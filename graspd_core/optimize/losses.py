@@ -1,7 +1,7 @@
-"""Compute the loss terms of the closed-form relaxation. Each is a pure function with one value per start, of order one.
+"""Compute the loss terms of the closed-form relaxation. Each term is a pure function with values of order one.
 
 For a unit disturbance w, the best resisting force in the friction cone of a contact has a closed form. So the support
-function of the grasp wrench space is a sum over contacts (docs/method.md):
+function of the grasp wrench space is a sum over contacts (docs/method.md, symbols as in `wrench_support`):
 
     v_ik = w_k,lin + w_k,ang × (x_i − c) / L
     h_k  = Σ_i s_i · max(0, −n_i·v_ik + μ ‖v_ik − (n_i·v_ik) n_i‖)
@@ -17,16 +17,16 @@ from torch import Tensor
 
 from graspd_core.optimize.loop import Distances, Joints, Points, Values
 
-# Floor of the squared tangential speed, relative to the unit disturbance. It keeps the square root differentiable.
+# Floor of the squared tangential speed, relative to the unit disturbance. So the square root is differentiable.
 _TANGENT_FLOOR = 1e-6
-# Lengths at which a term is one [m].
+# Units in which the terms measure lengths [m].
 _CENTIMETRE, _MILLIMETRE = 0.01, 0.001
-# Added to h so that a start without any contact has a finite task loss.
+# Added to h_k / μ, so that a start without any contact has a finite loss.
 _SUPPORT_FLOOR = 1e-3
 
 
 def disturbance_directions(count: int, seed: int, dtype: torch.dtype = torch.float64) -> Float[Tensor, "count 6"]:
-    """Return unit wrenches spread over the sphere in R⁶: the 12 signed axes, then random ones far from all before."""
+    """Return unit wrenches spread over the sphere in R⁶: the 12 signed axes, then random wrenches far apart."""
     axes = torch.cat([torch.eye(6, dtype=dtype), -torch.eye(6, dtype=dtype)])
     chosen = axes[:count]
     pool = torch.randn(64 * max(count, 1), 6, generator=torch.Generator().manual_seed(seed), dtype=dtype)
@@ -45,7 +45,7 @@ def wrench_support(
     """Return the support h_k of the soft grasp wrench space in each direction. Force closure is h_k > 0 for all k.
 
     Args:
-        arms: contact points about the centre of mass over the characteristic length, (x − c) / L.
+        arms: contact points relative to the centre of mass, divided by the characteristic length: (x − c) / L.
         normals: outward unit normals of the object.
         activation: soft contact weight s_i ≥ 0 of each point.
         directions: unit wrenches (linear, angular).
@@ -69,24 +69,24 @@ def wrench_support(
 
 
 def soft_contact(distance: Distances, radius: Values, delta: float) -> Distances:
-    """Return exp(−|`distance` − `radius`| / `delta`): one on the padded surface, with a gradient everywhere else."""
+    """Return exp(−|`distance` − `radius`| / `delta`). It is 1 at the distance `radius`, with a gradient elsewhere."""
     return (-(distance - radius[:, None]).abs() / delta).exp()
 
 
 def hard_contact(distance: Distances, radius: Values, delta: float) -> Distances:
-    """Return 1 within `delta` [m] of the padded surface, else 0, without gradient: the ablation of `soft_contact`."""
+    """Return 1 within `delta` [m] of the padded surface, else 0. An ablation uses it instead of `soft_contact`."""
     return ((distance - radius[:, None]).abs() <= delta).to(distance)
 
 
 def wrench_resistance(support: Float[Tensor, "batch directions"], friction: float, sharpness: float = 4.0) -> Values:
-    """Return the soft maximum of −log(h_k / μ + h₀) over `support` h_k. High if one disturbance is hardly resisted."""
+    """Return the soft maximum of −log(h_k / μ + `_SUPPORT_FLOOR`). It is high if a disturbance is hardly resisted."""
     resisted = -(support / friction + _SUPPORT_FLOOR).log()
     count = support.shape[-1]
     return (torch.logsumexp(sharpness * resisted, -1) - torch.log(torch.tensor(float(count)))) / sharpness
 
 
 def touch(gap: Float[Tensor, "batch groups"], reach: Float[Tensor, "groups"]) -> Values:
-    """Return the mean distance [cm] of link groups from the padded surface. It saturates beyond their `reach` [m].
+    """Return the mean distance [cm] of link groups from the padded surface. Distances saturate beyond `reach` [m].
 
     Groups with a long reach (fingertips) are attracted from afar. Other groups are attracted only if already near.
     """
@@ -95,7 +95,7 @@ def touch(gap: Float[Tensor, "batch groups"], reach: Float[Tensor, "groups"]) ->
 
 
 def penetration(distance: Distances, radius: Values) -> Values:
-    """Return a tenth of the sum of squared depths below the padded surface [mm²], linear for deep points."""
+    """Return a tenth of the sum of squared depths below the padded surface [mm²]. Great depths count linearly."""
     depth = (radius[:, None] - distance).clamp_min(0.0) / _MILLIMETRE
     return (depth * depth / (1.0 + 0.1 * depth)).sum(-1) / 10.0
 
@@ -103,13 +103,13 @@ def penetration(distance: Distances, radius: Values) -> Values:
 def self_collision(
     centers: Float[Tensor, "batch spheres 3"], radii: Float[Tensor, "spheres"], weight: Float[Tensor, "spheres spheres"]
 ) -> Values:
-    """Return a tenth of the squared overlap of spheres of non-adjacent links [mm²], with depth (R² − d²) / 2R.
+    """Return a tenth of the sum of squared overlap depths (R² − d²) / 2R of spheres of non-adjacent links [mm²].
 
     R is the sum of the radii, d the distance of the centres. `weight` is 1 / 2R [1/m], zero for unchecked pairs.
     """
     inner = (radii * radii - (centers * centers).sum(-1))[..., None]
     ones, r = torch.ones_like(inner), radii.expand(len(centers), -1)[..., None]
-    # R² − |a − b|² = 2 a·b + 2 rₐr_b + (rₐ² − |a|²) + (r_b² − |b|²), one matrix product.
+    # R² − |a − b|² = 2 a·b + 2 rₐr_b + (rₐ² − |a|²) + (r_b² − |b|²) is one matrix product.
     left = torch.cat([2 * centers, 2 * r, inner, ones], -1)
     right = torch.cat([centers, r, ones, inner], -1)
     depth = ((left @ right.transpose(-1, -2)) * (weight / _MILLIMETRE)).relu().flatten(1)
@@ -117,6 +117,6 @@ def self_collision(
 
 
 def posture(joints: Joints, lower: Float[Tensor, "joints"], upper: Float[Tensor, "joints"]) -> Values:
-    """Return the squared distance of the joints from mid-range, in half ranges."""
+    """Return the sum of the joints' squared distances from mid-range. Half a joint's range counts as 1."""
     middle, half = (lower + upper) / 2, (upper - lower) / 2
     return (((joints - middle) / half) ** 2).sum(-1)

@@ -1,9 +1,9 @@
 """Measure the hand's distance from the support plane and from the obstacles around the object.
 
-The hand's primitives are convex. So a primitive is clear of the support if all its extreme points are clear: corners
-of boxes and hulls, balls at ends of spheres and capsules, rim points of cylinders. Obstacles are also tested against
-the collision spheres (`hands.self_collision`), which extend a little out of flat faces. Gradients are exact, except for
-the interpolated distance to obstacles.
+The hand's primitives are convex. So a primitive is clear of the support if all its extreme points are clear: corners of
+boxes and hulls, centres of spheres, ends of capsules, rim points of cylinders. Obstacles are also tested against the
+collision spheres (`hands.self_collision`), which extend a little out of flat faces. Gradients are exact, except for the
+interpolated distance to obstacles.
 """
 
 from __future__ import annotations
@@ -34,12 +34,12 @@ from graspd_core.optimize.loop import Poses, Values
 from graspd_core.perception.scene import Scene
 from graspd_core.se3 import SE3, rotation_from_quaternion
 
-# Fractions at which the hand is tested: of the straight path from retreat to pregrasp, and of that to the grasp.
+# The hand is tested at these fractions of the path from pregrasp back to retreat, and from grasp back to pregrasp.
 RETREAT_SHARES = (0.15, 0.3, 0.5, 0.75, 1.0)
 _PATH_SHARES = (0.0, 0.25, 0.5, 0.75, 1.0)
 # Gaps of at least this make no difference to the optimiser [m].
 WIDE = 0.005
-# Points that represent the rim of a cylinder, and the greatest number of points that represent a hull.
+# Number of points that represent each rim of a cylinder, and greatest number of points that represent a hull.
 _RIM, _HULL = 12, 32
 
 
@@ -48,16 +48,16 @@ class ObstacleTensors:
     """Support and obstacles, and the points of the hand that are tested against them.
 
     Attributes:
-        corner_matrix: places the extreme points of the hand's primitives, see `hands.kinematics.placement`.
+        corner_matrix: with it, `place_points` computes the extreme points of the hand's primitives.
         corner_radii: radii of the balls about the extreme points [m].
-        sphere_matrix: places the centres of the collision spheres in the same way.
+        sphere_matrix: with it, `place_points` computes the centres of the collision spheres.
         sphere_radii: radii of the collision spheres [m].
         normal: unit normal of the support, towards the free side. None without a support.
-        offset: n·x of the support's points [m].
+        offset: n·x on the support, raised by the margin of the support [m]. 0 without a support.
         sdfs: signed distance fields of the obstacles within the hand's reach.
         approach: unit direction in which the hand moves to its pregrasp, base frame.
-        points, radii, links: centres (link frames), radii [m] and links of both kinds of balls.
-        around: bounding ball of all balls of each link: its centre in the link frame, and its radius [m].
+        points, radii, links: centre in the link frame [m], radius [m] and link of each ball: corners, then spheres.
+        around: for each link, a ball around all its balls: centre in the link frame and radius [m].
     """
 
     corner_matrix: Float[Tensor, "corners columns"]
@@ -113,7 +113,7 @@ def make_obstacle_tensors(
 
 
 def _balls_about(count: int, points: np.ndarray, radii: np.ndarray, links: np.ndarray) -> Float[np.ndarray, "links 4"]:
-    """Return centre and radius of the bounding ball of each link's balls. The radius is −inf if it has none."""
+    """Return for each link a ball around all its balls: centre and radius. The radius is −inf without balls."""
     around = np.zeros((count, 4))
     around[:, 3] = -np.inf
     for link in np.unique(links):
@@ -131,14 +131,14 @@ def hand_reach(hand: HandModel) -> float:
 
 
 def extreme_points(hand: HandModel) -> tuple[Float[np.ndarray, "corners 3"], Float[np.ndarray, "corners"], np.ndarray]:
-    """Return balls whose convex hulls are the hand's primitives: centres in link frames [m], radii [m] and links."""
+    """Join the balls of `extreme_points_of_solids` into arrays: centres in link frames [m], radii [m] and links."""
     solids = extreme_points_of_solids(hand)
     points, radii, links = zip(*((p, np.full(len(p), r), np.full(len(p), link)) for p, r, link in solids), strict=True)
     return np.concatenate(points), np.concatenate(radii), np.concatenate(links)
 
 
 def extreme_points_of_solids(hand: HandModel) -> list[tuple[Float[np.ndarray, "n 3"], float, int]]:
-    """Return balls whose convex hull is the primitive, for each one: centres in the link frame, radius [m], link."""
+    """Return balls for each primitive, whose convex hull it is: centres in the link frame [m], radius [m], link."""
     found = ((*_extremes(primitive), primitive) for primitive in hand.primitives)
     return [(at @ solid.rotation.T + solid.translation, radius, solid.link) for at, radius, solid in found]
 
@@ -180,7 +180,7 @@ def obstacle_gaps(obstacles: ObstacleTensors, base: SE3, links: SE3, wide: float
 def least_gap(obstacles: ObstacleTensors, base: SE3, links: SE3, wide: float = WIDE) -> Values:
     """Return the least of `obstacle_gaps` of each hand [m].
 
-    Obstacles beyond `wide` are ignored. Only links near an obstacle's grid are tested (in a bin, a tenth of them).
+    Obstacles beyond `wide` are ignored. Only links near an obstacle's grid are tested (in a bin, a tenth of the links).
     """
     least = base.translation.new_full(base.translation.shape[:1], wide)
     if obstacles.normal is not None:
@@ -204,7 +204,7 @@ def least_gap(obstacles: ObstacleTensors, base: SE3, links: SE3, wide: float = W
 def _gaps_to(
     sdf: GridSDF, points: Float[Tensor, "*batch 3"], radii: Float[Tensor, "points"], wide: float
 ) -> Float[Tensor, "*batch"]:
-    """Return the gaps of balls to one obstacle [m]. Only balls near its grid are sampled. The others get `wide`."""
+    """Return the gaps of balls to one obstacle [m]. Only balls near the grid are sampled. Other balls get `wide`."""
     off_grid = (points.detach() - (sdf.origin + sdf.half)).abs() - sdf.half
     near = (off_grid < (radii + wide)[:, None]).all(-1)
     gaps = points.new_full(near.shape, wide)
@@ -217,7 +217,7 @@ def _gaps_to(
 def gap_on_path(
     obstacles: ObstacleTensors, kinematics: Kinematics, pregrasp: Poses, grasp: Poses, wide: float = WIDE
 ) -> Values:
-    """Return the hand's least signed distance [m] to any obstacle, from the retreat over the pregrasp to the grasp.
+    """Return the hand's least signed distance [m] to obstacles on the path from retreat via pregrasp to grasp.
 
     Distances are negative inside. A distance of at least `wide` may be returned as `wide`. The base must have the same
     orientation in both poses.

@@ -1,7 +1,7 @@
 """Settings of a run of `plan_grasps`: the methods, the settings of each method, and the presets.
 
 A method of graspd_core is a row of `METHODS`. Another package registers a method by an entry point of the group
-`graspd.methods` that names its row. The row is loaded when the method is first used. A plugin is a Python file that
+`graspd.methods`, which names the row. The row is loaded when the method is first used. A plugin is a Python file that
 adds rows to `METHODS`, `METRICS` or `TRIALS`. Child processes load the plugins that an environment variable lists.
 """
 
@@ -39,9 +39,9 @@ class Method:
         config: dataclass of the method's settings. The preset section with the method's name fills it.
         label: name in charts.
         colour, marker: colour and marker in charts, as Matplotlib takes them.
-        benchmark_count: grasps of one unfiltered batch in the benchmark.
+        benchmark_count: number of grasps that the benchmark requests in a batch.
         at_budget: returns the settings for a multiple of the usual budget. The default keeps the settings.
-        searches: returns the greatest number of searches per round. Fewer run if enough grasps are expected to hold.
+        searches: returns the greatest number of searches per round. They end when enough grasps are expected to hold.
     """
 
     module: str
@@ -87,7 +87,7 @@ def _registered() -> dict[str, EntryPoint]:
 
 @cache
 def _run_plugins() -> None:
-    """Load the plugins of the parent process. Plugins import this module, so they cannot be loaded at its import."""
+    """Load the plugins of the parent process. Plugins import this module, so its import cannot load them."""
     for path in filter(None, os.environ.get(_PLUGINS, "").split(os.pathsep)):
         load_plugin(path)
 
@@ -113,7 +113,7 @@ class PlanConfig:
     """Settings of a run, apart from the scene, the hand and the seed.
 
     Attributes:
-        resolution: the signed distance grid has at most `resolution`³ nodes: `resolution` along each side of a cube.
+        resolution: the object's distance grid has at most `resolution`³ nodes. If it is a cube, `resolution` per side.
         method: name of the method, one of `method_names`.
         settings: settings of the method, an instance of `Method.config`. None takes the defaults.
         problem: settings for converting scene and hand to tensors.
@@ -147,7 +147,7 @@ class PlanConfig:
         return dataclasses.replace(self, settings=method_row(self.method).at_budget(self.settings, budget))
 
     def with_method(self, method: str) -> PlanConfig:
-        """Return the settings with another method at its defaults. The same method keeps its settings."""
+        """Return the settings with `method` at its defaults. If it is the method already, nothing changes."""
         return self if method == self.method else dataclasses.replace(self, method=method, settings=None)
 
 
@@ -213,7 +213,7 @@ def load_preset(name: str) -> PlanConfig:
 
 
 def load_plugin(path: str) -> str:
-    """Run a Python file that registers methods, metrics or trials. Child processes run it too. Returns its path.
+    """Run a Python file that registers methods, metrics or trials. Child processes run the file too. Returns its path.
 
     Raises:
         ConfigError: the file does not exist, its module name is taken, or the file raises.

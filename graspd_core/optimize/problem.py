@@ -39,15 +39,15 @@ from graspd_core.se3 import SE3
 if TYPE_CHECKING:
     from graspd_core.optimize.kernel_problem import KernelProblem
 
-# Distance at which a group of candidates is attracted to the surface [m]: fingertips from afar, other links only if
-# nearly touching, and the patches that are used where `patch_size` is set.
+# A group of candidates is attracted to the surface from this distance [m]. Fingertips are attracted from afar, other
+# links only if nearly touching. The third value is for patches, which are used if `patch_size` is set.
 _REACH_OF_TIPS, _REACH_OF_OTHERS, _REACH_OF_PATCHES = 0.1, 0.004, 0.03
 REACH_WHEN_SHARP = 0.01
-# A base frame nearer than this to the middle of the palm lies in the palm [m].
+# If the palm centre is farther than this from the base origin, solvers turn the hand about the palm centre [m].
 _PALM_RADIUS = 0.05
-# Number of contact candidates in the wrench resistance term, and of pairs of sharp point and solid in penetration.
+# Number of candidates in the wrench resistance term, and of pairs of sharp point and primitive in the penetration term.
 TASK_POINTS, FEATURE_PAIRS = 96, 96
-# Points of the surface and of its edges that measure how deep a grasp penetrates.
+# Number of points on the surface and on its edges that measure how deep a grasp penetrates.
 _SURFACE, _CREASES = 3000, 1000
 # Distance that the hand keeps from obstacles [m]. It is small, because fingertips at a low object almost touch a table.
 OBSTACLE_MARGIN = 0.001
@@ -58,9 +58,9 @@ class PointSet:
     """Contact candidates of a hand.
 
     Attributes:
-        matrix: places the candidates by their links' poses, see `hands.kinematics.placement`.
+        matrix: with it, `place_points` computes the positions of the candidates from the link poses.
         links: link of each candidate.
-        groups: indices of the candidates of each rigid group of links or each patch, padded by repetition.
+        groups: a row of candidate indices for each rigid group of links, or each patch. Short rows repeat an index.
     """
 
     matrix: Float[Tensor, "points columns"]
@@ -73,7 +73,7 @@ class SphereTensors:
     """Spheres that fill the hand's links, for self-collision.
 
     Attributes:
-        matrix: places the centres by their links' poses, see `hands.kinematics.placement`.
+        matrix: with it, `place_points` computes the centres from the link poses.
         radii: radii of the spheres [m].
         weight: 1 / 2R for checked pairs [1/m], where R is the sum of both radii. Zero for other pairs.
     """
@@ -94,7 +94,7 @@ class HandTensors:
         fine: all contact candidates. Used in the last steps.
         reach: attraction range of each group of candidates [m].
         solids: collision primitives, without hulls.
-        group_of_solid: first candidate group on each primitive's rigid group. The number of groups if there is none.
+        group_of_solid: for each primitive, the first candidate group on its rigid group. If none, the number of groups.
         solid_pairs: pairs of `solids` whose links are not adjacent.
         spheres: spheres for self-collision.
         lower, upper: joint limits [rad] or [m].
@@ -134,7 +134,7 @@ class ObjectTensors:
         center: centre of mass [m].
         mass: mass [kg].
         length: characteristic length that torques are divided by [m].
-        confidence: confidence in the surface near each node of `sdf`, at least a floor. None if no surface is guessed.
+        confidence: confidence in the surface near each `sdf` node, `confidence_floor` to 1. None if nothing is guessed.
     """
 
     sdf: GridSDF
@@ -219,7 +219,7 @@ def make_object_tensors(scene: Scene, settings: ProblemConfig, device: str, dtyp
     if settings.softness:
         sharp, thin, surface = sharp[:0], False, sharp[:0]
         sdf = replace(sdf, field=torch.cat([sdf.field[:1] + settings.softness, sdf.field[1:]]))
-    # Each sharp point was chosen farthest from all before, so the first half is spread over the object too.
+    # Each sharp point was chosen farthest from all earlier points, so the first half is spread over the object too.
     coarse = max(settings.features, len(sharp) // 2) if thin else 0
     features = [part[neighbours_together(part)] for part in (sharp[:coarse], sharp[coarse:])]
     return ObjectTensors(
@@ -237,10 +237,10 @@ def make_object_tensors(scene: Scene, settings: ProblemConfig, device: str, dtyp
 
 
 def _patches(hand: HandModel, candidates: int, size: int) -> Int[np.ndarray, "points"]:
-    """Return the patch of each contact candidate: the nearest patch of its rigid group.
+    """Return the index of each contact candidate's patch, the nearest in its rigid group.
 
-    A rigid group of links has one patch for every `size` coarse candidates, with centres far from each other. A group
-    without coarse candidates gets −1.
+    A group has about one patch per `size` coarse candidates (the first `candidates`). Patch centres are far apart.
+    Without coarse candidates the index is −1.
     """
     posture = link_poses(hand, (hand.lower + hand.upper) / 2)
     points = in_base(posture, hand.candidate_points, hand.candidate_link)
@@ -296,7 +296,7 @@ class Problem:
 
     @cached_property
     def _in_kernel(self) -> KernelProblem:
-        # kernel_problem imports this module, so it is imported late.
+        # kernel_problem imports this module, so it is imported here and not at the top.
         from graspd_core.optimize.kernel_problem import kernel_problem
 
         return kernel_problem(self)
@@ -356,7 +356,7 @@ def self_collision(problem: Problem, links: SE3) -> Values:
 
 
 def solid_collision(problem: Problem, links: SE3) -> Values:
-    """Return a tenth of the squared overlap of the hand's primitives with each other [mm²]. It is exact for boxes."""
+    """Return a tenth of the squared overlap of the hand's primitives with each other [mm²], exact for boxes."""
     row, depth = solid_overlaps(problem.hand.solids, problem.hand.solid_pairs, links)
     return depth.new_zeros(len(links.translation)).index_add(0, row, (1e3 * depth) ** 2 / 10.0)
 
@@ -370,7 +370,7 @@ def obstacle_depth(obstacles: ObstacleTensors, base: SE3, links: SE3) -> Values:
 def feature_distance(
     problem: Problem, features: Float[Tensor, "features 3"], placed: HandPlacement
 ) -> tuple[Float[Tensor, "batch pairs"], Int[Tensor, "batch pairs"]]:
-    """Return distance [m] and primitive index of the nearest pairs of a sharp point and a primitive of the hand."""
+    """Return distance [m] and primitive index of `FEATURE_PAIRS` close pairs of a sharp point and a hand primitive."""
     in_base = placed.base.apply_inverse(features)
     with torch.no_grad():
         every = solid_bound(problem.hand.solids, placed.links, in_base)
@@ -415,8 +415,8 @@ def evaluate(
     """Compute all loss terms of a batch of poses at padding `radius` [m] and contact width `delta` [m].
 
     Args:
-        fine: use all contact candidates.
-        sharp: use all sharp points, and attract only groups that are very near the surface.
+        fine: use all contact candidates, not only the coarse ones.
+        sharp: use all sharp points of the object. Attract only candidate groups within `REACH_WHEN_SHARP` of it.
         activate: contact weight of a candidate as a function of its distance, `radius` and `delta`.
     """
     points = problem.hand.fine if fine else problem.hand.coarse

@@ -21,11 +21,11 @@ from graspd_core.optimize.loop import Poses, Values
 from graspd_core.optimize.problem import Problem
 from graspd_core.se3 import rotation_from_quaternion
 
-# Figures are clamped at this many standard deviations from their mean.
+# The network's inputs are clamped at this many standard deviations from their mean.
 FARTHEST = 4.0
-# Cost of a hand without any contact force. The network was fitted to no such candidate.
+# Cost of a hand without any contact force. The network was fitted without such candidates.
 _IDLE_COST = 20.0
-# Cost of a self-collision deeper than `_DEEP` [m], which the trial refuses. Such a candidate is tried last.
+# Cost of a self-collision deeper than `_DEEP` [m]. The trial refuses such a candidate, so it is tried last.
 _SELF_COST, _DEEP = 100.0, 0.0018
 
 
@@ -53,7 +53,7 @@ def score(problem: Problem, staged: Staged) -> Values:
     """Return the log-odds of passing the hold trial, minus costs for faults that the trial tolerates.
 
     Costs are for penetration of the object beyond 2 mm, self-collision beyond 1 mm, and no contact force. Candidates
-    that the trial would refuse come last.
+    that the trial would refuse get the lowest scores.
     """
     odds = log_odds(_fitted(), ranking_figures(problem, staged)).to(staged.clearance)
     idle = (staged.pressed.forces == 0.0).all(-1).all(-1)
@@ -71,7 +71,7 @@ def log_odds(network: Mapping[str, Tensor], figures: Float[Tensor, "batch figure
 
 @torch.no_grad()
 def ranking_figures(problem: Problem, staged: Staged) -> Float[Tensor, "batch figures"]:
-    """Return the inputs of the network, on the CPU. Lengths are relative to the object, joints to their travel."""
+    """Return the inputs of the network, on the CPU. They are scaled by object size, joint range or a fixed unit."""
     poses, opened, pressed = staged.poses, staged.opened, staged.pressed
     hand, length = problem.hand, problem.object.length
     normal_forces = pressed.forces.norm(dim=-1)

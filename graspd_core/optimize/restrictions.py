@@ -34,7 +34,7 @@ class Roll:
 
     Attributes:
         side: unit vector perpendicular to the hand's approach, base frame.
-        zero: direction of `side` at a roll of 0, object frame. It is projected perpendicular to the approach.
+        zero: direction of `side` at a roll of 0, object frame. Its part along the approach is ignored.
         angle: wanted roll, right-handed about the approach [rad].
         tolerance: allowed deviation to either side [rad].
     """
@@ -96,7 +96,7 @@ class BoundRestriction:
 
     @property
     def impossible(self) -> str:
-        """The reason why no grasp can be admitted, as the message of the run. Empty if a grasp may be possible."""
+        """The reason why no grasp can be admitted, worded as the run's message. Empty if a grasp may be possible."""
         return ""
 
     @property
@@ -155,7 +155,7 @@ class BoundRestrictions:
         return aim if aim is None or aim.places is None else replace(aim, places=aim.places - self.origin)
 
     def searched(self, scene: Scene) -> Scene:
-        """Return the scene, which is relative to `origin`, with the additional obstacles of the restrictions."""
+        """Return `scene`, which is relative to `origin`, with the additional obstacles of the restrictions."""
         obstacles = tuple(moved_obstacle(o, -self.origin) for one in self.each for o in one.obstacles)
         return replace(scene, obstacles=(*scene.obstacles, *obstacles)) if obstacles else scene
 
@@ -183,11 +183,11 @@ UNRESTRICTED = BoundRestrictions()
 
 
 def restrictions_in_words(restrictions: BoundRestrictions, refused: Mapping[str, int], held: int, tried: int) -> str:
-    """Return a sentence about the refused candidates, most frequent reason first. Empty if none was refused.
+    """Return a sentence that counts the refused candidates by reason, most frequent reason first.
 
     Example: "12 candidates held, 9 refused: 7 outside the approach cone, 2 with a contact outside the region".
-    If no candidate was found, the sentence names the restrictions. `held` counts the candidates that held, and `tried`
-    the admitted candidates.
+    If no candidate was found, the sentence names the restrictions. If all candidates were admitted, it is empty.
+    `held` counts the candidates that held in the trials, and `tried` the admitted candidates.
     """
     if refused:
         reasons = ", ".join(f"{n} {reason}" for reason, n in sorted(refused.items(), key=lambda item: -item[1]))

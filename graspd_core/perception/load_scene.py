@@ -48,7 +48,7 @@ def load_scene(
     """Build the scene of one object.
 
     Args:
-        source: a mesh, its file, `shape:NAME`, or a point cloud or depth image, from which the object is reconstructed.
+        source: a mesh, the path of a mesh, `shape:NAME`, or the path of a point cloud or depth image to reconstruct.
         mass: mass of the object [kg]. None assumes the most that its volume allows (`heavy_mass`), with a warning.
         friction: Coulomb friction coefficient between hand and object.
         scale: factor that converts the file's coordinates to metres.
@@ -61,7 +61,7 @@ def load_scene(
             in metres per unit of depth, and 1 means the unit that the camera's file gives.
 
     Raises:
-        MeshError: the mesh cannot be read or used, comes with a target, or a number is out of range.
+        MeshError: the mesh cannot be read or used, comes with `target` or `view_point`, or a number is out of range.
         CloudError: the cloud cannot be read or shows no object.
     """
     started = time.perf_counter()
@@ -75,9 +75,9 @@ def load_scene(
         mesh, warnings = _read_mesh(source, scale)
         view = view_in_mesh(mesh, given)
         if view is not None:
-            views, warnings = (view,), (f"{given}: one camera's view, not a solid: its points are taken as a cloud",)
+            views, warnings = (view,), (f"{given}: shows one camera's view, so its points are used as a cloud",)
     if views or mesh is None:
-        # Imported here, because a mesh does not need it.
+        # The import is here, because a mesh does not need this module.
         from graspd_core.perception.scene_from_views import scene_from_views
 
         about = {"target": target, "alone": alone, "settings": settings, "source": given, "device": device}

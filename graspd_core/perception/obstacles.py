@@ -1,8 +1,8 @@
 """Obstacles around the object: convex hulls that the hand avoids, made from seen points or from known shapes.
 
-The back of a neighbouring object is not seen. Its obstacle is the convex hull of its points and their projection onto
-the support plane, so space beneath overhangs counts as full. Nothing is guessed behind the seen side, because a thick
-guess would block free space. A neighbour that surrounds the target is split into parts.
+The obstacle of a neighbouring object is the convex hull of its seen points and their projection onto the support plane.
+So space beneath overhangs counts as full. Nothing is guessed behind the seen side, because a thick guess would block
+free space. A neighbour that surrounds the target is split into parts.
 """
 
 from __future__ import annotations
@@ -28,18 +28,18 @@ from graspd_core.se3 import perpendicular, rotation_from_quaternion
 from graspd_core.types import Plane, Posture, TriangleMesh
 
 GRID_RESOLUTION = 32
-# Maximum number of parts along each axis of a neighbour whose hull would contain the object.
+# A neighbour whose hull would overlap the target is split into at most this many parts along each axis.
 MAX_PARTS_ACROSS = 8
-_TARGET_SAMPLES = 2000
-_HELD_CORNERS = 128
-# A collision object is the target itself if their hulls overlap by at least this intersection over union. A box around
-# a ball has 0.5, and so has a box that is a quarter too large every way. Objects that only touch have 0.
+_TARGET_SAMPLES = 2000  # surface points of the target, to measure its distance from neighbours
+_HELD_CORNERS = 128  # most corners of the hull of a held object
+# A collision object counts as the target if the intersection over union of their hulls is at least this. A box around a
+# ball has 0.5, and so has a box that is a quarter too large in each direction. Objects that only touch have 0.
 _SAME = 0.3
-_OVERLAP_SAMPLES = 4000
+_OVERLAP_SAMPLES = 4000  # random points that measure the overlap
 # Surface area for each sample of a shape near the object [m²], and the least and most samples of a shape.
 _AREA_OF_A_SAMPLE = 1e-4
 _FEWEST, _MOST = 200, 4000
-_CORNERS = 200
+_CORNERS = 200  # most points that a hull is computed of
 
 
 def make_obstacles(
@@ -49,13 +49,13 @@ def make_obstacles(
     reach: float,
     settings: ObstacleConfig | None = None,
 ) -> tuple[Obstacle, ...]:
-    """Return the obstacles of neighbouring objects, made from their seen points, in the frame of the points [m].
+    """Return the obstacles of neighbouring objects, made from seen points, in the frame of the points [m].
 
     Args:
-        points: the points of each neighbour. Neighbours with too few finite points are left out.
+        points: seen points of each neighbour [m]. Neighbours with too few finite points are left out.
         support: plane that the neighbours stand on, or None. Their points are extruded down to this plane.
         target: the object to grasp.
-        reach: neighbours farther than this from the target are left out [m].
+        reach: greatest distance from the target [m]. Farther neighbours are left out.
         settings: settings of the hulls.
     """
     settings = settings or ObstacleConfig()
@@ -70,7 +70,7 @@ def make_obstacles(
         if not (sample_sdf(whole.sdf, at)[0] < -2 * settings.padding).any():
             found.append(whole)
             continue
-        # The neighbour surrounds the object, like a tray, a box or a ring. Its hull would fill the object's own place.
+        # The neighbour surrounds the target, like a tray, a box or a ring. One hull would fill the target's own place.
         parts = [part for part in _cells(seen, support, settings.part_size) if near.query(part)[0].min() <= reach]
         found += [_obstacle(part, support, settings.padding) for part in parts]
     return tuple(found)
@@ -99,7 +99,7 @@ def padded_hull(points: Points, support: Plane | None, padding: float) -> Triang
     if support is not None:
         height = points @ support.normal - support.offset
         corners = np.vstack([points, points - height[:, None] * support.normal])
-    # Points of a flat face without a support have no hull until the padding makes them thicker.
+    # Without a support, the points of a flat face have no hull. The padding below makes them thicker.
     with suppress(QhullError):
         corners = corners[ConvexHull(corners).vertices]
     skin = padding * np.vstack([np.eye(3), -np.eye(3)])
@@ -120,13 +120,13 @@ def with_neighbours(
 ) -> Scene:
     """Return the scene with collision objects of a planning scene added as obstacles.
 
-    A collision object that fills the target's own place is taken for the target. It is left out, with a warning. A
-    collision object that does not rise above the support is left out too. Distant collision objects cost little time.
+    A collision object that largely overlaps the target is taken for the target, and left out with a warning. Collision
+    objects that do not rise above the support, or that are too far away, are left out without a warning.
 
     Args:
         scene: the scene of the object to grasp.
         things: closed meshes of each collision object by its name, in the object's frame [m].
-        settings: `segmentation.obstacle_range` limits how far obstacles are considered, `obstacles` sets their hulls.
+        settings: `segmentation.obstacle_range` limits distances from the object. `obstacles` holds the hulls' settings.
     """
     settings = settings or SceneConfig()
     mesh, reach = scene.object.mesh, settings.segmentation.obstacle_range
@@ -167,7 +167,7 @@ def _hull_corners(points: Float[np.ndarray, "_ 3"]) -> Float[np.ndarray, "_ 3"]:
 
 
 def _points_within(shape: TriangleMesh, low: Vector, high: Vector) -> Float[np.ndarray, "_ 3"]:
-    """Return points that span the hull of a shape's part inside a box: surface points, and corners of the box."""
+    """Return points whose hull is that of a shape's part in a box: surface points, and box corners inside the shape."""
     from trimesh.intersections import slice_faces_plane
 
     vertices, faces = shape.vertices, shape.faces

@@ -3,7 +3,7 @@
 A scene keeps the coordinates of its file. Float32 would round an object far from the origin, for example in map
 coordinates. `near_scene` moves such a scene near the origin, and `moved_grasp` moves grasps back.
 
-The confidence grid has the nodes of the signed distance grid. It is 1 where the surface was seen, 0 where guessed.
+The confidence grid has the nodes of the signed distance grid. It falls from 1 at seen to 0 at guessed surface.
 """
 
 from __future__ import annotations
@@ -63,7 +63,7 @@ _NEAR_SURFACE_CELLS = 2.0
 def confidence_grid(
     vertices: Float[np.ndarray, "vertices 3"], confidence: Float[np.ndarray, "vertices"], sdf: GridSDF
 ) -> Float[Tensor, "x y z"]:
-    """Return the confidence of the nearest vertex at nodes near the surface. Other nodes copy the nearest such node."""
+    """Give nodes near the surface the confidence of the nearest vertex. Other nodes copy the nearest of these nodes."""
     spacing = float(sdf.spacing)
     near = sdf.field[0].abs().cpu().numpy() < _NEAR_SURFACE_CELLS * spacing
     nodes = sdf.origin.cpu().numpy() + spacing * np.argwhere(near)
@@ -77,7 +77,7 @@ def confidence_grid(
 def sample_confidence(
     grid: Float[Tensor, "x y z"], sdf: GridSDF, points: Float[Tensor, "batch points 3"]
 ) -> Float[Tensor, "batch points"]:
-    """Interpolate the confidence linearly, differentiably, at points [m]. Outside the grid, use its border value."""
+    """Interpolate the confidence at points [m], linearly and differentiably. Outside the grid, use its border value."""
     unit = points / sdf.half - (sdf.origin / sdf.half + 1)
     # grid_sample takes x for the last axis of its input.
     field = grid.permute(2, 1, 0)[None, None]
@@ -85,12 +85,12 @@ def sample_confidence(
     return sampled.reshape(points.shape[:-1])
 
 
-# Meshes are simplified to this number of faces. More faces would be smaller than the cells of a 48³ grid, and slow.
+# Meshes are simplified to this number of faces. More faces would be slow, and smaller than the cells of a 48³ grid.
 MAX_FACES = 25_000
 
-# Assumed mass of a household object of one litre [kg], and exponent of its volume. The curve has water's density at 1.8
-# l and solid steel's at 0.03 l, because large objects are hollow or light and small ones may be metal. None of the ten
-# YCB scans of the fit is heavier. The heaviest, drill and hammer, reach 0.87 and 0.97 of the curve.
+# Assumed mass of a household object of one litre [kg], and exponent of the volume. Large objects are hollow or light,
+# and small objects may be metal. So the curve has water's density at 1.8 l, and solid steel's at 0.03 l. None of the
+# ten YCB scans of the fit is above the curve. The heaviest scans, drill and hammer, reach 0.87 and 0.97 of it.
 HEAVY_LITRE, HEAVY_GROWTH = 1.35, 0.5
 
 # Settings for cutting reconstructed or guessed surfaces into convex parts. They are accurate to millimetres only.
@@ -101,15 +101,15 @@ _COARSE_POOL = 2000
 
 @dataclass(frozen=True)
 class ObjectModel:
-    """The object to grasp, in the object frame (the frame of its mesh as loaded, after scaling).
+    """The object to grasp, in the object frame, which is the frame of the loaded and scaled mesh.
 
     Attributes:
-        source: origin of the object, such as its file, for messages.
+        source: name of the object's source, such as its file, for messages.
         sha256: hash of the cleaned mesh's content.
         mesh: the cleaned mesh [m].
         volume: enclosed volume [m³].
         mass: mass [kg].
-        mass_assumed: whether no mass was given, so that the mass is `heavy_mass` of the volume.
+        mass_assumed: True if no mass was given. The mass is then `heavy_mass` of the volume.
         center_of_mass: centre of mass [m].
         inertia: inertia about the centre of mass, along the mesh axes [kg·m²].
         friction: Coulomb friction coefficient between object and hand.
@@ -159,10 +159,10 @@ class Scene:
         object: the object to grasp.
         sdf: signed distance grid of the object.
         timing: time for loading and time for building the distance grid [s].
-        support: plane that the object stands on, or None. Gravity points against its normal.
+        support: plane that the object stands on, or None. Gravity points against the normal of the plane.
         obstacles: other bodies that the hand could reach.
-        confidence: at each node of `sdf`, 1 if the nearest surface was seen, 0 if guessed. None if all is known.
-        evidence: camera evidence for other possible shapes of the object. None for a mesh.
+        confidence: at each node of `sdf`, from 1 near seen surface to 0 near guessed. None if all is known.
+        evidence: camera evidence for other possible shapes of the object. None if the object was given as a mesh.
     """
 
     object: ObjectModel
@@ -195,7 +195,7 @@ def build_scene(
     Args:
         mesh: surface of the object [m].
         mass: mass of the object [kg]. None assumes `heavy_mass` of its volume and adds a warning.
-        scale: factor by which the file's coordinates were multiplied, for the record and for messages.
+        scale: factor by which the file's coordinates were already multiplied. It is only stored and named in messages.
         started: time when loading began (`time.perf_counter`), for the scene's timing. None means now.
         support: plane that the object stands on, or None.
         obstacles: other bodies near the object.
@@ -203,11 +203,11 @@ def build_scene(
         ahead: called with the object before its distance grid is built, to start work that does not need the grid.
 
     Raises:
-        MeshError: see `load_scene`, or the number of confidences differs from the number of vertices.
+        MeshError: the mesh is not usable (`check_mesh`), or `confidence` has another length than the vertices.
     """
     if confidence is not None and len(confidence) != len(mesh.vertices):
         raise MeshError(
-            f"{source}: {len(confidence)} values of confidence for {len(mesh.vertices)} vertices; valid: one each"
+            f"{source}: {len(confidence)} values of confidence for {len(mesh.vertices)} vertices; valid: one per vertex"
         )
     started = time.perf_counter() if started is None else started
     clean, found = check_mesh(mesh, source, MAX_FACES, scale=scale, dusty=confidence is None)
@@ -251,7 +251,7 @@ def object_sdf(model: ObjectModel, resolution: int = 48) -> GridSDF:
 
 
 def object_sharp_points(model: ObjectModel, count: int) -> tuple[Float[np.ndarray, "points 3"], float]:
-    """Return the object's sharp points [m] and its fraction of thin surface (`sharp_points`), cached by content."""
+    """Return the object's sharp points [m] and the thin fraction of its surface (`sharp_points`), cached by content."""
     coarse = {"pool": _COARSE_POOL} if model.reconstructed else {}
 
     def build() -> cache.Arrays:
@@ -268,12 +268,12 @@ def object_sharp_points(model: ObjectModel, count: int) -> tuple[Float[np.ndarra
 def object_parts(model: ObjectModel) -> tuple[TriangleMesh, ...]:
     """Return a convex decomposition of the object that keeps its hollows, cached by content.
 
-    For a reconstructed object the parts are coarser, like the camera data.
+    The parts of a reconstructed object are coarser, because camera data are coarse.
     """
     cuts = COARSE_CUTS if model.reconstructed else {}
 
     def build() -> cache.Arrays:
-        # This takes some tenths of a second. It runs in a child process, in parallel with the optimiser.
+        # The cuts take some tenths of a second. They run in a child process, in parallel with the optimiser.
         parts = run_isolated(convex_parts, model.mesh, object_sdf(model), **cuts)
         return {f"{kind}{i}": getattr(part, kind) for i, part in enumerate(parts) for kind in ("vertices", "faces")}
 
@@ -288,8 +288,8 @@ def object_parts(model: ObjectModel) -> tuple[TriangleMesh, ...]:
 def near_scene(scene: Scene) -> tuple[Scene, Float[np.ndarray, "3"]]:
     """Return the scene moved near the origin, and the new origin in the given scene's frame [m].
 
-    The scene moves only if the object is farther from the origin than a hundred times its size. So far away, float32
-    cannot resolve contacts, and MuJoCo finds none. Otherwise return the scene itself and zero.
+    Move only objects that are farther from the origin than a hundred times their size. That far away, float32 cannot
+    resolve contacts, and MuJoCo finds no contact. For nearer objects, return the scene itself and zero.
     """
     far = far_centre(scene.object.mesh.vertices)
     if not far.any():
@@ -324,7 +324,7 @@ def _object_model(mesh, source, mass, friction, scale, warnings, reconstructed) 
     assumed = mass is None
     if mass is None:
         mass = heavy_mass(volume)
-        told = f"no mass was given: {mass:.2g} kg is assumed, the most for its volume of {volume * 1e6:.0f} cm³"
+        told = f"no mass was given: {mass:.2g} kg is assumed, the greatest plausible mass for {volume * 1e6:.0f} cm³"
         warnings += (f"{source}: {told}",)
     return ObjectModel(
         source=source,

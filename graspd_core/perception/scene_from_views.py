@@ -22,8 +22,8 @@ from graspd_core.perception.segment.target_selection import Target
 from graspd_core.runtime.worker_process import run_isolated
 from graspd_core.types import Plane
 
-# From this distance to the origin on, float32 coordinates are coarser than a camera [m]. Coordinates from `_ENDLESS` on
-# count as missing, because their squares overflow.
+# Farther from the origin than this [m], float32 coordinates are coarser than a camera's data. Coordinates of `_ENDLESS`
+# or more count as missing, because their squares overflow.
 _FAR, _ENDLESS = 100.0, 1e100
 # Least range of depth cameras [m], and fraction of points out of range above which the unit of a scene is doubtful.
 _NEAREST, _CUT_OFF = 0.1, 0.3
@@ -42,21 +42,21 @@ def scene_from_views(
     device: torch.device | str = "cpu",
     ahead: Callable[[ObjectModel, Evidence], None] | None = None,
 ) -> Scene:
-    """Build a scene from one or several views, in their common frame. Its warnings name what was guessed.
+    """Build a scene from one or several views, in their common frame. The scene's warnings name what was guessed.
 
     Args:
         views: point cloud of each camera [m]. Points may be NaN.
-        target: selects the object. Without a target, take the object nearest the first view's optical axis.
-        alone: whether the views show only the object, so that all points belong to it.
+        target: selects the object. If None, the object nearest the first view's optical axis is taken.
+        alone: True if the views show only the object. Then all points belong to the object.
         settings: settings for segmentation, reconstruction and obstacles.
         mass: mass of the object [kg]. None assumes `heavy_mass` of its volume and adds a warning.
         friction: Coulomb friction coefficient between hand and object.
         source: name of the views, for messages.
         resolution: the distance grid has at most `resolution`³ nodes.
-        ahead: called with object and evidence before the distance grid is built, to start work that does not need it.
+        ahead: called with object and evidence before the grid is built, to start work that does not need the grid.
 
     Raises:
-        CloudError: the views show no usable object. If they do not show the target, it is a NoObjectError.
+        CloudError: the views show no usable object. The error is a NoObjectError if they do not show the target.
         MeshError: the object is too small or too large, or a number is out of range.
     """
     started = time.perf_counter()
@@ -84,7 +84,7 @@ def scene_from_views(
 def things_from_views(views: Sequence[PointCloud], settings: SegmentationConfig | None = None) -> tuple[Points, ...]:
     """Return the points [m] of each object that `scene_from_views` can select. See `find_things`.
 
-    The segmentation is kept, so scenes that are built next from the same views and settings reuse it.
+    The segmentation is cached. The next scenes from the same views and settings reuse it.
     """
     return run_isolated(find_things, [replace(view, points=_single(view.points)) for view in views], settings)
 
@@ -94,7 +94,7 @@ def reconstruct_object(
 ) -> tuple[Reconstruction, Plane | None, tuple[Obstacle, ...], tuple[str, ...]]:
     """Return the object's reconstructed surface, its support, its obstacles and the warnings.
 
-    Raises CloudError: see `segment` and `reconstruct`, or a camera cannot have been at its stated position.
+    Raises CloudError like `segment` and `reconstruct`, and if a camera cannot have been at its stated position.
     """
     # Round to float32, so that a cloud gives the same scene in float32 and float64.
     views = [replace(view, points=_single(view.points)) for view in views]
@@ -127,7 +127,7 @@ def _unit_doubts(seen: Segmentation, views: Sequence[PointCloud], farthest: floa
     beyond = float((away[np.isfinite(away)] > farthest).mean()) if np.isfinite(away).any() else 0.0
     first = np.linalg.norm(seen.views[0].points - seen.views[0].viewpoint, axis=1)
     thing = float(np.median(first[np.isfinite(first)])) if np.isfinite(first).any() else 0.0
-    asked = "are its numbers metres? (the camera's depth unit; --units or --scale for a file)"
+    asked = "are the coordinates in metres? (the camera's depth unit; --units or --scale for a file)"
     if thing < _NEAREST and seen.views[0].posed:
         return (f"the object is {1e3 * thing:.0f} mm from its camera, nearer than depth cameras see: {asked}",)
     if seen.support is None and (seen.cut or beyond > _CUT_OFF):
@@ -150,7 +150,7 @@ def _camera_doubts(seen: Segmentation, views: Sequence[PointCloud]) -> tuple[str
 
 
 def _is_whole_object(views: Sequence[PointCloud]) -> bool:
-    """Return True if `check_scene` fails, but the only cloud shows all sides. Raises CloudError: it fails otherwise."""
+    """Return True if `check_scene` fails for the only cloud, but it shows all sides. Otherwise, let the error pass."""
     try:
         check_scene(views)
     except CloudError:

@@ -1,1 +1,1 @@
-"""Planning of a run: its rounds, its restrictions, and the reasons why an object cannot be held."""
+"""Plan grasps: rounds of optimiser and trials, steering constraints, and the reasons why an object cannot be held."""

@@ -1,9 +1,9 @@
-"""Planning for any object of a scene: find one object with a verified grasp, else rank the objects by probability.
+"""Plan for any object of a scene: find an object with a verified grasp, else rank the objects by their best grasp.
 
-Objects with fewer earlier failures come first. Among equals, higher objects come first, because nothing lies on them.
-An object gets one round of the planner, and all rounds if an earlier search found no grasp for it. The first verified
-grasp ends the search. After `enough` objects, a likely grasp also ends the search, to limit its time.
-`result_of_things` returns the result of one request.
+Objects with fewer earlier failures come first. At equal numbers of failures, higher objects come first, because nothing
+lies on them. An object gets one round of the planner. After an earlier failure at this or an unknown object, it gets
+all rounds. The first verified grasp ends the search. After `enough` objects, a grasp with a probability of at least 0.5
+also ends it, to limit the time. `result_of_things` returns the result of one request.
 """
 
 from __future__ import annotations
@@ -33,15 +33,15 @@ from graspd_core.verify.robustness import begin_other_shapes
 
 # Two grasps are alike if their bases differ by less than this distance [m] and this angle [rad].
 LIKE_DISTANCE, LIKE_TURN = 0.015, 0.26
-# Why an object is skipped.
-OUT_OF_TRIES, NOT_LOOKED_AT = "failed too often", "not planned for"
+# Reasons why an object is skipped: too many failures, or the search ended before.
+OUT_OF_TRIES, NOT_LOOKED_AT = "no tries left", "not tried before the search ended"
 # An object within this distance of an earlier failure's place is the same object [m].
 _SAME_PLACE = 0.04
-# Why an object is doubted.
+# Doubt about the scene of an object if a robot executed a grasp of the object and the grasp failed.
 _FAILED = "an earlier grasp of this object failed"
 # Least probability of a likely grasp.
 _LIKELY = 0.5
-# Points are of a known solid if this fraction of them is within this distance of its surface [m].
+# Points belong to a known solid if the fraction `_NEARLY_ALL` of them is within `_STRAY` of the solid's surface [m].
 _STRAY, _NEARLY_ALL = 0.016, 0.9
 
 
@@ -50,9 +50,9 @@ class Failure:
     """An earlier failed try: a grasp that failed, or an object for which no grasp was found.
 
     Attributes:
-        place: mean of the object's points [m]. None if the object is unknown. Then only the grasp is avoided.
-        grasp: hand posture at the failed grasp. None if there was no grasp.
-        executed: whether a robot executed the grasp. If it did, the object's scene is doubted.
+        place: mean of the object's points [m]. None if the object is unknown. Then only the failed grasp is avoided.
+        grasp: hand posture at the failed grasp. None if no grasp was found.
+        executed: whether a robot executed the grasp. If so, its object gets a doubt, so no grasp of it is verified.
     """
 
     place: Float[np.ndarray, "3"] | None
@@ -66,10 +66,10 @@ class ThingPlan:
 
     Attributes:
         points: points of the object [m].
-        scene: scene of the object with its obstacles. None if it could not be built.
-        result: result of planning. None without a scene.
-        grasp: the best grasp, verified or not. None if there is none.
-        reason: why there is no verified grasp. Empty if there is one.
+        scene: scene of the object with its obstacles. None if the scene could not be built.
+        result: result of planning. None if planning did not run.
+        grasp: the best grasp, verified or unverified. None if no grasp was found.
+        reason: why there is no verified grasp. Empty if there is a verified grasp.
         looked_at: whether this request tried to find a grasp for the object.
     """
 
@@ -92,7 +92,7 @@ class ThingPlan:
 
     @property
     def surety(self) -> float:
-        """Probability that the grasp holds, plus 1 if it is verified. -1 without a grasp."""
+        """Probability that the grasp holds, plus 1 if the grasp is verified. -1 without a grasp."""
         if self.grasp is None:
             return -1.0
         return (self.grasp.probability or 0.0) + float(self.grasp.verdict is Verdict.VERIFIED)
@@ -118,23 +118,23 @@ def plan_any_thing(
     """Plan for one object after the other until one has a verified grasp. Return all objects, by descending `surety`.
 
     Args:
-        views: point cloud of each camera, in one frame [m].
+        views: point cloud of each camera, all in the same frame [m].
         settings: settings for segmentation, reconstruction and obstacles.
         surface: support plane of all objects, if it is known.
         solids: known solids by name, in the frame of the views [m]. They are obstacles and never grasped.
-        mass: mass of each object [kg]. None assumes the `heavy_mass` of each object's volume.
+        mass: mass of each object [kg]. None assumes the greatest mass that its volume allows (`heavy_mass`).
         friction: Coulomb friction coefficient between hand and objects.
         source: name of the views, for messages.
-        failures: failures of earlier requests. Grasps like the failed ones are left out.
+        failures: failures of earlier requests. Grasps like a failed grasp are left out (`unlike`).
         tries: number of failures after which an object is skipped.
         deadline: time after which the whole search ends [s]. None for no limit.
-        enough: number of objects after which a likely grasp ends the search.
-        most: greatest number of objects that are planned for. None for all.
-        plan: other keyword arguments of `plan_grasps`. `seed` is increased by the object's number of failures.
+        enough: number of objects after which a grasp with a probability of at least 0.5 ends the search.
+        most: greatest number of objects to plan for. None for all objects.
+        plan: other keyword arguments of `plan_grasps`. Each failure of this or an unknown object adds 1 to `seed`.
 
     Raises:
         CloudError: a cloud is empty, all NaN, or has too few points.
-        ConfigError: see `plan_grasps`. If a region misses an object, the object's `reason` says so instead.
+        ConfigError: see `plan_grasps`. If an object cannot meet a restriction, the object's `reason` says so instead.
     """
     began, things, over = time.perf_counter(), list[ThingPlan](), False
     asked = {"seed": 0, "count": 1, "verify": "standard", "device": "cpu", "preset": "balanced"} | plan
@@ -155,17 +155,17 @@ def plan_any_thing(
         things.append(_thing_plan(points, scene, hand, lost, {**asked, "preset": config, "deadline": left}))
         looked = sum(thing.looked_at for thing in things)
         late = deadline is not None and time.perf_counter() - began > deadline
-        over = late or stop() or looked == most or things[-1].surety > 1.0
+        over = late or stop() or looked == most or things[-1].surety >= 1.0
         over = over or (looked >= enough and any(thing.is_likely for thing in things))
     return tuple(sorted(things, key=lambda thing: -thing.surety))
 
 
 def result_of_things(things: Sequence[ThingPlan], seed: int = 0) -> GraspResult:
-    """Return the result of the first object. If it has no grasp, the message tells the reason for each object.
+    """Return the result of the first object. If no object has a grasp, the message gives the reason for each object.
 
     Raises:
         CloudError: `things` is empty (NoObjectError), or no object's scene can be built.
-        ConfigError: no object meets the restrictions.
+        ConfigError: no object can meet the restrictions.
     """
     if not things:
         raise NoObjectError("cloud: no object is seen, except known solids; valid: a cloud with a graspable object")
@@ -209,9 +209,9 @@ def _scene_among(
     about: dict[str, Any],
     failed: Sequence[Failure],
 ) -> Scene | str:
-    """Return the scene of the object with these points, or the message of the error.
+    """Return the scene of the object with the given points, or the error message if the scene cannot be built.
 
-    `about` holds other arguments of `scene_from_views`. If an executed grasp failed, the scene is doubted.
+    `about` holds other arguments of `scene_from_views`. If an executed grasp of the object failed, doubt the scene.
     """
     again = any(failure.grasp is not None and failure.executed for failure in failed)
     # The target is a point on the object, because the middle of a ring is empty.
@@ -238,7 +238,7 @@ def _thing_plan(
     count, seed = plan["count"] + 2 * len(lost), plan["seed"] + len(failed)
     try:
         result = plan_grasps(scene, hand, **{**plan, "preset": config, "count": count, "seed": seed})
-    except ConfigError as error:  # a restriction that this object cannot meet
+    except ConfigError as error:  # The object cannot meet a restriction.
         return ThingPlan(points, scene, reason=str(error))
     left = [grasp for grasp in unlike(result.tried, lost) if grasp.verdict is not Verdict.FAILED]
     if not left:
@@ -250,7 +250,7 @@ def _thing_plan(
 
 
 def unlike(grasps: Sequence[Grasp], lost: Sequence[Posture]) -> list[Grasp]:
-    """Return the grasps that are not like any posture in `lost` (within 15 mm and 0.26 rad)."""
+    """Return the grasps that differ from every posture in `lost` by at least 15 mm or 0.26 rad."""
     return [grasp for grasp in grasps if not any(_alike(grasp.grasp, posture) for posture in lost)]
 
 

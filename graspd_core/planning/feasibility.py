@@ -1,9 +1,9 @@
-"""Reasons why an object cannot be held, as advice for users: before any search, and after failed trials.
+"""Tell users why an object cannot be held: before any search, and after failed trials.
 
 The check before the search is a necessary condition from statics. Balanced contact forces cannot all point into one
-open half-space. The distance between any two contacts is at most the hand's span. The object cannot be held if, in
-every patch of this size, all friction-cone forces lie in one half-space. Rims, handles, walls and thin plates have
-opposing normals next to each other and pass.
+open half-space. The distance between two contacts is at most the hand's span. Consider all surface patches of this
+size. If in every patch all friction-cone forces lie in one half-space, the hand cannot hold the object. Rims, handles,
+walls and thin plates pass the check, because they have opposing normals next to each other.
 """
 
 from __future__ import annotations
@@ -25,23 +25,23 @@ from graspd_core.mesh.topology import packed_rows, scaled_normals
 from graspd_core.perception.scene import Scene
 from graspd_core.types import Grasp, Verdict
 
-# Greatest friction that trials use. See `verify.world.at_friction`.
+# Greatest friction that trials use (`verify.world.at_friction`).
 _MOST_FRICTION = 0.6
-# Number of surface samples. All face centres are added, so that no small handle is missed.
+# Number of surface samples in the check. All face centres are added, so that no small handle is missed.
 _SAMPLES = 4000
-# Number of directions in which the object's width is measured.
+# Greatest number of directions in which the object's width is measured.
 _DIRECTIONS = 400
-# Greatest number of steps in the search for a separating direction.
+# Greatest number of steps in the search for a direction that separates the normals from the origin (`_separated`).
 _STEPS = 60
-# Number of failure reasons in a message.
+# Greatest number of failure reasons in a message.
 _REASONS_TOLD = 3
-# An object is low if most contact normals have at least this cosine to the vertical, and if it is at most this high
-# [m].
+# Fingers press an object from above if the median cosine of contact normals to the vertical is at least `_FROM_ABOVE`.
+# An object up to this height is low [m]: `_LOW`.
 _FROM_ABOVE, _LOW = 0.5, 0.03
 
 
 def out_of_reach(scene: Scene, hand: HandModel) -> str:
-    """Return a sentence that says why the hand cannot hold the object anywhere. Empty if no reason is known."""
+    """Return a sentence that says why the hand cannot hold the object anywhere. Return "" if no reason is known."""
     span, opening = reach_of(hand)
     vertices = scene.object.mesh.vertices
     # Most objects fit into the hand along an axis and need no further check.
@@ -62,7 +62,7 @@ def out_of_reach(scene: Scene, hand: HandModel) -> str:
 
 
 def why_trials_failed(scene: Scene, grasps: Sequence[Grasp]) -> str:
-    """Return the reasons of failed trials, most frequent first, and advice. Empty without failures."""
+    """Return a text with the reasons of failed trials, most frequent first, and advice. "" without failed trials."""
     failed = [grasp for grasp in grasps if grasp.verdict is Verdict.FAILED and grasp.reason]
     if not failed:
         return ""
@@ -88,10 +88,10 @@ def kind_of(reason: str) -> str:
     return re.sub(r" (?=[;,.:])", "", " ".join(reason.split()))
 
 
-# The cache keeps the last few hands. They are hashed by identity.
+# The cache keeps the last eight hands. Hands are hashed by identity.
 @lru_cache(maxsize=8)
 def reach_of(hand: HandModel) -> tuple[float, float]:
-    """Return the open hand's greatest distance between contact candidates and widest gap between fingertips [m]."""
+    """Return the open hand's greatest distance of two contact candidates, and widest gap between fingertips [m]."""
     poses = forward(make_kinematics(hand, dtype=torch.float64), torch.as_tensor(hand.open_posture)[None])
     links = poses[0, torch.as_tensor(hand.candidate_link)]
     points = (links.rotation @ torch.as_tensor(hand.candidate_points)[..., None]).squeeze(-1) + links.translation
@@ -116,17 +116,17 @@ def _surface(scene: Scene) -> tuple[Float[np.ndarray, "n 3"], Float[np.ndarray, 
 def _one_sided(
     points: Float[np.ndarray, "n 3"], normals: Float[np.ndarray, "n 3"], radius: float, least: float
 ) -> bool:
-    """Return True if in every patch of `radius` [m] all friction-cone forces lie in one half-space (`_separated`)."""
+    """Return True if all friction-cone forces of each patch of `radius` [m] lie in one half-space (`_separated`)."""
     tree = KDTree(points)
     _, first = np.unique(packed_rows(np.round(points / (radius / 4)).astype(np.int64)), return_index=True)
     return all(_separated(normals[tree.query_ball_point(points[k], radius)], least) for k in first)
 
 
 def _separated(normals: Float[np.ndarray, "n 3"], least: float) -> bool:
-    """Return True if a unit direction a has n·a > `least`, the sine of the friction angle, for all normals n.
+    """Return True if a unit direction a has n·a > `least` for all normals n. `least` is the sine of the friction angle.
 
     The best direction points to the point of the normals' convex hull that is nearest to the origin. Gilbert's
-    algorithm (SIAM J. Control 1966) finds it. The search ends early once the distance is too small for any direction.
+    algorithm (SIAM J. Control 1966) finds this point. The search ends early once no direction can exist.
     """
     nearest = normals.mean(0)
     for _ in range(_STEPS):

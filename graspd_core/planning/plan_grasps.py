@@ -1,4 +1,4 @@
-"""Grasp planning: find, verify and rank grasps of a scene's object by a hand."""
+"""Plan grasps: find, verify and rank grasps of a scene's object by a hand."""
 
 from __future__ import annotations
 
@@ -40,15 +40,15 @@ from graspd_core.verify.limits import LEAST_PAYLOAD
 from graspd_core.verify.run_clock import Run, result_of
 from graspd_core.verify.verification import payloads, prefetch, rank_by_robustness
 
-# Number of grasps whose payload is measured if none is verified.
+# Number of grasps whose payload is measured if no grasp is verified.
 _WEIGHED = 8
 
 
 def planning_scene(scene: Scene, resolution: int) -> tuple[Scene, Float[np.ndarray, "3"]]:
-    """Return the scene for planning, moved near the origin (`near_scene`), and its origin in the given scene [m].
+    """Move the scene near the origin (`near_scene`) for planning. Return it, and the new origin in the given frame [m].
 
-    The distance grid is rebuilt if its resolution differs, or if the scene was moved, because float32 rounded its
-    nodes. Raises ConfigError: the resolution is out of range.
+    The distance grid is rebuilt if it has another resolution. It is also rebuilt after a move, because float32 had
+    rounded the positions of far nodes. Raises ConfigError: the resolution is out of range.
     """
     if not 8 <= resolution <= 256:
         raise ConfigError(f"resolution: {resolution} nodes; valid: 8 to 256")
@@ -89,18 +89,18 @@ def plan_grasps(
     """Plan grasps and try them in rank order until `count` pass all trials of the scene.
 
     Args:
-        scene: scene from `load_scene` or `scene_from_views`. Its distance grid is rebuilt if the preset needs another.
-        hand: hand from `load_hand`. It gets the number of contact candidates that the preset asks for.
+        scene: scene from `load_scene` or `scene_from_views`. `planning_scene` adapts it to the preset's resolution.
+        hand: hand from `load_hand`. Planning uses the number of contact candidates that the preset asks for.
         count: number of verified grasps to find.
-        seed: random seed. The same seed on the same machine gives the same grasps.
-        preset: name of a preset, a preset file, or the settings.
-        verify: "standard" or "hard" trials, "full" or "hard_full" for the same without early stop, or "none".
+        seed: random seed. On one machine, equal seeds give equal grasps.
+        preset: name of a preset, path of a preset file, or the settings.
+        verify: "standard" or "hard" trials, "full" or "hard_full" for these trials without early stop, or "none".
         deadline: time after which the run ends with the grasps found so far [s]. None for no limit.
         device: torch device of the optimiser.
         restrictions: further conditions on grasps. The result's `refused` counts the refused candidates.
         measure: whether to measure the metrics of grasps that did not fail. Measuring takes longer than a trial.
-        progress: called from this thread with `Progress` values.
-        watch: called from this thread with `Snapshot` values, the hands that the run is working on.
+        progress: hook that gets `Progress` values. This thread calls it.
+        watch: hook that gets `Snapshot` values, with the hands that the run is working on. This thread calls it.
         stop: polled hook. If it returns true, the run ends within one optimiser step or 0.1 s of simulated time.
 
     Raises:
@@ -135,7 +135,7 @@ def plan_grasps(
 def _prepared(
     run: Run, scene: Scene, hand: HandModel, config: PlanConfig, verify: str, bound: BoundRestrictions
 ) -> tuple[Scene, HandModel, str, list[PlanConfig]]:
-    """Return scene and hand for planning, why no grasp is possible (else empty), and the settings of the rounds."""
+    """Return scene and hand for planning, why no grasp can exist ("" if unknown), and the settings of the rounds."""
     if run.over():
         return scene, hand, "", []
     scene, run.origin = planning_scene(scene, config.resolution)
@@ -151,7 +151,7 @@ def _ranked(run: Run, found: RoundsResult, config: PlanConfig, seed: int) -> tup
 
 
 def on_surface(scene: Scene, grasps: Sequence[Grasp]) -> tuple[Grasp, ...]:
-    """Return the grasps with contacts and normals moved from the distance grid to the object's mesh."""
+    """Return the grasps with contact points and normals on the object's mesh, instead of on the distance grid."""
     contacts = [contact for grasp in grasps for contact in grasp.contacts]
     if not contacts:
         return tuple(grasps)
@@ -182,25 +182,25 @@ def _why_few(run: Run, scene: Scene, bound: BoundRestrictions, found: RoundsResu
 
 
 def _less_sure(scene: Scene, far: Float[np.ndarray, "3"], result: GraspResult) -> GraspResult:
-    """Return the result with a message why no grasp is robust and, if possible, the next best view, moved by `far`."""
+    """Say in the result that no grasp is robust. Add the next view if possible. `far`: the planning frame's origin."""
     held = sum(grasp.verdict is Verdict.UNVERIFIED for grasp in result.tried)
     if scene.evidence is None or not held:
         return result
-    message, view = f"{held} grasps hold on the likeliest shape, none is robust enough", None
+    message, view = f"{held} grasps hold on the likeliest shape, but none is robust enough", None
     if scene.evidence.doubts:
         message += f": {scene.evidence.doubts[0]}"
     elif scene.evidence.hidden:
         from graspd_core.perception.reconstruct.hidden_side import next_view
 
-        message += ", since a part of the object was guessed"
+        message += ", because a part of the object was guessed"
         view = next_view(scene.evidence, scene.object.mesh, far)
     if view is not None:
-        message += "; one more view, from next_view, would show most of it"
+        message += "; one more view, from next_view, would show most of that part"
     return replace(result, message="; ".join(filter(None, (message, result.message))), next_view=view)
 
 
 def _timing(run: Run, scene: Scene, found: RoundsResult) -> Timing:
-    """Return the time of each stage [s]. Loading took place before the run began."""
+    """Return the time of each stage [s]. Add the times of loading the scene, which was loaded before the run began."""
     elapsed, (load, sdf) = time.perf_counter() - run.began, scene.timing
     optimise = found.began - run.began + found.optimise_time
     return Timing(
@@ -214,7 +214,7 @@ def _timing(run: Run, scene: Scene, found: RoundsResult) -> Timing:
 
 
 def check_request(*, count: int, seed: int, verify: str, deadline: float | None, device: str) -> None:
-    """Check arguments of `plan_grasps` without a scene. Raises ConfigError: a value is not valid."""
+    """Check those arguments of `plan_grasps` that need no scene. Raises ConfigError: a value is not valid."""
     if not 1 <= count <= 1024:
         raise ConfigError(f"count: {count} grasps; valid: 1 to 1024")
     if not 0 <= seed < 2**63:
@@ -230,15 +230,15 @@ def check_request(*, count: int, seed: int, verify: str, deadline: float | None,
 
 
 def warm_up(hand: HandModel, stop: StopHook | None = None) -> None:
-    """Plan once on a small sphere, so that all libraries are loaded and the first request is as fast as later ones.
+    """Plan once on a small sphere. This loads all libraries, so that the first request is as fast as later requests.
 
-    Servers call this at start. It also starts the child process that `run_isolated` uses, for example to cut objects
-    into convex parts while other threads go on.
+    Servers call `warm_up` at start. It also starts the child process of `run_isolated`, which cuts objects into convex
+    parts while other threads go on.
     """
     from graspd_core.perception.scene_from_views import scene_from_views
 
     start_planning_worker()
-    # The sphere is drawn here, because `make_shape` would import trimesh, which only meshes need.
+    # Draw the sphere here, because `make_shape` would import trimesh, which planning on clouds does not need.
     ways = np.random.default_rng(0).normal(size=(2000, 3))
     ball = 0.04 * ways / np.linalg.norm(ways, axis=1, keepdims=True) + np.array([0.0, 0.0, 0.5])
     scene = scene_from_views([PointCloud(ball, np.zeros(3))], alone=True)

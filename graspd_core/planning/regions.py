@@ -21,12 +21,12 @@ from graspd_core.perception.scene import Obstacle, Scene
 from graspd_core.se3 import SE3, rotation_from_quaternion
 from graspd_core.types import Posture, TriangleMesh
 
-# A short sequence of numbers, in any form that callers may use.
+# A short sequence of numbers: a tuple, a list or an array.
 Numbers = Sequence[float | int] | np.ndarray
 
 
 def numbers(name: str, given: Any, count: int) -> tuple[float, ...]:
-    """Return `given` as `count` finite numbers. Raises ConfigError about `name`: `given` is something else."""
+    """Return `given` as `count` finite numbers, else raise ConfigError. The message begins with `name`."""
     try:
         values = np.asarray(given, dtype=float)
     except (TypeError, ValueError):
@@ -63,7 +63,7 @@ class Box:
 
     @cached_property
     def rotation(self) -> Float[np.ndarray, "3 3"]:
-        """`R_object_box`."""
+        """Rotation `R_object_box` from the box frame to the object frame."""
         return rotation_from_quaternion(torch.tensor(tuple(self.quaternion_wxyz), dtype=torch.float64)).numpy()
 
     def local(self, points: Float[np.ndarray, "*n 3"]) -> Float[np.ndarray, "*n 3"]:
@@ -133,17 +133,17 @@ class NearPoints:
 
 Region = Box | Sphere | NearPoints
 
-
+# Greatest number of steps in the distance search of `_enter`.
 _STEPS = 60
-# A gap narrower than this counts as contact [m].
+# A gap up to this width counts as contact [m].
 _TOUCH = 1e-5
 _GRID_RESOLUTION = 32
-# Boxes are padded by this for the search [m], which allows slight penetration. A squeeze also closes the fingers more.
+# Boxes grow by this as obstacles [m], because the search allows slight penetration and a squeeze closes the fingers.
 _PAD = 0.004
 
 
 def entered(hand: HandModel, postures: Sequence[Posture], boxes: Sequence[Box]) -> Bool[np.ndarray, "postures"]:
-    """Return in which postures a link enters one of the boxes. Postures and boxes are in the same frame."""
+    """Return for each posture whether a link enters any of the boxes. Postures and boxes are in the same frame."""
     if not boxes or not postures:
         return np.zeros(len(postures), dtype=bool)
     points, radii = _placed_solids(hand, postures)
@@ -154,7 +154,7 @@ def entered(hand: HandModel, postures: Sequence[Posture], boxes: Sequence[Box]) 
 def _placed_solids(
     hand: HandModel, postures: Sequence[Posture]
 ) -> tuple[Float[np.ndarray, "postures solids corners 3"], Float[np.ndarray, "solids"]]:
-    """Return each primitive's extreme points [m] and radius [m]. Repeated points pad the rows to equal length."""
+    """Return each primitive's extreme points by posture, and its radius [m]. Short rows repeat their first point."""
     solids = extreme_points_of_solids(hand)
     most = max(len(points) for points, _, _ in solids)
     local = np.stack([np.vstack([points, np.repeat(points[:1], most - len(points), 0)]) for points, _, _ in solids])
@@ -172,7 +172,7 @@ def _enter(
     radii: Float[np.ndarray, "solids"],
     half: Float[np.ndarray, "3"],
 ) -> Bool[np.ndarray, "postures"]:
-    """Return in which postures a primitive is nearer than its radius to the box |x| ≤ `half`."""
+    """Return for each posture whether a primitive is nearer than its radius to the box |x| ≤ `half` [m]."""
     flat = points.reshape(-1, *points.shape[2:])
     radius = np.tile(radii, len(points))
     clear = ((flat.min(1) - radius[:, None] > half) | (flat.max(1) + radius[:, None] < -half)).any(-1)
@@ -198,7 +198,7 @@ def _enter(
 
 
 def boxes_in_reach(scene: Scene, hand: HandModel, boxes: Sequence[Box]) -> tuple[Obstacle, ...]:
-    """Return the part of each box that the hand could reach while approaching the object, as obstacles."""
+    """Return, as obstacles, the part of each box that the hand could reach while approaching the object."""
     reach = scene.object.radius + hand_reach(hand) + RETREAT
     found = []
     for box in boxes:

@@ -1,4 +1,4 @@
-"""Rounds of optimiser and trials: their effort and their results."""
+"""Run rounds: each round runs the optimiser, then tries the candidates, with more effort from round to round."""
 
 from __future__ import annotations
 
@@ -32,13 +32,13 @@ from graspd_core.verify.verification import (
     surest_first,
 )
 
-# Parts of torch's messages when memory runs out, on the CPU and on CUDA. It raises a RuntimeError for both.
+# Parts of torch's messages when memory runs out, on the CPU or on CUDA. In both cases torch raises a RuntimeError.
 _TORCH_SAYS = ("can't allocate memory", "not enough memory", "out of memory")
 
 
 @contextmanager
 def enough_memory(what: str) -> Iterator[None]:
-    """Raise ResourceError, naming `what`, if the work inside the context runs out of memory."""
+    """Raise ResourceError if the work inside the context runs out of memory. `what` names the work."""
     try:
         yield
     except (MemoryError, RuntimeError) as error:
@@ -50,8 +50,8 @@ def enough_memory(what: str) -> Iterator[None]:
 def rounds_of(scene: Scene, config: PlanConfig, verify: str) -> list[PlanConfig]:
     """Return the settings of all rounds, with increasing effort.
 
-    The first round has less effort only for an object of known shape without support or obstacles. A hold trial then
-    shows failures quickly.
+    The first round has less effort for an object of known shape without support or obstacles. For such an object, hold
+    trials show quickly whether more effort is needed.
     """
     rounds = config.rounds
     cheap = verify != "none" and scene.support is None and not scene.obstacles and scene.confidence is None
@@ -61,15 +61,14 @@ def rounds_of(scene: Scene, config: PlanConfig, verify: str) -> list[PlanConfig]
     return [config.at_budget(effort) for effort in efforts]
 
 
-# Difference between the seeds of two rounds.
+# Difference between the seeds of two batches.
 _SEED_STEP = 1_000_003
-# From `_MANY` requested grasps on, the first batch seeks only `_FIRST_BATCH`, so that the first answer comes early. If
-# a round finds no grasp, the next one seeks at least `_MANY`.
+# If `_MANY` or more grasps are requested, the first batch seeks only `_FIRST_BATCH`, so that the first answer comes
+# early. If a batch finds no grasp, the next batch seeks at least `_MANY`.
 _MANY, _FIRST_BATCH = 8, 2
 
-
-# If no grasp holds the assumed mass: number of grasps whose payload is measured, and tried mass as a fraction of the
-# greatest payload. The tried mass is at most the least one at which a grasp may be verified.
+# Used if no grasp holds the assumed mass: number of grasps whose payload is measured, and tried mass as a fraction of
+# the greatest payload. The tried mass is at most `light_end`, the least mass at which a grasp may be verified.
 _WEIGHED, _LIFTED = 60, 0.8
 
 
@@ -79,12 +78,12 @@ class RoundsResult:
 
     Attributes:
         began: start of the first round, a `time.perf_counter()` value.
-        grasps: verified (or untried) grasps first, then failed ones.
+        grasps: the found grasps: first verified, then unverified, then failed grasps.
         context: context of the trials. None if no grasp was tried.
         optimise_time: time spent in the optimiser [s].
-        first: time of the first verified grasp, a `time.perf_counter()` value. None without one.
+        first: time at which the first grasp was verified, a `time.perf_counter()` value. None if none was verified.
         refused: number of candidates that restrictions refused, by reason.
-        lowered: mass of the second trials of the best grasps [kg] if none holds the assumed mass, else None.
+        lowered: mass at which the best grasps were tried again [kg]. None if they were not tried again.
     """
 
     began: float
@@ -97,7 +96,7 @@ class RoundsResult:
 
     @property
     def mass(self) -> float | None:
-        """Object mass of the trials [kg] if it is lower than the assumed mass, else None."""
+        """Object mass in the trials [kg] if this mass is below the assumed mass, else None."""
         return self.context.mass if self.context and self.lowered and self.good else self.lowered
 
     @property
@@ -107,14 +106,14 @@ class RoundsResult:
 
 
 def poses_seen(poses: Poses) -> Snapshot:
-    """Return a snapshot of an optimiser's poses."""
+    """Return a snapshot of the optimiser's poses."""
     return Snapshot(*(rows.detach().double().cpu().numpy() for rows in vars(poses).values()))
 
 
 def _hooks(run: Run, good: int) -> Hooks:
     return Hooks(
         report=lambda step, of, loss: run.report(Stage.OPTIMISE, step, of, loss, good),
-        # When the run is over, stop at once. An unfinished iterate is not a grasp.
+        # When the run is over, stop at once, because the poses of an unfinished search are no grasps.
         stop=run.over,
         watch=None if run.watch is None else lambda poses: run.show(poses_seen(poses)),
     )
@@ -133,11 +132,11 @@ def run_rounds(
     device: str,
     measure: bool = True,
 ) -> RoundsResult:
-    """Find and try candidates, round by round, until `count` grasps are `RoundsResult.good`.
+    """Find and try candidates, round by round, until `count` grasps are good (`RoundsResult.good`).
 
-    If many grasps are requested, a small batch comes first, for an early answer. If too few grasps hold, the next batch
-    starts from other initial poses. Candidates that a restriction refuses are not tried. `prefetched` holds the worlds
-    of the trials. Without it, no candidate is tried.
+    If many grasps are requested, the first batch is small, so that the first answer comes early. If too few grasps
+    hold, the next batch starts from other initial poses. Candidates that a restriction refuses are not tried.
+    `prefetched` holds the worlds of the trials. If `prefetched` is None, no candidate is tried.
     """
     state = RoundsResult(time.perf_counter())
     for attempt, batch in enumerate(_batches(scene, rounds, count, prefetched is not None)):
@@ -147,7 +146,7 @@ def run_rounds(
         with enough_memory(f"{seek} grasps at once"):
             task = PlannerInput(scene, hand, seek, seed + _SEED_STEP * attempt, **options)
             candidates = find_candidates(task, searches=batch.searches).grasps
-        # The time is counted here, because the loop below does not run after an interrupted search.
+        # Count the time here, because the loop below does not run if the search found nothing.
         state, began = _searched_since(state, began), time.perf_counter()
         for some in _in_rank_order(candidates, enough - good, restrictions):
             admitted, refused = restrictions.admit(some)
@@ -170,7 +169,7 @@ def run_rounds(
                 break
         if state.good >= count or run.over():
             break
-        # Lower the mass only after a second round for stronger grasps. Without an unverified grasp, lower it at once.
+        # With an unverified grasp, lower the mass only after the second round, which may find stronger grasps.
         unsure = any(grasp.verdict is Verdict.UNVERIFIED for grasp in state.grasps)
         too_heavy = batch.ends_round > unsure and not state.good and scene.object.mass_assumed
         if too_heavy and prefetched is not None and state.lowered is None:
@@ -185,9 +184,10 @@ class _Batch:
     """Candidates that are tried together.
 
     Attributes:
+        config: settings of the round.
         most: greatest number of grasps to find.
-        searches: greatest number of searches for the candidates. None takes the method's setting.
-        ends_round: number of the round that ends after this batch, from 1. 0 if none does.
+        searches: greatest number of optimiser runs (searches) for the candidates. None for the method's setting.
+        ends_round: number of the round that ends after this batch, from 1. 0 if no round ends then.
     """
 
     config: PlanConfig
@@ -197,10 +197,10 @@ class _Batch:
 
 
 def _batches(scene: Scene, rounds: Sequence[PlanConfig], count: int, tried: bool) -> Iterator[_Batch]:
-    """Yield the batches of all rounds, first a small one if many grasps are requested. `tried`: trials run.
+    """Yield the batches of all rounds. If many grasps are requested, a small batch comes first.
 
-    Trials show sooner than the ranking whether another search is needed, so each search is a batch. Trials in a doubted
-    scene show little, so there the ranking chooses from all searches of the only round.
+    `tried` says whether trials run. If so, each search is a batch, because trials show early whether another search is
+    needed. In a scene with doubts, trials show little. So there is one round, and its searches form one batch.
     """
     doubted = scene.evidence is not None and bool(scene.evidence.doubts)
     once = tried and not doubted
@@ -220,8 +220,8 @@ def _tried_lighter(
 ) -> RoundsResult:
     """Try the best grasps again, strongest first, with a lower mass that the strongest grasp can lift.
 
-    If even the strongest grasp is too weak to be verified, further rounds try their grasps with the least mass at
-    which a grasp may be verified.
+    If even the strongest grasp is too weak to be verified, later rounds use another mass. It is the least mass at which
+    a grasp may be verified.
     """
     if state.context is None:
         return state

@@ -1,8 +1,8 @@
-"""Steering constraints on grasps: approach direction, roll, contact region and boxes to avoid.
+"""Constrain grasps: approach direction, roll, contact region and boxes to avoid.
 
 The part of the object outside the wanted region is an obstacle of the search. The obstacle loss then moves all contacts
 into the region. The obstacle's signed distance is the maximum of the distances to the object and to the outside of the
-region. It is a lower bound of the true distance. Its gradient jumps where these two distances are equal.
+region. This maximum is a lower bound of the true distance. Its gradient jumps where these two distances are equal.
 """
 
 from __future__ import annotations
@@ -37,7 +37,7 @@ from graspd_core.planning.regions import Box, NearPoints, Numbers, Region, Spher
 from graspd_core.se3 import rotation_from_quaternion
 from graspd_core.types import Grasp
 
-# Distance outside the region at which the untouched part begins, and distance that links keep from its surface [m].
+# Distance from the region at which `untouched_part` begins, and distance that links keep from that part [m].
 _BEGINS, _SKIN = 0.003, 0.004
 
 
@@ -60,15 +60,15 @@ def untouched_part(scene: Scene, region: Region) -> Obstacle:
 # Distance by which a contact may lie outside the region [m], and tolerance of angles [rad].
 CONTACT_TOLERANCE = 0.005
 _ROUNDING = 1e-6
-# Number of surface samples that show which part of the object lies in a region, and greatest number of aim points.
+# Number of samples of the object's surface, and greatest number of samples in a region that serve as aims of starts.
 _SURFACE, _MOST_PLACES = 20_000, 400
-# If the angle between fingers and approach has a lower sine, the fingers define no side of the hand.
+# If the sine of the angle between fingers and approach is below this, the fingers define no side of the hand.
 _ALONG = 0.3
-# If the angle between approach and vertical has a higher cosine, the roll is measured from x.
+# If the cosine of the angle between approach and z is above this, the roll is measured from x instead of z.
 _VERTICAL = 0.95
-# Directions are parallel if the sine of their angle is lower.
+# Directions are parallel if the sine of the angle between them is at most this.
 _PARALLEL = 1e-3
-# Number of sampled starts, and their least penetration of the support above which the direction is impossible [m].
+# An approach direction is impossible if each of `_PROBES` starts penetrates the support by more than `_TOO_DEEP` [m].
 _PROBES, _TOO_DEEP = 8, 0.06
 
 
@@ -76,24 +76,23 @@ _PROBES, _TOO_DEEP = 8, 0.06
 class Steering:
     """Steering constraints on grasps, in the object frame. A constraint that is None does not apply.
 
-    A hand's approach is the direction in which it moves from the retreat over the pregrasp to the grasp. It is
-    `HandModel.approach`, by default the palm's normal.
-
-    The roll is measured at the hand's side: the direction from the palm to the fingertips, projected normal to the
-    approach. If the open fingers point along the approach, as in a gripper, the side is the closing direction.
+    A hand's approach is the direction in which the hand moves from the retreat over the pregrasp to the grasp. It is
+    `HandModel.approach`, by default the palm's normal. The roll is the rotation of the hand's side about the approach.
+    The side is the direction from the palm to the fingertips, projected normal to the approach. If the open fingers
+    point along the approach, as in a gripper, the side is the closing direction.
 
     Attributes:
         approach_direction: wanted approach direction, a vector of any non-zero length. (0, 0, -1) is from above.
         approach_angle: greatest angle between `approach_direction` and a grasp's approach, above 0, at most π [rad].
         region: a `Box`, a `Sphere` or `NearPoints`. Every contact lies in the region, or at most 5 mm outside.
         avoid: boxes that no link enters at pregrasp, grasp and squeeze.
-        roll: right-handed rotation of the hand's side about the approach [rad]. It needs `approach_direction`, and
-            `approach_angle` below π/2. At 0 the side points along z, or along x for an approach within 18° of vertical.
-        roll_zero: direction of the hand's side at roll 0, projected normal to the approach. None for the default above.
+        roll: wanted right-handed rotation of the side [rad]. It needs `approach_direction`, and `approach_angle` below
+            π/2. At 0 the side points along z, or along x for an approach within 18° of vertical.
+        roll_zero: direction of the side at roll 0, projected normal to the approach. None for z or x, as in `roll`.
         roll_tolerance: greatest deviation from `roll` in either direction, above 0, at most π [rad].
 
     Raises:
-        ConfigError: a value is out of its range, not finite, or contradicts another.
+        ConfigError: a value is out of its range, is not finite, or contradicts another value.
     """
 
     approach_direction: Numbers | None = None
@@ -121,7 +120,7 @@ class Steering:
         if not np.isfinite(self.roll):
             raise ConfigError(f"roll: {self.roll} rad; valid: a finite number")
         if self.approach_direction is None:
-            raise ConfigError("roll: no approach_direction is given, about which the hand rolls; give one")
+            raise ConfigError("roll: no approach_direction is given; give the direction about which the hand rolls")
         if self.approach_angle >= np.pi / 2:
             raise ConfigError(f"roll: approach_angle is {self.approach_angle:.4g} rad; valid: below pi/2 (90 degrees)")
         if self.roll_zero is not None:
@@ -151,7 +150,7 @@ class Steering:
 
 @dataclass(frozen=True, eq=False)
 class BoundSteering(BoundRestriction):
-    """`Steering` bound to one hand in one scene. `wanted` is the aim of the initial poses."""
+    """A `Steering` bound to one hand in one scene. `wanted` holds the constraints on initial poses."""
 
     steering: Steering
     scene: Scene
@@ -167,7 +166,7 @@ class BoundSteering(BoundRestriction):
 
     @property
     def aim(self) -> Aim | None:
-        """Aim of the initial poses. None without a constraint on region or approach direction."""
+        """Constraints on initial poses. None without a constraint on region or approach direction."""
         constrained = self.wanted.direction is not None or self.wanted.places is not None
         return self.wanted if constrained else None
 
@@ -180,7 +179,7 @@ class BoundSteering(BoundRestriction):
 
     @property
     def impossible(self) -> str:
-        """The reason: the hand would pass through the support on its approach. Empty otherwise."""
+        """Why no grasp can exist: the hand would pass through the support on its approach. "" otherwise."""
         if self.scene.support is None or self.wanted.direction is None:
             return ""
         depth = depth_of_starts(self.scene, self.hand, _PROBES, BoundRestrictions((self,)))
@@ -192,7 +191,7 @@ class BoundSteering(BoundRestriction):
         )
 
     def starts(self, positions: Places, quaternions: Turns, joints: JointRows) -> Allowed:
-        """Return which initial poses have the palm outside all avoided boxes, both at the pose and at its retreat."""
+        """Return for each initial pose whether the palm centre is outside all avoided boxes, also at the retreat."""
         if not self.steering.avoid:
             return np.ones(len(positions), dtype=bool)
         turns = rotation_from_quaternion(torch.as_tensor(quaternions)).numpy()
@@ -200,7 +199,7 @@ class BoundSteering(BoundRestriction):
         return np.all([box.distance(palm) > 0.0 for box in self.steering.avoid for palm in palms], axis=0)
 
     def admit(self, grasps: Sequence[Grasp]) -> Sequence[Grasp | Refusal]:
-        """Return each candidate that meets all constraints. For the others, return the first violated constraint."""
+        """Return each candidate that meets all constraints. Else return the constraint that it violates first."""
         if not grasps:
             return grasps
         steering, wanted, missed = self.steering, self.wanted, dict[str, Bool[np.ndarray, "grasps"]]()
@@ -231,7 +230,7 @@ def angle_of_approach(hand: HandModel, grasp: Grasp, direction: Float[np.ndarray
 
 
 def outside_region(region: Region, grasp: Grasp) -> float:
-    """Return the greatest signed distance of a grasp's contacts to a region [m]. Infinite without a contact."""
+    """Return the greatest signed distance of a grasp's contacts to a region [m]. Return infinity without a contact."""
     points = np.array([contact.position for contact in grasp.contacts], dtype=float)
     return float(region.distance(points).max()) if len(points) else np.inf
 
@@ -252,7 +251,7 @@ def hand_side(hand: HandModel) -> Float[np.ndarray, "3"]:
 
 
 def zero_of_roll(direction: Float[np.ndarray, "3"]) -> Float[np.ndarray, "3"]:
-    """Return the default zero direction of the roll: z, or x for a steep approach, projected normal to the approach."""
+    """Return the default direction of the side at roll 0: z, or x for a steep `direction`, projected normal to it."""
     up = np.eye(3)[0 if abs(direction[2]) > _VERTICAL else 2]
     square = up - (up @ direction) * direction
     return square / np.linalg.norm(square)
@@ -261,7 +260,7 @@ def zero_of_roll(direction: Float[np.ndarray, "3"]) -> Float[np.ndarray, "3"]:
 def _part_of_object(scene: Scene, region: Region, avoid: Sequence[Box]) -> Float[np.ndarray, "places 3"]:
     """Return points on the object's surface in a region [m].
 
-    Raises ConfigError: there is no such point, or all of them lie in an avoided box.
+    Raises ConfigError: no point lies in the region, or one avoided box contains all points in the region.
     """
     mesh = scene.object.mesh
     points = np.vstack([surface_samples(mesh, _SURFACE, seed=0)[0], mesh.vertices])

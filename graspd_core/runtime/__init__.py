@@ -1,1 +1,1 @@
-"""Support for processes: arrays cached on disk, a worker process, a safe reader of pickles."""
+"""Cache arrays on disk, run functions in a worker process, and read pickles safely."""

@@ -1,8 +1,8 @@
 """Cache arrays by key, in the memory of this process and on disk for other processes.
 
 Files are in `$XDG_CACHE_HOME/graspd`, by default `~/.cache/graspd`. `GRASPD_CACHE=off` disables the files. A damaged
-file is built again. A read-only disk is not used. The least recently used files are removed, because clouds are never
-the same twice. Files are written atomically.
+file is built again. On a read-only disk no file is written. The least recently used files are removed, because every
+cloud is new and adds files. Files are written atomically.
 """
 
 from __future__ import annotations
@@ -23,10 +23,10 @@ import numpy as np
 
 Arrays = dict[str, np.ndarray]
 
-# Part of every file name. Increase it if the arrays computed from the same mesh or hand change.
+# Part of every file name. Increase `VERSION` if the arrays that are computed from one mesh or hand change.
 VERSION = 8
 CAPACITY = 24
-# Greatest size of all files together [bytes], and number of written files between two checks of the size.
+# Greatest size of all files together [bytes]. The size is checked after every `LOOK_EVERY` written files.
 MOST_BYTES, LOOK_EVERY = 512 * 2**20, 16
 
 _memory: OrderedDict[str, Arrays] = OrderedDict()
@@ -37,7 +37,7 @@ _written = itertools.count(1)
 def remember(key: str, build: Callable[[], Arrays], valid: Callable[[Arrays], bool]) -> Arrays:
     """Return the arrays of `key`, from memory, from the file, or from `build`.
 
-    If there is no file, or `valid` rejects its arrays, `build` makes the arrays. Do not modify the returned arrays.
+    `build` runs if there is no file, or if `valid` rejects the file's arrays. Callers must not modify the result.
     """
     with _lock:
         if key in _memory:
@@ -60,7 +60,7 @@ def contents() -> dict[str, Arrays]:
 
 
 def supply(arrays: dict[str, Arrays]) -> None:
-    """Add arrays, which another process may have built, to the memory of this process."""
+    """Add arrays to the memory of this process, for example arrays that another process has built."""
     with _lock:
         _memory.update(arrays)
         while len(_memory) > CAPACITY:
@@ -74,7 +74,7 @@ def forget() -> None:
 
 
 def digest(values: Iterable[Any]) -> str:
-    """Return the hexadecimal SHA-256 of arrays, tuples, dataclasses and other values (by `repr`)."""
+    """Return the hexadecimal SHA-256 of arrays, tuples, dataclasses and other values. Other values count by `repr`."""
     found = hashlib.sha256()
 
     def add(value: Any) -> None:
@@ -103,7 +103,7 @@ def cache_path(key: str) -> Path | None:
 
 def _read(path: Path) -> Arrays | None:
     try:
-        # `open` closes the file also after an error. Members of npz have a CRC, so damage is detected.
+        # `open` also closes the file after an error. The members of an npz file have a CRC, so damage is detected.
         with path.open("rb") as file, np.load(file, allow_pickle=False) as stored:
             arrays = {name: stored[name] for name in stored.files}
         os.utime(path)
@@ -129,7 +129,7 @@ def _write(path: Path, arrays: Arrays) -> None:
 
 
 def _prune(directory: Path) -> None:
-    """Remove the least recently used files until the rest has at most `MOST_BYTES`."""
+    """Remove the least recently used files until the remaining files have at most `MOST_BYTES`."""
     files = sorted((path.stat().st_mtime, path.stat().st_size, path) for path in directory.glob("*.npz"))
     total = sum(size for _, size, _ in files)
     for _, size, path in files:
@@ -140,7 +140,7 @@ def _prune(directory: Path) -> None:
 
 
 def save_bytes(path: Path, content: bytes) -> None:
-    """Write a file atomically. Missing directories are created."""
+    """Write a file atomically. Make missing directories."""
     path.parent.mkdir(parents=True, exist_ok=True)
     handle, temporary = tempfile.mkstemp(dir=path.parent, prefix=path.name)
     try:

@@ -1,11 +1,11 @@
 """Read pickles without running any code that a file names.
 
 A pickle is a program that names classes and functions and calls them. This reader replaces every admitted name by an
-inert object of this module. `array_of` reads the numbers of an inert object. Any other name is refused, and no library
-is called. Limits on the file size, the arguments of a call and the keys (text or small numbers) bound time and memory.
-The memo is a dictionary. Opcodes that reserve memory in advance are refused.
+inert object of this module, and refuses any other name. No library is called. `array_of` reads the numbers of an inert
+object. Limits on file size, call arguments and dictionary keys (text or small numbers) bound time and memory. The memo,
+pickle's store of read objects, is a dictionary. Opcodes that reserve memory in advance are refused.
 
-Formats: protocol 0 to 4, written by Python 3 or by Python 2, whose text is bytes and is decoded as latin-1.
+Pickles may have protocol 0 to 4, from Python 3 or Python 2. Text of Python 2 is stored as bytes and read as latin-1.
 """
 
 from __future__ import annotations
@@ -20,9 +20,9 @@ from typing import Any, ClassVar
 
 import numpy as np
 
-# MANO's licensed file has 3.8 MB.
+# Greatest size of a file [bytes]. The licensed file of MANO has 3.8 MB.
 MAX_BYTES = 64 * 2**20
-# Greatest number of arguments of a call. The format needs four. Each call copies its arguments.
+# Greatest number of arguments of a call. The formats need four. Each call copies its arguments, which takes memory.
 _MOST_ARGUMENTS = 8
 # Opcodes that refer to data outside the file, or that reserve memory before reading.
 _REFUSED_OPCODES = (
@@ -33,12 +33,12 @@ _REFUSED_OPCODES = (
 
 @dataclass(eq=False)
 class Inert:
-    """An object of the file that is stored but never run.
+    """An object that the file constructs, kept as data. None of its code runs.
 
     Attributes:
         kind: kind of the object in the file, such as "array".
-        arguments: arguments of its construction.
-        state: argument of its `__setstate__`. None if that was not called.
+        arguments: arguments with which the file constructs the object.
+        state: argument of the object's `__setstate__`. None if the file does not call `__setstate__`.
     """
 
     kind: str
@@ -51,7 +51,7 @@ class Inert:
 
 @dataclass(frozen=True)
 class Maker:
-    """A replacement for a class or function that a file names. A call returns an `Inert` and does nothing else."""
+    """A replacement for a class or function that a file names. A call only returns an `Inert`."""
 
     kind: str
 
@@ -64,16 +64,16 @@ class Maker:
         return Inert(self.kind, arguments)
 
     def __setstate__(self, state: Any) -> None:
-        raise pickle.UnpicklingError(f"{self.kind}: a state is given, but it has none")
+        raise pickle.UnpicklingError(f"{self.kind}: a state is given, but this type has none")
 
 
 def makers(*rows: tuple[str, tuple[str, ...], tuple[str, ...]]) -> dict[tuple[str, str], Maker]:
-    """Return makers by (module, name). Each row has a kind, its modules and its names."""
+    """Return a maker for each pair of module and name. A row holds a kind, modules and names, in all combinations."""
     return {(module, name): Maker(kind) for kind, modules, names in rows for module in modules for name in names}
 
 
 # Names in pickles of numpy arrays. An array's state is version, shape, type, Fortran order, and the raw bytes. In old
-# protocols Python 3 writes bytes as "encoded" text. The same function has different modules in old and new numpy.
+# protocols Python 3 writes bytes as "encoded" text. Old and new numpy have these functions in different modules.
 NUMPY_NAMES = makers(
     ("array", ("numpy.core.multiarray", "numpy._core.multiarray"), ("_reconstruct",)),
     ("array", ("numpy",), ("ndarray",)),
@@ -88,7 +88,7 @@ def _is_plain(key: object) -> bool:
 
 
 def _with_plain_keys(name: str, keys: slice) -> Callable[[Any], None]:
-    """Return the base class's method `name`, preceded by a check of the dictionary keys at `keys` in the stack."""
+    """Return an opcode's handler. It checks dictionary keys at `keys` of the stack, then calls the method `name`."""
 
     def act(reader: Any) -> None:
         wrong = [key for key in reader.stack[keys] if not _is_plain(key)]
@@ -103,7 +103,7 @@ def _with_plain_keys(name: str, keys: slice) -> Callable[[Any], None]:
 class _Reader(pickle._Unpickler):
     """An unpickler that returns an inert object for an admitted name and refuses every other name."""
 
-    # Attributes of the base class that its type stubs lack.
+    # The base class has these attributes, but its type stubs lack them.
     stack: list[Any]
     memo: dict[int, Any]
     readline: Any
@@ -131,7 +131,7 @@ class _Reader(pickle._Unpickler):
         pickle.SETITEMS[0]: _with_plain_keys("load_setitems", slice(0, None, 2)),
         pickle.DICT[0]: _with_plain_keys("load_dict", slice(0, None, 2)),
         pickle.PUT[0]: _put,
-        # Sets contain no numbers. They become lists, so that their items are not hashed.
+        # Read sets as lists, so that their items are not hashed. No needed number is in a set.
         pickle.EMPTY_SET[0]: dispatch[pickle.EMPTY_LIST[0]],
         pickle.ADDITEMS[0]: dispatch[pickle.APPENDS[0]],
         pickle.FROZENSET[0]: dispatch[pickle.LIST[0]],
@@ -155,7 +155,7 @@ class _RefusedError(Exception):
 
 
 def read_bounded(path: Path, what: str) -> bytes:
-    """Read a file. Raises ValueError: the file is unreadable or too large. `what` names the format: "MANO file"."""
+    """Read a file. Raises ValueError: it is unreadable or too large. `what` names the format, e.g. "MANO file"."""
     try:
         with path.open("rb") as file:
             content = file.read(MAX_BYTES + 1)
@@ -169,14 +169,14 @@ def read_bounded(path: Path, what: str) -> bytes:
 def load_inert(content: bytes, admitted: Mapping[tuple[str, str], Maker], what: str) -> Any:
     """Return the content of a pickle: Python's numbers, text, lists and dictionaries, and `Inert` objects.
 
-    Raises ValueError: `content` is no pickle, or contains a name outside `admitted`. The error names it.
+    Raises ValueError: `content` is no pickle, or names a class or function that is not in `admitted`.
     """
     try:
         return _Reader(content, admitted).load()
     except _RefusedError as refused:
         reason = f"asks for {refused}, which a {what} does not need; the file is refused, and nothing was run"
         raise ValueError(reason) from None
-    # A file that is no pickle can raise any exception.
+    # The base class may raise any exception for a file that is no pickle.
     except Exception as error:
         reason = f"{type(error).__name__}: {error}".splitlines()[0]
         raise ValueError(f"not the pickle of a {what}: {reason[:200]}") from error

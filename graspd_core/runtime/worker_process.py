@@ -1,9 +1,9 @@
 """Run functions in a child process, because many libraries hold Python's lock during long calls and some crash.
 
 A server process calls `start_worker_process` once. After that `run_isolated` runs functions in the child. In other
-processes `run_isolated` runs them in place. The child is a bare interpreter. multiprocessing's child would import the
-user's main module again. This module imports fast, so that the child can start first. `trim_heap` returns freed memory
-to the system, for processes that run for days.
+processes `run_isolated` calls the functions directly. The child is a bare interpreter, because a child of
+multiprocessing would import the user's main module again. This module imports fast, so that the child can start before
+slow imports. `trim_heap` returns freed memory to the system, for processes that run for days.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ from multiprocessing.connection import Connection, Pipe
 from pathlib import Path
 from typing import Any, TypeVar
 
-# mallopt of glibc: its parameter for the greatest number of arenas, and that number.
+# Parameter of glibc's mallopt for the greatest number of arenas, and the number of arenas.
 _M_ARENA_MAX, _ARENAS = -8, 2
 
 
@@ -39,7 +39,7 @@ def trim_heap() -> None:
 
 
 def limit_malloc_arenas() -> None:
-    """Let all threads allocate from two arenas (glibc only). One arena per thread would keep much freed memory."""
+    """Let all threads share two memory arenas (glibc only). One arena per thread would keep much freed memory."""
     try:
         mallopt = ctypes.CDLL(None).mallopt
     except (OSError, AttributeError, TypeError):
@@ -49,10 +49,10 @@ def limit_malloc_arenas() -> None:
 
 T = TypeVar("T")
 
-# The child searches modules in the same paths as this process.
+# Program of the child. The child searches modules in the paths of this process.
 _CHILD = "import sys; sys.path[:] = {path!r}; from {module} import serve; serve({pipe}, {modules!r}, {parent})"
 
-# Interval at which a bounded call checks the child's memory [s].
+# Interval at which `bounded` checks the child's time and memory [s].
 _POLL = 0.1
 # prctl(2): the signal that a process gets when the thread that started it ends.
 _PR_SET_PDEATHSIG = 1
@@ -63,7 +63,7 @@ class WorkerProcess:
 
     The child first imports `modules`. Calls run one at a time. A dead child is replaced. Functions must be
     importable by name. Arguments, results and errors are pickled. If this process ends, the child finishes its call and
-    ends. With `killed_with_thread` (Linux) the end of the starting thread kills the child even during a call.
+    ends. With `killed_with_thread` (Linux only), the end of the starting thread kills the child, even during a call.
     """
 
     def __init__(self, *modules: str, killed_with_thread: bool = False) -> None:
@@ -74,7 +74,7 @@ class WorkerProcess:
 
     def __call__(self, work: Callable[..., T], *arguments: Any, **named: Any) -> T:
         """Run `work` in the child. Return its result or raise its error. Raises MemoryError: the child died twice."""
-        # pickle copies tensors. multiprocessing would share their memory, which is lost when a process dies.
+        # pickle copies tensors. multiprocessing would share the memory of tensors, which is lost if a process dies.
         call = pickle.dumps((work, arguments, named), pickle.HIGHEST_PROTOCOL)
         with self._lock:
             for _ in range(2):
@@ -87,12 +87,12 @@ class WorkerProcess:
                 except (EOFError, OSError):
                     self._process.wait()
                 except BaseException:
-                    # After Ctrl-C while waiting, the answer in the pipe would be taken for that of the next call.
+                    # After Ctrl-C, the answer to this call would stay in the pipe, and the next call would read it.
                     self._process.kill()
                     self._process.wait()
                     raise
             else:
-                # The function is not run in place, because it could kill this process too.
+                # Do not run the function in this process, because it could kill this process too.
                 raise MemoryError(f"{work.__name__}: the worker process died twice, perhaps for lack of memory")
         failed, answer = pickle.loads(reply)
         if failed:
@@ -143,8 +143,8 @@ class WorkerProcess:
         path = [entry for entry in sys.path if isinstance(entry, str)]
         names = {"module": __name__, "modules": self._modules, "parent": self._parent}
         program = _CHILD.format(path=path, pipe=theirs.fileno(), **names)
-        # Ctrl-C reaches every process of the terminal, but the child must end with its parent only. It starts with the
-        # signal blocked, because its imports take a second before it could ignore the signal.
+        # Ctrl-C reaches every process of the terminal, but the child must end with its parent only. Block the signal at
+        # the child's start, because the child's imports take a second before the child could ignore the signal.
         before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
         try:
             self._process = subprocess.Popen(
@@ -159,9 +159,9 @@ _child: WorkerProcess | None = None
 
 
 def start_worker_process(*modules: str) -> None:
-    """Start the child of `run_isolated`, so that its calls do not block other threads.
+    """Start the child of `run_isolated`, so that calls of `run_isolated` do not block other threads.
 
-    The child first imports `modules`. If there already is a child, do nothing.
+    The child first imports `modules`. If the child runs already, do nothing.
     """
     global _child
     if _child is None:
@@ -170,12 +170,12 @@ def start_worker_process(*modules: str) -> None:
 
 
 def run_isolated(work: Callable[..., T], *arguments: Any, **named: Any) -> T:
-    """Run `work` in the child if there is one, otherwise in this process. Return its result or raise its error."""
+    """Run `work` in the child, or in this process if there is no child. Return its result or raise its error."""
     return work(*arguments, **named) if _child is None else _child(work, *arguments, **named)
 
 
 def resident_mb(process: int) -> float:
-    """Return the resident memory of a process [MB]. It is 0 if the process has ended or there is no /proc."""
+    """Return the resident memory of a process [MB]. Return 0 if the process has ended or the system has no /proc."""
     try:
         pages = int(Path(f"/proc/{process}/statm").read_text().split()[1])
     except (OSError, IndexError):
@@ -186,16 +186,16 @@ def resident_mb(process: int) -> float:
 def serve(number: int, modules: Iterable[str] = (), parent: int = 0) -> None:
     """Import `modules`, then answer calls from the pipe with file descriptor `number` until the pipe is closed.
 
-    If `parent` is a process id, the end of that process kills this one.
+    If `parent` is a process id, the end of that process kills this process.
     """
     if parent:
         _end_with(parent)
     pipe = Connection(number)
-    # Libraries read this when they are imported. One thread is enough, because the parent uses the other cores.
+    # Libraries read this variable at import. One thread is enough, because the parent uses the other cores.
     os.environ.setdefault("OMP_NUM_THREADS", "1")
     limit_malloc_arenas()
     for name in modules:
-        # If an import fails, the calls that need the module will raise the error.
+        # Ignore a failing import. A call that needs the module will raise the error again.
         with contextlib.suppress(Exception):
             importlib.import_module(name)
     while True:
@@ -226,7 +226,7 @@ def _answer(call: bytes) -> bytes:
         work, arguments, named = pickle.loads(call)
         return pickle.dumps((False, work(*arguments, **named)), pickle.HIGHEST_PROTOCOL)
     except Exception as error:
-        # A traceback cannot be pickled, so it is added as a note.
+        # A traceback cannot be pickled, so add its text as a note.
         error.add_note("".join(traceback.format_exception(error)))
         try:
             answer = pickle.dumps((True, error))
@@ -241,5 +241,5 @@ _MODULES = ("graspd_core.perception.scene_from_views", "graspd_core.verify.robus
 
 
 def start_planning_worker() -> None:
-    """Start the child process if there is none yet. It imports the libraries of planning in the background."""
+    """Start the child process if it does not run yet. In the background, it imports the libraries of planning."""
     start_worker_process(*_MODULES)

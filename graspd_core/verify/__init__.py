@@ -1,1 +1,1 @@
-"""Trials in MuJoCo, metrics, and the verdict."""
+"""Try grasps in MuJoCo, measure metrics, and derive the verdict of each grasp."""

@@ -1,7 +1,7 @@
-"""Compute distances to a mesh and overlaps of a hand with the compiled kernel, while other Python threads run.
+"""Let the compiled kernel compute distances to a mesh, and overlaps of hand and mesh. Other threads run meanwhile.
 
-`mesh/surface_queries` and `prepared_grasp` do the same in Python, with results that are equal up to rounding. They are
-the reference in the tests, and the fallback if there is no kernel.
+Functions in `mesh/surface_queries` and `prepared_grasp` compute the same values in Python, up to rounding. Tests
+compare both. Without a compiled kernel, planning uses the Python functions.
 """
 
 from __future__ import annotations
@@ -21,15 +21,15 @@ from graspd_core.mesh.topology import cut_long_faces
 from graspd_core.optimize.kernel.builds import Bodies, Surface, kernel
 from graspd_core.types import TriangleMesh
 
-# Size of a node of the tree, in doubles. A leaf has at least two faces, so there are no more nodes than faces.
+# Size of one node of the kernel's surface tree, in doubles. The tree has fewer than two nodes per face.
 _NODE = 15
 
 
 @dataclass(frozen=True, eq=False)
 class CompiledQuery:
-    """A mesh prepared for distance queries by the kernel, safe to use from several threads.
+    """A mesh in the form that the kernel needs for distance queries. Several threads may use it at the same time.
 
-    `surface` holds the addresses of `nodes` and `triangles`, as the kernel expects them.
+    `surface` holds the addresses of the arrays `nodes` and `triangles`. The kernel reads the arrays from there.
     """
 
     library: CDLL
@@ -39,11 +39,11 @@ class CompiledQuery:
 
 
 def make_query(mesh: TriangleMesh) -> CompiledQuery | DistanceQuery:
-    """Prepare a mesh for distance queries. Without the kernel, libigl answers them."""
+    """Prepare a mesh for distance queries with the kernel. If there is no kernel, prepare it for libigl."""
     library = kernel().library
     if library is None:
         return make_distance_query(mesh)
-    # A node is as wide as its longest face, and near nodes are summed face by face.
+    # Long faces make wide tree nodes. Queries near a node visit each of its faces, which is slow. So cut long faces.
     cut = cut_long_faces(mesh, float(np.ptp(mesh.vertices, axis=0).max()) / 3)
     corners = np.ascontiguousarray(cut.vertices[cut.faces], dtype=float).reshape(-1, 9)
     nodes, triangles = np.zeros((2 * len(corners), _NODE)), np.empty_like(corners)
@@ -59,9 +59,9 @@ def signed_distance(
     order: Int[np.ndarray, "n"] | None = None,
     reach: float = np.inf,
 ) -> Float[np.ndarray, "n"]:
-    """Return the distance [m] to the nearest triangle, negative inside. Beyond `reach` [m] it is a lower bound.
+    """Return each point's distance [m] to the mesh, negative inside. If it exceeds `reach` [m], return a lower bound.
 
-    The query is faster with an `order`: int32 indices of the points, sorted so that neighbours follow each other.
+    Pass `order` for a faster query: the int32 indices of the points, with near points next to each other.
     """
     if isinstance(query, DistanceQuery):
         return python_distance(query, points, reach=reach)
@@ -77,8 +77,8 @@ class CompiledHand:
     """The collision primitives of a hand in the kernel's layout.
 
     Attributes:
-        bodies: counts and addresses of `arrays`, as the kernel expects them.
-        arrays: numbers that describe the primitives.
+        bodies: number of primitives, number of links, and the memory addresses at which the kernel reads `arrays`.
+        arrays: poses, bounding spheres, sizes, kinds, links and hull planes of the primitives.
         apart: 1 for each pair of links that must not touch, else 0.
     """
 
@@ -123,7 +123,7 @@ def _ball(solid: Primitive) -> tuple[float, ...]:
     return (0.0, 0.0, 0.0, reach)
 
 
-# Poses of links, as rows of 3 x 4 matrices [m].
+# Link poses. Each row is a flattened 3 x 4 matrix: rotation and translation [m].
 _Links = Float[np.ndarray, "links 12"]
 
 
@@ -136,8 +136,8 @@ def depth_in_hand(
 ) -> float:
     """Return the greatest depth of any point inside the hand's primitives [m], 0 if no point is inside.
 
-    `links` are link poses in the frame of `points`. If `link_of` gives each point's link, the primitives of this link
-    and of its adjacent links are skipped.
+    `links` are link poses in the frame of `points`. For points on the hand, `link_of` holds the link index of each
+    point. Then a point's own link and adjacent links do not count.
     """
     compiled, depth, points = compiled_hand(hand), np.empty(1), _doubles(points)
     of = None if link_of is None else np.ascontiguousarray(link_of, dtype=np.int32)
@@ -150,7 +150,7 @@ def depth_in_hand(
 
 
 def shared_volume(query: CompiledQuery, hand: HandModel, links: _Links, cell: float) -> float:
-    """Return the volume of a hand inside a mesh [m³], summed over grid cells of width `cell` [m]."""
+    """Return the volume of the hand's part inside a mesh [m³], summed over grid cells of width `cell` [m]."""
     volume = np.empty(1)
     arguments = links.ctypes.data, byref(query.surface), cell, volume.ctypes.data
     if query.library.graspd_shared_volume(byref(compiled_hand(hand).bodies), *arguments):

@@ -1,11 +1,11 @@
-"""Early stop of a hold: end it once the object's drift cannot reach a limit in the remaining time.
+"""End a hold early, once the object drifts too slowly to reach a limit. In a hold, the closed hand keeps the object.
 
-Up to the stop, a trial has the same states as a full one. It can pass where a full trial would fail, but it never fails
-where a full trial would pass. A slowly sliding object may reach an edge and slip suddenly, so the drift is multiplied
-by a safety factor. Over a few steps, contact jitter is larger than the drift. The drift is therefore measured over
-windows of several lengths. The hold ends if the drift of any one window is small enough. At low friction or with few
-fingers, the object must also be at rest. The rules come from pulls with four hands on eleven shapes and ten scans.
-`graspd bench early` measures their effect.
+Up to the stop, a shortened trial has the same states as a full trial. A grasp may pass the shortened trial although it
+would fail the full trial. The opposite never happens. A slowly sliding object may reach an edge and slip suddenly, so
+the drift is multiplied by a safety factor. Over a few steps, contact jitter is larger than the drift. The drift is
+therefore measured over windows of several lengths. The hold ends if the drift of any one window is small enough. At low
+friction or with few fingers, the object must also be at rest. The rules were chosen from simulated pulls with four
+hands, on eleven shapes and ten scans. `graspd bench early` measures how many verdicts the early stop changes.
 """
 
 from __future__ import annotations
@@ -16,9 +16,9 @@ from dataclasses import dataclass, replace
 
 from graspd_core.verify.world import Protocol
 
-# Steps between two checks for an early stop. This divides `CHECK_EVERY` and every number of steps in a rule.
+# Steps between two checks for an early stop. `CHECK_EVERY` and all step numbers in a `StopRule` are its multiples.
 LOOK_EVERY = 5
-# Steps between two checks of the limits.
+# Steps between two checks of the limits on travel and rotation.
 CHECK_EVERY = 25
 
 
@@ -30,8 +30,8 @@ class StopRule:
         first: number of steps before the first check.
         windows: window lengths for the drift, in steps. A hold stops if the drift of one window is small enough.
         safety: factor by which the measured drift is multiplied when it is extrapolated to the end.
-        speed: speed below which the object is at rest [m/s]. Infinite if it need not be at rest.
-        spin: angular speed below which the object is at rest [rad/s]. Infinite if it need not be at rest.
+        speed: speed below which the object is at rest [m/s]. Infinite if the object need not be at rest.
+        spin: angular speed below which the object is at rest [rad/s]. Infinite if the object need not be at rest.
     """
 
     first: int
@@ -42,20 +42,20 @@ class StopRule:
 
 
 FIRM = StopRule(first=10, windows=(5, 10, 20, 40), safety=8.0)
-# For the pulls of a payload: a third fewer steps. Of 719 pulls at 1.03 payloads and more, 4 seemed to hold.
+# `payload` uses ROUGH to save a third of the steps. Only 4 of 719 pulls above 1.03 times the payload seemed to hold.
 ROUGH = replace(FIRM, safety=2.0)
 SLIPPERY = StopRule(first=10, windows=(5, 10, 20, 40), safety=16.0)
-# Objects may begin to slip after 1.9 s. An object that creeps at 1 mm/s until then may slip suddenly.
+# At low friction, an object may creep at 1 mm/s and suddenly slip after 1.9 s. So CREEPING requires an object at rest.
 CREEPING = StopRule(first=100, windows=(50,), safety=16.0, speed=0.0005, spin=math.radians(0.5))
-# Between fewer fingertips, an object may begin to turn about the line that joins them, just as late.
+# Between one or two fingertips, an object may begin to turn after 1.9 s. Hands with fewer fingers use CREEPING.
 _FEWEST_FINGERS = 3
-# Rule, least impedance ratio and least sliding friction. Below all of them CREEPING applies. Measured at 0.6 and 0.3.
+# Rows: stop rule, and least impedance ratio and sliding friction for it, measured at 0.6 and 0.3. Else CREEPING.
 _RULES = ((FIRM, 10.0, 0.6), (SLIPPERY, 10.0, 0.3))
 
 
 @dataclass(frozen=True)
 class ObjectState:
-    """Pose and speed of the object during a trial, world frame.
+    """Pose and speed of the object at one time of a trial, world frame.
 
     Attributes:
         center: centre of mass [m].
@@ -73,7 +73,7 @@ class ObjectState:
 def stop_rule(protocol: Protocol, fingers: int, *, rough: bool = False) -> StopRule | None:
     """Return the stop rule for a protocol and a number of fingers. Return None if the protocol forbids early stops.
 
-    If `rough` is set, the rule for high friction is `ROUGH`, which stops sooner but may miss a late slip.
+    With `rough`, `ROUGH` replaces `FIRM`, the rule for high friction. `ROUGH` stops sooner but may miss a late slip.
     """
     if protocol.full_length:
         return None
@@ -87,7 +87,7 @@ def stop_rule(protocol: Protocol, fingers: int, *, rough: bool = False) -> StopR
 def answer_known(
     rule: StopRule, protocol: Protocol, states: Sequence[ObjectState], moved: tuple[float, float], left: int
 ) -> bool:
-    """Return True if a hold can stop, because the object will stay within its limits. False if a value is not finite.
+    """Return True if a hold can stop, as the object will stay within the limits. Return False for non-finite states.
 
     Args:
         rule: stop rule of the hold.
@@ -111,6 +111,6 @@ def _stays(protocol: Protocol, moved: tuple[float, float], drift: tuple[float, f
 
 
 def drifted(before: ObjectState, now: ObjectState) -> tuple[float, float]:
-    """Return travel [m] and rotation [rad] from one state to another."""
+    """Return the object's travel [m] and rotation [rad] from one state to another."""
     cosine = abs(sum(a * b for a, b in zip(before.quaternion_wxyz, now.quaternion_wxyz, strict=True)))
     return math.dist(before.center, now.center), 2 * math.acos(min(1.0, cosine))

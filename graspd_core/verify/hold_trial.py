@@ -1,8 +1,8 @@
-"""The hold trial: close the hand on a free object, pull the object along ±x, ±y, ±z in turn, and check that it stays.
+"""Run the hold trial: close the hand on a free object, pull along ±x, ±y, ±z in turn, check that the object stays.
 
-The trial re-implements DexGraspBench's floating protocol from its parameters. Travel and rotation of the object are
-measured from its pose at the start of the trial, so they include motion while the hand closes. A pull may stop early
-(`early_stop`), unless the protocol asks for the full length.
+The trial re-implements DexGraspBench's floating protocol from the protocol's parameters. Travel and rotation of the
+object are measured from the object's pose at the start of the trial. So they include motion while the hand closes. A
+pull may stop early (`early_stop`). If the protocol asks for the full length, no pull stops early.
 
 The noisy hold trial repeats the hold trial with a displaced hand, to simulate errors of the object's estimated pose.
 """
@@ -29,19 +29,19 @@ from graspd_core.verify.world import Protocol, World, advance, trial_data
 
 
 DIRECTIONS = np.concatenate([np.eye(3), -np.eye(3)])
-# Reason of a trial that its stop hook ended.
+# Reason of a trial result if the stop hook ended the trial.
 STOPPED = "stopped before the trial ended"
 
 
 def hold_trial(
     world: World, grasp: Grasp, protocol: Protocol, *, stop: Callable[[], bool] = lambda: False
 ) -> TrialResult:
-    """Run one hold trial. It ends as soon as the object exceeds a limit.
+    """Run one hold trial. The trial ends as soon as the object exceeds a limit.
 
     Returns:
         The result, with the greatest displacement [m] of the object's centre of mass and the greatest rotation [rad]
-        until the trial ended. If the simulation diverges or runs out of contact memory, the trial fails with this
-        reason.
+        until the trial ended. If the simulation diverges or runs out of contact memory, the trial fails. The result's
+        reason then says so.
     """
     import mujoco
 
@@ -54,12 +54,12 @@ def hold_trial(
 
 
 def gave_up(error: Exception) -> str:
-    """Return, as the reason of a failed trial, a text about the MuJoCo error that ended it."""
+    """Return the reason of a trial that failed because MuJoCo raised `error`."""
     return f"the simulation gave up: {str(error).splitlines()[0]}"
 
 
 def _hold(world: World, grasp: Grasp, protocol: Protocol, worst: np.ndarray, stop: Callable[[], bool]) -> str:
-    """Return why the grasp fails, empty if it holds. Update `worst`, the greatest travel [m] and rotation [rad]."""
+    """Return why the grasp fails, "" if it holds. Update `worst`, the greatest travel [m] and rotation [rad]."""
     import mujoco
 
     with trial_data(world) as data:
@@ -90,9 +90,9 @@ def step_until_known(
     stop: Callable[[], bool],
     rough: bool = False,
 ) -> str:
-    """Simulate `steps` steps, or fewer if the stop rule knows that the object stays within the limits.
+    """Simulate `steps` steps. Stop earlier if the stop rule finds that the object will stay within the limits.
 
-    Return why the trial failed, empty if it did not. Update `worst`, the greatest travel [m] and rotation [rad]. If
+    Return why the trial failed, "" if it did not. Update `worst`, the greatest travel [m] and rotation [rad]. If
     `rough` is set, the pull stops earlier (`stop_rule`), and the limits are checked more often.
     """
     rule, done = stop_rule(protocol, world.fingers, rough=rough), 0
@@ -146,7 +146,7 @@ def close_hand(
 ) -> str:
     """Move the hand from the pregrasp over the grasp to the squeeze.
 
-    Return why the trial failed, empty if it did not. Update `worst`, the greatest travel [m] and rotation [rad].
+    Return why the trial failed, "" if it did not. Update `worst`, the greatest travel [m] and rotation [rad].
     """
     import mujoco
 
@@ -168,7 +168,7 @@ def close_hand(
 
 
 def posture_fault(world: World, data: Any, grasp: Grasp, protocol: Protocol) -> str:
-    """Return why pregrasp or grasp is invalid: the hand penetrates the object or itself. Empty if both are valid."""
+    """Return why pregrasp or grasp is invalid: the hand penetrates object or itself. Return "" if both are valid."""
     deepest = {"pregrasp": protocol.max_start_penetration, "grasp": protocol.max_grasp_penetration}
     for name, limit in deepest.items():
         place_hand(world, data, getattr(grasp, name))
@@ -180,7 +180,7 @@ def posture_fault(world: World, data: Any, grasp: Grasp, protocol: Protocol) -> 
 
 
 def start_penetration(world: World, data: Any) -> float:
-    """Return the greatest penetration of hand and object in the current state [m]."""
+    """Return the greatest penetration of the hand into the object in the simulation's current state [m]."""
     bodies = world.model.geom_bodyid
     contact = data.contact
     on_object = (bodies[contact.geom1] == world.object_body) != (bodies[contact.geom2] == world.object_body)
@@ -188,7 +188,7 @@ def start_penetration(world: World, data: Any) -> float:
 
 
 def self_fault(world: World, data: Any, protocol: Protocol) -> str:
-    """Return a text about the deepest forbidden self-penetration in the current state, empty if there is none."""
+    """Return which two links penetrate each other most in the current state. Return "" if none exceed the limit."""
     first, second, distance = data.contact.geom1, data.contact.geom2, data.contact.dist
     deep = np.flatnonzero(distance < -protocol.max_self_penetration)
     own = deep[np.isin(first[deep], world.hand_geoms) & np.isin(second[deep], world.hand_geoms)]
@@ -220,14 +220,14 @@ def place_hand(world: World, data: Any, posture: Posture) -> None:
 
 
 def set_joints(world: World, data: Any, values: np.ndarray) -> None:
-    """Set the actuated joints to `values` [rad] or [m], and the coupled joints accordingly."""
+    """Set the actuated joints to `values` [rad] or [m]. Set each coupled joint to the value set by its leader."""
     data.qpos[world.joint_addresses] = values
     for address, mimic in zip(world.coupled_addresses, world.mimics, strict=True):
         data.qpos[address] = mimic.multiplier * values[mimic.joint] + mimic.offset
 
 
 def _move(world: World, data: Any, start: Posture, end: Posture, protocol: Protocol, worst: np.ndarray) -> str:
-    """Move the hand's targets linearly from start to end. Return why the trial failed, empty if it did not."""
+    """Move the hand's targets linearly from start to end. Return why the trial failed, "" if it did not."""
     steps = round(protocol.stage_time / protocol.timestep)
     for step, posture in enumerate(straight_path(start, end, np.arange(1, steps + 1) / steps), 1):
         set_targets(data, posture)
@@ -259,7 +259,7 @@ def set_targets(data: Any, posture: Posture) -> None:
 
 
 def diverged(data: Any) -> bool:
-    """Return True if MuJoCo warned of a bad state. Its other warnings, such as a full contact buffer, are harmless."""
+    """Return True if MuJoCo warned of a bad state. Other MuJoCo warnings, e.g. a full contact buffer, are harmless."""
     import mujoco
 
     bad = (mujoco.mjtWarning.mjWARN_BADQPOS, mujoco.mjtWarning.mjWARN_BADQVEL, mujoco.mjtWarning.mjWARN_BADQACC)
@@ -267,7 +267,7 @@ def diverged(data: Any) -> bool:
 
 
 def breach(world: World, data: Any, protocol: Protocol, worst: np.ndarray) -> str:
-    """Update `worst`, the greatest travel [m] and rotation [rad]. Return which limit is exceeded, empty if none is."""
+    """Update `worst`, the greatest travel [m] and rotation [rad]. Return which limit is exceeded, "" if none is."""
     travel, turn = moved(world, object_state(world, data))
     if diverged(data) or not np.isfinite(data.qpos[world.object_address : world.object_address + 7]).all():
         worst[:] = np.inf
@@ -277,7 +277,7 @@ def breach(world: World, data: Any, protocol: Protocol, worst: np.ndarray) -> st
 
 
 def broken_limit(protocol: Protocol, travel: float, turn: float) -> str:
-    """Return as text which limit a travel [m] or a rotation [rad] exceeds, empty if none."""
+    """Return a text about the limit that the travel [m] or the rotation [rad] exceeds, "" if both are within limits."""
     if travel > protocol.max_displacement:
         return f"the object moved {travel * 100:.1f} cm"
     if turn > protocol.max_rotation:
@@ -286,15 +286,15 @@ def broken_limit(protocol: Protocol, travel: float, turn: float) -> str:
 
 
 def out_of_place(protocol: Protocol) -> Protocol:
-    """Return the protocol for a displaced or altered object, without a limit on penetration at the grasp."""
+    """Return the protocol without limit on penetration at the grasp, for trials of displaced hands and other shapes."""
     return replace(protocol, max_grasp_penetration=math.inf)
 
 
-# Number of pose errors per noisy trial.
+# Number of pose errors, each with one hold trial, in the noisy hold trial.
 TRIALS = 8
-# Rotation and offset [m] of the hand.
+# Pose error: rotation and offset [m] of the hand.
 PoseError = tuple[Float[np.ndarray, "3 3"], Float[np.ndarray, "3"]]
-# Greatest pose errors, drawn uniformly: along each axis [m], and about a random axis through the centre of mass [rad].
+# Greatest offset along each axis [m] and greatest rotation about a random axis [rad]. Errors are drawn uniformly.
 OFFSET, TURN = 0.005, float(np.deg2rad(5.0))
 
 
@@ -308,8 +308,8 @@ def noisy_share(
 ) -> float | None:
     """Return the fraction of hold trials that the grasp passes, with one trial per pose error.
 
-    Each error displaces pregrasp, grasp and squeeze alike, as a wrong estimate of the object's pose would. A pregrasp
-    that penetrates the object too deeply counts as not held. Return None if `stop` ended a trial or `errors` is empty.
+    Each error displaces pregrasp, grasp and squeeze alike, as a wrong estimate of the object's pose would. A trial
+    fails if the pregrasp penetrates the object too deeply. Return None if `stop` ended a trial or `errors` is empty.
     """
     held, protocol = 0, out_of_place(protocol)
     for error in errors:
@@ -320,13 +320,13 @@ def noisy_share(
 
 
 def pose_errors(seed: int | Sequence[int], count: int) -> list[PoseError]:
-    """Return `count` random pose errors, the same for the same seed."""
+    """Return `count` random pose errors. Equal seeds give equal errors."""
     rng = np.random.default_rng(seed)
     return [pose_error(rng) for _ in range(count)]
 
 
 def pose_error(rng: np.random.Generator) -> PoseError:
-    """Draw a random rotation and a random offset [m]."""
+    """Draw one random pose error: a rotation up to 5° (`TURN`), an offset up to 5 mm (`OFFSET`) along each axis."""
     axis = rng.normal(size=3)
     angle = torch.tensor(rng.uniform(-TURN, TURN), dtype=torch.float64)
     rotation = rotation_from_axis_angle(torch.as_tensor(axis / np.linalg.norm(axis)), angle).numpy()

@@ -1,11 +1,11 @@
-"""The lift trial: approach an object on its support, close the hand, lift the object, and hold it.
+"""Run the lift trial: approach an object on its support, close the hand, lift the object, and hold the object.
 
-The trial first checks whether the commanded postures, from the retreat over the pregrasp to the grasp, penetrate the
-support or a neighbour. It uses MuJoCo's distances, because a mocap base passes through fixed bodies. Then it simulates
-under gravity and checks whether the object rises with the hand and stays in it.
-
-The lift is simulated in the hand's frame. The base stands still, support and neighbours move down, and inertial forces
-act on the free bodies. MuJoCo gives mocap bodies no velocity, so a rising base would not carry the object by friction.
+The hand starts at the retreat, 10 cm before the pregrasp, and moves over the pregrasp to the grasp. First, MuJoCo's
+distances show whether these commanded postures penetrate the support or a neighbour. The simulation cannot show this,
+because a mocap base passes through fixed bodies. Then the trial simulates under gravity, and checks that the object
+rises with the hand and stays in the hand. The lift is simulated in the hand's frame: the base stands still, support and
+neighbours move down, and an inertial force acts on the object. MuJoCo gives mocap bodies no velocity, so a rising base
+would not carry the object by friction.
 """
 
 from __future__ import annotations
@@ -40,7 +40,7 @@ from graspd_core.verify.world import Protocol, World, advance, trial_data
 
 
 _COMING, _CLOSING, _SQUEEZING, _LIFTING = "while approaching", "while closing", "while squeezing", "while lifting"
-# Fractions of each path at which the hand's commanded postures are checked against the obstacles.
+# Fractions of each path at which the hand's commanded postures are checked for collisions. The path's end is added.
 _SHARES = (0.0, 0.25, 0.5, 0.75)
 
 
@@ -49,8 +49,8 @@ class LiftSettings:
     """Settings of a lift trial, in addition to the physics and limits of `world.Protocol`.
 
     Attributes:
-        retreat: distance of the start pose behind the pregrasp, along the hand's approach [m].
-        approach_time: duration from the start pose to the pregrasp [s].
+        retreat: distance from the pregrasp back to the start pose, against the hand's approach direction [m].
+        approach_time: duration of the motion from the start pose to the pregrasp [s].
         lift_height: height of the lift [m].
         lift_time: duration of the lift [s].
         hold_time: duration of the hold after the lift [s].
@@ -74,11 +74,11 @@ def lift_trial(
     settings: LiftSettings = LiftSettings(),
     stop: Callable[[], bool] = lambda: False,
 ) -> TrialResult:
-    """Run one lift trial in a world built with a support or neighbours. It ends as soon as the object exceeds a limit.
+    """Run one lift trial in a world with a support or neighbours. The trial ends once the object exceeds a limit.
 
-    The object is fixed until the hand first touches it, because it may fall over on a badly reconstructed bottom. Then
-    it is free. In the frame that rises with the hand, the object must always stay within the protocol's limits (5 cm,
-    15°) of its start. Without a support there is no gravity, and the hand retreats with the object along the approach.
+    The object is fixed until the first touch, so that it cannot fall over on a badly reconstructed bottom. In the
+    rising hand's frame, the object must stay within the protocol's limits (5 cm, 15°) of its start pose. Without a
+    support there is no gravity. Then the hand moves back against the approach direction instead of up.
     """
     import mujoco
 
@@ -117,7 +117,7 @@ def _raise(
     worst: np.ndarray,
     stop: Callable[[], bool],
 ) -> str:
-    """Approach, close, squeeze and lift. Return why the trial failed, empty if it did not. Update `worst`."""
+    """Approach, close, squeeze, lift. Return why the trial failed, "" if it did not. Update `worst` (see `breach`)."""
     away, touched = (begin.position - grasp.pregrasp.position) / settings.retreat, False
     stages = (
         (_COMING, begin, grasp.pregrasp, settings.approach_time),
@@ -168,7 +168,7 @@ def _sink(world: World, data: Any, up: Float[np.ndarray, "3"], a: float, setting
 
 
 def reach_through(world: World, data: Any, postures: tuple[Posture, ...], limit: float) -> str:
-    """Return a text about the deepest penetration of an obstacle on the straight path, empty if at most `limit` [m]."""
+    """Return where the hand is deepest in an obstacle on the straight path. Return "" if at most `limit` [m] deep."""
     import mujoco
 
     worst, reason = 0.0, ""

@@ -1,6 +1,6 @@
-"""Limits of a grasp: the greatest mass that it holds at the object's friction, and the least friction at its mass.
+"""Find a grasp's limits: the greatest mass at the object's friction, and the least friction at the object's mass.
 
-Both are found by bisection over hold trials with early stop (`early_stop`).
+Bisection over hold trials finds both limits. The trials may stop early (`early_stop`).
 """
 
 from __future__ import annotations
@@ -21,14 +21,14 @@ from graspd_core.verify.world import Protocol, World, advance, altered, at_frict
 
 # Range of the payload search [kg].
 LEAST_PAYLOAD, MOST_PAYLOAD = 0.01, 16.0
-# Smallest tried friction, as a fraction of the protocol's.
+# Smallest friction that `least_friction` tries, as a fraction of the protocol's friction.
 _LEAST_SHARE = 0.02
-# The bisections end when the bounds differ by less than this factor.
+# A bisection ends when its upper bound is at most this factor times its lower bound.
 FINENESS = 1.1
-# Estimate of a payload: steps in which the pull doubles, steps over which the hand's force is averaged, and share of
-# this force that resists a sudden pull. Most estimates are within a factor of 2.
+# Numbers for the estimate of a payload: steps in which the pull doubles, steps over which the hand's force is averaged,
+# and the fraction of this force that also resists a sudden pull. Most estimates are within a factor of 2.
 _DOUBLING, _WINDOW, _SHARE = 2, 8, 0.5
-# Factor between the masses that are tried from the estimate on.
+# Greatest factor between two masses that the payload search tries in turn, beginning at the estimate.
 _STRIDE = 1.2
 
 
@@ -44,8 +44,8 @@ def payload(
     """Return the payload [kg]: the greatest mass at which the grasp withstands every pull of the protocol.
 
     The result is 0 if the grasp does not hold the mass `least` [kg]. The hand closes once, with the object's own mass.
-    If a hold trial has already closed the hand, its state is reused. Each pull starts from this state, with the force
-    for the tried mass. Set `held` if a hold trial has already passed at `least`.
+    If a hold trial has already closed the hand, the state of that trial is reused. Each pull starts from this state,
+    with a force proportional to the tried mass. Set `held` if the grasp has already passed a hold trial at `least`.
     """
     import mujoco
 
@@ -64,14 +64,14 @@ def payload(
             def holds(direction: np.ndarray, mass: float) -> bool:
                 mujoco.mj_setState(world.model, data, closed, kind)
                 data.xfrc_applied[world.object_body, :3] = protocol.pull * mass * direction
-                # An object that is heavier than the tried mass drifts too slowly for the rough rule.
+                # The object keeps its own mass. If this mass exceeds the tried one, it drifts too slowly for `rough`.
                 return not step_until_known(world, data, protocol, np.zeros(2), steps, stop=stop, rough=held)
 
             pulls = []
             for direction in DIRECTIONS[list(protocol.pulls)]:
                 mujoco.mj_setState(world.model, data, closed, kind)
                 pulls.append((_estimated(world, data, protocol, direction, least), direction))
-            # The weakest direction comes first. Search again only in a direction that is weaker than all earlier ones.
+            # Start with the direction of the lowest estimate. In the others, search only if `most` is not held there.
             for estimate, direction in sorted(pulls, key=lambda pull: pull[0]):
                 resists = partial(holds, direction)
                 if not held and not resists(least):
@@ -84,7 +84,7 @@ def payload(
 
 
 def least_friction(world: World, grasp: Grasp, protocol: Protocol, *, stop: StopHook = lambda: False) -> float:
-    """Return the least sliding friction, at most the protocol's, at which the grasp passes the hold trial."""
+    """Return the least sliding friction at which the grasp passes the hold trial. It is not above the protocol's."""
 
     def holds(fraction: float) -> bool:
         slippery = at_friction(protocol, Protocol.friction[0] / fraction)
@@ -94,7 +94,7 @@ def least_friction(world: World, grasp: Grasp, protocol: Protocol, *, stop: Stop
 
 
 def _estimated(world: World, data: Any, protocol: Protocol, direction: np.ndarray, least: float) -> float:
-    """Pull the object along `direction` ever harder until the hand loses it. Return the estimated payload [kg]."""
+    """Estimate the payload [kg]: pull ever harder along `direction`, from 2 · `least` [kg] on, until the hand fails."""
     force, resisted = slice(world.object_velocity, world.object_velocity + 3), list[float]()
     for step in range(max(math.ceil(_DOUBLING * math.log2(MOST_PAYLOAD / least)), _WINDOW)):
         data.xfrc_applied[world.object_body, :3] = 2 * protocol.pull * least * 2 ** (step / _DOUBLING) * direction
@@ -107,9 +107,9 @@ def _estimated(world: World, data: Any, protocol: Protocol, direction: np.ndarra
 
 
 def _greatest(holds: Callable[[float], bool], low: float, high: float, start: float | None = None) -> float:
-    """Return by bisection the greatest value that holds. `low` must hold and `high` must not.
+    """Find by bisection the greatest value that `holds` accepts. It must accept `low` and refuse `high`.
 
-    If `start` is given, the search moves away from it by at most a factor of `_STRIDE` at a time.
+    If `start` is given, the search begins there. Successive tried values then differ at most by the factor `_STRIDE`.
     """
     middle, stride = (math.sqrt(low * high), math.inf) if start is None else (start, _STRIDE)
     while high > FINENESS * low:

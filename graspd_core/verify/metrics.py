@@ -1,7 +1,7 @@
-"""Registry of grasp metrics. `measure`, files, messages and tables use its rows.
+"""Define the grasp metrics in a registry, and measure them. Files, messages and tables take names and units from it.
 
-The metrics are static and independent of the frame. docs/metrics.md defines them, and a test compares that page with
-the rows. `distinct` removes near-duplicate grasps.
+The metrics are static and do not depend on the choice of frame. docs/metrics.md defines them, and a test compares that
+page with the registry. `distinct` removes near-duplicate grasps.
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ class Metric:
         name: key of `GraspMetrics`.
         unit: unit in files and tables. Empty if the metric has no unit.
         scale: factor from SI units to `unit`.
-        measure: function that returns the value in SI units. None if another step of planning measures it.
+        measure: function that returns the value in SI units. None if another step of planning measures the metric.
         description: definition for docs/metrics.md.
         digits: number of decimals in tables.
     """
@@ -77,12 +77,12 @@ _ROWS = (
     ),
     Metric(
         "contact_depth", "mm", 1e3, lambda g: contact_depth(g.context, g.posture),
-        "depth of the deepest contact in MuJoCo, with the object's convex parts; measured where a trial is run",
+        "depth of the deepest contact of the hand with the object's convex parts in MuJoCo. Measured if a trial is run",
     ),
     Metric(
         "self_penetration", "mm", 1e3, lambda g: self_penetration(g.context, g.placed),
-        "greatest depth of a sample inside a link not adjacent to the sample's link; links are adjacent when a joint "
-        "joins them, or when they overlap by design",
+        "greatest depth of a sample inside a link not adjacent to the sample's link. Links are adjacent if a joint "
+        "joins them, or if they overlap by design",
     ),
     Metric(
         "contact_area", "cm²", 1e4, lambda g: contact_area(g.placed),
@@ -98,12 +98,12 @@ _ROWS = (
     ),
     Metric(
         "intersection_volume", "cm³", 1e6, lambda g: g.shared_volume,
-        "IV: volume shared by hand and object, in 2 mm cells of a lattice fixed in the hand's base frame; an octree "
-        "finds them, so that no overlap is too small to be visited, and a cell counts by the thickness of the overlap",
+        "IV: volume shared by hand and object, summed over 2 mm grid cells in the hand's base frame. An octree finds "
+        "the cells, so even the smallest overlap counts. Each cell counts by the thickness of the overlap",
     ),
     Metric(
         "contact_per_volume", "1/cm", 1e-2, _contact_per_volume,
-        "CA/IV: contact area within 2 mm over intersection volume; none where nothing is shared", 0,
+        "CA/IV: contact area within 2 mm divided by intersection volume. None if that volume is 0", 0,
     ),
     Metric(
         "contact_links", "", 1.0, lambda g: contact_links(g.placed),
@@ -112,25 +112,25 @@ _ROWS = (
     Metric(
         "epsilon", "", 1.0, lambda g: g.wrench_hull.epsilon,
         "ε: radius of the largest ball about the origin in the convex hull of contact wrenches (Ferrari and Canny, "
-        "ICRA 1992); 0 when the origin is outside", 3,
+        "ICRA 1992). 0 if the origin is outside", 3,
     ),
-    Metric("volume", "", 1.0, lambda g: g.wrench_hull.volume, "volume of that hull", 3),
+    Metric("volume", "", 1.0, lambda g: g.wrench_hull.volume, "volume of the convex hull of contact wrenches", 3),
     Metric(
         "payload", "kg", 1.0, None,
-        "greatest mass at which the grasp resists the pulls of the hold trial, by bisection to a tenth, at its "
-        "friction; only for grasps that passed that trial",
+        "greatest mass at which the grasp resists the pulls of the hold trial, at the trial's friction. Found by "
+        "bisection to 10 %. Measured only for verified grasps",
     ),
     Metric(
         "least_friction", "", 1.0, None,
-        "least sliding friction at which the grasp passes the hold trial; measured with `robust.friction` only",
+        "least sliding friction at which the grasp passes the hold trial. Measured only with `robust.friction`",
     ),
     Metric(
         "robustness", "", 1.0, None,
-        "share of noisy trials (below) that a verified grasp held; measured with `robust.rank` only",
+        "fraction of noisy hold trials that a verified grasp passes. Measured only with `robust.rank`",
     ),
 )  # fmt: skip
 METRICS: dict[str, Metric] = {row.name: row for row in _ROWS}
-"""The metrics by name. `measure` measures every row."""
+"""The metrics by name. `measure` measures each metric that has a function `Metric.measure`."""
 
 
 def measure(context: MetricsContext, posture: Posture, *, max_contacts: int = MAX_CONTACTS) -> GraspMetrics:
@@ -148,11 +148,11 @@ APART, TURNED = 0.02, float(np.deg2rad(20.0))
 
 
 def distinct(grasps: Sequence[Grasp], hand: HandModel) -> tuple[Grasp, ...]:
-    """Return the grasps in order, without near-duplicates of an earlier grasp.
+    """Return the grasps in order, but leave out each near-duplicate of an earlier grasp.
 
-    A near-duplicate has its palm centre within 20 mm and its base rotation within 20° of the other grasp's, in the
-    object frame. Symmetry of the object is ignored. Grasping a ball from the left and from the right counts as two
-    grasps, because a robot may reach only one side.
+    The palm centres of near-duplicates are less than 20 mm apart. Their base rotations differ by less than 20°.
+    Symmetry of the object is ignored. Grasping a ball from the left or the right gives two grasps, because a robot may
+    reach only one side.
     """
     kept: list[Grasp] = []
     palms, turns = np.zeros((0, 3)), np.zeros((0, 3, 3))

@@ -1,8 +1,8 @@
-"""Measurements of one grasp. Quantities that several metrics need are computed once.
+"""Measure one grasp. Quantities that several metrics need are computed once.
 
-Dense samples of the hand's surface give its contacts, its penetration of the object and its self-penetration. The
-optimiser never sees these samples. The wrench space of unit contact forces gives the quality measures of Ferrari and
-Canny (ICRA 1992).
+Dense samples of the hand's surface give the hand's contacts, its penetration of the object and its self-penetration.
+The optimiser never sees these samples. The wrenches of unit contact forces give the grasp quality of Ferrari and Canny
+(ICRA 1992).
 """
 
 from __future__ import annotations
@@ -44,10 +44,10 @@ from graspd_core.verify.compiled_overlap import (
 from graspd_core.verify.hold_trial import place_hand, start_penetration
 from graspd_core.verify.world import World, trial_data
 
-# Candidate arrival postures: fraction of the closing motion, and distance back towards the pregrasp [m]. A candidate is
-# invalid if it penetrates by more than `_SUNK` [m], there or at the fractions `_WAY_BACK` of the path to the pregrasp.
+# Postures that `arrival` tries: fraction of the closing motion, and distance back towards the pregrasp [m]. The hand
+# may penetrate at most `_SUNK` [m], at the posture and at the fractions `_WAY_BACK` of the path to the pregrasp.
 _CLOSED, _DRAWN_BACK, _SUNK, _WAY_BACK = (0.0, 0.25, 0.5, 0.75), (0.0, 0.001, 0.002, 0.003), 1e-5, (0.5, 1.0)
-# Number of samples, and a seed that the optimiser does not use.
+# Number of surface samples of hand and object, and their seed. The optimiser uses another seed.
 _SAMPLES, _SEED = 4000, 20_000
 
 
@@ -60,7 +60,7 @@ class HandSurface:
         links: link index of each sample.
         areas: surface area that each sample represents [m²].
         kinematics: the hand's kinematics in float64.
-        order: int32 indices of the samples, sorted so that neighbours follow each other.
+        order: int32 indices of the samples, sorted so that near samples follow each other.
     """
 
     points: Float[np.ndarray, "samples 3"]
@@ -75,6 +75,7 @@ class MetricsContext:
     """Precomputed data for measuring grasps of one object by one hand (`make_metrics_context`, `metrics.measure`).
 
     Attributes:
+        query: the object's mesh, prepared for distance queries.
         points: points on the object's surface and edges [m].
         tree: `scipy.spatial.KDTree` of `points`.
         world: world of the hold trial. If it is None, the contact depth is not measured.
@@ -108,9 +109,9 @@ def hand_surface(hand: HandModel) -> HandSurface:
     return HandSurface(points, links, areas, make_kinematics(hand, "cpu", torch.float64), order)
 
 
-# A hand sample nearer than this to the object's surface is in contact [m].
+# A hand sample is in contact if it is at most this far from the object's surface, or inside the object [m].
 CONTACT_DISTANCE = 0.002
-# Samples farther than this from the object have no exact distance [m]. The widest contact is 10 mm.
+# Distances above this are not exact, to save time [m]. No metric needs more than 10 mm (`contact_area_10mm`).
 _REACH = 0.015
 
 
@@ -122,9 +123,9 @@ class PlacedHand:
         points: sample positions [m].
         links: link index of each sample.
         areas: surface area that each sample represents [m²].
-        distance: signed distance of each sample to the object [m]. Beyond 15 mm it is a lower bound.
-        rotations: `R_object_link`.
-        translations: link origins, object frame [m].
+        distance: signed distance of each sample to the object [m]. Values above 15 mm are lower bounds.
+        rotations: rotation `R_object_link` of each link.
+        translations: origin of each link in the object frame [m].
     """
 
     points: Float[np.ndarray, "samples 3"]
@@ -154,7 +155,7 @@ def placed_hand(context: MetricsContext, posture: Posture) -> PlacedHand:
 
 
 def contact_area(placed: PlacedHand, within: float = CONTACT_DISTANCE) -> float:
-    """Return the area [m²] of the hand samples at most `within` [m] inside or outside the object (up to 15 mm)."""
+    """Return the area [m²] of hand samples at most `within` [m] from the object's surface. `within` is up to 0.015."""
     return float(placed.areas[np.abs(placed.distance) <= within].sum())
 
 
@@ -164,11 +165,11 @@ def contact_links(placed: PlacedHand, within: float = CONTACT_DISTANCE) -> int:
 
 
 def touching(placed: PlacedHand, within: float = CONTACT_DISTANCE) -> Bool[np.ndarray, "samples"]:
-    """Return which samples lie within `within` [m] of the object or inside it."""
+    """Return for each sample whether it is at most `within` [m] from the object, or inside the object."""
     return placed.distance <= within
 
 
-# Cells are halved until they are 2 mm wide: 16, 8, 4, 2 mm. Cell sizes and positions are integers, in units of 2 mm.
+# Width of the octree's smallest cells [m], and number of halvings: 16, 8, 4, 2 mm. The code counts in units of 2 mm.
 _CELL, _HALVINGS = 0.002, 3
 # Half the diagonal of a unit cube, with a margin for rounding.
 _HALF_DIAGONAL = 0.5 * np.sqrt(3.0) * 1.001
@@ -189,7 +190,7 @@ def penetration(context: MetricsContext, placed: PlacedHand) -> float:
 
 @lru_cache(maxsize=8)
 def _link_balls(hand: HandModel) -> tuple[Float[np.ndarray, "links 3"], Float[np.ndarray, "links"]]:
-    """Return centers, in link frames, and radii of each link's bounding sphere [m]. Both are 0 without primitives."""
+    """Return centre (link frame) and radius of each link's bounding sphere [m]. Links without primitives have zeros."""
     centers, radii = np.zeros((hand.num_links, 3)), np.zeros(hand.num_links)
     for link, primitives in enumerate(hand.primitives_of):
         if primitives:
@@ -200,11 +201,11 @@ def _link_balls(hand: HandModel) -> tuple[Float[np.ndarray, "links 3"], Float[np
 
 
 def arrival(context: MetricsContext, grasp: Grasp, support: Plane | None) -> Posture | None:
-    """Return a posture at the grasp with fingers as open as possible and a collision-free path from the pregrasp.
+    """Return a posture near the grasp with open fingers and a collision-free path from the pregrasp.
 
-    Some planners close the fingers only at the grasp. Their open fingers may penetrate the object there. To avoid this,
-    the function closes the fingers in part, moves the hand back by at most 3 mm, or both. Return None if
-    no such posture is free of collisions with object and support.
+    Some planners move the hand with open fingers to the grasp and close the fingers there. Open fingers may penetrate
+    the object there. So this function closes the fingers in part, or moves the hand back by at most 3 mm, or both. It
+    prefers a small move, then open fingers. Return None if every tried posture collides with the object or the support.
     """
     open_joints, closing = grasp.pregrasp.joint_positions, grasp.grasp.joint_positions - grasp.pregrasp.joint_positions
     back = grasp.pregrasp.position - grasp.grasp.position
@@ -257,10 +258,10 @@ def self_penetration(context: MetricsContext, placed: PlacedHand) -> float:
 
 
 def intersection_volume(context: MetricsContext, placed: PlacedHand) -> float:
-    """Return the volume of the hand inside the object [m³], summed over 2 mm grid cells in the base frame.
+    """Return the volume of the hand's part inside the object [m³], summed over 2 mm grid cells in the base frame.
 
     An octree of each primitive finds the cells, so even small and thin overlaps are found. In each cell, hand and
-    object are treated as two facing half-spaces, which is exact for flat overlaps of any thickness. Volume that several
+    object count as two facing half-spaces. This is exact for flat overlaps of any thickness. Volume that several
     primitives share is counted once.
     """
     if isinstance(context.query, CompiledQuery):
@@ -276,7 +277,7 @@ def intersection_volume(context: MetricsContext, placed: PlacedHand) -> float:
         depth = -_solid_distance(solids, which, centers)
         kept = depth > -half_diagonal
         cells, which, centers, depth = cells[kept], which[kept], centers[kept], depth[kept]
-        # Overlapping primitives share cells.
+        # Overlapping primitives share cells. Count each cell once.
         _, first, same = np.unique(packed_rows(cells), return_index=True, return_inverse=True)
         if size == 1:
             deepest = np.full(len(first), -np.inf)
@@ -298,9 +299,9 @@ def _near_box(query: DistanceQuery, points: Float[np.ndarray, "n 3"], margin: fl
 
 @dataclass(frozen=True, eq=False)
 class _PlacedSolids:
-    """A hand's primitives at its grasp, hulls last, with their poses in the object frame [m].
+    """A hand's primitives at a grasp, hulls last, with their poses in the object frame [m].
 
-    `smooth` are those that are not hulls, for distance queries.
+    `smooth` holds the primitives that are not hulls, for distance queries.
     """
 
     primitives: tuple[Primitive, ...]
@@ -320,7 +321,7 @@ def _placed_solids(hand: HandModel, placed: PlacedHand) -> _PlacedSolids:
 def _root_cells(
     solids: _PlacedSolids, placed: PlacedHand
 ) -> tuple[Int[np.ndarray, "cells 3"], Int[np.ndarray, "cells"]]:
-    """Return the coarsest octree cells of all primitives, base frame, and each cell's primitive index, ascending."""
+    """Return the coarsest octree cells about each primitive, base frame, and each cell's primitive index, ascending."""
     size, base, cells = 2**_HALVINGS, placed.rotations[0], [np.zeros((0, 3), dtype=np.int64)]
     for primitive in solids.primitives:
         low, high = bounds(primitive)
@@ -335,7 +336,7 @@ def _root_cells(
 def _solid_distance(
     solids: _PlacedSolids, which: Int[np.ndarray, "n"], points: Float[np.ndarray, "n 3"]
 ) -> Float[np.ndarray, "n"]:
-    """Return each point's signed distance [m] to primitive `which`, a lower bound for hulls. `which` must ascend."""
+    """Return each point's signed distance [m] to its primitive, a lower bound for hulls. The indices `which` ascend."""
     local = np.einsum("nji,nj->ni", solids.rotations[which], points - solids.translations[which])
     hulls = int(np.searchsorted(which, len(solids.smooth.link)))
     smooth = local_distance(solids.smooth, torch.as_tensor(local[:hulls]), torch.as_tensor(which[:hulls])).numpy()
@@ -355,14 +356,13 @@ def _lattice(low: Int[np.ndarray, "3"], high: Int[np.ndarray, "3"]) -> Int[np.nd
 
 
 CONE_EDGES = 8
-# Wrenches span no volume if their smallest extent is below this fraction of their largest.
+# Wrenches span no volume if their smallest extent is at most this fraction of their largest extent.
 _FLAT = 1e-9
 
-
-# Wrenches are perturbed by up to the first number, so that at most six lie on a facet. If the plane error of a compiled
-# hull exceeds the second number, Qhull builds the hull again.
+# Wrenches are perturbed by up to `_JOGGLE`, so that at most six wrenches lie on a facet. If the plane error of a
+# compiled hull is `_PLANE_ERROR` or more, Qhull builds the hull again.
 _JOGGLE, _PLANE_ERROR = 1e-9, 1e-9
-# The compiled hull stores wrench indices as bytes.
+# Greatest number of wrenches in a compiled hull, because the kernel stores wrench indices as bytes.
 _MOST_WRENCHES = 256
 
 
@@ -373,8 +373,8 @@ class WrenchHull:
     Attributes:
         epsilon: radius of the largest ball about the origin inside the hull. 0 if the origin is outside.
         volume: volume of the hull.
-        weakest_push: unit disturbance (force, torque over length) that the grasp resists least: the negative
-            normal of the nearest facet. None if the origin is outside.
+        weakest_push: unit disturbance (force, torque over length) that the grasp resists least. It is the negative
+            normal of the facet nearest to the origin. None if the origin is outside.
     """
 
     epsilon: float = 0.0
@@ -391,7 +391,7 @@ def wrench_hull(
         arms: contact points relative to the centre of mass [m].
         normals: outward unit normals of the object.
         friction: Coulomb coefficient.
-        length: length that torques are divided by, the object's largest radius [m].
+        length: length by which torques are divided: the object's largest radius [m].
     """
     if len(arms) < 2:
         return WrenchHull()
@@ -408,7 +408,7 @@ Hull = tuple[float, Float[np.ndarray, "6"], float]
 
 
 def compiled_hull(wrenches: Float[np.ndarray, "n 6"]) -> Hull | None:
-    """Build the wrenches' convex hull in the compiled kernel. None without it, on failure, or above 256 wrenches."""
+    """Build the convex hull of wrenches in the kernel. None without kernel, after a failure, or above 256 wrenches."""
     library = kernel().library
     if library is None or len(wrenches) > _MOST_WRENCHES:
         return None
@@ -422,7 +422,7 @@ def qhull(wrenches: Float[np.ndarray, "n 6"]) -> Hull:
     """Build the convex hull of wrenches with Qhull."""
     from scipy.spatial import ConvexHull
 
-    # QJ perturbs the input. It takes half the time of merging facets and is deterministic.
+    # QJ perturbs the input. The result is deterministic, and QJ takes half the time of Qhull's merging of facets.
     hull = ConvexHull(wrenches, qhull_options="QJ")
     nearest = hull.equations[:, -1].argmax()
     return -float(hull.equations[nearest, -1]), hull.equations[nearest, :-1], float(hull.volume)
@@ -431,7 +431,7 @@ def qhull(wrenches: Float[np.ndarray, "n 6"]) -> Hull:
 def cone_wrenches(
     arms: Float[np.ndarray, "n 3"], normals: Float[np.ndarray, "n 3"], friction: float, length: float
 ) -> Float[np.ndarray, "wrenches 6"]:
-    """Return the wrenches (force, torque over length) of unit forces along each contact's friction cone edges."""
+    """Return the wrenches (force, torque over length) of unit forces on the edges of each contact's friction cone."""
     reference = np.eye(3)[np.abs(normals).argmin(-1)]
     first = np.cross(normals, reference)
     first /= np.maximum(np.linalg.norm(first, axis=-1, keepdims=True), 1e-12)
@@ -443,16 +443,16 @@ def cone_wrenches(
     return np.concatenate([forces, torques], -1).reshape(-1, 6)
 
 
-# Greatest number of contacts in the wrench hull. A hull of 32 contacts has some 22,000 facets, takes five times as long
-# and raises ε by a tenth (docs/metrics.md).
+# Greatest number of contacts in the wrench hull. A hull of 32 contacts has some 22,000 facets. It takes five times as
+# long and raises ε by a tenth (docs/metrics.md).
 MAX_CONTACTS = 16
-# Half the distance of a central difference [m].
+# Step of the central differences in `surface_normals` [m].
 _STEP = 2e-4
 
 
 @dataclass(frozen=True, eq=False)
 class PreparedGrasp:
-    """A hand at a grasp, with the quantities that metrics share."""
+    """A hand at a grasp, with the quantities that several metrics need."""
 
     context: MetricsContext
     posture: Posture
@@ -469,12 +469,12 @@ class PreparedGrasp:
 
     @cached_property
     def shared_volume(self) -> float:
-        """Volume of the hand inside the object [m³]."""
+        """Volume of the hand's part inside the object [m³]."""
         return intersection_volume(self.context, self.placed)
 
 
 def prepare_grasp(context: MetricsContext, posture: Posture, max_contacts: int = MAX_CONTACTS) -> PreparedGrasp:
-    """Place the hand at a posture and compute its samples' distances."""
+    """Place the hand at a posture and compute the distance of each hand sample to the object."""
     return PreparedGrasp(context, posture, placed_hand(context, posture), max_contacts)
 
 

@@ -1,9 +1,9 @@
-"""Robustness checks for objects seen by cameras: other poses, less friction, other shapes of the hidden side.
+"""Check the robustness of grasps of objects that cameras saw: other poses, less friction, other shapes.
 
-A grasp that holds on the likeliest scene must also pass these checks. It must hold on two other shapes, with two thirds
-of the usual limit of rotation, because the hidden side may be guessed wrong. docs/clouds.md reports how often such
-grasps hold on the true object. Trials run on several threads. `results_in_order` yields the same results in the same
-order for any number of threads.
+A grasp that holds on the likeliest scene, the best guess from the clouds, must also pass these checks. The hidden side
+may be guessed wrong, so the grasp must also hold on two other shapes. On these shapes, the limit of rotation is two
+thirds of the usual limit. docs/clouds.md reports how often grasps that pass all checks hold on the true object. Trials
+run on several threads. Their number changes neither results nor their order (`results_in_order`).
 """
 
 from __future__ import annotations
@@ -64,15 +64,15 @@ def results_in_order(
 ) -> Generator[Result]:
     """Yield the result of each item in order, until `over` returns true.
 
-    If the caller closes the iterator, the stop hooks of the work that was started ahead return true.
+    If the caller closes the iterator, the stop hooks of all running work return true.
 
     Args:
-        over: ends the iteration. Only the calling thread calls it.
+        over: stop hook that ends the iteration. Only the calling thread calls it.
         work: function of an item and a stop hook. With one thread, the calling thread runs it. Otherwise a pool does.
         items: the items to work on.
         threads: number of threads, at least 1.
-        needed: returns the least number of further results that the caller needs. That many are started ahead.
-        known_over: stop hook that also ends running work. All threads call it.
+        needed: returns the least number of results that the caller still needs. At least this many items are queued.
+        known_over: stop hook that ends running work. All threads call it.
     """
     if min(threads, len(items)) <= 1:
         for item in items:
@@ -85,7 +85,7 @@ def results_in_order(
     waiting, left = deque[Future[Result]](), iter(items)
     try:
         while not over():
-            # Queue twice as many items as threads, and all that are needed, so that no thread is idle.
+            # Queue at least twice as many items as threads, so that no thread is idle. Queue all needed items.
             for item in islice(left, max(2 * threads, needed()) - len(waiting)):
                 waiting.append(pool.submit(work, item, lambda: closed.is_set() or known_over()))
             if not waiting:
@@ -99,33 +99,33 @@ def results_in_order(
         pool.shutdown(cancel_futures=True)
 
 
-# Factor on the friction in the check with less friction.
+# The check with less friction multiplies the friction by this factor.
 _LESS_FRICTION = 2 / 3
-# Factor on the limit of rotation for other shapes. Grasps that fail on the true object mostly turn it a little too far.
+# Factor on the limit of rotation on other shapes. Grasps that fail on the true object mostly turn it a little too far.
 _LESS_TURN = 2 / 3
-# Number and seed of the displaced object poses, the same for all grasps. No benchmark uses them.
+# Number and seed of the displaced poses, equal for all grasps. No benchmark uses this seed.
 _PLACES, _PLACES_SEED = 3, 0x706C616365
-# Least number of displaced poses on which a grasp must hold if the mass is assumed, and number of other shapes.
+# If the mass is assumed, a grasp must hold at `_LEAST_PLACES` displaced poses. It must hold on `OTHER_SHAPES` shapes.
 _LEAST_PLACES, OTHER_SHAPES = 2, 2
-# Nodes of a guessed shape's distance grid along an axis. A finer grid would not help.
+# Number of nodes of another shape's distance grid along an axis. The shape is guessed, so a finer grid would not help.
 _RESOLUTION = 24
 # Interval at which the stop hook is polled while waiting for a world [s].
 _POLL = 0.02
 # Name of the threads that build other shapes.
 _SHAPES = "graspd-shapes"
 
-# Results of some checks in order, None for an impossible check. `HoldUnder` runs the checks of a stage on a grasp.
+# Results of checks in order. A result is None if the check is impossible. `HoldUnder` runs a stage's checks on a grasp.
 Results = Generator[TrialResult | None]
 HoldUnder = Callable[["CheckStage", Grasp, StopHook], Results]
 
 
 @dataclass(frozen=True)
 class RobustnessCheck:
-    """One robustness check: a variant of the scene that may be the true one.
+    """One robustness check: a variant of the scene that may be the true scene.
 
     Attributes:
         name: name of the variant, for messages.
-        hold: runs the hold trial of a grasp in the variant. Returns None if the variant is impossible or was stopped.
+        hold: function that runs a grasp's hold trial. It returns None if the variant is impossible or was stopped.
     """
 
     name: str
@@ -138,8 +138,8 @@ class CheckStage:
 
     Attributes:
         items: the checks, in the order in which they run.
-        least: number of checks that a grasp must pass. If there are fewer possible checks, it must pass all.
-        may_fail: number of checks that it may fail before it has passed `least`.
+        least: number of checks that a grasp must pass. If fewer checks are possible, the grasp must pass all of them.
+        may_fail: number of checks that a grasp may fail before it has passed `least` checks.
         though_failed: probability that a grasp holds on the true object although it fails this stage.
     """
 
@@ -150,19 +150,19 @@ class CheckStage:
 
 
 class LaterWorld:
-    """A world that a thread builds on the first request. The result is kept. It is None if there is no such world."""
+    """A world that a thread builds on the first request. Later requests get this world, or None if building failed."""
 
     def __init__(self, make: Callable[[], World | None]):
         self._make, self._begun, self._lock = make, None, threading.Lock()
 
     def begin(self) -> Future[World | None]:
-        """Start to build the world, if that has not started yet. Return its future."""
+        """Start to build the world, if nobody has started yet. Return the future of the world."""
         with self._lock:
             self._begun = self._begun or begin_in_thread(_SHAPES, self._make)
             return self._begun
 
     def altered(self, mass: float) -> LaterWorld:
-        """Return the world with another object mass [kg], also built on the first request."""
+        """Return a world with another object mass [kg], which is also built on the first request."""
         return LaterWorld(lambda: (world := self.begin().result()) and altered(world, mass=mass))
 
 
@@ -171,10 +171,10 @@ class RobustnessChecks:
     """The robustness checks that a grasp must pass.
 
     Attributes:
-        stages: displaced poses and less friction, which are cheap to try, then other shapes.
+        stages: first checks with displaced poses and less friction, because they are fast, then with other shapes.
         probability: probability that a grasp holds on the true object if it passes all stages.
-        waited_for: set once a trial waits for its world, so that other trials may start.
-        doubts: reasons to doubt the scene or its mass. If there are any, no grasp passes.
+        waited_for: event that is set once a trial waits for its world, so that other trials may start.
+        doubts: reasons to doubt the scene or the object's mass. If there is a doubt, no grasp passes.
     """
 
     stages: tuple[CheckStage, ...]
@@ -186,10 +186,10 @@ class RobustnessChecks:
 def begin_other_worlds(
     run: Run, scene: Scene, hand: HandModel, protocol: Protocol, probability: float
 ) -> tuple[LaterWorld, ...]:
-    """Return the worlds of other possible shapes of the object. Empty if grasps need not be tried on them.
+    """Return the worlds of other possible shapes of the object. Empty if grasps need not be tried on other shapes.
 
-    The first two worlds, in which every grasp is tried, are built immediately, one after the other. The other worlds
-    are built when needed. A world is None if there is no such shape or if the run ended first.
+    For each world, another rule guesses the hidden side. The first two are built now, in turn, as every grasp needs
+    them. The others are built when needed. A world is None if its rule gives no other shape, or the run ended.
     """
     making = threading.Lock()
 
@@ -207,7 +207,7 @@ def begin_other_worlds(
 def robustness_checks_of(
     scene: Scene, others: Sequence[LaterWorld], trials: TrialContext, probability: float
 ) -> RobustnessChecks | None:
-    """Return the checks that a grasp must pass to reach the requested `probability`. None if it needs no check.
+    """Return the checks that a grasp must pass to reach the requested `probability`. None if no check is needed.
 
     `others` comes from `begin_other_worlds`. If the mass is known, a grasp must hold on all displaced poses and with
     less friction.
@@ -233,7 +233,7 @@ def robustness_checks_of(
 
 
 def _places(scene: Scene, trials: TrialContext, though_failed: float) -> CheckStage:
-    """Return the checks with displaced poses and, if the mass is known, with less friction."""
+    """Return the checks with displaced poses of the hand and, if the mass is known, the check with less friction."""
     places = [
         RobustnessCheck(f"displaced pose {number}", partial(_hold_displaced, trials, error))
         for number, error in enumerate(pose_errors(_PLACES_SEED, _PLACES), 1)
@@ -248,9 +248,9 @@ def _places(scene: Scene, trials: TrialContext, though_failed: float) -> CheckSt
 
 
 def doubted_if_weak(checks: RobustnessChecks, most: float, heavy: float) -> RobustnessChecks:
-    """Return checks with a doubt if too many objects weigh more than the payload `most` [kg]. Then no check runs.
+    """Replace the checks by a doubt if too many objects of this volume weigh more than the payload `most` [kg].
 
-    `heavy` is the greatest mass that the object's volume allows [kg]. Checks with doubts are returned unchanged.
+    `heavy` is the greatest mass that the object's volume allows [kg]. If there are doubts already, change nothing.
     """
     if checks.doubts or most >= light_end(heavy):
         return checks
@@ -259,9 +259,9 @@ def doubted_if_weak(checks: RobustnessChecks, most: float, heavy: float) -> Robu
 
 
 def less_sure(checks: RobustnessChecks, most: float, heavy: float) -> RobustnessChecks:
-    """Scale all probabilities by the fraction of objects that weigh at most the payload `most` [kg].
+    """Scale all probabilities by the fraction of objects of this volume that weigh at most the payload `most` [kg].
 
-    First the doubt of `doubted_if_weak` is added.
+    `doubted_if_weak` runs first and may add a doubt. `heavy` has the same meaning there.
     """
     checks, share = doubted_if_weak(checks, most, heavy), share_as_light(most, heavy)
     stages = tuple(replace(stage, though_failed=share * stage.though_failed) for stage in checks.stages)
@@ -282,8 +282,8 @@ def try_robustness(
 ) -> tuple[TrialResult, float]:
     """Run the robustness checks of a grasp, stage by stage. A stage ends when enough checks pass or too many fail.
 
-    Return the combined result and the probability that the grasp holds on the true object. The result has the greatest
-    travel and rotation of the passed trials. `hold_under` runs the checks of one stage.
+    Return the combined result and the probability that the grasp holds on the true object. The combined result holds
+    the greatest travel and rotation of all passed trials. `hold_under` runs the checks of one stage.
     """
     travel = turn = 0.0
     for stage in checks.stages:
@@ -296,7 +296,7 @@ def try_robustness(
                     held += 1
                     travel, turn = max(travel, result.displacement), max(turn, result.rotation)
                 else:
-                    reasons.append(f"fails under {item.name}: {result.reason}")
+                    reasons.append(f"fails with {item.name}: {result.reason}")
                 if held == stage.least or len(reasons) > stage.may_fail:
                     break
         if stop():
@@ -307,7 +307,7 @@ def try_robustness(
 
 
 def held_shares(target: ObjectModel) -> HeldShares:
-    """Return the measured probabilities that grasps hold, for an object of assumed or of known mass."""
+    """Return the measured fractions of grasps that hold, depending on whether the object's mass is assumed or known."""
     return MASS_ASSUMED if target.mass_assumed else MASS_KNOWN
 
 
@@ -344,9 +344,9 @@ def _begun(evidence: Evidence) -> dict[str, Future[Scene | None]]:
 
 
 def begin_other_shapes(probability: float, likeliest: ObjectModel, evidence: Evidence) -> None:
-    """Start background threads that build the other shapes on which every grasp will be tried, if there are any.
+    """Start background threads that build the other shapes on which every grasp will be tried.
 
-    `scene_from_views` calls this, so that the shapes are built in parallel with the likeliest shape's distance grid.
+    `scene_from_views` calls this function early: the likeliest shape's distance grid is built at the same time.
     """
     for rule in _rules_needed(evidence, probability, held_shares(likeliest))[:OTHER_SHAPES]:
         work = partial(run_isolated, other_scene, evidence, rule, likeliest)
@@ -355,20 +355,20 @@ def begin_other_shapes(probability: float, likeliest: ObjectModel, evidence: Evi
 
 @lru_cache(maxsize=16)
 def _other_world(scene: Scene, hand: HandModel, protocol: Protocol, rule: str) -> World | None:
-    """Return the world of another shape with the object's mass and friction. None if there is no such shape."""
+    """Return the world of another shape with the object's mass and friction. None if the rule gives no other shape."""
     assert scene.evidence is not None
-    # The future is removed. If building the shape failed, for example for lack of memory, it is built again next time.
+    # Remove the future. If building the shape failed, e.g. for lack of memory, the next call builds the shape again.
     begun = _begun(scene.evidence).pop(rule, None)
     other = run_isolated(other_scene, scene.evidence, rule, scene.object) if begun is None else begun.result()
     if other is None:
         return None
-    # This is a separate call, so that the likeliest shape, which every grasp needs first, may be cut before it.
+    # Cutting is a separate call, so that the likeliest shape can be cut before. Every grasp needs that shape first.
     parts = run_isolated(convex_parts, other.object.mesh, other.sdf, **COARSE_CUTS)
     return build_world(hand, other.object, parts, protocol)
 
 
 def other_scene(evidence: Evidence, rule: str, likeliest: ObjectModel) -> Scene | None:
-    """Return a scene with the hidden side guessed by `rule`, at the same mass and friction. None if that fails."""
+    """Return the scene in which `rule` guesses the hidden side, or None. Keep the mass and friction of `likeliest`."""
     from graspd_core.perception.reconstruct.hidden_side import other_shape
 
     mesh = other_shape(evidence, rule, likeliest.mesh)

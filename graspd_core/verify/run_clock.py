@@ -1,4 +1,4 @@
-"""Clock, hooks and result of one run."""
+"""Keep the clock and the hooks of one run, and make the result of the run."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ class Run:
     Attributes:
         began: start of the run, a `time.perf_counter()` value.
         cancelled: whether the stop hook has returned true.
-        watch: hook that gets snapshots of the hands, or None.
+        watch: hook that gets snapshots of the hands, or None if nobody watches.
         origin: origin of the planning frame, in the frame of the request [m].
     """
 
@@ -49,12 +49,12 @@ class Run:
         self._progress, self._stop = progress, stop
 
     def over(self) -> bool:
-        """Return True if the run must end. This calls the stop hook, so only the run's own thread may call it."""
+        """Return True if the run must end. Only the run's thread may call `over`, because it calls the stop hook."""
         self.cancelled = self.cancelled or (self._stop is not None and self._stop())
         return self.known_over()
 
     def known_over(self) -> bool:
-        """Return True if the run must end. This does not call the stop hook, so any thread may call it."""
+        """Return True if the run must end. Any thread may call `known_over`, because it does not call the stop hook."""
         return self.cancelled or self.late()
 
     def late(self) -> bool:
@@ -74,7 +74,7 @@ class Run:
 
     @property
     def ended_early(self) -> Outcome | None:
-        """`CANCELLED` or `DEADLINE` if one of them ended the run, else None."""
+        """`CANCELLED` if the stop hook ended the run, `DEADLINE` if the deadline has passed, else None."""
         return Outcome.CANCELLED if self.cancelled else Outcome.DEADLINE if self.late() else None
 
 
@@ -90,9 +90,9 @@ def result_of(
     warnings: tuple[str, ...] = (),
     refused: Mapping[str, int] | None = None,
 ) -> GraspResult:
-    """Return the result of a run. Its outcome is success if at least `count` grasps are usable.
+    """Return the result of a run. The outcome is success if at least `count` grasps are usable.
 
-    `ended_early` is the outcome if an early end left too few of them. `refused` counts refused candidates by reason.
+    Otherwise it is `ended_early` if given, else too few or none. `refused` counts the refused candidates by reason.
     """
     few = Outcome.TOO_FEW if grasps else Outcome.NO_CANDIDATES
     enough = sum(grasp.usable for grasp in grasps) >= count

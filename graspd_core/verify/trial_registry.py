@@ -1,4 +1,4 @@
-"""Registry of the trials that planning runs, in order. `types.Grasp.verdict` says what passing them means."""
+"""Define the trials of planning in a registry, and run them in order. `types.Grasp.verdict` derives the verdict."""
 
 from __future__ import annotations
 
@@ -19,8 +19,8 @@ class TrialContext:
 
     Attributes:
         protocol: physics settings of the trials.
-        alone: world of hand and object only.
-        around: world with support and obstacles. None if the scene has neither.
+        alone: world with only the hand and the object.
+        around: world that also has the support and the obstacles. None if the scene has neither.
     """
 
     hand: HandModel
@@ -35,8 +35,8 @@ class Trial:
 
     Attributes:
         name: name in the trial results.
-        applies: returns whether the trial runs in a context.
-        run: tries one grasp. It polls the stop hook, and the trial fails if the hook stops it.
+        applies: function that returns whether the trial runs in a context.
+        run: function that tries one grasp. It polls the stop hook. If the hook returns true, the trial fails.
     """
 
     name: str

@@ -1,6 +1,6 @@
-"""The trials of a run: build the worlds once, try candidates in rank order, sort the verified grasps.
+"""Try grasps in MuJoCo: build the worlds once, try candidates in rank order, sort the verified grasps.
 
-`verify_grasps` tries and measures grasps of another planner or of a file in the same worlds.
+`verify_grasps` tries and measures given grasps, for example from another planner or from a file.
 """
 
 from __future__ import annotations
@@ -48,14 +48,12 @@ from graspd_core.verify.world import PROTOCOLS, altered, at_friction
 
 # Interval at which stop hook and deadline are polled while waiting for the worlds [s].
 _POLL = 0.02
-
 # Only one object at a time is cut into convex parts.
 _CUTTING = threading.Lock()
-
-# Robustness by which verified grasps without a measured robustness are sorted.
+# Sorting uses this robustness for verified grasps whose robustness was not measured.
 _UNKNOWN = 0.5
 
-# Added to the seed of the pose errors for ranking, so that they differ from all others.
+# First part of the seed of the pose errors for ranking, so that no other pose errors have this seed.
 _NOISE = 0x6E6F697365
 
 
@@ -64,9 +62,11 @@ class VerificationContext:
     """Worlds, metrics and robustness checks of a run.
 
     Attributes:
-        metrics: returns the context for measuring metrics. None if metrics are not measured.
+        trials: worlds and physics settings of the trials.
+        metrics: function that returns the context for measuring metrics. None if metrics are not measured.
+        checks: robustness checks. None if grasps need no such check.
         friction: whether to measure the least friction.
-        heavy: the assumed mass [kg], if the trials use a lower one. None otherwise.
+        heavy: the assumed mass [kg], if the trials use a lower mass. None otherwise.
     """
 
     trials: TrialContext
@@ -83,10 +83,10 @@ class VerificationContext:
 
 @dataclass(frozen=True)
 class Prefetched:
-    """Worlds of the trials, which background threads build during the search.
+    """Worlds of the trials, which background threads build while the optimiser runs.
 
     Attributes:
-        worlds: worlds of the likeliest scene. The result is None if the run ended before they were built.
+        worlds: future of the likeliest scene's worlds. Its result is None if the run ended before they were built.
         others: worlds of other possible shapes of the object. Empty if grasps are not tried on them.
     """
 
@@ -95,10 +95,10 @@ class Prefetched:
 
 
 def prefetch(run: Run, scene: Scene, hand: HandModel, verify: str, certainty: CertaintyConfig) -> Prefetched:
-    """Start to build the trial worlds in background threads, which takes about as long as the optimiser.
+    """Start to build the trial worlds in background threads. This takes about as long as the optimiser.
 
-    Only one object at a time is cut into convex parts. An object is skipped if its run has ended. Otherwise work would
-    pile up if many runs were cancelled quickly.
+    Only one object at a time is cut into convex parts. The object of an ended run is skipped, so that quickly cancelled
+    runs do not pile up work.
     """
 
     def build() -> TrialContext | None:
@@ -133,10 +133,10 @@ def make_trial_context(
 def lighter(
     scene: Scene, ahead: Prefetched, context: VerificationContext, certainty: CertaintyConfig, mass: float, most: float
 ) -> VerificationContext:
-    """Return the context with a lower object `mass` [kg] than the assumed one.
+    """Return the context for trials at `mass` [kg], which is below the assumed mass.
 
     The probability of a grasp is then lower, because the object may weigh more than the grasp can lift. `most` is the
-    greatest payload of any grasp [kg]. If `most` is too low for a verified grasp, no robustness check runs.
+    greatest payload of any grasp [kg]. If `most` is too low for any grasp to be verified, no robustness check runs.
     """
     trials, others = context.trials, [world.altered(mass) for world in ahead.others]
     around = trials.around and altered(trials.around, mass=mass)
@@ -148,7 +148,7 @@ def lighter(
 
 
 def payloads(context: VerificationContext, grasps: Sequence[Grasp], stop: StopHook) -> list[float]:
-    """Return the payload of each grasp [kg], or 0 if an earlier grasp has about the same payload or more."""
+    """Return the payload of each grasp [kg]. Return 0 if it is less than 10 % above the greatest earlier payload."""
     trials, found = context.trials, list[float]()
     for grasp in grasps:
         least = FINENESS * max(found, default=LEAST_PAYLOAD)
@@ -156,10 +156,10 @@ def payloads(context: VerificationContext, grasps: Sequence[Grasp], stop: StopHo
     return found
 
 
-# The cache keeps the last few scenes and hands. They are hashed by identity.
+# The cache keeps the last four pairs of scene and hand. Scenes and hands are hashed by identity.
 @lru_cache(maxsize=4)
 def trial_context(scene: Scene, hand: HandModel, verify: str) -> TrialContext:
-    """Build the worlds of the `verify` trials at the object's friction, for a scene moved by `near_scene`."""
+    """Build the worlds of the `verify` trials at the object's friction, for a scene near the origin (`near_scene`)."""
     protocol = at_friction(PROTOCOLS[verify], scene.object.friction)
     return build_worlds(scene, hand, object_parts(scene.object), protocol)
 
@@ -193,8 +193,8 @@ class TriedGrasps:
     """Candidates with their trial results.
 
     Attributes:
-        grasps: the tried grasps, verified ones first.
-        first: time at which the first grasp was verified, a `time.perf_counter()` value. None without one.
+        grasps: the tried grasps, verified grasps first.
+        first: time at which the first grasp was verified, a `time.perf_counter()` value. None if none was verified.
     """
 
     grasps: tuple[Grasp, ...] = ()
@@ -202,7 +202,7 @@ class TriedGrasps:
 
 
 def candidates_seen(candidates: tuple[Grasp, ...]) -> Snapshot:
-    """Return a snapshot of the candidates, all of them unverified."""
+    """Return a snapshot of the candidates, in which all candidates are unverified."""
     hands = [(g.grasp.position, g.grasp.quaternion_wxyz, g.grasp.joint_positions) for g in candidates]
     return Snapshot(*map(np.stack, zip(*hands, strict=True)), verdicts=(Verdict.UNVERIFIED,) * len(candidates))
 
@@ -212,14 +212,14 @@ def run_trials(
 ) -> TriedGrasps:
     """Try candidates in rank order until `count` are verified, and measure each verified grasp.
 
-    `before` is the number of grasps that were verified earlier. The trials use torch's number of threads, which changes
-    neither verdicts nor order. Grasps are measured in parallel with the next trials.
+    `before` is the number of grasps that earlier rounds verified. The trials use torch's number of threads. This number
+    changes neither verdicts nor order. Grasps are measured in parallel with the next trials.
     """
     verified: list[Grasp] = []
     others: list[Grasp] = []
     metrics: list[Future[GraspMetrics]] = []
     threads, doubted = torch.get_num_threads(), 0
-    # If the scene itself is doubtful, no grasp can be verified. Then `count` grasps that fail no check are enough.
+    # If there is a doubt, no grasp can be verified. Then `count` grasps whose only fault is the doubt are enough.
     doubts = context.checks.doubts[:1] if context.checks is not None else ()
     first = None
     seen = None if run.watch is None else candidates_seen(candidates)
@@ -247,7 +247,7 @@ def run_trials(
             # Measure after the report, because measuring takes longer than a trial. Failed grasps are not measured.
             if passed and context.metrics is not None:
                 metrics.append(pool.submit(_measured, context.trials, context.metrics(), context.friction, tried))
-                # A run that ends now still measures its grasps. This limits them to the number of threads.
+                # A run that ends now still measures its waiting grasps. Limit their number to that of the threads.
                 wait(metrics[: 1 - threads or None])
             (verified if passed else others).append(tried)
             if enough:
@@ -275,7 +275,7 @@ def _tried(
 def _best_first(
     context: VerificationContext, checks: RobustnessChecks, best: Grasp, threads: int, grasp: Grasp, stop: StopHook
 ) -> Grasp:
-    """Try a candidate. All but the best wait until the best one waits for a world or is done."""
+    """Try a candidate. All but `best` start when `best` is done or waits until a world is built."""
     if grasp is not best:
         while not checks.waited_for.wait(_POLL) and not stop():
             pass
@@ -287,7 +287,7 @@ def _best_first(
 
 
 def _at_once(threads: int, stage: CheckStage, grasp: Grasp, stop: StopHook) -> Results:
-    """Yield trial results. The checks that every grasp needs run in parallel, then the others one by one."""
+    """Yield a stage's trial results. The first `least` checks run in parallel. Then the other checks run in turn."""
     first, others = stage.items[: stage.least], stage.items[stage.least :]
     yield from results_in_order(stop, lambda item, ended: item.hold(grasp, ended), first, threads, lambda: len(first))
     yield from one_by_one(replace(stage, items=others), grasp, stop)
@@ -314,10 +314,10 @@ def surest_first(grasps: Sequence[Grasp]) -> tuple[Grasp, ...]:
 def rank_by_robustness(
     run: Run, context: VerificationContext, grasps: tuple[Grasp, ...], config: RobustConfig, seed: int
 ) -> tuple[Grasp, ...]:
-    """Sort the verified grasps by robustness: the fraction of noisy trials that a grasp holds.
+    """Sort the verified grasps by robustness: the fraction of noisy trials that a grasp passes.
 
-    The fraction is added to each verified grasp's metrics. If the run ends early, a grasp without noisy trials is
-    sorted like one with robustness 0.5. Unverified and failed grasps follow unchanged.
+    The robustness is added to each verified grasp's metrics. If the run ends early, a grasp without noisy trials is
+    sorted as if its robustness were 0.5. Unverified and failed grasps follow unchanged.
     """
     verified = [grasp for grasp in grasps if grasp.verdict is Verdict.VERIFIED]
     measured: list[Grasp] = []
@@ -340,7 +340,7 @@ def rank_by_robustness(
 
 
 def most_robust_first(verified: Sequence[Grasp]) -> list[Grasp]:
-    """Return the grasps by descending robustness, 0.5 if unmeasured. Grasps of equal robustness keep their order."""
+    """Sort grasps by descending robustness. It counts as 0.5 if not measured. Equal grasps keep their order."""
 
     def share(grasp: Grasp) -> float:
         known = grasp.metrics.get("robustness") if grasp.metrics else None
@@ -362,11 +362,11 @@ def verify_grasps(
         scene: scene with the object. With a support or obstacles, the lift trial runs too.
         hand: hand of the postures. Their joint values are in the order of `hand.joint_names`.
         grasps: grasps with `pregrasp`, `grasp` and `squeeze`. Earlier metrics and trials are replaced.
-        verify: "standard" or "hard" trials, "full" or "hard_full" for the same without early stop, or "none".
-        measure: whether to measure metrics, also of failed grasps.
+        verify: "standard" or "hard" trials, "full" or "hard_full" for these trials without early stop, or "none".
+        measure: whether to measure metrics, also for failed grasps.
 
     Raises:
-        ConfigError: `verify` is unknown, or a posture does not fit the hand or is not finite.
+        ConfigError: `verify` is unknown, or a posture does not fit the hand, or a posture has non-finite values.
     """
     if verify not in VERIFICATIONS:
         raise ConfigError(f"verify: {verify!r}; valid: {', '.join(VERIFICATIONS)}")

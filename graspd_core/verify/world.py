@@ -1,10 +1,10 @@
 """Build the MuJoCo world of a trial: a hand of primitives on a mocap base, and a free object of convex parts.
 
 A support adds gravity and a table. Neighbours add obstacles. Table and obstacles are mocap bodies, so that a trial can
-lower them away from the hand. Their mocap indices follow the hand's.
+lower them away from the hand. Their mocap indices come after the index of the hand.
 
 Contact and solver settings use the published parameters of DexGraspBench's floating protocol (Chen et al., BODex, ICRA
-2025). Nothing here is differentiable, and the optimiser does not use it.
+2025). Nothing in this module is differentiable, and the optimiser does not use this module.
 """
 
 from __future__ import annotations
@@ -32,16 +32,16 @@ from graspd_core.types import Plane, Posture, TriangleMesh
 
 
 OBJECT = "graspd_object"
-# Names of the plane that the hand collides with, and of the plane that the object rests on.
+# Name of the plane with which the hand collides, and name of the plane on which the object rests.
 TABLE, _REST = "the support", "graspd_rest"
 _GRAVITY = 9.81
 
-# Sliding, torsional and rolling coefficients.
+# Sliding, torsional and rolling friction coefficients.
 Friction = tuple[float, float, float]
 
 
 def add_primitive(spec: Any, body: Any, primitive: Primitive, name: str, friction: Friction) -> None:
-    """Add a collision primitive of the hand. `name` is the name of the mesh that a hull needs."""
+    """Add a collision primitive of the hand to `body`. If the primitive is a hull, its mesh is called `name`."""
     import mujoco
 
     geom = body.add_geom(
@@ -49,7 +49,7 @@ def add_primitive(spec: Any, body: Any, primitive: Primitive, name: str, frictio
         quat=quaternion_from_rotation(torch.as_tensor(primitive.rotation, dtype=torch.float64)).numpy(),
         condim=4,
         friction=friction,
-        # In each contact of the hand, MuJoCo uses the hand's contact softness.
+        # With this priority, MuJoCo uses the hand's contact settings in each contact of the hand.
         priority=1,
         solref=[0.005, 1.0],
         solimp=[0.5, 0.99, 1e-4, 0.5, 2.0],
@@ -101,7 +101,7 @@ def add_support(spec: Any, hand: HandModel, parts: Sequence[TriangleMesh], frict
     spec.option.gravity = -_GRAVITY * support.normal
     add_plane(spec, TABLE, replace(support, offset=support.offset + support.margin), friction)
     for link in hand.link_names:
-        # Real hands carry their own weight.
+        # Compensate gravity for the hand's links, because a real hand carries its own weight.
         spec.body(f"link:{link}").gravcomp = 1.0
     lowest = min(float((part.vertices @ support.normal).min()) for part in parts)
     add_plane(spec, _REST, Plane(support.normal, lowest), friction)
@@ -133,7 +133,7 @@ def add_obstacle(spec: Any, name: str, neighbour: Obstacle, target: ObjectModel,
     body.add_geom(name=name, type=mujoco.mjtGeom.mjGEOM_MESH, meshname=name, condim=4, friction=friction)
     surface = torch.as_tensor(surface_samples(target.mesh, 1000, 0)[0]).to(neighbour.sdf.field)
     if bool((sample_sdf(neighbour.sdf, surface)[0] < 0).any()):
-        # A padded hull that overlaps the object would push the object away.
+        # An obstacle is a padded convex hull. If it overlaps the object, it would push the object away.
         spec.add_exclude(bodyname1=name, bodyname2=OBJECT)
 
 
@@ -143,12 +143,12 @@ def add_mesh(spec: Any, name: str, vertices: np.ndarray, faces: np.ndarray) -> N
     mesh = spec.add_mesh(name=name)
     mesh.uservert = np.asarray(vertices, dtype=float).ravel()
     mesh.userface = np.asarray(faces, dtype=np.int32).ravel()
-    # Masses are given explicitly, so a part may have any thickness.
+    # Shell inertia accepts parts without volume. MuJoCo does not use it, because all masses are given explicitly.
     mesh.inertia = mujoco.mjtMeshInertia.mjMESH_INERTIA_SHELL
 
 
 def full_inertia(inertia: Float[np.ndarray, "3 3"], floor: float) -> list[float]:
-    """Make an inertia valid, with principal moments of at least `floor`. Return xx, yy, zz, xy, xz, yz [kg·m²]."""
+    """Return a valid inertia as xx, yy, zz, xy, xz, yz [kg·m²]. Each principal moment is at least `floor`."""
     moments, axes = np.linalg.eigh(0.5 * (inertia + inertia.T))
     moments = np.maximum(moments, floor)
     moments[2] = min(moments[2], 0.999 * (moments[0] + moments[1]))
@@ -156,7 +156,7 @@ def full_inertia(inertia: Float[np.ndarray, "3 3"], floor: float) -> list[float]
     return [m[0, 0], m[1, 1], m[2, 2], m[0, 1], m[0, 2], m[1, 2]]
 
 
-# A hand with more primitives than this has thousands of contacts. They exceed MuJoCo's default memory of 14 MB.
+# Simulation memory [bytes] of hands with more than `_CROWD` primitives. Their contacts exceed MuJoCo's usual 14 MB.
 _CROWD, _MEMORY = 100, 2**28
 
 
@@ -165,19 +165,19 @@ class Protocol:
     """Physics settings of a trial. The defaults are those of the `standard` hold trial.
 
     Attributes:
-        friction: sliding, torsional and rolling coefficients.
+        friction: sliding, torsional and rolling friction coefficients.
         noslip_iterations: iterations of MuJoCo's noslip solver.
         impratio: ratio of frictional to normal impedance.
         timestep: simulation time step [s].
         stiffness: position gain of every revolute joint [N·m/rad].
         damping: damping of every revolute joint [N·m·s/rad].
-        slide_stiffness: position gain of every prismatic joint [N/m]. It equals `stiffness` at the end of a 5 cm link.
-        slide_damping: damping of every prismatic joint [N·s/m]. It equals `damping` at the end of a 5 cm link.
+        slide_stiffness: position gain of every prismatic joint [N/m], as of a revolute joint at 5 cm from its axis.
+        slide_damping: damping of every prismatic joint [N·s/m], as of a revolute joint at 5 cm from its axis.
         armature: rotor inertia of every joint [kg·m²] or [kg].
         stage_time: duration of pregrasp → grasp and of grasp → squeeze [s].
         hold_time: duration of each pull [s].
-        pulls: row indices of `hold_trial.DIRECTIONS`. Each pull in turn starts from the squeezed state.
-        pull: pull force per object mass [N/kg].
+        pulls: row indices of `hold_trial.DIRECTIONS`, one per pull. Every pull starts from the squeezed state.
+        pull: pull force per kilogram of object mass [N/kg].
         max_displacement: greatest allowed travel of the object's centre of mass [m].
         max_rotation: greatest allowed rotation of the object [rad].
         max_start_penetration: greatest allowed penetration of the object at the pregrasp [m].
@@ -217,16 +217,16 @@ PROTOCOLS: dict[str, Protocol] = {
 
 
 def at_friction(protocol: Protocol, friction: float) -> Protocol:
-    """Return the protocol for an object of this friction, with all three coefficients scaled by friction / 0.6.
+    """Return the protocol with all three friction coefficients multiplied by the object's friction / 0.6.
 
-    The scale is at most 1, so that no grasp passes because of an assumed high friction.
+    The factor is at most 1, so that no grasp passes only because a high friction is assumed.
     """
     share = min(friction / Protocol.friction[0], 1.0)
     sliding, torsional, rolling = protocol.friction
     return replace(protocol, friction=(sliding * share, torsional * share, rolling * share))
 
 
-# Squeeze posture and protocol of a grasp that held, and MuJoCo's state with the hand closed. A world keeps the last 32.
+# Squeeze posture and protocol of a grasp that held, and MuJoCo's state after squeezing. A world keeps the last 32.
 ClosedState = tuple[Posture, Protocol, Float[np.ndarray, "state"]]
 _MOST_CLOSED = 32
 
@@ -237,7 +237,7 @@ class World:
 
     Attributes:
         model: the `mujoco.MjModel`.
-        joint_addresses: index into `qpos` of each actuated hand joint, in the hand's order.
+        joint_addresses: index into `qpos` of each actuated hand joint, in the order of the hand's joint names.
         object_address: index into `qpos` of the object's free joint (position, then wxyz).
         object_velocity: index into `qvel` of the object's free joint.
         object_body: body id of the object.
@@ -248,9 +248,9 @@ class World:
         coupled_addresses: index into `qpos` of each coupled joint, in the order of `mimics`.
         mimics: the coupled joints.
         fingers: number of the hand's fingertips.
-        spare: `mujoco.MjData` of ended trials, which `trial_data` reuses.
-        closed: squeeze, protocol and closed-hand state of the last grasps that held. `payload` reuses them.
-        watch: called with the `mujoco.MjData` after every step of a trial. None in planning.
+        spare: `mujoco.MjData` objects of ended trials, which `trial_data` reuses.
+        closed: squeeze posture, protocol and closed-hand state of the last grasps that held. `payload` reuses them.
+        watch: hook that gets the `mujoco.MjData` after every step of a trial. None in planning.
     """
 
     model: Any
@@ -289,8 +289,9 @@ def altered(world: World, *, mass: float | None = None, friction: Friction | Non
 def trial_data(world: World) -> Iterator[Any]:
     """Provide the `mujoco.MjData` of one trial, reset to the model's initial state.
 
-    This is thread-safe, because each trial has its own data. Data of an ended trial is reused, because making new data
-    takes about a millisecond. Data is not reused after a MuJoCo error, which may leave its memory in use.
+    Several threads may call this function, because each trial has its own data. Data of an ended trial is reused,
+    because making new data takes about a millisecond. After a MuJoCo error, data is not reused, because the error may
+    leave the data's memory in use.
     """
     import mujoco
 
@@ -326,17 +327,16 @@ def build_world(
     """Compile the world of one hand and one object.
 
     Args:
-        target: the object, near the origin (`near_scene`). It gives mass, centre of mass and inertia.
+        target: the object, near the origin (`near_scene`), with its mass, centre of mass and inertia.
         parts: convex collision parts of the object, object frame [m].
         protocol: physics settings.
         support: a table, with gravity along its negative normal. The hand collides with this plane. The object rests on
-            its own plane through its lowest point, because a reconstructed bottom may be millimetres too high or too
-            low.
-        obstacles: fixed bodies, as their convex hulls. An obstacle that overlaps the object does not collide with it.
+            another plane, through its lowest point, because a reconstructed bottom may be millimetres off.
+        obstacles: fixed bodies, as convex hulls. An obstacle that overlaps the object does not collide with the object.
     """
     import mujoco
 
-    # Without this handler MuJoCo writes a log file into the working directory. Trials read the warning counters.
+    # Without this handler, MuJoCo writes warnings to a file in the working directory. Trials read warning counters.
     mujoco.set_mju_user_warning(lambda message: None)
     spec = mujoco.MjSpec()
     spec.compiler.degree = False
@@ -432,7 +432,7 @@ def _add_joint(spec: Any, body: Any, hand: HandModel, link: int, protocol: Proto
         **_joint_physics(hand, link, protocol),
         range=[hand.lower[joint], hand.upper[joint]],
         limited=True,
-        # Joint limits are as stiff as the time step allows (two steps). MuJoCo's default is softer (five steps).
+        # Joint limits are as stiff as the time step allows: time constant two steps. MuJoCo's default is five steps.
         solref_limit=[2 * protocol.timestep, 1.0],
     )
     effort = float(hand.effort[joint])
@@ -443,7 +443,7 @@ def _add_joint(spec: Any, body: Any, hand: HandModel, link: int, protocol: Proto
 
 
 def _add_coupled_joint(spec: Any, body: Any, hand: HandModel, mimic: Mimic, protocol: Protocol) -> None:
-    """Add a coupled joint, without actuator or limits. An equality constraint ties it to its leader joint."""
+    """Add a coupled joint, without actuator or limits. An equality constraint ties the joint to its leader joint."""
     import mujoco
 
     name = f"joint:{mimic.name}"
@@ -453,7 +453,7 @@ def _add_coupled_joint(spec: Any, body: Any, hand: HandModel, mimic: Mimic, prot
         objtype=mujoco.mjtObj.mjOBJ_JOINT,
         name1=name,
         name2=f"joint:{hand.joint_names[mimic.joint]}",
-        # The constraint is as stiff as gears. If it were softer, a loaded finger would lag behind its leader.
+        # The constraint is as stiff as gears. With a softer constraint, a loaded joint would lag behind its leader.
         solref=[2 * protocol.timestep, 1.0],
         solimp=[0.9999, 0.9999, 1e-3, 0.5, 2.0],
     )

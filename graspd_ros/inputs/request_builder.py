@@ -1,7 +1,7 @@
 """Conversion of messages to requests: mesh paths, clouds, depth images, and GraspRequest with its checks.
 
-Each row of `SOURCES` is a source of a GraspRequest's object. A new source needs a function and a row here, and a
-constant in `GraspRequest.msg`. No other file changes.
+Each row of `SOURCES` is one way in which a GraspRequest gives its object. A new source needs a function and a row here,
+and a constant in `GraspRequest.msg`. No other file changes.
 """
 
 from __future__ import annotations
@@ -40,7 +40,7 @@ from graspd_ros.request import MOST_ID, KnownObject, Listener, Request, SeenView
 
 MOST_EXCLUDED = 256
 MOST_BOXES = 64
-MOST_MESH_BYTES = 10**8  # an OBJ of about 1.5 million faces. Reading more takes minutes and gigabytes
+MOST_MESH_BYTES = 10**8  # an OBJ file of about 1.5 million faces. Reading a larger one takes minutes and gigabytes
 MOST_PATH = 4096
 _FORMS = "a path, file:///path or package://package/path"
 _ID = re.compile(rf"[A-Za-z0-9_.:@+-]{{1,{MOST_ID}}}")
@@ -50,14 +50,14 @@ _DEFAULTS = Steering()
 
 
 class RequestBuilder:
-    """Builder of requests. It stores the newest sensor frame and the views.
+    """Builder of requests. It stores the newest sensor frame (a cloud or depth image) and the views (stored clouds).
 
-    `missing` maps a sensor topic to one line about its missing messages. Only the executor's thread uses a builder.
-    Frames and views are immutable, so requests may keep them.
+    `missing` maps the name of each sensor topic without messages to the reason. Only the executor's thread uses a
+    builder. Requests may keep sensor frames and views, because both are immutable.
 
     Args:
-        lookup: function that returns `T_target_source` at a time without waiting. May raise a TransformError.
-        lookup_in_time: like `lookup`, but waits for late transforms, in the worker's thread. None uses `lookup`.
+        lookup: function that returns `T_target_source` at a time. It never waits, and may raise a TransformError.
+        lookup_in_time: like `lookup`, but waits for late transforms in the worker's thread. If None, `lookup` is used.
     """
 
     def __init__(
@@ -74,15 +74,15 @@ class RequestBuilder:
         self._started = time.strftime("%Y%m%dT%H%M%S")
 
     def new_id(self, kind: str) -> str:
-        """Return an id that begins with `kind`. It stays unique after a restart, because it names output files."""
+        """Return a new id that begins with `kind`. Ids name output files, so they stay unique after a restart."""
         return f"{kind}-{self._started}-{next(self._numbers)}"
 
     def forget(self) -> None:
-        """Delete the newest frame and the views."""
+        """Delete the newest sensor frame and the views."""
         self.newest, self.views = None, Views()
 
     def latest(self, settings: Settings) -> SensorFrame:
-        """Return the newest frame. Raises RequestError: no frame has arrived, or the newest is too old."""
+        """Return the newest sensor frame. Raises RequestError: no frame has arrived, or the newest frame is too old."""
         if self.newest is None:
             why = "".join(f"; {reason}" for reason in self.missing.values())
             raise RequestError(ErrorCode.NO_CLOUD, f"no cloud or depth image has arrived yet{why}")
@@ -90,7 +90,7 @@ class RequestBuilder:
         return self.newest
 
     def add_view(self, settings: Settings) -> None:
-        """Store the newest frame as a view. Raises GraspdError: no frame has arrived, or the newest is unusable."""
+        """Store the newest sensor frame as a view. Raises GraspdError: no sensor frame, or the newest is unusable."""
         frame = self.latest(settings)
         cloud = seen.seen_by_camera(frame, place_of(settings), self.lookup)
         if settings.segment:
@@ -104,7 +104,7 @@ class RequestBuilder:
         return Request(request_id, "mesh", settings.mesh_frame, self._now(), settings, load, timeless=True, known=known)
 
     def from_sensor_frame(self, request_id: str, settings: Settings, sensor_frame: SensorFrame) -> Request:
-        """Return the request for a frame without a GraspRequest. Raises RequestError: the frame is too old."""
+        """Return the request for a sensor frame without a GraspRequest. Raises RequestError: the frame is unusable."""
         load = self._frame_loader(settings, sensor_frame)
         newest = settings.cloud_policy == "newest"
         return Request(request_id, "cloud", sensor_frame.frame, sensor_frame.stamp, settings, load, only_newest=newest)
@@ -112,9 +112,9 @@ class RequestBuilder:
     def from_message(
         self, request_id: str, settings: Settings, message: GraspRequest, listener: Listener | None = None
     ) -> Request:
-        """Return the request of a GraspRequest.
+        """Return the request that a GraspRequest describes.
 
-        Raises GraspdError: a field is invalid, the mesh or cloud is missing or refused, or a frame is not in /tf.
+        Raises GraspdError: a field is invalid, the mesh or cloud is missing or unusable, or a frame is not in /tf.
         """
         check_request(message, self._hand)
         if message.any_object and not settings.segment:
@@ -129,7 +129,7 @@ class RequestBuilder:
         return replace(request, closes_late=message.closes_late, **fields)
 
     def _steering(self, message: GraspRequest, request: Request) -> Callable[[], Steering] | None:
-        """Check the steering fields. Return a function that makes the constraints and reads `region_mask`, or None."""
+        """Check the constraint fields. Return a function that makes the constraints, or None without constraints."""
         if not _has_constraints(message):
             return None
         stamp, region_points = message.header.stamp, request.region_points
@@ -142,7 +142,7 @@ class RequestBuilder:
     def from_loader(
         self, request_id: str, header: Header, settings: Settings, load: Callable[[], Scene], listener: Listener | None
     ) -> Request:
-        """Return the request for a GraspPlanning object. Without a frame in the header, `mesh_frame` applies."""
+        """Return the request for a GraspPlanning object. If the header has no frame, use the parameter `mesh_frame`."""
         timeless = nanoseconds(header.stamp) == 0
         stamp = self._now() if timeless else header.stamp
         frame = header.frame_id or settings.mesh_frame
@@ -163,7 +163,7 @@ class RequestBuilder:
 
 
 def check_request(message: GraspRequest, hand: str) -> None:
-    """Raise RequestError if a field is invalid on its own. `source_of` checks the source."""
+    """Raise RequestError if a field is invalid or contradicts another field. `source_of` checks the field `source`."""
     if message.id and not _ID.fullmatch(message.id):
         start = message.id[:MOST_ID]
         raise bad_request(f"id: {start!r}; valid: at most {MOST_ID} letters, digits and _.:@+-")
@@ -228,7 +228,7 @@ def _check_mask_source(message: GraspRequest, name: str, height: int) -> None:
 
 
 def settings_of(message: GraspRequest, settings: Settings) -> Settings:
-    """Return the settings with the values of a checked request in place of the parameters."""
+    """Return the settings with a checked request's values in place of the parameters. Mesh scale 0 means 1."""
     return replace(
         settings,
         num_grasps=message.num_grasps or settings.num_grasps,
@@ -254,9 +254,9 @@ def _has_constraints(message: GraspRequest) -> bool:
 
 
 def steering_of(message: GraspRequest, T_object_header: Matrix) -> Steering:
-    """Return the steering constraints of a request in the object's frame, without its `region_mask`.
+    """Return the constraints on a request's grasps, in the object's frame. `region_mask` is left out.
 
-    Raises GraspdError: a field is invalid. The message names field, value and valid values.
+    Raises GraspdError: a field is invalid. The error names field, value and valid values.
     """
     _check(message)
     rotation = T_object_header[:3, :3]
@@ -278,7 +278,7 @@ def steering_of(message: GraspRequest, T_object_header: Matrix) -> Steering:
 
 
 def _check(message: GraspRequest) -> None:
-    """Refuse constraints that need another field, and constraints given twice."""
+    """Raise RequestError if a constraint is given twice, lacks a field that it needs, or has too many boxes."""
     if message.approach_angle and not _direction(message):
         raise bad_request("approach_angle: needs approach_direction; give both or neither")
     if (message.roll or message.roll_tolerance) and not message.use_roll:
@@ -292,7 +292,7 @@ def _check(message: GraspRequest) -> None:
 
 
 def _direction(message: GraspRequest) -> tuple[float, ...]:
-    """Return the approach direction of a request. It is empty if all components are 0."""
+    """Return the approach direction of a request, or an empty tuple if all its components are 0."""
     given = message.approach_direction.x, message.approach_direction.y, message.approach_direction.z
     return given if any(given) else ()
 
@@ -320,9 +320,9 @@ def _box(name: str, solid: SolidPrimitive, pose: Pose, T_object_header: Matrix) 
 
 @dataclass(frozen=True, eq=False)
 class SourceInput:
-    """Input of a source's function: the checked message, and the builder with its frames and views.
+    """Input of `Source.find`: the checked message, its settings, and the builder with its sensor frame and views.
 
-    `settings` include the values of the message.
+    The values of the message have replaced the parameters in `settings`.
     """
 
     request_id: str
@@ -334,7 +334,7 @@ class SourceInput:
     builder: RequestBuilder
 
     def request(self, frame: str, stamp: Time, load: Callable[[], Scene], **fields: Any) -> Request:
-        """Return the request for an object in a frame. A zero stamp means now. `fields` are other fields of Request."""
+        """Return the request for an object in a frame. A zero stamp means now. `fields` set other fields of Request."""
         timeless = nanoseconds(stamp) == 0
         fields |= {"listener": self.listener, "timeless": timeless}
         stamp = self.now if timeless else stamp
@@ -343,9 +343,9 @@ class SourceInput:
 
 @dataclass(frozen=True)
 class Source:
-    """Source of objects. A constant of GraspRequest is named like the source, in capitals.
+    """Source of objects. The source's constant in GraspRequest is `name` in capitals.
 
-    `find` returns the request without reading the object. Raises GraspdError: the object is missing, old or forbidden.
+    `find` builds a Request, which reads the object later. Raises GraspdError: object missing, too old or not allowed.
     """
 
     name: str
@@ -373,7 +373,7 @@ def frame_loader(
 ) -> Callable[[], Scene]:
     """Return a function that makes a scene from one sensor frame. The worker's thread calls `lookup`.
 
-    The target is selected by `point`, a point on or near the target in `frame` [m], or by `mask`, an image mask.
+    `point` [m] is on or near the target object, in the frame of the points. Or `mask` marks the target's pixels.
     """
 
     def load() -> Scene:
@@ -392,7 +392,7 @@ def frame_loader(
 
 
 def frame_views(frame: SensorFrame, settings: Settings, place: CameraPlace, lookup: Lookup) -> SeenViews:
-    """Return a function that reads a sensor frame as one view. The worker's thread calls `lookup`."""
+    """Return a function that reads a sensor frame as one view, and warnings. The worker's thread calls `lookup`."""
 
     def read() -> tuple[tuple[PointCloud, ...], tuple[str, ...]]:
         cloud = seen.seen_by_camera(frame, place, lookup)
@@ -411,7 +411,7 @@ def _from_cloud(given: SourceInput) -> Request:
 def _from_mesh(given: SourceInput) -> Request:
     settings, uri = given.settings, given.message.mesh_uri
     path = resolve_mesh(uri, settings.mesh_roots)
-    # The key is equal for the same mesh at the same scale, until the file changes.
+    # Equal keys mean: same unchanged file, scale, mass and friction.
     key = f"mesh {uri} {path.stat().st_mtime_ns} {settings.mesh_scale} {settings.mass} {settings.friction}"
     found = _placed(given, mesh_loader(path, settings), key, known_mesh(path, settings))
     if found.surface is None:
@@ -468,7 +468,7 @@ SOURCES: dict[int, Source] = {
 
 
 def source_of(message: GraspRequest) -> Source:
-    """Return the row of the request's source. Raises RequestError: the source is unknown."""
+    """Return the row of `SOURCES` for a request. Raises RequestError: the source is unknown."""
     if message.source not in SOURCES:
         valid = ", ".join(f"{source.name.upper()}={number}" for number, source in SOURCES.items())
         raise bad_request(f"source: {message.source}; valid: {valid}")
@@ -506,10 +506,10 @@ def _target(given: SourceInput, frame: str) -> Float[np.ndarray, "3"] | None:
 
 
 def resolve_mesh(uri: str, roots: Sequence[str]) -> Path:
-    """Return the mesh file of a path, `file://` or `package://` URI. Relative paths start at the first root.
+    """Return the mesh file at `uri`: a path, a `file://` or a `package://` URI. Relative paths start at the first root.
 
-    Symbolic links are resolved before the comparison with the roots, so that no link leads outside. A root may be a
-    `package://` name. Roots whose package is not installed are ignored.
+    Symbolic links are resolved before the path is compared with the roots, so that no link leads out of a root. A root
+    may be a `package://` name. Roots whose package is not installed are ignored.
     Raises MeshError: the form or package is unknown, or the file is outside every root, missing or too large.
     """
     uri = uri.strip()
@@ -519,7 +519,7 @@ def resolve_mesh(uri: str, roots: Sequence[str]) -> Path:
         raise MeshError(f"the mesh path is empty; give {_FORMS}")
     allowed = _allowed_roots(roots)
     if not allowed:
-        raise MeshError(f"{uri}: the parameter mesh_roots {list(roots)} names no directory; give one that exists")
+        raise MeshError(f"{uri}: the parameter mesh_roots {list(roots)} names no existing directory; give one")
     try:
         path = (allowed[0] / _local_path(uri)).resolve()
         if not any(path.is_relative_to(root) for root in allowed):
@@ -563,5 +563,5 @@ def _package_share(package: str, uri: str) -> Path:
 
     try:
         return Path(get_package_share_directory(package))
-    except (PackageNotFoundError, ValueError, OSError):  # ValueError: a malformed name; OSError: no AMENT_PREFIX_PATH
+    except (PackageNotFoundError, ValueError, OSError):  # ValueError: malformed name. OSError: no AMENT_PREFIX_PATH
         raise MeshError(f"{uri}: package {package!r} is not installed") from None

@@ -1,8 +1,8 @@
 """Clouds and depth images from cameras, stored views of one scene, and camera positions.
 
-A cloud message does not contain its camera's position. The request or the parameters give it. Otherwise the origin of
-the cloud's frame is assumed and checked against the cloud. With a wrong position the table is not found, the object's
-shape is wrong, and grasps are verified on the wrong shape.
+A cloud message does not contain its camera's position. The request or the parameters give the position. If they do not,
+the camera is assumed at the origin of the cloud's frame, and the cloud is checked against this assumption. With a wrong
+position the table is not found, the object's shape is wrong, and grasps are verified on the wrong shape.
 """
 
 from __future__ import annotations
@@ -39,20 +39,20 @@ from graspd_ros.convert import Matrix, array_of, nanoseconds
 from graspd_ros.error_codes import ErrorCode, RequestError, bad_request
 from graspd_ros.parameters import WORKSPACE, Settings
 
-CLOUD = "cloud"  # kind of frame whose message does not contain the camera position
+CLOUD = "cloud"  # `kind` of a SensorFrame from a cloud message, which does not contain the camera's position
 Pixels = Float[np.ndarray, "height width 3"]
-# Returns `T_target_source` at a time. May raise a TransformError.
+# Function that returns `T_target_source` at a time. May raise a TransformError.
 Lookup = Callable[[str, str, Time], Matrix]
 
 DepthMessage = Image | CompressedImage
 _Kind = tuple[str, int, int]  # frame, width and height of an image (compressed or not) or of a CameraInfo
 
-MOST_CALIBRATIONS = 8  # stored per topic. Several cameras may share a topic
+MOST_CALIBRATIONS = 8  # CameraInfos stored per topic, because several cameras may share a topic
 AHEAD = 0.5  # seconds that a stamp may lie in the future without a warning
 UNPAIRED = 2.0  # seconds without a matching CameraInfo before images cause a warning
 MOST_CLOUD_BYTES = 2**27  # 128 MiB: 4 million points of 32 bytes
 MOST_VIEWS = 64
-MOST_VIEW_POINTS = 200_000  # stored per view. 64 views take at most 300 MB
+MOST_VIEW_POINTS = 200_000  # points stored per view, so that 64 views take at most 300 MB
 
 
 @dataclass(frozen=True)
@@ -64,9 +64,9 @@ class SensorFrame:
         frame: coordinate frame of the points.
         stamp: capture time on the sensor's clock. Zero if the message has no stamp.
         arrived: time of arrival on the node's clock [ns].
-        read: returns the points in `frame` and the camera's position. Its arguments are the configured camera position
-            and a frame lookup. It takes some milliseconds and may raise a CloudError or TransformError.
-        pixels: returns one point per pixel, NaN without a measurement. May raise a CloudError.
+        read: returns the points in `frame` [m] and the camera's position. Its arguments are the configured camera
+            position and a frame lookup. It takes some milliseconds and may raise a CloudError or TransformError.
+        pixels: returns one point per pixel in `frame` [m], NaN without a measurement. May raise a CloudError.
     """
 
     kind: str
@@ -77,7 +77,7 @@ class SensorFrame:
     pixels: Callable[[], Pixels] | None = None
 
     def check(self, now: int, limit: float) -> None:
-        """Check frame and age. Raises RequestError: no frame id, or a stamp over `limit` [s] from `now` [ns].
+        """Check frame id and age. Raises RequestError: no frame id, or a stamp over `limit` [s] away from `now` [ns].
 
         A `limit` of 0 means no limit.
         """
@@ -90,21 +90,21 @@ class SensorFrame:
         text, hint = f"is {age:.1f} s old", "for a bag, set use_sim_time, or cloud_max_age to 0"
         if age < 0:
             text = f"has a stamp {-age:.1f} s in the future"
-            hint = "its clock is not the node's, or use_sim_time is set for one of them only"
+            hint = "its publisher and the node use different clocks, or only one of the two has use_sim_time"
         more = f"more than cloud_max_age={limit:g} s ({hint})"
         raise RequestError(ErrorCode.STALE_CLOUD, f"the {self.kind} in {self.frame!r} {text}, {more}")
 
     def warnings(self, cloud: PointCloud) -> tuple[str, ...]:
-        """Return warnings about a cloud, one sentence each: a stamp in the future, or a wrong frame orientation."""
+        """Return one sentence for each fault: a stamp in the future, a view direction unlike the frame's name."""
         ahead = (nanoseconds(self.stamp) - self.arrived) * 1e-9
-        early = f"the {self.kind} came {ahead:.1f} s before its stamp: its clock is ahead of the node's"
+        early = f"the {self.kind} came {ahead:.1f} s before its stamp: the sensor's clock is ahead of the node's"
         # The orientation is checked only if the camera is at the frame's origin.
         turned = "" if cloud.viewpoint.any() else frame_fault(self.frame, cloud.points)
         return tuple(said for said in (early if ahead > AHEAD else "", turned) if said)
 
 
 def cloud_frame(message: PointCloud2, arrived: int) -> SensorFrame:
-    """Return a cloud that arrived at `arrived` [ns] as a frame. It is read on use. Raises RequestError: too large."""
+    """Return the sensor frame of a cloud that arrived at `arrived` [ns]. Raises RequestError: the cloud is too big."""
     if len(message.data) > MOST_CLOUD_BYTES:
         fault = f"the cloud has {len(message.data)} bytes; valid: at most {MOST_CLOUD_BYTES}"
         raise RequestError(ErrorCode.BAD_CLOUD, fault)
@@ -114,7 +114,7 @@ def cloud_frame(message: PointCloud2, arrived: int) -> SensorFrame:
 
 
 def depth_sensor_frame(image: DepthMessage, info: CameraInfo, arrived: int) -> SensorFrame:
-    """Return a depth image with calibration, arrived at `arrived` [ns], as a frame. Its points are read on use."""
+    """Return the sensor frame of a depth image with calibration that arrived at `arrived` [ns]."""
 
     def read(place: CameraPlace = ORIGIN, lookup: object = None) -> PointCloud:
         # The camera of a depth image is at the origin of its frame.
@@ -138,7 +138,7 @@ class ImagePairs:
         self._clock = clock
         self._infos: OrderedDict[_Kind, CameraInfo] = OrderedDict()
         self._waiting: DepthMessage | None = None
-        self._images = self._calibrations = 0  # since the last pair
+        self._images = self._calibrations = 0  # counts of messages since the last pair
         self._alone_since = 0.0
 
     def add(self, message: DepthMessage | CameraInfo) -> tuple[DepthMessage, CameraInfo] | None:
@@ -174,7 +174,7 @@ class ImagePairs:
         last = next(reversed(self._infos.values()), None)
         of = "none" if last is None else _kind_text(last)
         return (
-            f"depth images: {self._images} images and {self._calibrations} CameraInfos received, but no two match; "
+            f"depth images: {self._images} images and {self._calibrations} CameraInfos received, but no pair matches; "
             f"last image: {_kind_text(self._waiting)}, last CameraInfo: {of}; "
             "valid: a CameraInfo of the same frame and size"
         )
@@ -201,7 +201,7 @@ def place_of(settings: Settings, message: GraspRequest | None = None) -> CameraP
 
 
 def seen_by_camera(frame: SensorFrame, place: CameraPlace, lookup: Lookup) -> PointCloud:
-    """Return the cloud of a frame with its camera position.
+    """Return the cloud of a sensor frame, with the camera's position.
 
     Raises:
         CloudError: the cloud cannot be read, or its pixels contradict the camera position.
@@ -213,10 +213,10 @@ def seen_by_camera(frame: SensorFrame, place: CameraPlace, lookup: Lookup) -> Po
 def masked_points(
     frame: SensorFrame, mask: Image, name: str = "target_mask"
 ) -> tuple[Float[np.ndarray, "points 3"], Bool[np.ndarray, "points"]]:
-    """Return one point per pixel, NaN without a measurement, and True for the pixels inside the mask.
+    """Return a point for each pixel (NaN if not measured), and whether each pixel is inside the mask.
 
     Raises:
-        RequestError: the mask is no mono8 image of the cloud's size. The error names the field `name`.
+        RequestError: the mask is not a mono8 image of the cloud's size. The error names the field `name`.
         CloudError: the cloud cannot be read.
     """
     pixels = np.empty((0, 0, 3)) if frame.pixels is None else frame.pixels()
@@ -242,12 +242,12 @@ class Views:
     clouds: tuple[PointCloud, ...] = ()
 
     def add(self, sensor_frame: SensorFrame, cloud: PointCloud, settings: Settings, lookup: Lookup) -> Views:
-        """Add a cloud, transformed to the common frame: `fixed_frame`, or the frame of the first view.
+        """Return the views with a new cloud in the common frame: parameter `fixed_frame`, or the first view's frame.
 
-        Raises GraspdError if there are `MOST_VIEWS` views already, or the cloud cannot be cropped or transformed.
+        Raises GraspdError if `MOST_VIEWS` views are stored already, or the cloud cannot be cropped or transformed.
         """
         if len(self.clouds) >= MOST_VIEWS:
-            raise bad_request(f"{MOST_VIEWS} views are stored, the most possible; call ~/reset_views first")
+            raise bad_request(f"{MOST_VIEWS} views are stored, which is the limit; call ~/reset_views first")
         frame = self.frame or settings.fixed_frame or sensor_frame.frame
         cloud = trimmed(cloud, settings)
         if len(cloud.points) > MOST_VIEW_POINTS:
@@ -261,12 +261,12 @@ class Views:
 def scene_of_views(
     views: tuple[PointCloud, ...], settings: Settings, target: Target | None, warnings: tuple[str, ...] = ()
 ) -> Scene:
-    """Return the scene of clouds in a common frame. `target` selects the object in the same frame.
+    """Return the scene that clouds in a common frame show. `target` selects the object, in this frame too.
 
     `warnings` become warnings of the object. Raises GraspdError if the clouds show no usable object, or the
     `scene_config` file is no longer valid.
     """
-    # Start the robustness variants of the shape in parallel with its distance grid, if grasps are verified.
+    # If grasps are verified, build the other likely shapes in parallel with the likeliest shape's distance grid.
     certainty = load_preset(settings.preset).certainty
     ahead = None if settings.verify == "none" else partial(begin_other_shapes, certainty.probability)
     scene = scene_from_views(

@@ -1,7 +1,7 @@
 """Subscriptions to sensor topics with the QoS that their publishers offer, and detection of lost messages.
 
-rmw's BEST_AVAILABLE chooses the QoS once, when the subscription is created. That QoS may not fit a camera that starts
-later, and no message would arrive. This module chooses again when publishers appear or disappear.
+rmw's BEST_AVAILABLE chooses the QoS once, when the subscription is created. A camera that starts later may need another
+QoS, and its messages would not arrive. This module chooses the QoS again when publishers appear or disappear.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ MOST_TWICE = 100  # stamps remembered to drop duplicates while two subscriptions
 SILENCE = 5.0  # seconds that a publisher may be silent without a warning
 REPEAT = 10.0  # seconds between two warnings about lost messages
 REMEDY = (
-    "Fast DDS loses large messages in its shared memory of 512 KB; start both processes with "
+    "Fast DDS loses messages above its shared memory of 512 KB; start sensor and node with "
     "FASTRTPS_DEFAULT_PROFILES_FILE=config/fastdds.xml, or let the sensor publish reliably (docs/ros.md, Large clouds)"
 )
 
@@ -36,8 +36,8 @@ class SensorTopic:
         kind: message type.
         name: name of the topic before remapping.
         callback: called with each message.
-        instead_of: preferred topic. While that topic has publishers, there is no subscription to this one.
-        ending: suffix. If `name` is not remapped, this topic is called `instead_of.name + ending`.
+        instead_of: preferred topic. While that topic has publishers, this object does not subscribe.
+        ending: suffix of the topic's name. If `name` is not remapped, the topic is `instead_of.name + ending`.
     """
 
     def __init__(
@@ -58,15 +58,15 @@ class SensorTopic:
         self._silent_since = self._reported = -float("inf")
         self._subscription: Subscription | None = None
         self._before: Subscription | None = None
-        self._twice: set[int] = set()  # stamps that the old subscription received while both existed
+        self._twice: set[int] = set()  # stamps received by the old subscription while both existed
         self._qos = QoSProfile(depth=DEPTH, reliability=ReliabilityPolicy.BEST_EFFORT)
-        # A QoS override of the user stays. rclpy has no public access to it.
+        # The user's QoS override is kept. rclpy has no public function that reads overrides.
         self._fixed = f"qos_overrides.{self.name}.subscription.reliability" in getattr(node, "_parameter_overrides", {})
         if instead_of is None:
             self._listen(QoSOverridingOptions.with_default_policies())
 
     def publishers(self) -> list[Any]:
-        """Return information about the publishers of the right message type."""
+        """Return information about the publishers that send messages of type `kind`."""
         kind = f"{self._kind.__module__.partition('.')[0]}/msg/{self._kind.__name__}"
         return [info for info in self._node.get_publishers_info_by_topic(self.name) if info.topic_type == kind]
 

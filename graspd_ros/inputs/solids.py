@@ -30,9 +30,9 @@ _SIZES = {SolidPrimitive.BOX: 3, SolidPrimitive.SPHERE: 1, SolidPrimitive.CYLIND
 def placed_shapes(
     kind: Literal["mesh", "primitive"], shapes: Collection[Any], poses: Collection[Pose], owner: str
 ) -> list[TriangleMesh]:
-    """Return the meshes of shapes at their poses, or at the origin without.
+    """Return the meshes of shapes at their poses. Without poses, the shapes stay at the origin.
 
-    Raises RequestError about `owner`: a shape or pose is invalid, or their numbers differ.
+    Raises RequestError, which names `owner`: a shape or pose is invalid, or there is not one pose for each shape.
     """
     make = _mesh if kind == "mesh" else _primitive
     if len(poses) not in (0, len(shapes)):
@@ -84,12 +84,12 @@ def _solid(kind: int, sizes: np.ndarray) -> Any:
 
 
 def bad_message(owner: str, message: str) -> RequestError:
-    """Return the error with the prefix `owner`, the name of the object that the message is about."""
+    """Return the error about an object. Its text begins with the object's name, `owner`."""
     return bad_request(f"{owner}: {message}")
 
 
 def plane_of(surface: PlaneMessage, T_object_frame: Matrix | None = None) -> Plane | None:
-    """Return the support plane in the object's frame, None if all numbers are 0. Raises RequestError if not a plane."""
+    """Return the support plane in the object's frame. None if all coefficients are 0. Raises RequestError: no plane."""
     a, b, c, d = map(float, surface.coef)
     if not any((a, b, c, d)):
         return None
@@ -101,7 +101,7 @@ def plane_of(surface: PlaneMessage, T_object_frame: Matrix | None = None) -> Pla
 
 
 def with_support(load: Callable[[], Scene], plane: Plane | None) -> Callable[[], Scene]:
-    """Return a loader that adds the support `plane`, if any, to the scene, with its normal towards the object."""
+    """Return `load`. If `plane` is given, the loaded scene gets it as support, with the normal towards the object."""
     if plane is None:
         return load
 
@@ -115,7 +115,7 @@ def with_support(load: Callable[[], Scene], plane: Plane | None) -> Callable[[],
 
 @dataclass(frozen=True, eq=False)
 class SceneObject:
-    """Collision object of the planning scene. Its shapes are in its own frame [m]."""
+    """Collision object at the pose `T_frame_object` in `frame`. `shapes` are in the object's own frame [m]."""
 
     frame: str
     T_frame_object: Matrix
@@ -123,7 +123,7 @@ class SceneObject:
 
 
 def updated_objects(objects: Mapping[str, SceneObject], message: Any) -> Mapping[str, SceneObject]:
-    """Return a copy of the collision objects, by id, updated with a `moveit_msgs/CollisionObject`.
+    """Return the collision objects by id, with the change of a `moveit_msgs/CollisionObject` applied.
 
     Raises RequestError if the id is unknown, or a shape, pose or operation is invalid.
     """
@@ -132,7 +132,7 @@ def updated_objects(objects: Mapping[str, SceneObject], message: Any) -> Mapping
     if operation == message.REMOVE and not name:
         return {}
     if not name:
-        raise bad_message(owner, "id: empty; give a name; only REMOVE may leave it empty, to remove all objects")
+        raise bad_message(owner, "id: empty; give a name; an empty id is valid only to REMOVE all objects")
     if operation not in operations:
         raise bad_message(owner, f"operation: {operation[0]}; valid: ADD=0, REMOVE=1, APPEND=2, MOVE=3")
     there = objects.get(name)
@@ -141,7 +141,7 @@ def updated_objects(objects: Mapping[str, SceneObject], message: Any) -> Mapping
     if operation == message.REMOVE:
         return {other: kept for other, kept in objects.items() if other != name}
     if there is None and len(objects) >= MOST_OBJECTS:
-        raise bad_message(owner, f"{MOST_OBJECTS} collision objects are stored, the most possible; REMOVE some")
+        raise bad_message(owner, f"{MOST_OBJECTS} collision objects are stored, which is the limit; REMOVE some")
     return {**objects, name: _changed(there, message, owner)}
 
 
@@ -161,12 +161,12 @@ def _changed(there: SceneObject | None, message: Any, owner: str) -> SceneObject
             raise bad_message(owner, "operation: MOVE takes no shapes; use ADD, or remove the shapes")
         return SceneObject(frame, T, there.shapes)
     if not shapes:
-        raise bad_message(owner, "it has no primitives or meshes; give at least one")
+        raise bad_message(owner, "no primitives and no meshes; give at least one")
     return SceneObject(frame, T, shapes)
 
 
 def with_collision_objects(request: Request, lookup: FrameLookup) -> Request:
-    """Return the request with its collision objects as `solids`, and a loader that adds them to the scene as obstacles.
+    """Return the request with its collision objects as obstacles. `solids` has their meshes, and `load` adds them.
 
     `lookup` transforms between frames at the request's time. Raises TransformError: an object's frame is unknown.
     """

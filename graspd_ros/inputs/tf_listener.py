@@ -28,7 +28,7 @@ if TYPE_CHECKING:
     from graspd_core import Arm, Reach
 
 TRANSFORM_PATIENCE = 1.0  # seconds that the worker waits for a transform
-ROBOT_PATIENCE = 10.0  # seconds that the start waits for the robot
+ROBOT_PATIENCE = 10.0  # seconds that the node's start waits for the robot's URDF
 _POLL = 0.01  # seconds between two lookups in the buffer
 _COMPLAIN_AGAIN = 10.0  # seconds between two log lines about invalid transforms
 
@@ -60,7 +60,7 @@ class TransformListener:
         return self._buffer.lookup(target, source, nanoseconds(stamp) or None)
 
     def lookup_in_time(self, target: str, source: str, stamp: Time, stop: StopHook) -> Matrix:
-        """Return `T_target_source`. Wait for late transforms, because they arrive after their clouds.
+        """Return `T_target_source`. Wait for a late transform, because clouds may arrive before their transforms.
 
         Do not call this in the executor's thread, which must receive the transforms meanwhile. Raises the last
         TransformError after `TRANSFORM_PATIENCE` seconds, or when `stop` returns True.
@@ -89,7 +89,7 @@ class TransformListener:
 
 
 def reach_of(request: Request, lookup: FrameLookup, robot_description: str = "") -> Reach:
-    """Return the restriction to grasps that the arm of the request's settings can reach, in the object's frame.
+    """Return a restriction, in the object's frame, that allows only grasps within reach of the settings' arm.
 
     `lookup` transforms between frames at the request's time. `robot_description` is the URDF of a robot with the arm.
     """
@@ -103,7 +103,7 @@ def reach_of(request: Request, lookup: FrameLookup, robot_description: str = "")
     return Reach(arm, (x, y, z), (qw, qx, qy, qz))
 
 
-# The tables of an arm take 0.1 s to compute and are stored with the arm.
+# Arms are cached, because an arm's tables take 0.1 s to compute.
 @lru_cache(maxsize=2)
 def _arm(name: str, robot_description: str) -> Arm:
     from graspd_core import load_arm
@@ -129,14 +129,14 @@ def heard_robot(node: Node, arm: str) -> str:
     executor.add_node(node)
     end = time.monotonic() + ROBOT_PATIENCE
     while not heard and time.monotonic() < end:
-        executor.spin_once(timeout_sec=0.1)  # in short turns, between which signals are handled
+        executor.spin_once(timeout_sec=0.1)  # in short turns, because Python handles signals between them
     name = topic.topic_name
     executor.remove_node(node)
     executor.shutdown()
     node.destroy_subscription(topic)
     if not heard:
         raise ConfigError(
-            f"parameter arm: {arm} needs the robot from {name}, but none arrived within {ROBOT_PATIENCE:g} s; "
+            f"parameter arm: {arm} needs a URDF from {name}, but none arrived within {ROBOT_PATIENCE:g} s; "
             "start robot_state_publisher first, or give a URDF file as urdf"
         )
     robot = str(heard[-1].data)

@@ -26,7 +26,7 @@ ARGUMENTS = {
     "name": ("graspd", "name of the node"),
     "namespace": ("", "namespace of the node"),
     "use_sim_time": ("", "whether the time comes from /clock"),
-    "large_clouds": ("false", "whether Fast DDS shares 64 MB instead of 512 KB; the cameras must do so too"),
+    "large_clouds": ("false", "whether Fast DDS shares 64 MB instead of 512 KB of memory; cameras need the same"),
     "respawn": ("false", "whether to restart the node when it dies"),
 }
 PARAMETERS = ("hand", "hand_prefix", "output_frame", "sensor_frame", "use_sim_time")

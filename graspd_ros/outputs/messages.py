@@ -2,12 +2,12 @@
 
 Metrics that were not measured are omitted. Other non-finite numbers become -1.
 
-A trajectory has three points for the fingers, and a base pose for each point. Velocities are zero at every point.
-A controller with cubic interpolation, such as ros2_control's, then moves all joints in step on straight lines, as the
-trial did. Its greatest speed is 1.5 times the mean speed of a stage. The stage times allow for this factor.
+A finger trajectory has three points: pregrasp, grasp and squeeze. Each point has a pose of the hand's base link and
+zero velocities. So a controller with cubic interpolation (ros2_control) moves straight in joint space, as in the trial.
+Between two points, the greatest speed is 1.5 times the mean speed. The durations keep the speeds within their limits.
 
-RViz markers show the hand at its grasp, the contacts, the axes of the base link, and the quality. Each name of `PARTS`
-is a marker namespace that can be switched off. The ids of a grasp start at `IDS_OF_A_GRASP` times its rank. Markers
+RViz markers show the hand at its grasp, the contacts, the axes of the base link, and a text. Each name of `PARTS`
+is a marker namespace that can be switched off. Marker ids of a grasp start at `IDS_OF_A_GRASP` times its rank. Markers
 stay until the next result deletes them.
 """
 
@@ -77,7 +77,7 @@ _PEAK = 1.5
 IDS_OF_A_GRASP = 1000
 GEOMETRIES = ("visual", "collision")
 # Parts that markers can show. For the best grasps: the hand at grasp, pregrasp and squeeze (the last two faint),
-# contacts, axes of the base link, and figures. `rejected` shows position and reason of grasps that failed a trial.
+# contacts, axes of the base link, and a text. `rejected` shows position and reason of grasps that failed a trial.
 PARTS = ("hand", "pregrasp", "squeeze", "contacts", "axes", "text", "rejected")
 USUAL_PARTS = ("hand", "contacts", "axes", "text")
 _FAINT = 0.25
@@ -99,7 +99,7 @@ class Pace:
     joint_speed: float = 1.0  # greatest speed of a revolute joint [rad/s]
     base_speed: float = 0.05  # greatest speed of the hand's base and of prismatic joints [m/s]
     base_turn: float = 0.5  # greatest angular speed of the base [rad/s]
-    shortest: float = 1.0  # least duration of a stage, 2.5 times that of the trial [s]
+    shortest: float = 1.0  # least duration of a stage, 2.5 times its duration in the trial [s]
 
     def __post_init__(self) -> None:
         for name, value in vars(self).items():
@@ -111,8 +111,8 @@ class Pace:
 class AnswerEnding:
     """Outcome of a request, for a GraspArray. The grasps of `result` are in the answer's frame.
 
-    `mass` is the object's mass in the trials [kg], 0 without trials. `mass_assumed` is True if no mass was given.
-    For a request for any object, `objects` has the position [m] of each object seen, and why it has no verified grasp.
+    `mass` is the object's mass for planning and trials [kg], 0 if unknown. `mass_assumed`: no mass was given.
+    For a request for any object, `objects` has each object's position [m], and the reason if no grasp is verified.
     """
 
     status: int
@@ -125,7 +125,7 @@ class AnswerEnding:
 
 
 def ending_of(result: GraspResult) -> AnswerEnding:
-    """Return the ending of a run from its outcome."""
+    """Return status, error code and message for the GraspArray of a planning result."""
     message = result.message or result.outcome.value
     if result.outcome is Outcome.SUCCEEDED:
         return AnswerEnding(GraspArray.SUCCEEDED, ErrorCode.NONE, message, result)
@@ -138,7 +138,7 @@ def ending_of(result: GraspResult) -> AnswerEnding:
 def array_message(
     ending: AnswerEnding, request_id: str, header: Header, elapsed: float, hand: HandModel, pace: Pace
 ) -> GraspArray:
-    """Return the answer to a request after `elapsed` seconds. Raises FloatingPointError if a grasp has a NaN."""
+    """Return the answer to a request that came `elapsed` seconds ago. Raises FloatingPointError: a grasp has a NaN."""
     message = GraspArray(
         header=header,
         request_id=request_id,
@@ -176,7 +176,7 @@ def grasp_message(
 ) -> GraspMessage:
     """Return one grasp in the header's frame. Raises FloatingPointError if the grasp contains a NaN.
 
-    `mass` is the object's mass [kg], None if unknown. The lift acceleration depends on it.
+    The lift acceleration depends on `mass`, the object's mass [kg]. None if unknown.
     """
     _check_finite(grasp, rank)
     pregrasp, closed, squeeze = (joint_message(posture, hand, header.stamp) for posture in _postures(grasp))
@@ -301,8 +301,8 @@ def _number(value: float, otherwise: float = UNMEASURED) -> float:
 def trajectory_of(grasp: Grasp, hand: HandModel, pace: Pace) -> JointTrajectory:
     """Return the trajectory through pregrasp, grasp and squeeze. Its stamp is zero, so it starts on receipt.
 
-    Only the driven joints are in it, because controllers refuse others. Any start posture is valid. Positions are
-    within the joint limits. The last point is a target inside the object, which the joints do not reach.
+    The trajectory has only the driven joints, because controllers refuse others. The hand may start in any posture.
+    Positions are within the joint limits. The last point is a target inside the object, which stops the joints.
     """
     times = posture_times(grasp, hand, pace)
     return JointTrajectory(
@@ -313,14 +313,14 @@ def trajectory_of(grasp: Grasp, hand: HandModel, pace: Pace) -> JointTrajectory:
 
 
 def base_poses(grasp: Grasp, frame: str, stamp: Time) -> list[PoseStamped]:
-    """Return the base link's pose at each trajectory point. The base moves and rotates uniformly between the points."""
+    """Return the base link's pose at each trajectory point. Between points, the base must move and rotate uniformly."""
     return [PoseStamped(header=Header(frame_id=frame, stamp=stamp), pose=pose_of_posture(p)) for p in _postures(grasp)]
 
 
 def posture_times(grasp: Grasp, hand: HandModel, pace: Pace) -> tuple[float, float, float]:
     """Return the times of pregrasp, grasp and squeeze from the start of the trajectory [s].
 
-    The first time lets every joint cross its whole range. The base is assumed to be at the pregrasp by then.
+    The first time lets every joint cross its whole range. The arm must bring the base to the pregrasp by then.
     """
     speed = _greatest_speeds(hand, pace)
     first = max(pace.shortest, _PEAK * float(np.max((hand.upper - hand.lower) / speed, initial=0.0)))
@@ -338,7 +338,7 @@ def _move_time(start: Posture, end: Posture, speed: np.ndarray, pace: Pace) -> f
 
 
 def _greatest_speeds(hand: HandModel, pace: Pace) -> np.ndarray:
-    """Return the speed limit of each actuated joint [rad/s] or [m/s] at which coupled joints keep their limits too."""
+    """Return the speed limit of each actuated joint [rad/s] or [m/s] that keeps coupled joints within their limits."""
     speed = np.minimum(np.where(hand.slides, pace.base_speed, pace.joint_speed), hand.velocity)
     for mimic in hand.mimics:
         own = pace.base_speed if hand.joint_kind[mimic.link] == "prismatic" else pace.joint_speed
@@ -360,8 +360,8 @@ def _point(posture: Posture, hand: HandModel, at: float) -> JointTrajectoryPoint
 def arm_trajectory(grasp: Grasp, path: ArmPath, pace: Pace) -> JointTrajectory:
     """Return all waypoints of the arm without velocities, so that controllers pass them without stopping.
 
-    The arm must start at the retreat, the first point, whose time is `pace.shortest` [s]. Points of a stage are
-    evenly spaced in time. Joints stay below `pace.joint_speed` and the hand below `pace.base_speed`.
+    The first point is the retreat posture, at the time `pace.shortest` [s]. The arm must start in this posture. Points
+    of a stage are evenly spaced in time. Joints stay below `pace.joint_speed`, the hand below `pace.base_speed`.
     """
     from graspd_core.arms.arm_paths import LIFT
 
@@ -381,7 +381,7 @@ def arm_trajectory(grasp: Grasp, path: ArmPath, pace: Pace) -> JointTrajectory:
 def execution_message(
     grasp: Grasp, path: ArmPath, hand: HandModel, pace: Pace, mass: float | None = None
 ) -> GraspExecution:
-    """Return the motion from retreat to the end of the lift, with the point index of each gate (all joints rest)."""
+    """Return the motion from retreat to the end of the lift, with the index of each gate (named point of rest)."""
     from graspd_core.arms.execution import GATES, ExecutionPace, execution_of
 
     own = ExecutionPace(pace.joint_speed, pace.base_speed, pace.base_speed, pace.shortest)
@@ -413,9 +413,9 @@ def result_markers(
     parts: Sequence[str] = USUAL_PARTS,
     solids: Sequence[Primitive] | None = None,
 ) -> MarkerArray:
-    """Return the markers of the namespaces `parts` for the best `most` grasps, and for all rejected ones.
+    """Return markers of the best `most` grasps: the `parts`, by names of `PARTS`. `rejected` shows all failed grasps.
 
-    The first marker deletes all earlier ones. `solids` are drawn as the hand. None takes its collision shapes.
+    The first marker deletes all earlier markers. The hand is drawn as `solids`, or as its collision shapes if None.
     """
     header = Header(frame_id=frame, stamp=stamp)
     markers = [Marker(header=header, action=Marker.DELETEALL)]
@@ -485,14 +485,14 @@ def _hand(
                     yield _solid(Marker.SPHERE, ball, np.full(3, 2 * size[0]), colour)
 
 
-# Making thousands of points takes tens of milliseconds. The lists are never modified.
+# The lists are cached, because thousands of points take tens of milliseconds. Nothing modifies the lists.
 @lru_cache(maxsize=256)
 def _corners(mesh: Primitive) -> list[Point]:
     return [point_of(corner) for corner in mesh.vertices[mesh.faces.reshape(-1)]]
 
 
 def _contact(contact: Contact) -> Marker:
-    """Return an arrow that ends at the contact. It points against the object's normal, as the link presses."""
+    """Return an arrow that ends at the contact and points in the direction in which the link presses."""
     tip = np.array(contact.position)
     tail = tip + _ARROW_LENGTH * np.array(contact.normal)
     return _arrow(tail, tip, (0.1, 0.3, 0.9))

@@ -37,7 +37,7 @@ _LEAST_APPROACH = 0.5
 
 
 class MoveItMissing(GraspdError):
-    """moveit_msgs cannot be imported."""
+    """moveit_msgs or one of its messages is not installed."""
 
 
 def moveit_grasp(
@@ -69,7 +69,7 @@ def moveit_grasp(
         ConfigError: the grasp failed its trial, or `retreat` is zero or not finite.
     """
     if grasp.verdict == Grasp.FAILED:
-        raise ConfigError(f"grasp {grasp.id!r}: the grasp failed its trial ({grasp.reason}); execute a verified one")
+        raise ConfigError(f"grasp {grasp.id!r}: the grasp failed its trial ({grasp.reason}); execute a verified grasp")
     up = np.array(retreat, dtype=float)
     if not (np.isfinite(up).all() and up.any()):
         raise ConfigError(f"retreat: {retreat}; valid: a finite direction that is not zero")
@@ -115,7 +115,7 @@ def attached_object(
         mass: mass of the object [kg]. 0 if unknown.
         messages: module with the message classes. If None, `moveit_msgs.msg` is used.
 
-    Raises MoveItMissing: moveit_msgs is not installed, or is an old subset without this message.
+    Raises MoveItMissing: moveit_msgs is not installed, or its version lacks this message.
     """
     kind = attached_kind(messages)
     if kind is None:

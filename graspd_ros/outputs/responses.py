@@ -1,7 +1,7 @@
 """Outcomes of requests as messages: one GraspArray per request, and events for clients without graspd_msgs.
 
-A cloud without a request gets no answer if a newer cloud replaces it, and is only counted. The node publishes its
-health and its counts since the start on /diagnostics.
+A newer cloud may replace a waiting cloud that came without a request. The old cloud is counted, but gets no answer.
+The node reports its health on /diagnostics, with counts since its start or the last ~/reset.
 """
 
 from __future__ import annotations
@@ -56,7 +56,7 @@ _ENDS = {
     GraspArray.SUPERSEDED: "requests superseded",
     GraspArray.REFUSED: "requests refused",
 }
-# Keys in /diagnostics of the counts since the start.
+# Keys of the counts in /diagnostics.
 ACCEPTED, RECEIVED, SUPERSEDED = "requests accepted", "clouds received", "clouds superseded"
 VERIFIED, FAILED = "grasps verified", "grasps failed"
 COUNT_PERIOD = 1.0  # seconds between two reports of superseded clouds, or of unusable clouds
@@ -72,7 +72,7 @@ SHOWN = {
     JointTrajectory: "~/trajectory",
     MarkerArray: "~/markers",
 }
-# Late subscribers get the last message of each.
+# Late subscribers get the last message of each of these topics.
 LATCHED = {GraspArray: "~/grasps", **SHOWN}
 
 
@@ -83,9 +83,9 @@ class Health:
     Attributes:
         running: id of the running request. Empty when idle.
         waiting: number of waiting requests, at most `queue_size`.
-        counts: counts since the start, by their keys in the message.
-        last_latency: time from the last planned request to its answer [s]. None before the first.
-        last_first_verified: planning time until that request's first verified grasp [s]. None without such a grasp.
+        counts: counts since the start or the last ~/reset, by their keys in /diagnostics.
+        last_latency: time from the arrival of the last planned request to its answer [s]. None before the first answer.
+        last_first_verified: planning time of the same request until its first verified grasp [s]. None without one.
     """
 
     name: str
@@ -104,7 +104,7 @@ class Health:
 
 
 class Counters:
-    """Thread-safe counts by name, and the times of the last request."""
+    """Thread-safe store of counts by name, the times of the last planned request, and the last error."""
 
     def __init__(self) -> None:
         self._lock = threading.Lock()
@@ -161,7 +161,7 @@ def health_message(health: Health, stamp: Time, memory: int) -> DiagnosticArray:
 def resident_memory(pid: int | None = None) -> int:
     """Return the resident memory of a process (None for this one) and its children [bytes]. 0 if unknown.
 
-    Shared memory counts once for each process.
+    Memory that several processes share is counted for each process.
     """
     process = Path("/proc", str(pid or os.getpid()))
     try:
@@ -181,7 +181,7 @@ def _words(file: Path) -> list[str]:
 
 
 def _verdict(health: Health) -> tuple[bytes, str]:
-    """Return the level and message of the worst problem."""
+    """Return the diagnostic level and message of the worst problem, or OK and what the node does."""
     if not health.worker_alive:
         return DiagnosticStatus.ERROR, "the worker has ended; restart the node"
     if not health.ready:
@@ -257,9 +257,9 @@ class Publishers:
         self.publish(String(data=status_line(line)))
 
     def forget(self) -> None:
-        """Reset the latched poses, joint values and markers, so that late subscribers do not get old ones.
+        """Renew all latched publishers except ~/grasps and ~/status, so that late subscribers get no old messages.
 
-        Answers stay latched. Subscribers need a moment to find a new publisher and would miss the first answers.
+        ~/grasps keeps its publisher, because subscribers need a moment to find a new one and would miss answers.
         """
         with self._lock:
             for kind, topic in self._shown.items():
@@ -284,7 +284,7 @@ class Responses:
         self._superseded_reported = self._complained = -float("inf")
 
     def forget(self) -> None:
-        """Reset counters and latched topics. Only the last answer stays available to late subscribers."""
+        """Reset counters and latched topics. Late subscribers still get the last answer and the events on ~/status."""
         self.publishers.publish(result_markers((), self._hand, "", self._now()))
         self.publishers.forget()
         self.counters.clear()
@@ -316,7 +316,7 @@ class Responses:
             self.not_made(request_id, "cloud", error)
 
     def refused(self, request_id: str, source: str, code: ErrorCode, message: str) -> None:
-        """Report on `~/status` and in the log why a message is not used. The id is empty if it is no request."""
+        """Report on `~/status` and in the log why a message is not used. `request_id` is empty for other messages."""
         self.publishers.emit("refused", request_id, source, code=code, message=message)
         self._log().warning(f"{request_id or source}: refused: {message}")
 
@@ -328,13 +328,13 @@ class Responses:
             self._report(request, GraspProgress(header=header, request_id=request.id, stage="queued", message=message))
 
     def started(self, request: Request) -> None:
-        """Report that the worker starts an `only_newest` request. Other requests are reported on submission."""
+        """Report an `only_newest` request as accepted when it starts. Other requests are reported on submission."""
         if request.only_newest:
             self._report_superseded(request.id)
             self._accepted(request, 0)
 
     def progress_hook(self, request: Request) -> ProgressHook:
-        """Return a hook that publishes progress at most at `progress_rate`, and passes each grasp to the listener."""
+        """Return a hook that publishes progress at up to `progress_rate` [Hz], and gives each grasp to the listener."""
         lowest, last, period = math.inf, -math.inf, 1 / request.settings.progress_rate
 
         def publish_progress(progress: Progress) -> None:
@@ -432,7 +432,7 @@ class Responses:
                 self._visuals = visual_solids(self._hand, settings.hand_prefix)
             except GraspdError as error:
                 self._visuals = self._hand.primitives
-                self._log().warning(f"~/markers draws the hand's collision solids: {error}")
+                self._log().warning(f"~/markers draws the hand's collision shapes: {error}")
         return self._visuals
 
     def _answer(self, request: Request, ending: messages.AnswerEnding) -> GraspArray:
@@ -463,7 +463,7 @@ class Responses:
         self._log().error(f"{request_id or source}: {message}{detail}")
 
     def _report_superseded(self, request_id: str) -> None:
-        """Publish and reset the number of clouds superseded since the last report. The event gets `request_id`."""
+        """Publish how many clouds newer clouds have replaced since the last report. The event has `request_id`."""
         count, self._superseded = self._superseded, 0
         if count:
             self._superseded_reported = time.monotonic()
@@ -486,7 +486,7 @@ def _pace(request: Request) -> Pace:
 
 
 def presentable(result: GraspResult) -> Grasp | None:
-    """Return the best grasp if it is usable, otherwise None, so that no uncertain grasp is published."""
+    """Return the best grasp if it is usable, otherwise None, so that topics for robots get no doubtful grasp."""
     best = result.tried[0] if result.tried else None
     return best if best is not None and best.usable else None
 
@@ -498,7 +498,7 @@ def progress_event(progress: Progress) -> dict[str, Any]:
 
 
 def result_event(result: GraspResult) -> dict[str, Any]:
-    """Return outcome, counts, timing and the best grasp's metrics. `best` is None if no grasp may be published."""
+    """Return the event with outcome, counts, timing and the best grasp. `best` is None if no grasp is usable."""
     best = presentable(result)
     return {
         "outcome": result.outcome.name.lower(),

@@ -118,7 +118,7 @@ def test_both_verdicts_stand_side_by_side(tmp_path: Path, capsys):
     told = capsys.readouterr().out
     for variant in (AS_IS, ARMATURE):
         assert re.search(rf"\| sphere \| {variant} \| \d+ \| 2 \| 1 \| 1 \| \d+ \| \d+ \| 50% \|", told)
-        assert f"Held by ours only, {variant}: 1: refused: the pregrasp overlaps" in told
+        assert f"Failed only there, {variant}: 1: refused: the pregrasp overlaps" in told
     assert "Known differences" in told
 
 

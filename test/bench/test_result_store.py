@@ -170,7 +170,7 @@ def test_a_death_and_a_hang_cost_their_case_only(tmp_path: Path, job):
     records = {done.case: record for done, record in run_cases(jobs, tmp_path / "out", 3)}
     died, hung, told = (records[wanted.case] for wanted in jobs)
     assert (died["failed"], died["error"]) == ("died", "RuntimeError: its process died with exit code 7")
-    assert (hung["failed"], hung["error"]) == ("hung", "TimeoutError: no end after 2 s")
+    assert (hung["failed"], hung["error"]) == ("hung", "TimeoutError: did not end within 2 s")
     assert told["environment"] == ENVIRONMENT
     assert told["odd"] is None, "JSON knows no infinity"
     kept = [store.read_record(tmp_path / "out", "errands", wanted.case, "1+a", failed=True) for wanted in jobs]

@@ -115,7 +115,7 @@ def test_what_needs_the_user_s_files_says_so():
     assert "frames" not in studies_of(["all"])
     with pytest.raises(ConfigError, match="objects: no"):
         STUDIES["frames"].cases(Request())
-    with pytest.raises(ConfigError, match="hand: none given; valid: MANO_RIGHT"):
+    with pytest.raises(ConfigError, match="hand: none given; valid: the path of MANO_RIGHT"):
         STUDIES["mano"].cases(Request())
 
 
@@ -173,7 +173,7 @@ def test_cells_that_raise_are_named_at_the_end_and_the_others_kept(tmp_path, rec
     assert main(["bench", *SMALL, "--seeds", "0", "1", "--out", str(tmp_path)]) == 1
     out, err = capsys.readouterr()
     assert "graspd: failed: main raw random_closure sphere seed 1: ValueError: odd" in err
-    assert "graspd: 2 cases, about 0 minutes on 1 quiet cores" in err
+    assert "graspd: 2 cases, about 0 minutes on 1 idle cores" in err
     assert "| `random_closure` | 50% |" in out
     assert len(read_results(tmp_path / "results.json")) == 2
 

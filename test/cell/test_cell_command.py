@@ -52,12 +52,12 @@ def test_an_empty_bin_is_filled_again_until_there_were_enough_picks(capsys: pyte
 @pytest.mark.parametrize(
     ("words", "reason"),
     [
-        (("--count", "0"), "--count 0: valid: 1 to 24"),
-        (("--seed", "-1"), "--seed -1: valid: 0 to"),
-        (("--speed", "0"), "--speed 0.0: valid: more than zero"),
-        (("--attempts", "0"), "--attempts 0: valid: 1 or more"),
-        (("--picks", "0"), "--picks 0: valid: 1 or more"),
-        (("--picks", "9", "--view"), "--picks: --view or --film is given too; give one of them"),
+        (("--count", "0"), "--count: 0; valid: 1 to 24"),
+        (("--seed", "-1"), "--seed: -1; valid: 0 to"),
+        (("--speed", "0"), "--speed: 0.0; valid: more than zero"),
+        (("--attempts", "0"), "--attempts: 0; valid: 1 or more"),
+        (("--picks", "0"), "--picks: 0; valid: 1 or more"),
+        (("--picks", "9", "--view"), "--picks cannot be combined with --view or --film; remove one of them"),
         (("--things", "nothing"), "unknown thing 'nothing'"),
         (("--hand", "none"), "hand"),
     ],

@@ -13,10 +13,12 @@ import pytest
 import rclpy
 from rclpy.context import Context
 
+from graspd_cell.controller import JointLimits, Tolerances, TrajectoryController
 from graspd_cell.grasp_source import cloud_of
 from graspd_cell.layout import layout_of
 from graspd_cell.robot import JointMotion, MotionAborted
-from graspd_cell.ros_robot import RobotSilentError, RobotTopics, RosRobot
+from graspd_cell.ros_robot import RobotSilentError, RobotTopics, RosRobot, goal_of
+from graspd_cell.simulator_node import motion_of
 from graspd_core.arms.arm import load_arm
 from graspd_core.hands.library import load_hand
 
@@ -47,6 +49,17 @@ def to(robot: RosRobot, change: float, seconds: float) -> JointMotion:
     """A motion of all arm joints by so much."""
     goal = robot.joints().of(ARM.joint_names).positions + change
     return JointMotion(ARM.joint_names, np.array([seconds]), goal[None], np.zeros((1, len(goal))))
+
+
+@pytest.mark.parametrize("late", [None, 3.5])
+def test_a_goal_carries_the_whole_motion(late: float | None):
+    times, rows = np.array([0.5, 2.0]), np.array([[0.01], [0.05]])
+    motion = JointMotion(HAND.joint_names[:1], times, rows, 0 * rows, np.array([0.2]), np.array([0.1]), late)
+    limits = JointLimits(motion.names, np.zeros(1), np.ones(1), np.ones(1))
+    back = motion_of(goal_of(motion), TrajectoryController(limits, Tolerances(), rows[0]))
+    assert (back.names, back.goal_time) == (motion.names, late)
+    for name in ("times", "positions", "velocities", "path_tolerance", "goal_tolerance"):
+        np.testing.assert_allclose(getattr(back, name), getattr(motion, name))
 
 
 def test_a_look_shows_the_thing_in_the_bin_where_the_layout_has_it(robot: RosRobot):
@@ -80,7 +93,7 @@ def test_a_stop_leaves_the_arm_still(robot: RosRobot):
 
 
 def test_what_the_controller_refuses_says_why_and_timeouts_end_a_motion(robot: RosRobot):
-    with pytest.raises(MotionAborted, match="is sent at"):
+    with pytest.raises(MotionAborted, match="would move at"):
         robot.follow(to(robot, 0.5, 0.02), 5.0)
     with pytest.raises(MotionAborted, match="timeout"):
         robot.follow(to(robot, 0.3, 6.0), 0.5)

@@ -229,7 +229,7 @@ def test_a_goal_that_makes_no_sense_is_aborted_with_a_reason_and_the_cell_lives_
         "a motion's times": goal_of(names),
         "strictly increasing": goal_of(names, (1.0, here), (0.5, here)),
         "beyond its limits": goal_of(names, (30.0, [*here[:2], 9.0, *here[3:]])),
-        "is sent at": goal_of(names, (0.01, [value + 1.0 for value in here])),
+        "would move at": goal_of(names, (0.01, [value + 1.0 for value in here])),
     }
     for reason, goal in bad.items():
         result = cell.result(cell.send("arm", goal))

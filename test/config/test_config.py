@@ -1,6 +1,8 @@
 """Settings of plans and of scenes: presets load, one file reaches every field, and what is wrong in one is named."""
 
 import dataclasses
+import inspect
+import re
 from pathlib import Path
 from typing import Any
 
@@ -141,6 +143,19 @@ def test_one_file_reaches_every_field(tmp_path: Path):
     config = dataclasses.asdict(load_scene_config(written(tmp_path, yaml.safe_dump(values))))
     for name, part in PARTS:
         assert all(config[name][field] != value for field, value in dataclasses.asdict(part).items())
+
+
+def test_the_documented_settings_are_those_of_the_code():
+    page = (Path(__file__).parents[2] / "docs" / "tables" / "clouds.md").read_text().split("<!-- scene:end -->")[0]
+    documented = {name: shown for name, *shown in re.findall(r"^\| `([\w.]+)` \| (\S+) \| (.+) \|$", page, re.M)}
+    expected = {}
+    for name, part in PARTS:
+        attributes = (inspect.getdoc(part) or "").split("Attributes:\n")[1].split("\n\n")[0]
+        told = dict(re.findall(r"^ {4}(\w+): (.+(?:\n {8}.+)*)", attributes, re.M))
+        for field, value in dataclasses.asdict(part).items():
+            default = f"{value:g}" if type(value) in (int, float) else yaml.safe_dump(value).split("\n")[0]
+            expected[f"{name}.{field}"] = [default, " ".join(told[field].split())]
+    assert documented == expected
 
 
 @pytest.mark.parametrize(

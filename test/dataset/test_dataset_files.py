@@ -91,14 +91,14 @@ def test_spoilt_moved_doubled_and_missing_files_are_found(copied: DatasetStore, 
     changed[_last_of_a_page(first)] ^= 0xFF
     first.write_bytes(changed)
     assert graspd("dataset", "validate", root) == 1
-    assert f"{first.name}: not a whole Parquet file" in capsys.readouterr().out
+    assert f"{first.name}: not a complete Parquet file" in capsys.readouterr().out
     first.write_bytes(content[: len(content) // 3])
     assert graspd("dataset", "validate", root) == 1
-    assert f"{first.name}: not a whole Parquet file" in capsys.readouterr().out
+    assert f"{first.name}: not a complete Parquet file" in capsys.readouterr().out
     first.write_bytes(content)
     shutil.copy(first, second)
     (fault, twice) = list(faults_of_dataset(copied))
-    assert f"its metadata does not match its name: it is of block {first.stem}" in fault
+    assert f"its metadata does not match its name: the metadata names block {first.stem}" in fault
     assert "a grasp is also in" in twice
     second.unlink()
     shutil.rmtree(root / "objects")

@@ -81,7 +81,7 @@ def test_a_pose_alone_is_closed_and_pressed(exported, tmp_path: Path, graspd, ca
     assert graspd("import", folder / "graspgen", *words) == 0
     document, back = json.loads(out.read_text()), load_grasps(out)
     failed = sum(row["verdict"] == "failed" for row in rows)
-    assert document["refused"].get("its file says that it did not hold", 0) == failed
+    assert document["refused"].get("its file says that the grasp did not hold", 0) == failed
     assert len(back) + sum(document["refused"].values()) == len(rows)
     ours = {tuple(np.round(row["grasp_position"], 7)): row for row in rows}
     for grasp in back:
@@ -306,7 +306,7 @@ def test_a_joint_beyond_its_limit_is_refused_and_counted(exported, tmp_path: Pat
 def test_an_order_that_is_not_known_or_does_not_fit_is_refused(exported, tmp_path: Path, graspd, capsys):
     folder, _ = exported
     for words, message in (
-        (("--hand", "leap_right"), "joint order: not known for leap_right, and npy files have no names; give one: "),
+        (("--hand", "leap_right"), "joint order: not known for leap_right, and npy files name no joints; give one: "),
         (("--hand", "allegro_right", "--joint-order", "a,b"), "joint order: 'a' is no joint of allegro_right; valid: "),
         (("--hand", "allegro_right", "--joint-order", HAND.joint_names[0]), "of allegro_right is missing"),
     ):
@@ -323,7 +323,7 @@ def test_coupled_joints_may_be_named_and_must_follow():
     values = dict(zip(all_joint_names(hand), all_joint_positions(hand, joints).tolist(), strict=True))
     assert np.abs(joints_by_name(values, hand, "x") - joints).max() < 1e-12
     coupled = next(mimic.name for mimic in hand.mimics)
-    with pytest.raises(FormatError, match=f"joint '{coupled}' is .*; valid: .*, as it is coupled"):
+    with pytest.raises(FormatError, match=f"joint '{coupled}' is .*; valid: .*, because it is coupled"):
         joints_by_name({**values, coupled: values[coupled] + 0.1}, hand, "x")
 
 

@@ -118,7 +118,7 @@ def test_a_driver_that_is_killed_goes_on_where_it_was(start: Start, many: dict[s
     process = dataset(start, store.where, "--per-object", "40")
     _, errors = process.communicate()
     assert process.returncode == 0, errors
-    assert "of 20 blocks are there" in errors
+    assert "of 20 blocks exist" in errors
     assert files(store) == many
     rows, different = count_by_content(store)
     assert rows == different
@@ -242,4 +242,4 @@ def test_a_poisoned_object_is_written_down_and_stops_nothing(start: Start, many:
     process = start("-m", "graspd_core.cli", "dataset", *words)
     _, errors = process.communicate()
     assert process.returncode == 0, errors
-    assert "40 of 40 blocks are there or failed before" in errors
+    assert "40 of 40 blocks exist or failed before" in errors

@@ -86,7 +86,7 @@ def test_a_table_comes_back_as_it_was_and_a_changed_byte_is_found(made: DatasetS
 
 def test_a_file_of_somebody_else_or_of_another_version_is_refused(made: DatasetStore):
     _, content, table, told = next(iter(tables_of(made)))
-    with pytest.raises(FormatError, match="not a whole Parquet file"):
+    with pytest.raises(FormatError, match="not a complete Parquet file"):
         read_parquet(content[:-20], "cut.parquet")
     with pytest.raises(FormatError, match="version 7; known: 1"):
         read_parquet(parquet_bytes(table, {**told, "version": 7}), "new.parquet")

@@ -152,7 +152,7 @@ CLOUDS = (
     Situation(
         "a table with nothing on it",
         array_file("a.npy", lambda: rows_of("")),
-        "no object among .* nothing on it",
+        "no graspable object among .* nothing on it",
         "atenpas/gpd/issues/119",
     ),
     Situation(

@@ -7,8 +7,8 @@ import pytest
 
 from graspd_bench.rendering.depth_noise import DEFAULT
 from graspd_bench.rendering.tabletop import CAMERA, ring_poses, tabletop, views_of
-from graspd_core import Grasp, Outcome, PointCloud, Posture, Sphere, Steering, Verdict, load_hand
-from graspd_core.config.planning_config import DOUBTED_SHARE
+from graspd_core import Grasp, Outcome, PointCloud, Posture, Sphere, Steering, Verdict, load_hand, load_preset
+from graspd_core.config.planning_config import DOUBTED_SHARE, CertaintyConfig
 from graspd_core.errors import CloudError, ConfigError, NoObjectError
 from graspd_core.planning.any_thing import (
     NOT_LOOKED_AT,
@@ -45,7 +45,15 @@ def test_the_first_verified_grasp_ends_the_search_and_all_things_are_told(first:
     assert best.reason == ""
     # The price is that of one thing wherever the first has a grasp.
     assert sum(thing.looked_at for thing in first) == 1
-    assert first[1].reason == "not planned for"
+    assert first[1].reason == "not tried before the search ended"
+
+
+def test_a_verified_grasp_of_unknown_probability_ends_the_search_too(views):
+    preset = replace(load_preset("fast"), certainty=CertaintyConfig(0.0))
+    found = plan_any_thing(views, HAND, **{**ASKED, "preset": preset})
+    assert found[0].grasp is not None
+    assert (found[0].grasp.verdict, found[0].grasp.probability) == (Verdict.VERIFIED, None)
+    assert [thing.looked_at for thing in found].count(True) == 1
 
 
 @pytest.mark.parametrize("enough", [1, 2])

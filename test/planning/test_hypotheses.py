@@ -115,7 +115,7 @@ def under(*stages: Sequence[bool | None], least: int | None = None) -> Robustnes
 def test_a_grasp_must_hold_under_all_that_can_be_tried(passed, verified, probability, travel, reason):
     result, likely = try_robustness(under(*passed), GRASP, lambda: False)
     assert (result.name, result.passed, likely) == (ROBUSTNESS, verified, probability)
-    assert result.reason == (f"fails under {reason}" if reason else "")
+    assert result.reason == (f"fails with {reason}" if reason else "")
     assert result.displacement == travel
 
 
@@ -155,7 +155,7 @@ def test_another_shape_may_turn_less_than_the_likeliest(monkeypatch):
     monkeypatch.setattr(hypotheses, "_LESS_TURN", 1e-3)
     reasons = [grasp.reason for grasp in plan(seen_from(), SURE, rounds=1).tried if grasp.trials[0].passed]
     assert reasons
-    assert all(reason.startswith("fails under ") for reason in reasons)
+    assert all(reason.startswith("fails with ") for reason in reasons)
     assert any("other shape" in reason and "turned" in reason for reason in reasons)
 
 
@@ -405,7 +405,7 @@ def test_what_speaks_against_a_scene_leaves_no_grasp_verified(monkeypatch):
     held = [grasp for grasp in plan(doubted, SURE, rounds=1).tried if grasp.verdict is Verdict.UNVERIFIED]
     assert held
     for grasp in held:
-        assert grasp.reason.startswith("fails under displaced pose")
+        assert grasp.reason.startswith("fails with displaced pose")
         assert grasp.probability == pytest.approx(DOUBTED_SHARE * MASS_KNOWN.fails_places / MASS_KNOWN.places)
 
 

@@ -60,9 +60,9 @@ def test_the_true_place_is_taken_and_the_places_of_robots_are_refused(shape, ele
     thing = points[(np.abs(points[:, :2]) < 0.08).all(1) & (points[:, 2] > 0.008)]
     assert check_viewpoint(PointCloud(thing, place), cloud, np.array([0.0, 0.0, 1.0])) == ""
     for base in BASES.values():
-        with pytest.raises(CloudError, match="its pixels show it at") as refused:
+        with pytest.raises(CloudError, match="its pixels show the camera at") as refused:
             seen_from(grid, np.array(base))
-        told = str(refused.value).split("show it at (")[1].split(")")[0]
+        told = str(refused.value).split("show the camera at (")[1].split(")")[0]
         # The fit is to a pixel or so; the frame of the figure is the cloud's.
         np.testing.assert_allclose([float(x) for x in told.split(",")], place, atol=0.005)
         assert is_refused(PointCloud(thing, np.array(base)), replace(cloud, viewpoint=np.array(base)))
@@ -108,17 +108,17 @@ def test_one_side_of_an_object_about_its_own_middle_is_refused_by_that_reason():
     assert is_all_round(PointCloud(surface_samples(make_shape("mug"), 3000, seed=0)[0], place))
     assert not is_all_round(PointCloud(thing, place))
     assert not is_all_round(PointCloud(points, place))
-    with pytest.raises(CloudError, match="did not stand at the origin of its frame: it lies within the object"):
+    with pytest.raises(CloudError, match="did not stand at the origin of its frame: this place lies within the object"):
         scene_from_views([PointCloud(thing - thing.mean(0), np.zeros(3))], alone=True)
 
 
-@pytest.mark.parametrize(("factor", "doubt"), [(4.0, "are its numbers metres"), (0.1, "nearer than depth"), (10.0, "")])
+@pytest.mark.parametrize(("factor", "doubt"), [(4.0, "coordinates in metres"), (0.1, "nearer than depth"), (10.0, "")])
 def test_a_scene_in_another_unit_is_refused_or_doubted(factor, doubt):
     """Depth of 0.25 mm a unit that is read as millimetres, and its like."""
     scene = tabletop("mug", yaw=0.4, obstacles=[("box", 0.15, 0.05)])
     T = ring_poses(1, elevation=0.6, azimuth=0.3)[0]
     depth = depth_views(scene, CAMERA, [T], DEFAULT, seed=3)[0][0]
-    with nullcontext() if doubt else pytest.raises(CloudError, match="are their numbers metres"):
+    with nullcontext() if doubt else pytest.raises(CloudError, match="are the coordinates in metres"):
         seen = scene_from_views([cloud_from_depth(factor * depth, CAMERA)])
         assert seen.evidence is not None
         assert doubt in " ".join(seen.evidence.doubts)

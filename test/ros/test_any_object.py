@@ -62,7 +62,7 @@ def test_any_object_is_taken_and_after_a_loss_another(client, start_node, make_c
     first = ask("first")
     assert first.status == GraspArray.SUCCEEDED, first.message
     np.testing.assert_allclose(places(first), PLACES, atol=0.04)
-    assert list(first.object_reasons) == ["", "not planned for"]
+    assert list(first.object_reasons) == ["", "not tried before the search ended"]
     assert nearest(first) == 0
     # The object in the hand, for a motion planner: its middle is where the answer says, seen from the base link.
     (held,) = client.spin_until(lambda: attached, "object in the hand")

@@ -161,7 +161,7 @@ def test_a_group_that_is_no_hand_and_an_object_without_shape_are_aborted_and_tol
     refused = client.event(event="refused", code="WRONG_HAND")
     assert "group_name: unknown hand 'left_arm'; this node plans for 'allegro_right'" in refused["message"]
     assert ask(client, planning, Object())[0] == GoalStatus.STATUS_ABORTED
-    assert "object: it has no meshes" in client.event(event="refused", code="BAD_REQUEST")["message"]
+    assert "object: no meshes" in client.event(event="refused", code="BAD_REQUEST")["message"]
 
 
 def test_the_client_of_the_docs_gets_grasps_in_a_process_of_its_own(client, planning):

@@ -144,7 +144,7 @@ BAD = {
     "operation: 7; valid: ADD=0, REMOVE=1, APPEND=2, MOVE=3": message(b"\x07", **crate()),
     "'wall': meshes: 0 vertices and 0 triangles": message(meshes=[Mesh()]),
     "'wall': planes: infinite planes are not supported": message(planes=[Plane()], **crate()),
-    "'wall': it has no primitives or meshes": message(),
+    "'wall': no primitives and no meshes": message(),
     "'wall': header.frame_id: empty": message(frame="", **crate()),
     "'wall': pose: position [nan, 0.0, 0.0]": message(**crate(), pose=Pose(position=Point(x=np.nan))),
     "'wall': primitive_poses: its quaternion has length 3": message(
@@ -168,7 +168,7 @@ def test_a_message_that_cannot_be_meant_is_refused_by_name(culprit: str):
 def test_there_is_an_end_of_things():
     wall = updated_objects({}, message(**crate()))["wall"]
     many = {str(number): wall for number in range(MOST_OBJECTS)}
-    with pytest.raises(GraspdError, match="1000 collision objects are stored, the most possible"):
+    with pytest.raises(GraspdError, match="1000 collision objects are stored, which is the limit"):
         updated_objects(many, message(**crate()))
     assert updated_objects(many, message(name="7", **crate()))
 

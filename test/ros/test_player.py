@@ -152,5 +152,5 @@ def test_a_bag_without_any_known_type_is_refused(client, tmp_path, monkeypatch):
     monkeypatch.setitem(sys.modules, "tf2_msgs.msg", None)  # as where the package is not installed
     message = transforms_message([("world", "camera", np.eye(4))], START)
     write_bag(tmp_path / "only_tf", [Record("/tf", START, message)])
-    with pytest.raises(BagError, match=r"no topic of a type that is installed here; the bag has: /tf \(tf2_msgs"):
+    with pytest.raises(BagError, match=r"no topic has a type that is installed here; the bag has: /tf \(tf2_msgs"):
         play(client.node, tmp_path / "only_tf")

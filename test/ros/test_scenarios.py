@@ -279,7 +279,7 @@ def depth_images_are_grasped(client) -> None:
             asked.append(f"{name}-{len(asked)}")
             client.send_request(id=asked[-1], source=GraspRequest.LATEST_CLOUD)
             answer = client.answer(asked[-1])
-            return answer.error_code != "NO_CLOUD" or "but no two match" in answer.message
+            return answer.error_code != "NO_CLOUD" or "but no pair matches" in answer.message
 
         client.spin_until(sent, "an answer about the image")
         client.node.destroy_publisher(publisher)
@@ -289,7 +289,7 @@ def depth_images_are_grasped(client) -> None:
     assert (missing.status, missing.error_code) == (GraspArray.REFUSED, "NO_CLOUD")
     assert missing.message.startswith("no cloud or depth image has arrived yet; ")
     assert "; depth images: " in missing.message
-    assert "and 0 CameraInfos received, but no two match; last image: 320 x 240" in missing.message
+    assert "and 0 CameraInfos received, but no pair matches; last image: 320 x 240" in missing.message
     assert client.event(event="refused", source="sensors")["code"] == "NO_CLOUD"
     # Once, and without a stamp.
     calibration = CameraInfo(height=240, width=320, k=[308.0, 0, 159.5, 0, 308.0, 119.5, 0, 0, 1])

@@ -125,7 +125,7 @@ def test_a_robot_that_never_comes_is_waited_for_so_long(start_node, tmp_path):
     arm = description(tmp_path)
     (told,) = told_at_the_start(start_node, arm)
     assert told == (
-        f"graspd_node: parameter arm: {arm} needs the robot from /robot_description, but none arrived within 10 s"
+        f"graspd_node: parameter arm: {arm} needs a URDF from /robot_description, but none arrived within 10 s"
         "; start robot_state_publisher first, or give a URDF file as urdf"
     )
 

@@ -289,7 +289,7 @@ def test_targets_that_cannot_be_meant_are_refused(target, complaint):
 
 def test_points_without_any_surface_are_no_object():
     points = np.random.default_rng(0).random((2000, 3))
-    with pytest.raises(NoObjectError, match="no object among 2000 points"):
+    with pytest.raises(NoObjectError, match="no graspable object among 2000 points"):
         segment([PointCloud(points, np.zeros(3))])
 
 

@@ -92,7 +92,7 @@ def test_the_grasps_of_a_run_are_those_that_were_measured(tmp_path: Path, viewer
         with page.tab.expect_popup() as popup:
             page.press("Show these grasps")
         popup.value.get_by_text("fast, box, seed 3").first.wait_for()
-        popup.value.get_by_text(f"{record['held']} of 4 held; {record['held']} did in the benchmark").first.wait_for()
+        popup.value.get_by_text(f"{record['held']} of 4 held; {record['held']} held in the benchmark").first.wait_for()
         popup.value.get_by_text("#0 ").first.wait_for()
         popup.value.close()
     for grasp, measured in zip(shown[-1].grasps, record["grasps"], strict=True):

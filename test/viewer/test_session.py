@@ -52,7 +52,7 @@ def test_an_object_that_is_gone_or_another_is_said(grasps_file, tmp_path):
     assert "gone.obj" in gone.notes[0]
     assert len(gone.grasps) == 4
     other = open_grasps(grasps_file, object_source="shape:mug")
-    assert "not what these grasps were planned on" in other.notes[0]
+    assert "planned on another object than 'shape:mug'" in other.notes[0]
     with pytest.raises(MeshError, match="cube"):
         open_grasps(grasps_file, object_source="shape:cube")
 
@@ -84,7 +84,7 @@ def test_the_list_is_filtered_and_sorted_and_escaped(result):
 
 def test_a_grasp_that_is_less_sure_is_said_with_its_probability(result):
     held = result.tried[0]
-    under = TrialResult(ROBUSTNESS, False, 0.1, 0.1, "fails under 2 of the 5 hypotheses tried")
+    under = TrialResult(ROBUSTNESS, False, 0.1, 0.1, "fails with 2 of the 5 hypotheses tried")
     less = replace(held, trials=(*held.trials, under), probability=0.75)
     sure, untried = replace(held, probability=0.97), replace(held, trials=())
     grasps = (less, sure, untried, result.tried[3])
@@ -99,7 +99,7 @@ def test_a_grasp_that_is_less_sure_is_said_with_its_probability(result):
     assert table.count(" %</td>") == 2
     figures = figures_html(less, 0)
     assert "probability <b>75 %</b>" in figures
-    assert "fails under 2 of the 5" in figures
+    assert "fails with 2 of the 5" in figures
     assert "probability" not in figures_html(untried, 2)
 
 

@@ -1,7 +1,7 @@
 """Read a MANO file: template, blend shapes, weights and tree (Romero, Tzionas and Black 2017).
 
 The file is licensed and not part of graspd. Users download it from https://mano.is.tue.mpg.de. The pickle may contain
-arrays, sparse matrices and expressions. Any other name is refused. No name is ever called (`runtime/inert_pickle`).
+only data, arrays, sparse matrices and chumpy expressions. No code of the pickle runs (`runtime/inert_pickle`).
 """
 
 from __future__ import annotations
@@ -18,8 +18,8 @@ from graspd_core.errors import HandError
 from graspd_core.runtime.inert_pickle import NUMPY_NAMES, Inert, array_of, is_shape, load_inert, makers, read_bounded
 
 # The state of a sparse matrix has data, indices, indptr and the shape. A leaf of chumpy has the value `x`. A selection
-# takes the entries `idxs` of the flattened `a`, in `preferred_shape`. The same class has different names in Python 2
-# and 3, and in old and new scipy.
+# of chumpy has the entries `idxs` of the flattened array `a`, reshaped to `preferred_shape`. The same class has
+# different names in Python 2 and 3, and in old and new scipy.
 ADMITTED = NUMPY_NAMES | makers(
     ("sparse columns", ("scipy.sparse.csc", "scipy.sparse._csc"), ("csc_matrix",)),
     ("sparse rows", ("scipy.sparse.csr", "scipy.sparse._csr"), ("csr_matrix",)),
@@ -33,9 +33,9 @@ _MAX_DENSE, _MAX_DEPTH = 2**22, 8
 
 
 def read_pickle(path: Path) -> Any:
-    """Return the content of a MANO file: Python's numbers, text, lists and dictionaries, and `Inert` objects.
+    """Return the content of a MANO file: numbers, text, lists, dictionaries, and `Inert` data of class instances.
 
-    Raises HandError: the file does not exist, is too large, is no pickle, or contains a name outside `ADMITTED`.
+    Raises HandError: the file does not exist, is too large, is no pickle, or has a class or function not in `ADMITTED`.
     """
     try:
         return load_inert(read_bounded(path, "MANO file"), ADMITTED, "MANO file")
@@ -46,7 +46,7 @@ def read_pickle(path: Path) -> Any:
 def numbers(value: Any, depth: int = 0) -> np.ndarray:
     """Return the dense array of numbers that a value of the file represents.
 
-    `depth` is the number of expressions around the value. Raises ValueError: the value is not numeric.
+    `depth` is the number of values in which the value is nested. Raises ValueError: the value is not numeric.
     """
     if depth > _MAX_DEPTH:
         raise ValueError(f"holds an expression nested more than {_MAX_DEPTH} deep")
@@ -72,7 +72,7 @@ def _dense(value: Inert, depth: int) -> np.ndarray:
     data, indices, starts = (numbers(_entry(value, key), depth).ravel() for key in ("data", "indices", "indptr"))
     if indices.dtype.kind not in "iu" or starts.dtype.kind not in "iu":
         raise ValueError("holds a sparse matrix whose indices are not integers")
-    # Unsigned indices are made signed, because their differences would wrap around.
+    # Indices become signed, because differences of unsigned numbers wrap around.
     indices, starts = indices.astype(np.int64), starts.astype(np.int64)
     shape = value.state.get("_shape", value.state.get("shape"))
     if not is_shape(shape) or len(shape) != 2 or 0 in shape:
@@ -127,8 +127,8 @@ class ManoData:
         path: path of the file.
         template: vertices of the mean shape at rest [m].
         shape_directions: displacement of each vertex per unit of each shape coefficient [m].
-        pose_directions: displacement of each vertex per unit of each entry of R − I [m]. Entries are row-major by body.
-        joint_regressor: joints as combinations of vertices.
+        pose_directions: displacement of each vertex per entry of R − I [m], row by row, for each body's rotation R.
+        joint_regressor: weights that combine the vertices to each joint position.
         weights: skinning weights. Each row sums to one.
         faces: triangles, counter-clockwise seen from outside. The mesh is open at the wrist.
         mean: mean pose, as axis-angle vectors of bodies 1 to 15 [rad].
@@ -165,7 +165,7 @@ def read_mano(path: Path) -> ManoData:
         mean=_read(path, content, "hands_mean", (45,)),
     )
     tree = _read(path, content, "kintree_table", (2, len(BODIES))).astype(np.int64)
-    # The root's parent is -1. In an unsigned table this is the largest number, so the entry is not compared.
+    # The root's parent is -1, which is the largest number in an unsigned table. So the root's entry is not compared.
     if not np.array_equal(tree[1], range(len(BODIES))) or tuple(tree[0, 1:]) != PARENTS[1:]:
         raise HandError(f"{path}: kintree_table is not MANO's tree of a wrist and five fingers of three joints")
     for key, rows in (("weights", data.weights), ("J_regressor", data.joint_regressor)):
@@ -180,7 +180,7 @@ def read_mano(path: Path) -> ManoData:
 
 
 def _read(path: Path, content: Mapping[str, Any], key: str, shape: tuple[int | None, ...]) -> np.ndarray:
-    """Return an entry as float64. A None in `shape` allows any positive number."""
+    """Return an entry as float64. A None in `shape` allows any positive size."""
     if key not in content:
         known = ", ".join(sorted(str(name)[:40] for name in content)[:20])
         raise HandError(f"{path}: {key} is missing; the file has {known}")

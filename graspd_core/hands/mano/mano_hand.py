@@ -8,11 +8,11 @@ The base frame has the model's axes and its origin in the wrist joint. The palm 
 
 Each of MANO's fifteen ball joints becomes three hinges. A body turns relative to its parent by `R = B Rx(flexion)
 Ry(abduction) Rz(twist) Bᵀ`. B is the anatomical frame at rest: z along the bone, x the flexion axis, y = z × x. The
-order follows the ISB (Wu et al. 2005, after Grood and Suntay 1983). Both conversions are exact for abduction below 90°.
+order of the hinges follows the ISB (Wu et al. 2005, after Grood and Suntay 1983).
 
-The anatomical frames come from the joints of the shape. A finger flexes towards the palm normal, which is the normal of
-the plane through wrist, index knuckle and little knuckle. The thumb flexes towards a point in front of the palm. In the
-mean pose the fingers are bent, which shows the palm's side of the plane.
+The anatomical frames come from the joints of the shape. The palm normal is normal to the plane through wrist, index
+knuckle and little knuckle. The normal points to the side to which the fingers bend in the mean pose. A finger flexes
+towards the palm normal. The thumb flexes towards a point in front of the palm.
 """
 
 from __future__ import annotations
@@ -44,13 +44,13 @@ from graspd_core.se3 import rotation_from_quaternion
 from graspd_core.types import Posture, TriangleMesh
 
 HINGES = ("flexion", "abduction", "twist")
-# Distance from the palm of the point towards which the thumb flexes [m].
+# The thumb flexes towards a point at this distance in front of the palm [m].
 _OPPOSITION = 0.05
-# Limits of flexion, abduction and twist [deg], from the flat hand. Fingers: Lin, Wu and Huang 2000 (flexion 0 to 90 at
-# the knuckle, 0 to 110, 0 to 90, abduction ±15), knuckles also 20 backwards (Norkin and White: 45 passively). Thumb:
-# flexion of knuckle and tip 50 and 80 (American Academy of Orthopaedic Surgeons 1965). Saddle joint 53 of flexion, 42
-# of abduction and 17 of twist in all (Cooney et al. 1981), with MANO's rest pose in the middle. Axes that are no degree
-# of freedom in the literature get a small range, because human joints have some play.
+# Limits of flexion, abduction and twist [deg] from the flat hand. The joints of a finger flex by 90, 110 and 90, and a
+# knuckle abducts by ±15 (Lin, Wu and Huang 2000). A knuckle also bends 20 backwards (Norkin and White: 45 passively).
+# The thumb's knuckle and tip flex by 50 and 80 (American Academy of Orthopaedic Surgeons 1965). Its saddle joint has
+# total ranges of 53, 42 and 17 (Cooney et al. 1981), near the middle of which MANO's rest pose lies. Axes that are no
+# degree of freedom in the literature get a small range, because human joints have some play.
 _LIMITS_DEG = {
     "finger1": ((-20.0, 90.0), (-15.0, 15.0), (-5.0, 5.0)),
     "finger2": ((-5.0, 110.0), (-3.0, 3.0), (-3.0, 3.0)),
@@ -64,12 +64,12 @@ _OPEN_DEG = {"finger": (10.0, 20.0, 10.0), "thumb": (10.0, 0.0, 0.0)}
 _CLOSED_DEG = {"finger": (45.0, 40.0, 20.0), "thumb": (15.0, 10.0, 10.0)}
 # Greatest force of a fingertip [N]: half of an adult's tip pinch (Mathiowetz et al. 1985: 50 N women, 80 N men).
 _TIP_FORCE = 30.0
-# Lever of twist, which is half the breadth of a finger, and least lever of every axis [m].
-_TWIST_LEVER, _LEAST_LEVER = 0.01, 0.02
+# Least lever arm of every axis [m]. Twist has this lever arm.
+_LEAST_LEVER = 0.02
 
 
 def kind_of(body: int) -> str:
-    """Return the key of a body in `_LIMITS_DEG`. The body must not be the wrist."""
+    """Return the key of the body's joint limits in `_LIMITS_DEG`. The body must not be the wrist."""
     name = BODIES[body]
     return name if name.startswith("thumb") else f"finger{name[-1]}"
 
@@ -90,9 +90,9 @@ def postures() -> tuple[Float[np.ndarray, "45"], Float[np.ndarray, "45"]]:
 
 
 def efforts(joints: Float[np.ndarray, "16 3"], tips: Float[np.ndarray, "5 3"]) -> Float[np.ndarray, "45"]:
-    """Return the joint torque limits [N·m]: a straight finger needs them to press `_TIP_FORCE` with its tip."""
+    """Return the joint torque limits [N·m], with which a straight finger presses `_TIP_FORCE` with its tip."""
     reach = np.linalg.norm(np.repeat(tips, 3, axis=0) - joints[1:], axis=1)
-    lever = np.maximum(np.column_stack([reach, reach, np.full(15, _TWIST_LEVER)]), _LEAST_LEVER)
+    lever = np.maximum(np.column_stack([reach, reach, np.zeros(15)]), _LEAST_LEVER)
     return (_TIP_FORCE * lever).ravel()
 
 
@@ -107,7 +107,7 @@ def palm_normal(data: ManoData, joints: Float[np.ndarray, "16 3"]) -> Float[np.n
     flat = torch.eye(3).to(zero).expand(1, 16, 3, 3)
     bent, straight = (skin_vertices(data, zero, r, zero.new_zeros(1, 3))[1][0].numpy() for r in (turned, flat))
     ends = [3, 6, 9, 12]
-    # A flat mean pose does not show the side. Then a right hand is assumed.
+    # If the mean pose is flat, it does not show the palm's side. Then a right hand is assumed.
     return -normal if float(((bent - straight)[ends] @ normal).mean()) < -1e-4 else normal
 
 
@@ -129,10 +129,10 @@ def anatomical_frames(
 def rotations_from_joints(
     frames: Float[Tensor, "16 3 3"], values: Float[Tensor, "batch 45"]
 ) -> Float[Tensor, "batch 16 3 3"]:
-    """Return the rotation of every body relative to its parent, in model axes. The wrist has the identity."""
+    """Return the rotation of every body relative to its parent, in model axes. The wrist's rotation is the identity."""
     sine, cosine = values.sin().unflatten(-1, (15, 3)), values.cos().unflatten(-1, (15, 3))
     (sx, sy, sz), (cx, cy, cz) = sine.unbind(-1), cosine.unbind(-1)
-    # The entries of Rx Ry Rz.
+    # Entries of the matrix product Rx Ry Rz, row by row.
     local = torch.stack(
         [
             cy * cz, -cy * sz, sy,
@@ -167,7 +167,7 @@ class _Rest:
     frames: Float[np.ndarray, "16 3 3"]
 
     def in_body(self, body: int) -> Float[np.ndarray, "vertices 3"]:
-        """Return the vertices in the frame of a body [m]."""
+        """Return the skin's vertices in the frame of a body [m]."""
         return (self.vertices - self.joints[body]) @ self.frames[body]
 
 
@@ -188,7 +188,7 @@ class ManoHand:
     frames: Float[np.ndarray, "16 3 3"]
 
     def skinned_mesh(self, posture: Posture) -> TriangleMesh:
-        """Return MANO's own surface at a posture [m], in the frame of the posture's position. The wrist is closed."""
+        """Return MANO's own surface at a posture [m], closed at the wrist, in the frame of `posture.position`."""
         betas = torch.as_tensor(self.betas)[None]
         rotations = rotations_from_joints(torch.as_tensor(self.frames), torch.as_tensor(posture.joint_positions)[None])
         origin = rest(self.data, betas)[1][:, 0]
@@ -209,7 +209,7 @@ def load_mano(path: str | Path, betas: Sequence[float] = (), *, candidates: int 
         raise HandError(f"{path}: betas has {len(betas)} numbers; valid: at most {len(shape)} finite numbers")
     shape[: len(betas)] = betas
     vertices, joints = (t[0].numpy() for t in rest(data, torch.as_tensor(shape)[None]))
-    closed_faces(data)  # This refuses a mesh that cannot be closed before any planning.
+    closed_faces(data)  # Called only to raise, before any planning, if the mesh cannot be closed.
     owner = data.weights.argmax(1)
     tips = _fingertips(vertices, joints, owner)
     normal = palm_normal(data, joints)
@@ -268,7 +268,7 @@ def _bare_hand(still: _Rest) -> HandModel:
 
 
 def _skins(hand: HandModel, still: _Rest) -> tuple[tuple[int, TriangleMesh], ...]:
-    """Return the link and a skin mesh of each body: all faces with a vertex of the body, in the link frame [m]."""
+    """Return link and skin mesh of each body, link frame [m]. The mesh has all faces with a vertex of the body."""
     faces = still.data.faces
     own = [faces[(still.owner[faces] == body).any(1)] for body in range(len(BODIES))]
     return tuple(
@@ -320,7 +320,7 @@ def _inertial(hull: Primitive) -> tuple[float, Float[np.ndarray, "3"], Float[np.
 def _palm_center(
     palm: Primitive, joints: Float[np.ndarray, "16 3"], normal: Float[np.ndarray, "3"]
 ) -> Float[np.ndarray, "3"]:
-    """Return the point where the normal through the middle of the palm's bones leaves the hull, base frame [m]."""
+    """Follow the palm normal from the middle of the palm's bones. Return where it leaves the hull, base frame [m]."""
     middle = joints[[1, 4, 7, 10]].mean(0) * 0.7 + joints[0] * 0.3 - joints[0]
     a, b, c = (palm.vertices[palm.faces[:, i]] for i in range(3))
     outward = np.cross(b - a, c - a)

@@ -1,7 +1,7 @@
 """Compute MANO's forward function in torch: blend shapes and linear blend skinning, batched and differentiable.
 
-Sources: Romero, Tzionas and Black, "Embodied Hands", 2017, after SMPL (Loper et al. 2015). Gradients are exact in the
-shape, the pose and the translation, also at zero rotation.
+Sources: Romero, Tzionas and Black, "Embodied Hands", 2017, after SMPL (Loper et al. 2015). Gradients in shape, pose and
+translation are exact, also at zero rotation.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from graspd_core.se3 import rotation_from_quaternion, safe_norm
 def rest(
     data: ManoData, betas: Float[Tensor, "batch shapes"]
 ) -> tuple[Float[Tensor, "batch vertices 3"], Float[Tensor, "batch 16 3"]]:
-    """Return vertices and joints of a shape at rest [m]. Missing betas are zero."""
+    """Return the vertices and joint positions of a shape at rest [m]. Missing betas are zero."""
     arrays = data.template, data.shape_directions[..., : betas.shape[-1]], data.joint_regressor
     template, directions, regressor = (torch.as_tensor(array).to(betas) for array in arrays)
     shaped = template + torch.einsum("vcs,bs->bvc", directions, betas)
@@ -33,13 +33,13 @@ def skin_vertices(
     rotations: Float[Tensor, "batch 16 3 3"],
     translation: Float[Tensor, "batch 3"],
 ) -> tuple[Float[Tensor, "batch vertices 3"], Float[Tensor, "batch 16 3"]]:
-    """Return posed vertices and joints [m].
+    """Return the vertices and joint positions of the posed hand [m].
 
     Args:
-        data: the model.
+        data: MANO model.
         betas: shape coefficients.
         rotations: rotation of every body relative to its parent, in model axes. The first turns the whole hand.
-        translation: added to all vertices and joints [m].
+        translation: shift of all vertices and joints [m].
     """
     shaped, joints = rest(data, betas)
     feature = (rotations[:, 1:] - torch.eye(3, dtype=rotations.dtype, device=rotations.device)).flatten(1)
@@ -65,9 +65,9 @@ def rotation_from_vector(vector: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*b
 
 
 def wrist_loop(data: ManoData) -> Int[np.ndarray, "loop"]:
-    """Return the vertices around the opening at the wrist, in edge direction. Empty for a closed mesh.
+    """Return the indices of the vertices around the wrist opening, in the direction of face edges. Empty if closed.
 
-    Raises HandError: the boundary is not a single loop.
+    Raises HandError: the boundary is not a single loop, faces have opposite winding, or three faces share an edge.
     """
     edges = face_edges(data.faces).tolist()
     present = set(map(tuple, edges))

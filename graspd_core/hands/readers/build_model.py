@@ -1,7 +1,7 @@
 """Build a `HandModel` from links and joints of any file format: check them, order them, resolve limits and couplings.
 
 Links and joints are ordered depth-first, with children in file order. Actuated joints get finite limits, such that
-coupled joints stay within their limits too. Joints whose limits coincide become fixed. Chains of coupled joints
+coupled joints stay within their limits too. Joints with equal limits become fixed. Chains of coupled joints
 (`<mimic joint="..." multiplier="..." offset="..."/>`) are resolved to actuated joints.
 """
 
@@ -22,22 +22,22 @@ from graspd_core.hands.model import HandModel, JointKind, Mimic, Primitive
 from graspd_core.hands.readers.xml_io import read_numbers
 from graspd_core.se3 import axis_rotation
 
-# Limits of a hand. Checking a larger one for self-collision would take minutes.
+# Most links, most shapes, and longest chain of joints. Checking a larger hand for self-collision would take minutes.
 _MOST_LINKS, _MOST_SOLIDS, _LONGEST_CHAIN = 300, 2000, 100
 _DEFAULTS = (("multiplier", "1"), ("offset", "0"))
 # Greatest valid multiplier and offset of a coupled joint.
 _LARGEST = 1e6
 # A joint with less travel than this becomes fixed [rad] or [m].
 _STILL = 1e-6
-# A limit between these two values is probably given in degrees instead of [rad].
+# A joint limit between these two values [rad] is probably given in degrees.
 _FULL_TURN, _CIRCLE = 2 * np.pi + 0.05, 360.5
-# A wider range counts as endless rotation [rad]. Longer travel of a prismatic joint is an error of the unit [m].
+# A joint with a wider range counts as endless [rad]. A prismatic joint with longer travel has a wrong unit [m].
 _WIDEST, _LONGEST_SLIDE = 4 * np.pi, 2.0
 
 
 @dataclass(frozen=True, eq=False)
 class LinkSpec:
-    """A link of a file: mass [kg], centre of mass [m], inertia about it in link axes [kg·m²], and primitives."""
+    """A link of a file: mass [kg], centre of mass [m], inertia about this centre in link axes [kg·m²], primitives."""
 
     name: str
     mass: float = 0.0
@@ -65,8 +65,8 @@ class JointSpec:
         rotation, translation: `T_parent_child` at joint value zero [m].
         axis: unit axis in the child's frame. Zero for a fixed joint.
         lower, upper: joint limits [rad] or [m]. Infinite if not given.
-        effort: greatest torque [N·m] or force [N].
-        velocity: greatest speed [rad/s] or [m/s].
+        effort: greatest torque [N·m] or force [N]. Infinite if not given.
+        velocity: greatest speed [rad/s] or [m/s]. Infinite if not given.
     """
 
     name: str
@@ -83,7 +83,7 @@ class JointSpec:
 
 
 def refuse_crowds(path: Path, links: int, joints: int, solids: int) -> None:
-    """Raise HandError if a file has too many links, joints or shapes for a hand. Call this before reading them."""
+    """Raise HandError if a file has too many links, joints or shapes for a hand. Call this before reading shapes."""
     for what, count, most in (
         ("links", links, _MOST_LINKS),
         ("joints", joints, _MOST_LINKS),
@@ -101,7 +101,7 @@ def assemble(
     couplings: Mapping[str, Coupling],
     warnings: tuple[str, ...] = (),
 ) -> HandModel:
-    """Return the hand without candidates and adjacent links. Postures are mid-range, the palm is at the base's origin.
+    """Return the hand, yet without candidates and `adjacent`. Postures are mid-range, the palm is at the base's origin.
 
     Args:
         path, name: path of the file for error messages, and name of the hand.
@@ -147,7 +147,7 @@ def _actuated(joints: Sequence[JointSpec]) -> dict[str, Any]:
 
 
 def _linked(order: Sequence[str], chain: Sequence[JointSpec], couplings: Mapping[str, Coupling]) -> dict[str, Any]:
-    """Return the fields of a hand model that describe its tree. `chain` has the joint of each link but the first."""
+    """Return the fields of a hand model that describe its tree. `chain` has the joint above each link but the base."""
     index = {link: i for i, link in enumerate(order)}
     actuated = [joint.name for joint in chain if joint.kind != "fixed" and joint.name not in couplings]
     number = {joint: i for i, joint in enumerate(actuated)}
@@ -224,10 +224,10 @@ def _reaches(root: str, link: str, above: Mapping[str, str]) -> bool:
 def _settled(
     path: Path, joints: Sequence[JointSpec], couplings: Mapping[str, Coupling]
 ) -> tuple[list[JointSpec], dict[str, Coupling], tuple[str, ...]]:
-    """Return the joints with usable limits, the remaining couplings, and a warning for each change.
+    """Return the joints with usable limits, the remaining couplings, and warnings.
 
-    Limits of actuated joints are reduced to what their coupled joints allow, and to one turn. A joint that cannot move
-    becomes fixed, together with the joints coupled to it. Raises HandError: a joint has a travel of more than 2 m.
+    Limits of actuated joints are reduced to what their coupled joints allow. Endless rotation is reduced to one turn.
+    An actuated joint without travel becomes fixed, as do its coupled joints. Raises HandError: a travel exceeds 2 m.
     """
     moving = [joint for joint in joints if joint.kind != "fixed"]
     followers = [joint for joint in moving if joint.name in couplings]
@@ -284,7 +284,7 @@ def _narrowed(leader: JointSpec, follower: JointSpec, coupling: Coupling) -> Joi
 
 
 def _finite(path: Path, joint: JointSpec) -> JointSpec:
-    """Return the joint, limited to one turn if it rotates endlessly. Raises HandError: its travel is more than 2 m."""
+    """Return the joint. Endless rotation becomes one turn. Raises HandError: a prismatic joint travels over 2 m."""
     reach = joint.upper - joint.lower
     if joint.kind == "prismatic" and not reach <= _LONGEST_SLIDE:
         raise _too_long(path, joint.name, reach)
@@ -309,10 +309,10 @@ def _too_long(path: Path, joint: str, slide: float) -> HandError:
 
 
 def read_couplings(path: Path, joints: Sequence[ET.Element]) -> dict[str, Coupling]:
-    """Read the couplings of all joints with a `<mimic>`, by name of the coupled joint.
+    """Read the couplings of all joints with a `<mimic>`. Each key is the name of the coupled joint.
 
-    Each leader is an actuated joint. The `<mimic>` of a fixed joint is ignored. Raises HandError: the leader is the
-    joint itself, missing or fixed, or a number is invalid.
+    Each `leader` is an actuated joint. The `<mimic>` of a fixed joint is ignored. Raises HandError: the leader
+    is the joint itself, missing or fixed, or a number is invalid.
     """
     moving = {str(joint.get("name")): joint for joint in joints if joint.get("type") != "fixed"}
     direct: dict[str, Coupling] = {}

@@ -25,7 +25,7 @@ _LARGEST = 1e9
 
 @dataclass(frozen=True, eq=False)
 class Source:
-    """A file and the line of each key. A nested key is written `palm.center`. The methods check values."""
+    """A file and the line of each key. Nested keys are written like `palm.center`. The methods check values."""
 
     path: Path
     lines: Mapping[str, int]
@@ -36,7 +36,7 @@ class Source:
         return HandError(f"{self.path}:{line}: {key}: {message}")
 
     def mapping(self, key: str, value: Any) -> dict[str, Any]:
-        """Check a mapping. Keys are converted to text, because the names of some joints are numbers."""
+        """Check a mapping, and convert its keys to text, because some joints have numbers as names."""
         if not isinstance(value, dict):
             raise self.error(key, f"expected a mapping of keys to values, got {short_repr(value)}")
         return {name if isinstance(name, str) else short_repr(name): entry for name, entry in value.items()}
@@ -90,7 +90,7 @@ class Source:
         return efforts if isinstance(efforts, dict) else float(efforts)
 
     def mount(self, value: Any) -> Mount:
-        """Read the `mount` entry: the arm's link, and the pose of the base link in it. The default is the identity."""
+        """Read the `mount` entry: a link of the arm, and the base link's pose in that link, by default the identity."""
         given = self.section("mount", value, _MOUNT_KEYS, ("parent",))
         parent = self.text("mount.parent", given["parent"])
         x, y, z = self.numbers("mount.position", given.get("position", [0, 0, 0]), 3).tolist()
@@ -114,7 +114,7 @@ class HandDescription:
         palm_center: centre of the palm's surface [m]. None to guess the palm.
         palm_normal: unit direction out of the palm. None to guess the palm.
         approach: unit direction of approach in the base frame. None for the palm normal.
-        effort: greatest effort [N·m] or [N] of all joints, or of some by joint name. None to keep the URDF's efforts.
+        effort: greatest effort [N·m] or [N], of all joints or by joint name. None to keep the efforts of the URDF.
         open, closed: joint values by joint name [rad] or [m]. None to guess the posture.
         mount: pose of the base link on an arm. None if the file has no `mount`.
         root: first link of the hand in a URDF of a whole robot. None if the whole URDF is the hand.
@@ -251,6 +251,6 @@ def _key_lines(node: yaml.Node | None, prefix: str = "") -> dict[str, int]:
         for key, value in node.value:
             name = f"{prefix}{key.value}"
             lines[name] = key.start_mark.line + 1
-            # Only one level is read, because with YAML aliases a mapping may contain itself.
+            # Deeper levels are not read, because a YAML alias may put a mapping into itself.
             lines |= {} if prefix else _key_lines(value, f"{name}.")
     return lines

@@ -19,7 +19,7 @@ from graspd_core.mesh.convex_parts import limited_hull
 from graspd_core.mesh.mesh_files import load_mesh
 from graspd_core.types import TriangleMesh
 
-# Greatest number of corners of a hull. For a ball of 12 mm the facets lie up to 0.3 mm below the surface.
+# Greatest number of corners of a hull. For a ball of 12 mm, the hull then lies up to 0.3 mm below the surface.
 _CORNERS = 200
 # Greatest number of corners of all hulls of a hand together, and least number that every hull may have.
 _ALL_CORNERS, _FEWEST_CORNERS = 12_800, 48
@@ -44,7 +44,7 @@ def resolve_mesh(urdf: Path, shape: ET.Element, filename: str) -> Path:
     else:
         folders = list(parents)
     for folder in folders:
-        # For an invalid name this is False, where pathlib may raise.
+        # `isfile` returns False for an invalid name. The method of pathlib may raise.
         if os.path.isfile(folder / rest):
             return folder / rest
     where = "in any package path, nor " if scheme in ("package", "model") else ""
@@ -78,7 +78,7 @@ def mesh_hull(
 ) -> TriangleMesh:
     """Return the convex hull [m] of a mesh file scaled along each axis, with at most `corners` corners.
 
-    A negative factor mirrors the mesh. Raises HandError: the file does not exist, is no mesh, or is larger than a hand.
+    A negative factor mirrors the mesh. Raises HandError: the file does not exist, is no mesh, or is too large.
     """
     path = resolve_mesh(urdf, shape, filename)
     try:
@@ -107,7 +107,7 @@ def whole_mesh(urdf: Path, shape: ET.Element, filename: str, scale: Float[np.nda
 def _hull(path: Path, modified: int, scale: tuple[float, float, float], corners: int) -> TriangleMesh:
     del modified
     mesh = load_mesh(path)
-    # The points are scaled before the hull is computed, because mirroring a hull would turn it inside out.
+    # Scale the points before computing the hull, because mirroring a hull would turn the hull inside out.
     points = mesh.vertices[np.unique(mesh.faces)] * np.array(scale)
     return limited_hull(points, corners)
 

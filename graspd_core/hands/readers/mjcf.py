@@ -48,7 +48,7 @@ class _MeshAsset:
     Attributes:
         place: line and name of the asset, for error messages.
         file: path relative to the MJCF file's folder. Empty if the vertices are in the MJCF file.
-        scale: factors of the coordinates along each axis.
+        scale: factor along each axis.
         vertices: vertices of a mesh without file, before scaling [m].
     """
 
@@ -73,7 +73,7 @@ def _read_assets(path: Path, spec: Any) -> dict[str, _MeshAsset]:
 
 
 def fault(path: Path, element: Any, message: str) -> HandError:
-    """Return an error about an element of an `MjSpec`. The message names the file, the line and the owner."""
+    """Return an error about an element of an `MjSpec`. The message names file, line, and the element or its parent."""
     return wrong(path, _place(element), message)
 
 
@@ -107,7 +107,7 @@ def check_type(path: Path, geom: Any, assets: Mapping[str, _MeshAsset]) -> None:
 
 
 def _read_geom(path: Path, model: Any, geom: Any, hull: TriangleMesh | None) -> Primitive:
-    """Return a geom as a primitive of link zero. A mesh gives its `hull`. An ellipsoid becomes a hull too.
+    """Return a geom as a primitive of link zero. `hull` is None except for a mesh. An ellipsoid becomes a hull.
 
     Raises HandError: the geom is larger than `LARGEST_SIZE`.
     """
@@ -127,10 +127,7 @@ def _read_geom(path: Path, model: Any, geom: Any, hull: TriangleMesh | None) -> 
 
 
 def _asset_hull(path: Path, mesh: _MeshAsset, corners: int) -> TriangleMesh:
-    """Return the hull of a mesh with at most `corners` corners [m].
-
-    Raises HandError: the file does not exist or is no mesh, or the mesh is larger than `LARGEST_SIZE`.
-    """
+    """Return a hull [m] with at most `corners` corners. Raises HandError: the mesh is missing, broken or too large."""
     if mesh.file:
         return mesh_hull(path, mesh.place, mesh.file, mesh.scale, corners)
     points = mesh.vertices * mesh.scale
@@ -142,9 +139,9 @@ def _asset_hull(path: Path, mesh: _MeshAsset, corners: int) -> TriangleMesh:
 
 _KINDS: dict[str, JointKind] = {"hinge": "revolute", "slide": "prismatic"}
 _REFUSED = ("replicate", "attach", "composite", "flexcomp", "plugin")
-# Sections that MuJoCo gets. Others may name files, allocate memory, or do not matter here.
+# Sections that MuJoCo gets. Other sections may name files or allocate memory, or do not matter here.
 _SECTIONS = ("compiler", "default", "asset", "worldbody", "tendon", "equality", "actuator")
-# Attributes with names as values. A name may contain "nan" or "inf".
+# Attributes whose values are names. They are not searched for nan and inf, because a name may contain these letters.
 _NAMES = {"name", "class", "childclass", "model", "mesh", "file"}
 _HEAVIEST, _MOST_CLASSES = 1e3, 300
 # Greatest number of files, the main file included.
@@ -153,11 +150,12 @@ _MOST_FILES = 30
 
 @dataclass(eq=False)
 class _Parts:
-    """A file parsed (`spec`) and compiled (`model`) by MuJoCo, and the links and joints read from it so far.
+    """A file parsed (`spec`) and compiled (`model`) by MuJoCo, and the links and joints read so far.
 
     Attributes:
-        meshes: mesh asset of each mesh geom, by geom id.
-        labels, shown: joint names by joint id, and names of bodies without colliding geoms, which use visual geoms.
+        meshes: mesh asset of each mesh geom, by MuJoCo's geom id.
+        labels: joint names by MuJoCo's joint id. Unnamed joints get a name.
+        shown: names of bodies whose visual geoms are used, because no geom of the body collides.
     """
 
     path: Path
@@ -171,10 +169,10 @@ class _Parts:
 
 
 def read_mjcf(path: Path, root: ET.Element | None = None) -> HandModel:
-    """Read the hand of an MJCF file. The result is like that of `read_urdf`.
+    """Read the hand of an MJCF file. Palm and postures are set as by `read_urdf`.
 
-    The base is the only body of the world. Raises HandError: MuJoCo refuses the file, the world has several bodies, or
-    the file uses unsupported elements.
+    The only body directly in the world is the base. Raises HandError: MuJoCo refuses the file, the world has several
+    bodies, or the file uses unsupported elements.
     """
     root = read_xml(path) if root is None else root
     _include(path, path, root, {path.resolve()})
@@ -197,7 +195,7 @@ def read_mjcf(path: Path, root: ET.Element | None = None) -> HandModel:
     if parts.spec.tendons:
         warnings.append("tendons are not read: joints that they couple move independently")
     if parts.shown:
-        warnings.append(f"no colliding geom, so the visual ones are taken: {', '.join(parts.shown)}")
+        warnings.append(f"no colliding geom, so visual geoms are used: {', '.join(parts.shown)}")
     efforts, couplings = _efforts(parts), resolved_couplings(path, _couplings(parts))
     joints = [replace(j, effort=min(j.effort, efforts.get(j.name, np.inf))) for j in parts.joints]
     hand = assemble(path, root.get("model") or path.stem, parts.links, joints, couplings, tuple(warnings))
@@ -265,7 +263,7 @@ def _refuse(path: Path, root: ET.Element) -> None:
 
 def _compiled(path: Path, root: ET.Element) -> _Parts:
     """Compile the file with MuJoCo. A small sphere replaces each mesh, so that MuJoCo opens no mesh file."""
-    mujoco: Any = importlib.import_module("mujoco")  # it ships no type information
+    mujoco: Any = importlib.import_module("mujoco")  # MuJoCo ships no type information.
     root[:] = [section for section in root if section.tag in _SECTIONS]
     for assets in root.findall("asset"):
         assets[:] = assets.findall("mesh")
@@ -289,7 +287,7 @@ def _compiled(path: Path, root: ET.Element) -> _Parts:
 
 
 def _refusal(path: Path, root: ET.Element, text: str) -> HandError:
-    """Convert MuJoCo's error message to an error about the element that it names."""
+    """Convert MuJoCo's error message to an error about the element that the message names."""
     line, tag = re.search(r",? line (\d+)", text), re.search(r"Element '(\w+)'", text)
     place = Element(tag.group(1) if tag else "mujoco")
     if line:
@@ -300,7 +298,7 @@ def _refusal(path: Path, root: ET.Element, text: str) -> HandError:
 
 
 def _read_body(parts: _Parts, body: Any, parent: str | None) -> None:
-    """Append a body's link and joints to `parts`, then those of its child bodies."""
+    """Append a body's link and joints to `parts`, then the links and joints of its child bodies."""
     model, name = parts.model, body.name or f"body_{len(parts.links)}"
     link = LinkSpec(name, *_inertial(parts, body), _primitives(parts, body, name))
     rotation, translation = pose(model.body_pos[body.id], model.body_quat[body.id])
@@ -312,7 +310,7 @@ def _read_body(parts: _Parts, body: Any, parent: str | None) -> None:
             offset = np.array(model.jnt_pos[joint.id])
             _refuse_far(parts, joint, offset)
             last = number == len(body.joints) - 1 and not offset.any()
-            # A joint beside the body's origin, or one of several joints, gets an extra link without mass.
+            # A joint not at the body's origin, or not the last joint of the body, gets an extra link without mass.
             child = name if last else f"{name}:{label}"
             at_joint = JointSpec(label, above, child, "fixed", rotation, translation + rotation @ offset)
             parts.joints.append(_moving(parts, joint, at_joint))
@@ -327,13 +325,13 @@ def _read_body(parts: _Parts, body: Any, parent: str | None) -> None:
 
 
 def _moving(parts: _Parts, joint: Any, placed: JointSpec) -> JointSpec:
-    """Return a MuJoCo joint as a `JointSpec`. `placed` is a fixed joint with its pose, name and links."""
+    """Return a MuJoCo joint as a `JointSpec`. `placed` is a fixed joint with the same pose, name and links."""
     model, number = parts.model, joint.id
     kind = _KINDS.get(_type_name(joint))
     if kind is None:
         raise fault(parts.path, joint, f"is of type {_type_name(joint)!r}; known: {', '.join(_KINDS)}")
     axis, rotation, translation = np.array(model.jnt_axis[number]), placed.rotation, placed.translation
-    # The file shows the joint at the value `ref`. So the pose at zero is `ref` back along the joint.
+    # The pose in the file belongs to the joint value `ref`. So the pose at zero is moved back by `ref`.
     if kind == "revolute":
         rotation = rotation @ axis_rotation(axis, -_reference(parts, number))
     else:
@@ -371,7 +369,7 @@ def _primitives(parts: _Parts, body: Any, name: str) -> tuple[Primitive, ...]:
 
 
 def _inertial(parts: _Parts, body: Any) -> tuple[float, Float[np.ndarray, "3"], Float[np.ndarray, "3 3"]]:
-    """Return mass [kg], centre of mass [m] and inertia about it [kg·m²]. Zero if the body has no <inertial>."""
+    """Return mass [kg], centre of mass [m] and inertia about this centre [kg·m²]. Zero if there is no <inertial>."""
     if not body.explicitinertial:
         return 0.0, np.zeros(3), np.zeros((3, 3))
     model, number = parts.model, body.id

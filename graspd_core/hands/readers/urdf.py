@@ -24,13 +24,13 @@ from graspd_core.mesh.mesh_files import simplify
 from graspd_core.types import TriangleMesh
 
 _ROUND: dict[str, PrimitiveKind] = {"cylinder": "cylinder", "capsule": "capsule"}
-# Lengths that differ by less than this are equal [m].
+# Lengths that differ by less than this count as equal [m].
 _SAME = 1e-6
 _SHAPES = ("box", "sphere", "cylinder", "capsule", "mesh")
-# For the viewer: number of triangles of all meshes of a hand, and least number of each mesh.
+# For the viewer: number of triangles of all meshes of a hand together, and least number of each mesh.
 _MOST_TRIANGLES, _FEWEST_TRIANGLES = 4000, 60
 # Simplifying may fail on torn surfaces or lose a thin part. The hull is drawn instead if a mesh keeps more than this
-# multiple of the triangles, or less than this share of its extent.
+# multiple of the wanted triangles, or less than this share of its extent.
 _STUCK, _SHRUNK = 1.5, 0.95
 
 
@@ -45,7 +45,7 @@ def _shapes(
 
 
 def _with_capsules(shapes: Sequence[Primitive]) -> tuple[Primitive, ...]:
-    """Replace each cylinder with two spheres at its ends by a capsule, because URDF has no capsule."""
+    """Make a capsule of a cylinder with a sphere at each end. URDF files write capsules this way."""
     found, taken = list(shapes), set[int]()
     for i, shape in enumerate(shapes):
         if shape.kind != "cylinder":
@@ -110,7 +110,7 @@ _KINDS: dict[str, JointKind] = {
     "prismatic": "prismatic",
     "fixed": "fixed",
 }
-# What to do with a xacro file.
+# Advice in errors about xacro files.
 EXPAND = "expand it to a URDF first: xacro FILE > hand.urdf"
 # Types of joints that place a whole robot in the world.
 _FREE = ("floating", "planar")
@@ -122,7 +122,7 @@ _HEAVIEST = 1e3
 def read_urdf(path: Path, root: ET.Element | None = None) -> HandModel:
     """Read a hand from a URDF. Contact candidates are not set.
 
-    All postures have joints at mid-range. The palm is at the base's origin. A missing or zero effort or velocity
+    Open and closed posture are both mid-range. The palm is at the base's origin. A missing or zero effort or velocity
     becomes infinite. The following changes add a warning. A `continuous` joint is limited to ±π. A link without
     collision shapes gets its visual shapes. A `world` link or a floating joint above the base is dropped.
 
@@ -154,7 +154,7 @@ def read_urdf(path: Path, root: ET.Element | None = None) -> HandModel:
             shown.append(name)
         bodies.append(LinkSpec(name, *_inertial(path, link), _shapes(path, elements, hull)))
     if shown:
-        dropped.append(f"no <collision>, so the <visual> is taken: {', '.join(shown)}")
+        dropped.append(f"no <collision>, so the <visual> is used: {', '.join(shown)}")
     dropped += missing_packages(
         path, (mesh for link in links for shape in _colliding(link) for mesh in shape.iter("mesh"))
     )
@@ -163,10 +163,10 @@ def read_urdf(path: Path, root: ET.Element | None = None) -> HandModel:
 
 
 def visual_solids(hand: HandModel, prefix: str = "") -> tuple[Primitive, ...]:
-    """Return the shapes for a viewer, in link frames as `hand.primitives`.
+    """Return the shapes for a viewer, in link frames.
 
-    A `hull` among them need not be convex. All meshes together are simplified to about 4000 triangles, at most 6000.
-    Links without visual shapes, and hands without a URDF, get their collision shapes.
+    A shape of kind `hull` may be non-convex here. All meshes together are simplified to about 4000 triangles. Links
+    without visual shapes, and hands without a URDF, get their collision shapes.
 
     Args:
         hand: any loaded hand.
@@ -189,7 +189,7 @@ def visual_solids(hand: HandModel, prefix: str = "") -> tuple[Primitive, ...]:
 
 
 def _simpler(shape: Primitive, share: float) -> Primitive:
-    """Return a mesh simplified to this share of its triangles. Other shapes do not change."""
+    """Return a mesh simplified to `share` of its triangles. Other shapes do not change."""
     count = max(int(len(shape.faces) * share), _FEWEST_TRIANGLES)
     if shape.kind != "hull" or len(shape.faces) <= count:
         return shape
@@ -204,7 +204,7 @@ def below_link(path: Path, root: ET.Element, link: str) -> None:
     """Keep only `link` and the links and joints below it. Raises HandError: the file has no such link."""
     links = [str(element.get("name")) for element in root.findall("link")]
     if link not in links:
-        raise HandError(f"{path}: root: no link {link!r}; links: {', '.join(links) or 'none, it is no URDF'}")
+        raise HandError(f"{path}: root: no link {link!r}; links: {', '.join(links) or 'none, the file is no URDF'}")
     ends = [(joint_end(joint, "parent"), joint_end(joint, "child")) for joint in root.findall("joint")]
     kept, waiting = {link}, [link]
     while waiting:
@@ -293,7 +293,7 @@ def _axis(path: Path, joint: ET.Element) -> Float[np.ndarray, "3"]:
 
 
 def _limits(path: Path, joint: ET.Element) -> tuple[float, float, float, float]:
-    """Return lower and upper limit [rad] or [m], effort [N·m] or [N], and velocity. Infinite if not given."""
+    """Return lower and upper limit [rad] or [m], effort [N·m] or [N], and velocity. The last two may be infinite."""
     limit = joint.find("limit")
     continuous = joint.get("type") == "continuous"
     if limit is None:
@@ -316,7 +316,7 @@ def _unset_if_zero(path: Path, limit: ET.Element, key: str) -> float:
 
 
 def _inertial(path: Path, link: ET.Element) -> tuple[float, Float[np.ndarray, "3"], Float[np.ndarray, "3 3"]]:
-    """Return mass [kg], centre of mass [m] and inertia about it [kg·m²] in link axes. Zero without `<inertial>`."""
+    """Return mass [kg], centre of mass [m] and inertia about this centre [kg·m²]. Zero without `<inertial>`."""
     inertial = link.find("inertial")
     if inertial is None:
         return 0.0, np.zeros(3), np.zeros((3, 3))

@@ -18,7 +18,7 @@ from jaxtyping import Float
 
 from graspd_core.errors import HandError
 
-# Greatest length of an error message, because a file may contain a word of megabytes.
+# Error messages are cut to this length, because a file may contain a word of megabytes.
 _LONGEST = 1000
 _LARGEST_FILE = 32 * 2**20
 DEEPEST = 150
@@ -31,7 +31,7 @@ _OWNERS = ("link", "joint", "body", "geom", "mesh")
 
 
 class Element(ET.Element):
-    """An XML element with its `line` in the file. `owner` is the tag and name of the enclosing named element."""
+    """An XML element with its `line` in the file. `owner` is tag and name of the link, body or joint around it."""
 
     line = 0
     owner = ""
@@ -101,7 +101,7 @@ def _decoded(data: bytes) -> str:
     declared = re.search(rb"<\?xml[^>]*?encoding=[\"']([\w.-]+)", data[:2000])
     try:
         name = codecs.lookup(declared.group(1).decode() if declared else "utf-8").name
-        # The decoder of punycode (for host names) takes quadratic time, so it is not used.
+        # Punycode (for host names) is not decoded, because its decoder takes quadratic time.
         return data.decode("utf-8" if name == "punycode" else name, errors="replace")
     except LookupError:
         return data.decode("utf-8", errors="replace")
@@ -160,7 +160,7 @@ def _parsed(path: Path, text: str) -> Element:
 
 
 def read_origin(path: Path, element: ET.Element) -> tuple[Float[np.ndarray, "3 3"], Float[np.ndarray, "3"]]:
-    """Return rotation and translation [m] of an element's `<origin>`. Without `<origin>` this is the identity.
+    """Return rotation and translation [m] of an element's `<origin>`. Without `<origin>` the pose is the identity.
 
     Raises HandError: a value is not a finite number, or a translation is longer than `FARTHEST`.
     """

@@ -1,1 +1,1 @@
-"""The closed-form relaxation of the grasp problem (docs/method.md)."""
+"""Solve the closed-form relaxation of the grasp problem (docs/method.md)."""

@@ -1,10 +1,10 @@
-"""Solve the closed-form relaxation: projected Adam on all starts, then on the starts that are not hopeless.
+"""Solve the closed-form relaxation by projected Adam: explore from all starts, then refine and polish the best starts.
 
-The padding radius and the contact width shrink while exploring, and keep their end values while refining. Only iterates
-at the end values may become the best iterate of a start.
+Exploring shrinks two lengths: the padding around the object, and the width of the soft contact. Only iterates of the
+last steps (`fine_steps`) may become the best iterate of a start.
 
-`ClosedForm` steps in torch. `minimise_compiled` runs the same schedule in the compiled kernel, with the same results up
-to rounding. The kernel optimises every start by itself, on as many threads as torch has (`torch.set_num_threads`). Its
+`ClosedForm` runs in torch. `minimise_compiled` runs the same schedule in the compiled kernel, with the same results up
+to rounding. The kernel optimises every start by itself, on as many threads as torch has (`torch.set_num_threads`). The
 result for a start does not depend on the number of threads or on the other starts.
 """
 
@@ -38,7 +38,7 @@ from graspd_core.optimize.loop import (
 from graspd_core.optimize.losses import hard_contact, soft_contact
 from graspd_core.optimize.problem import Problem, Terms, evaluate, least_distance
 
-# Step size at the end of the run, as a share of that at the start.
+# Step size at the end of the run, as a share of the first step size.
 _FINAL_RATE = 0.05
 # Smaller batches are padded to this many rows with copies of the first row. Matrix products of one to three rows are
 # summed in another order, so a start would give another result alone than in a batch.
@@ -49,10 +49,10 @@ _FEWEST_STARTS, _FEWEST_KEPT = 16, 8
 
 @dataclass(frozen=True)
 class AdamState:
-    """Iterate, moments and best iterate of every start, as rows of one matrix (translation, quaternion, joints).
+    """Iterate, gradient moments and best iterate of every start: rows of translation, quaternion and joints.
 
     The translation is the position of `pivot`, the point about which a step turns the hand. If the base frame is far
-    from the palm, a small rotation about its origin would move the fingers away from the object.
+    from the palm, a small rotation about the base origin would move the fingers away from the object.
     """
 
     pivot: Positions
@@ -68,14 +68,14 @@ class AdamState:
         return AdamState(**{name: value[rows] for name, value in vars(self).items()})
 
     def best(self) -> tuple[Poses, Values]:
-        """Return the best iterate of every start and its loss. If no iterate was scored, return the last one."""
+        """Return the best iterate of every start, or the last if none was scored, and its loss."""
         scored = torch.isfinite(self.best_loss)
         poses = unpack(torch.where(scored[:, None], self.best_x, self.x))
         return moved_along(poses, -self.pivot), torch.where(scored, self.best_loss, self.loss)
 
 
 def initial_state(problem: Problem, starts: Poses, radius: Values) -> AdamState:
-    """Return the state before the first step. `radius` [m] is the initial padding of the object for each start."""
+    """Return the state before the first step. `radius` [m] is the object's padding in the first step of each start."""
     x = pack(moved_along(starts, problem.hand.pivot))
     worst = x.new_full((len(x),), torch.inf)
     pivot = problem.hand.pivot.expand(len(x), 3)
@@ -148,7 +148,7 @@ class ClosedForm:
     def value_and_gradient(
         self, problem: Problem, x: Rows, radius: Values, delta: float, *, fine: bool, sharp: bool
     ) -> tuple[Values, Rows]:
-        """Return the loss of every start and its gradient, or infinity and zero if one of them is not finite."""
+        """Return loss and gradient of every start. If either is not finite, return infinity and a zero gradient."""
         rows = len(x)
         short = max(0, _FEWEST_ROWS - rows)
         x = torch.cat([x, x[:1].expand(short, -1)]).detach().requires_grad_(True)
@@ -183,7 +183,7 @@ def minimise_compiled(
 def _run_steps(
     compiled: KernelProblem, config: ClosedFormConfig, state: AdamState, span: tuple[int, int], follow: Follow
 ) -> None:
-    """Run the steps `span` in the kernel and update `state` in place. A stop ends the run within milliseconds."""
+    """Run the steps `span` (first, end) in the kernel and change `state`. A stop ends the run within milliseconds."""
     (begin, end), rows = span, len(state.x)
 
     def over(done: int) -> bool:

@@ -1,4 +1,4 @@
-"""Settings of the closed-form method."""
+"""Define the settings of the closed-form method."""
 
 from __future__ import annotations
 
@@ -14,10 +14,10 @@ class LossWeights:
     Attributes:
         wrench_resistance: resistance against the worst disturbances.
         distance: attraction of the hand to the surface.
-        penetration: depth below the padded surface.
+        penetration: depth of the hand below the object's padded surface.
         self_collision: overlap of the hand with itself.
         posture: distance of joints from the middle of their range.
-        obstacle: depth in the support or in an obstacle. A scene with neither has no such term.
+        obstacle: depth in the support or in an obstacle. Without support and obstacles there is no such term.
     """
 
     wrench_resistance: float = 3.0
@@ -34,17 +34,17 @@ class ClosedFormConfig:
 
     Attributes:
         starts_per_grasp: number of starts for each requested grasp. Exploring drops hopeless starts.
-        fingertip_starts: share of starts with half-closed fingertips at the object, instead of the open palm.
+        fingertip_starts: share of starts with half-closed fingers, with tips at the object. Others have an open hand.
         explore_steps: number of first steps, in which hopeless starts are dropped.
         refine_steps: number of steps after exploring, with the kept starts.
-        polish_steps: number of last steps, with all sharp points of the object and with weights for exact contact.
+        polish_steps: number of last steps. They use all sharp points of the object, and `polish_weights`.
         fine_steps: number of the last polishing steps, which use all contact candidates.
         keep_per_grasp: number of starts kept after exploring, for each requested grasp.
-        drops: how often exploring drops starts. Drops are evenly spread, and each drops the same share.
-        activation: `soft` contact decays over its width. `hard` contact, for the ablation, ends at `delta_end`.
-        delta_start: width of the soft contact at the start [m].
-        delta_end: width of the soft contact at the end [m].
-        radius_start: greatest padding of the object at the start [m].
+        drops: how many times exploring drops starts, at equal intervals. Each time the same share of starts is dropped.
+        activation: `soft` contact decays with distance. `hard` contact, for an ablation, is 1 up to `delta_end`.
+        delta_start: width of the soft contact in the first step [m].
+        delta_end: width of the soft contact after exploring [m].
+        radius_start: greatest padding of the object in the first step [m]. A start near the object has less padding.
         translation_rate: step size of the base position [m].
         rotation_rate: step size of the base quaternion [half rad].
         joint_rate: step size of the joints [rad]. For prismatic joints 0.05 m count as one radian.
@@ -83,7 +83,7 @@ def drop_steps(settings: ClosedFormConfig) -> list[int]:
 
 
 def rows_kept(settings: ClosedFormConfig, keep: int, rows: int, index: int) -> int:
-    """Return how many of `rows` starts are kept before step `index`. After exploring, `keep` starts are left."""
+    """Return how many of `rows` starts take part in step `index`. After exploring, `keep` starts are left."""
     at = drop_steps(settings)
     if index not in at or keep >= rows:
         return rows
@@ -92,9 +92,9 @@ def rows_kept(settings: ClosedFormConfig, keep: int, rows: int, index: int) -> i
 
 
 def at_budget(settings: ClosedFormConfig, budget: float) -> ClosedFormConfig:
-    """Return the settings for a budget. A budget above 1 scales the starts, because hard objects need more.
+    """Return the settings for `budget` times the usual effort. Above 1 it multiplies the starts, for hard objects.
 
-    A budget below 1 scales the steps and allows one search. The steps determine the time of a small batch.
+    Below 1 it multiplies the steps and allows one search. Fewer starts would save hardly any time in a small batch.
     """
     share, times = min(budget, 1.0), max(budget, 1.0)
     steps = {

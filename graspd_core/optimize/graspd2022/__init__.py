@@ -1,1 +1,1 @@
-"""Grasp'D (Turpin et al., ECCV 2022)."""
+"""Solve Grasp'D (Turpin et al., ECCV 2022)."""

@@ -1,15 +1,15 @@
-"""Solve Grasp'D as published (Turpin et al., ECCV 2022): find forces that stop the object, and a pose that yields them.
+"""Solve Grasp'D as published (Turpin et al., ECCV 2022): find forces that stop the object, and a pose that gives them.
 
     min L_phys + L_range + L_inter  subject to  L_task < C_task, L_limit < C_limit
 
-by damped multipliers and Adamax. Contact is with the level set φ = r, where r shrinks to zero (docs/method.md, §1).
+with damped multipliers and Adamax. The hand touches the level set φ = r, where r shrinks to zero (docs/method.md, §1).
 
 Physics is relaxed as in contact-invariant optimisation. Every hand point has in every simulation a desired force f̂ on
-the object. The pose need not supply it. L_task is a constraint: f̂ shall stop the object. L_phys is a cost: the pose
+the object. The pose need not supply f̂. L_task is a constraint: f̂ shall stop the object. L_phys is a cost: the pose
 shall supply f̂.
 
-For min f(x) subject to g(x) < C the Lagrangian is f + λ c + d c² / 2 with c = max(g − C, 0). Each step decreases it in
-x and increases it in λ. The damping d c² / 2 prevents oscillation (Platt & Barr, NIPS 1987).
+For min f(x) subject to g(x) < C the Lagrangian is f + λ c + d c² / 2 with c = max(g − C, 0). Each step decreases the
+Lagrangian in x and increases it in λ. The damping d c² / 2 prevents oscillation (Platt & Barr, NIPS 1987).
 
 Hand points that penetrate the object push it by the penalty contact of Grasp'D:
 
@@ -20,8 +20,8 @@ the hand. The simulation is one semi-implicit Euler step of a free rigid body wi
 computed. All values are in SI units and in the object frame. Torques and angular velocities are about the centre of
 mass.
 
-Gradients are exact with four exceptions. Contacts leak (`leaky_min`). The tangential speed has a floor, so that
-friction is smooth without sliding. L_task has no gradient in the pose. `into_cone` has no gradient.
+Gradients are exact with four exceptions. Points out of contact get a gradient too (`leaky_min`). The tangential speed
+has a floor, so that friction is smooth without sliding. L_task has no gradient in the pose. `into_cone` has none.
 """
 
 from __future__ import annotations
@@ -50,9 +50,9 @@ from graspd_core.se3 import EPSILON, aligning_rotation, quaternion_from_rotation
 # Floor of the squared tangential speed [m²/s²]. A micrometre per second counts as no motion.
 _SLIP_FLOOR = 1e-12
 _BETA1, _EPSILON = 0.9, 1e-8
-# Poses drawn for each start kept. Poses that touch the object come last. The released code draws them again.
+# Number of poses drawn for each kept start. Poses that touch the object come last. The released code redraws them.
 _POOL = 4
-# L_task if nothing slows the object: 1e5 times the squared speeds [m²/s²] of three simulations: 0, 3e-4 and 3e-4.
+# L_task if nothing slows the object: 1e5 times the sum of the squared speeds 0, 3e-4 and 3e-4 [m²/s²].
 _ALL_MOTION = 60.0
 # One variable with a row for every start.
 Variable = Float[Tensor, "batch *shape"]
@@ -61,7 +61,7 @@ Forces = Float[Tensor, "batch points simulations components"]
 
 
 class LeakyMin(torch.autograd.Function):
-    """The function min(x, 0), with slope `leak` instead of zero for x ≥ 0: the leaky gradient of Grasp'D."""
+    """The function min(x, 0). Its gradient is `leak` instead of zero for x ≥ 0: the leaky gradient of Grasp'D."""
 
     @staticmethod
     def forward(ctx: Any, x: Tensor, leak: float) -> Tensor:
@@ -76,25 +76,25 @@ class LeakyMin(torch.autograd.Function):
 
 
 def leaky_min(x: Float[Tensor, "*shape"], leak: float) -> Float[Tensor, "*shape"]:
-    """Return min(x, 0), with slope `leak` where x ≥ 0."""
+    """Return min(x, 0). Where x ≥ 0, the gradient is `leak` instead of zero."""
     return cast(Tensor, LeakyMin.apply(x, leak))
 
 
 def contact_forces(
     height: Distances, normals: Points, velocities: Float[Tensor, "simulations 3"], contact: ContactConfig
 ) -> Float[Tensor, "batch points simulations 3"]:
-    """Compute forces on the object at every hand point, once for each velocity of the object [N].
+    """Compute the force [N] on the object at every hand point, once for each velocity of the object.
 
     Args:
         height: height of the hand's points above the level set, φ − r [m].
         normals: ∇φ at these points. A zero vector gives no normal force.
         velocities: linear velocities of the object relative to the hand [m/s].
-        contact: k_n, k_f, μ and the leak.
+        contact: settings k_n, k_f, μ and `leak`, the gradient out of contact (`leaky_min`).
     """
     push = contact.stiffness * leaky_min(height, contact.leak)
     along = normals @ velocities.T
     slip = ((velocities * velocities).sum(-1) - along * along).clamp_min(_SLIP_FLOOR).sqrt()
-    # Friction force per tangential speed. The last line adds v_t = v − (n·v) n together with the normal force.
+    # `drag` is the friction force per tangential speed. The last line adds the normal force to the drag of v − (n·v) n.
     drag = (-contact.friction * push[..., None] / slip).clamp(max=contact.friction_stiffness)
     return (push[..., None] + drag * along)[..., None] * normals[:, :, None] - drag[..., None] * velocities
 
@@ -169,12 +169,12 @@ def euler_step(
 def speed_left(
     body: FreeBody, linear: Float[Tensor, "*batch 3"], angular: Float[Tensor, "*batch 3"]
 ) -> Float[Tensor, "*batch"]:
-    """Return the squared speed ‖v‖² + ‖L ω‖² of a body [m²/s²]."""
+    """Return the squared speed ‖v‖² + ‖L ω‖² of a body of length L [m²/s²]."""
     return (linear * linear).sum(-1) + body.length**2 * (angular * angular).sum(-1)
 
 
 def actual(forces: Float[Tensor, "batch points simulations 3"], arms: Points, length: float, components: int) -> Forces:
-    """Return the contact forces as forces (3 components), or as wrenches with torques over `length` (6 components)."""
+    """Return the forces unchanged (3 components), or as wrenches with torques divided by `length` (6 components)."""
     if components == 3:
         return forces
     torques = torch.linalg.cross(arms[:, :, None] / length, forces)
@@ -182,7 +182,7 @@ def actual(forces: Float[Tensor, "batch points simulations 3"], arms: Points, le
 
 
 def physics(desired: Forces, supplied: Forces) -> Values:
-    """Return L_phys: squared differences of desired and supplied forces, over all points and simulations [N²]."""
+    """Return L_phys [N²]: squared differences of desired and supplied forces, summed over points and simulations."""
     difference = (desired - supplied).flatten(1)
     return (difference * difference).sum(-1)
 
@@ -190,9 +190,9 @@ def physics(desired: Forces, supplied: Forces) -> Values:
 def motion_left(
     body: FreeBody, forces: Forces, arms: Points, velocities: Float[Tensor, "simulations 3"], time_step: float
 ) -> Float[Tensor, "batch simulations"]:
-    """Return the object's squared speed after a step, divided by the mean before the step. 1 if no motion is stopped.
+    """Return the object's squared speed after a step, divided by the mean of the squared initial speeds.
 
-    Forces with six components contain torques, divided by the body's length.
+    Without forces the results average 1. Forces with six components contain torques, divided by the body's length.
     """
     if forces.shape[-1] == 3:
         force, torque = net_wrench(forces, arms)
@@ -211,7 +211,7 @@ def into_cone(
     along = -(forces * normals[:, :, None]).sum(-1)
     across = forces + along[..., None] * normals[:, :, None]
     side = across.norm(dim=-1)
-    # Forces inside the cone do not change. For others the nearest point is on the cone's surface or at its apex.
+    # Forces inside the cone do not change. For other forces the nearest point is on the cone.
     rim = ((along + friction * side) / (1 + friction**2)).clamp_min(0.0)
     inside = side <= friction * along
     push = torch.where(inside, along, rim)
@@ -221,12 +221,12 @@ def into_cone(
 
 @dataclass(frozen=True)
 class Adamax:
-    """A variable of every start, with its moments (Kingma & Ba 2015, §7.1).
+    """A variable with a row for every start, and its moments (Kingma & Ba 2015, §7.1).
 
     Attributes:
         value: the iterate.
         mean: running mean of the gradient.
-        top: decaying maximum of the gradient's magnitude. With Adam, the running mean of its square.
+        top: decaying maximum of the gradient's magnitude (Adamax), or running mean of its square (Adam).
     """
 
     value: Variable
@@ -255,7 +255,7 @@ def adam_step(state: Adamax, gradient: Variable, rate: float, count: int, memory
 
 
 def excess(value: Float[Tensor, "*shape"], bound: float) -> Float[Tensor, "*shape"]:
-    """Return the violation max(`value` − `bound`, 0) of a constraint: the Lagrangian's gradient in the multiplier."""
+    """Return the violation max(`value` − `bound`, 0) of a constraint. It is also the Lagrangian's gradient in λ."""
     return (value - bound).clamp_min(0.0)
 
 
@@ -271,7 +271,7 @@ def published_starts(problem: Problem, scene: Scene, hand: HandModel, count: int
     Starts that touch the object are chosen last.
     """
     generator = torch.Generator().manual_seed(seed)
-    # Samples come in the order of the mesh's faces. Without shuffling, the chosen ones would all lie on one side.
+    # Samples come in the order of the mesh's faces. Without shuffling, all chosen samples would lie on one side.
     order = torch.randperm(_POOL * count, generator=generator)
     points, normals = (torch.as_tensor(x)[order] for x in surface_samples(scene.object.mesh, _POOL * count, seed))
     roll = math.pi * (2 * torch.rand(len(points), generator=generator, dtype=torch.float64) - 1)
@@ -299,7 +299,7 @@ class Evaluation(NamedTuple):
 
 
 class Slope(NamedTuple):
-    """Cost, constraint violations, and gradients of the Lagrangian. `by_force` is None without desired forces."""
+    """Cost, constraint violations, gradients of the Lagrangian in pose and desired forces (or None), and normals."""
 
     cost: Values
     broken: Float[Tensor, "batch constraints"]
@@ -310,7 +310,7 @@ class Slope(NamedTuple):
 
 @dataclass(frozen=True)
 class RelaxedState:
-    """Iterate of every start, and the best iterate on the true surface so far.
+    """Iterate of every start, and its best iterate so far. Only iterates for contact at r = 0 can become the best.
 
     Attributes:
         pose: rows of translation, quaternion, joints.
@@ -386,7 +386,7 @@ class Graspd2022:
         loss = slope.cost + damped(slope.broken, torch.ones_like(slope.broken), 1.0).sum(-1)
         finite = torch.isfinite(slope.by_pose).all(-1) & torch.isfinite(loss)
         loss = torch.where(finite, loss, torch.inf)
-        # An iterate on a padded surface cannot become the best.
+        # An iterate on a padded surface cannot become the best iterate.
         better = (loss < state.best_loss) & (remaining == 0.0)
         rate = self.rate(index) * config.relaxation.force_rate
         pulled, count = state.forces, index + 1
@@ -434,7 +434,7 @@ class Graspd2022:
         return fade * min(1.0, index / config.warm_up) if config.warm_up else fade
 
     def moved(self, problem: Problem, pose: Adamax, gradient: Rows, when: tuple[int, int]) -> Adamax:
-        """Move the pose. `when` is the index of the step, and the turn (0 or 1) in the step.
+        """Move the pose. `when` is the step's index and the turn: 0, or with `in_turns` also 1 for the second move.
 
         As in the released code, the moments of all variables are updated, also of variables that do not move this turn.
         """
@@ -458,13 +458,13 @@ class Graspd2022:
         return unpack(x), torch.where(scored, state.best_loss, state.loss)
 
     def cost(self, found: Evaluation) -> Values:
-        """Return L_phys + L_range + L_inter, weighted. Without relaxation the remaining motion replaces L_phys."""
+        """Return L_phys + L_range + L_inter, weighted. Without relaxation the object's motion replaces L_phys."""
         config = self.config
         goal = config.weights.physics * found.physics if config.relaxation.enabled else found.motion
         return goal + config.weights.range * found.range + config.weights.inter * found.inter
 
     def evaluate(self, problem: Problem, pose: Rows, desired: Forces, radius: Values) -> Evaluation:
-        """Compute all terms at a pose with desired forces, for contact with the level set φ = `radius` [m]."""
+        """Compute all loss terms at a pose with desired forces, for contact with the level set φ = `radius` [m]."""
         config, body, poses, velocities = self.config, self.body, unpack(pose), self.velocities
         placed = hand_forward(problem, self.points(problem), poses)
         distance, normals = sample_sdf(problem.object.sdf, placed.points)
@@ -473,7 +473,7 @@ class Graspd2022:
         none = torch.zeros_like(radius)
         if config.relaxation.enabled:
             difference = physics(desired, actual(supplied, arms, body.length, desired.shape[-1]))
-            # As in the released code, L_task depends on the forces alone. `detach` drops its gradient in the pose.
+            # As in the released code, L_task depends on the forces alone. `detach` drops its dependence on the pose.
             left = motion_left(body, desired, arms.detach(), velocities, self.time_step)
             task, motion = _ALL_MOTION * left.mean(-1), none
         else:
@@ -495,7 +495,7 @@ class Graspd2022:
 
 
 def move_shares(steps: PoseStepsConfig, turn: int, joints: int) -> list[float]:
-    """Return factors of the step size for position, quaternion and joints in a turn of a step. 0 for no move."""
+    """Return the step-size factor of each pose variable. With `in_turns`, a variable of the other turn has 0."""
     position, others = (1 - turn, turn) if steps.in_turns else (1, 1)
     return [position * steps.translation_share] * 3 + [others * steps.rotation_share] * 4 + [float(others)] * joints
 

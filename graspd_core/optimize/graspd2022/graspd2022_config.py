@@ -1,4 +1,4 @@
-"""Settings of the published Grasp'D."""
+"""Define the settings of the published Grasp'D."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ class InitialPosesConfig:
 
     Attributes:
         starts_per_grasp: number of starts for each requested grasp.
-        kind: `published` has the palm at `standoff` from a random surface point. `hull` uses `draw_starts`.
+        kind: `published` puts the palm at `standoff` from a random surface point. `hull` calls `draw_starts`.
         standoff: distance of the palm from the surface point [m].
     """
 
@@ -27,8 +27,8 @@ class LevelSetConfig:
 
     Attributes:
         schedule: first r. `paper` takes `radius_start`. `code` takes the hand's least distance minus `clearance`.
-        radius_start: first r of the paper [m].
-        clearance: distance of the hand from the first level set of the code [m].
+        radius_start: first r, for the schedule `paper` [m].
+        clearance: distance of the hand from the first level set, for the schedule `code` [m].
         coarse_steps: number of steps in which r shrinks to zero. 0 disables coarse-to-fine.
     """
 
@@ -43,7 +43,7 @@ class ContactConfig:
     """The penalty contact.
 
     Attributes:
-        leak: slope of the penalty out of contact. 0 gives the exact gradient.
+        leak: slope of the penalty out of contact, only in gradients. 0 gives the exact gradient.
         stiffness: normal force per depth [N/m].
         friction_stiffness: friction force per tangential speed, below Coulomb's bound [N·s/m].
         friction: Coulomb coefficient.
@@ -65,7 +65,7 @@ class SimulationConfig:
         scaling: `published` uses `time_step`. `object` uses the time in which `stopping_force` stops the object.
         stopping_force: force that stops the object, for the scaling `object` [N].
         time_step: duration of the step, for the scaling `published` [s].
-        speed: initial speed along each axis [m/s]: 0, positive and negative in the three simulations.
+        speed: along every axis, the object starts with 0, +`speed` and −`speed` in the three simulations [m/s].
     """
 
     scaling: Literal["published", "object"] = "published"
@@ -80,7 +80,7 @@ class RelaxationConfig:
 
     Attributes:
         enabled: optimise desired forces. If false, the motion after one step is minimised directly.
-        desired: kind of desired force: a free `force`, a free `wrench` (as in the code), or a force in the `cone`.
+        desired: kind of desired force: a free `force`, a free `wrench` (as in released code), or a force in the `cone`.
         force_rate: step size of the desired forces [N].
     """
 
@@ -91,13 +91,13 @@ class RelaxationConfig:
 
 @dataclass(frozen=True)
 class PoseStepsConfig:
-    """Steps of the pose. The defaults follow the paper, the alternatives follow grasping/src/cio.py.
+    """Steps of the pose. The defaults follow the paper. The other values follow the released code, grasping/src/cio.py.
 
     Attributes:
-        optimiser: `adamax`, or `adam` as in the code.
+        optimiser: `adamax`, or `adam` as in the released code.
         translation_share: step size of the base position, relative to `pose_rate`.
         rotation_share: step size of the base quaternion, relative to `pose_rate`.
-        in_turns: a step first moves the base position. Then it moves orientation and joints with a new gradient.
+        in_turns: move first the base position, then orientation and joints with a new gradient. Else move all at once.
         within_limits: clamp joints to their limits after every move. If false, limits are only a constraint.
     """
 
@@ -113,7 +113,7 @@ class ConstraintsConfig:
     """Bounds on L_task and L_limit, and their multipliers.
 
     Attributes:
-        task_bound: bound on the motion that the desired forces leave, where 60 is all motion. The code has 10.
+        task_bound: bound on L_task, the motion left by the desired forces: 60 without forces. The released code has 10.
         limit_bound: bound on the sum by which joints exceed their limits [rad].
         damping: damping coefficient of the multipliers.
         multiplier_rate: step size of the multipliers.
@@ -149,8 +149,8 @@ class Graspd2022Config:
         pose_rate: step size of position [m], quaternion [half rad] and joints [rad].
         beta2: decay rate of the gradient's infinity norm (Adamax) or of its square (Adam).
         warm_up: number of first steps, in which the step sizes of pose and forces grow linearly from zero.
-        final_rate: step sizes at the end relative to the start, after a half-cosine decay. 1 keeps them constant.
-        keep: return the `best` iterate on the true surface, or the `last` one.
+        final_rate: last step sizes as a share of the full ones, reached by a half-cosine decay. 1 keeps them constant.
+        keep: return the `best` iterate for contact at r = 0, or the `last` iterate.
     """
 
     initial: InitialPosesConfig = field(default_factory=InitialPosesConfig)

@@ -1,1 +1,1 @@
-"""Steps of the closed-form method in C++, with value and gradient of a start in one pass (docs/kernel.md)."""
+"""Run the steps of the closed-form method in C++. One pass gives value and gradient of a start (docs/kernel.md)."""

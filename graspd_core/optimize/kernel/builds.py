@@ -1,7 +1,7 @@
-"""Load the build of the compiled kernel that this machine can run, or report why there is none.
+"""Load the build of the compiled kernel that this machine can run, or report why no build can run.
 
 The environment variable `GRASPD_KERNEL` is `off` (torch alone), the name of a build, or the path of a library. The
-default is the best build that runs here. The structures mirror src/layout.hpp by field. `load` compares their sizes.
+default is the best build that runs here. The structures mirror those of src/layout.hpp. Loading compares their sizes.
 """
 
 from __future__ import annotations
@@ -167,7 +167,7 @@ class Obstacles(ctypes.Structure):
 
 
 class Weights(ctypes.Structure):
-    # In the order of `closed_form_config.LossWeights`.
+    # The fields are in the order of `closed_form_config.LossWeights`.
     _fields_ = _of(_FLOAT, "wrench_resistance distance penetration self_collision posture obstacle")
 
 
@@ -214,7 +214,7 @@ class Bodies(ctypes.Structure):
     _fields_ = [*_of(_INT, "count links"), *_of(_AT, "pose ball core radius round link plane_start planes")]
 
 
-# In the order of `graspd_sizes`.
+# The structures are in the order of `graspd_sizes`.
 STRUCTURES = (
     *(Hand, Points, Grid, Solids, Spheres, Object, Obstacles, Weights, Problem, Schedule, State, Pregrasp),
     *(Surface, Bodies),

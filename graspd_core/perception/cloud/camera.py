@@ -1,8 +1,8 @@
 """Pinhole cameras with lens distortion, conversion of depth images to points, and objects at the image border.
 
-Camera frames follow the optical convention: z forward, x right, y down. Distortion is that of OpenCV's camera model
-(Brown and Conrady), which ROS calls plumb_bob (k1, k2, p1, p2, k3) and rational_polynomial (k4, k5, k6 after those).
-An object that reaches the border of an image may continue beyond it.
+Camera frames follow the optical convention: z forward, x right, y down. The distortion follows OpenCV's model (Brown
+and Conrady). ROS calls the model plumb_bob with k1, k2, p1, p2, k3, and rational_polynomial if k4, k5, k6 follow.
+An object that reaches the image border may continue beyond the border.
 """
 
 from __future__ import annotations
@@ -21,38 +21,38 @@ from graspd_core.perception.cloud.point_cloud import PointCloud, Vector, convex_
 DISTORTION_MODELS = {"plumb_bob": 5, "rational_polynomial": 8}
 
 _Numbers = Sequence[float | int]
-# Positions on the plane of unit depth, or in an image [pixels].
+# Positions (x, y) on the plane at depth 1, or (column, row) in an image [pixels].
 _Places = Float[np.ndarray, "*batch 2"]
 DepthImage = Float[np.ndarray, "height width"]
 
-# Newton's method doubles the correct digits in each step. Five steps suffice, and extreme lenses need a few more.
+# Newton's method doubles the correct digits in each step. Most lenses need five steps, extreme lenses a few more.
 _NEWTON_STEPS = 20
 _NEWTON_TOLERANCE = 1e-10
-# Least focal length, and greatest value of any number of a calibration [pixels]. Beyond them rays are not finite.
+# Smallest valid focal length, and largest valid number of a calibration [pixels]. Other values give infinite rays.
 _MIN_FOCAL_PX, _MAX_CALIBRATION_PX = 1e-2, 1e7
-# A side of the hull is an image border only if it has this many points of the object, and as many of other objects. An
-# object alone in front of nothing makes a hull of its own.
+# A hull side is an image border only if this many points of the object touch the side, and as many other points. An
+# object without other points around it has a hull too, but no image border.
 MIN_BORDER_POINTS = 8
-# Sides shorter than this fraction of the outline's size are not borders of an image.
+# Hull sides shorter than this fraction of the hull's longest extent are not image borders.
 MIN_SIDE_SHARE = 0.1
-# An image border has points all along it: in at least this fraction of its parts of equal length. A hull side from the
-# top of an object to the table's corner behind it has none between.
+# An image border has points along its whole length: with SIDE_PARTS equal parts, at least MIN_FILLED_SHARE of the parts
+# have points. A hull side from an object's top to a corner of the table has points only at its ends.
 SIDE_PARTS, MIN_FILLED_SHARE = 20, 0.6
-# Number of points whose hull is checked first, because most objects are far from the outline.
+# The hull of at most this many points is checked first, because most objects are far from the hull.
 HULL_POINTS = 2000
-# For each encoding, the type of a pixel, and metres per unit.
+# For each depth encoding: NumPy type of a pixel, and metres per unit.
 ENCODINGS = {"16UC1": ("u2", 1e-3), "mono16": ("u2", 1e-3), "32FC1": ("f4", 1.0), "64FC1": ("f8", 1.0)}
-# Advice for images of another encoding, by the beginning of the encoding's name.
+# Advice for images that hold no depth, by the beginning of the encoding's name.
 _REMEDIES = {
     "8U": "8 bits per pixel are too few for depth: publish 16UC1 (millimetres) or 32FC1 (metres)",
     "mono8": "8 bits per pixel are too few for depth: publish 16UC1 (millimetres) or 32FC1 (metres)",
     "rgb": "it is a colour picture: name the depth image's topic",
     "bgr": "it is a colour picture: name the depth image's topic",
 }
-# Depth in mm that was cut to 8 bits has this greatest value [m] at more than this fraction of the pixels.
+# In depth images that were cut to 8 bits: greatest depth [m], and smallest fraction of pixels with the greatest depth.
 _MOST_OF_8_BITS, _CUT_SHARE = 0.255, 0.2
-# If the principal point is this far off the middle (relative), and by the same factor across and down within this
-# tolerance, the camera matrix is for another image size. Cropping seldom gives equal factors.
+# If the principal point is off the middle by equal factors across and down, the camera matrix is for another size.
+# Cropping seldom gives equal factors. Limits: least |factor - 1|, relative difference of the factors, largest factor.
 _OFF_MIDDLE, _SAME_MIDDLE, _MOST_SCALED = 0.3, 0.08, 4.5
 
 
@@ -77,7 +77,7 @@ class PinholeCamera:
 
     def __post_init__(self) -> None:
         if self.width < 1 or self.height < 1:
-            raise CloudError(f"camera: an image of {self.width} x {self.height} pixels; both must be 1 or more")
+            raise CloudError(f"camera: an image of {self.width} x {self.height} pixels; valid: at least 1 x 1")
         numbers = (self.fx, self.fy, self.cx, self.cy, *self.distortion)
         if not (
             all(abs(number) <= _MAX_CALIBRATION_PX for number in numbers) and min(self.fx, self.fy) >= _MIN_FOCAL_PX
@@ -95,7 +95,7 @@ def camera_from_calibration(
 ) -> PinholeCamera:
     """Return a camera from image size [pixels], camera matrix (row by row), distortion coefficients and their model.
 
-    Raises CloudError if `model` is unknown or has fewer coefficients than given, or `matrix` is not a calibration.
+    Raises CloudError if `model` is unknown, `distortion` has too many numbers, or size or `matrix` is not valid.
     """
     if len(matrix) != 9:
         raise CloudError(f"camera: its matrix K has {len(matrix)} numbers; 9 are needed")
@@ -114,7 +114,7 @@ def camera_from_calibration(
 
 @lru_cache(maxsize=8)
 def camera_rays(camera: PinholeCamera) -> Float[np.ndarray, "height width 3"]:
-    """Return the ray of unit depth through each pixel, camera frame, read-only. It is NaN beyond the lens model."""
+    """Return a read-only array of one ray per pixel (camera frame, z = 1). NaN marks pixels without a ray."""
     column, row = np.meshgrid(np.arange(camera.width), np.arange(camera.height))
     image = np.stack([(column - camera.cx) / camera.fx, (row - camera.cy) / camera.fy], -1)
     rays = np.concatenate([undistort(image, camera.distortion), np.ones((*image.shape[:2], 1))], -1)
@@ -123,18 +123,18 @@ def camera_rays(camera: PinholeCamera) -> Float[np.ndarray, "height width 3"]:
 
 
 def project(points: Float[np.ndarray, "*batch 3"], camera: PinholeCamera) -> _Places:
-    """Return the pixel coordinates (column, row) of points [m] in the camera frame, in front of the camera."""
+    """Return pixel coordinates (column, row) of points [m] in the camera frame. All points must have z > 0."""
     seen = distort(points[..., :2] / points[..., 2:], camera.distortion)
     return seen * [camera.fx, camera.fy] + [camera.cx, camera.cy]
 
 
 def distort(ideal: _Places, coefficients: _Numbers) -> _Places:
-    """Apply the lens distortion to positions on the plane of unit depth."""
+    """Apply the lens distortion to positions on the plane at depth 1."""
     return _lens(ideal, coefficients)[0] if any(coefficients) else np.array(ideal, dtype=float)
 
 
 def undistort(seen: _Places, coefficients: _Numbers) -> _Places:
-    """Return the inverse of `distort`, NaN where the lens model has no inverse."""
+    """Invert `distort`. Return NaN where the lens model has no inverse."""
     if not any(coefficients):
         return np.array(seen, dtype=float)
     target = np.asarray(seen, dtype=float)
@@ -152,13 +152,13 @@ def undistort(seen: _Places, coefficients: _Numbers) -> _Places:
                 break
         image, slope = _lens(ideal, coefficients)
         a, b, d = np.moveaxis(slope, -1, 0)
-        # Beyond its rim a lens model folds back, which makes the determinant or the trace of the derivative negative.
+        # Outside its valid range, a lens model folds back: the derivative has a negative determinant or trace.
         found = (np.abs(target - image).max(-1) < _NEWTON_TOLERANCE) & (a * d - b * b > 0) & (a + d > 0)
     return np.where(found[..., None], ideal, np.nan)
 
 
 def _lens(ideal: _Places, coefficients: _Numbers) -> tuple[_Places, Float[np.ndarray, "*batch 3"]]:
-    """Return distorted positions, and a, b, d of their derivative, the symmetric matrix [[a, b], [b, d]]."""
+    """Return distorted positions, and (a, b, d): their derivative by the ideal positions is [[a, b], [b, d]]."""
     k1, k2, p1, p2, k3, k4, k5, k6 = (*coefficients, *[0.0] * (8 - len(coefficients)))
     x, y = ideal[..., 0], ideal[..., 1]
     s = x * x + y * y
@@ -178,9 +178,9 @@ def _lens(ideal: _Places, coefficients: _Numbers) -> tuple[_Places, Float[np.nda
 def reaches_image_border(
     points: Float[np.ndarray, "points 3"], eye: Vector, mine: Bool[np.ndarray, "points"], width: float
 ) -> bool:
-    """Return True if the points `mine` touch an image border: a side of the view's outline that others touch too.
+    """Return True if an object reaches an image border of the camera at `eye`. `mine` marks the object's points.
 
-    The outline is the hull of the directions from `eye` to all points. Points within `width` [rad] of it touch it.
+    A border is a long side of the hull of all lines of sight. Object and other points lie within `width` [rad] of it.
     """
     if not mine.any():
         return False
@@ -197,7 +197,7 @@ def reaches_image_border(
     ends = plane[hull.simplices]
     long = np.linalg.norm(ends[:, 0] - ends[:, 1], axis=1) > MIN_SIDE_SHARE * longest_side(plane)
     for (*normal, offset), (start, end) in zip(hull.equations[long], ends[long], strict=True):
-        # The object's few points are checked first, because they are far from most sides.
+        # The object's points are checked first, because they are few and far from most sides.
         near = own[own @ np.array(normal) + offset > -width]
         if len(near) < MIN_BORDER_POINTS:
             continue
@@ -232,15 +232,15 @@ def depth_in_metres(image: UInt16[np.ndarray, "height width"] | DepthImage, enco
 def cloud_from_depth(
     depth: DepthImage, camera: PinholeCamera, T_frame_camera: Float[np.ndarray, "4 4"] | None = None
 ) -> PointCloud:
-    """Return the points of a depth image in the camera frame, or moved by `T_frame_camera` if that is given.
+    """Return the points of a depth image [m] as a point cloud.
 
     Args:
         depth: depth along the optical axis [m]. Pixels of 0, NaN or infinity give no point.
         camera: the camera, of the same size as the image.
-        T_frame_camera: pose of the camera (z forward, x right, y down).
+        T_frame_camera: pose of the camera (z forward, x right, y down). If None, points are in the camera frame.
 
     Raises:
-        CloudError: image and camera differ in size, depth was cut to 8 bits, or the camera fits another resolution.
+        CloudError: image and camera differ in size, depth was cut to 8 bits, or the matrix is for another image size.
     """
     if depth.shape != (camera.height, camera.width):
         raise CloudError(
@@ -260,13 +260,13 @@ def cloud_from_depth(
 
 
 def _check_image(depth: Float[np.ndarray, "pixels"], camera: PinholeCamera) -> None:
-    """Raise CloudError if depth was cut to 255 mm, or if the camera's matrix is for another resolution."""
+    """Raise CloudError if depth was cut to 8 bits (255 mm), or if the camera matrix is for another image size."""
     known = depth[np.isfinite(depth) & (depth > 0)]
     if known.size and abs(float(known.max()) - _MOST_OF_8_BITS) < 1e-6:
         share = float((known > _MOST_OF_8_BITS - 1e-6).mean())
         if share > _CUT_SHARE:
             raise CloudError(
-                f"depth image: {100 * share:.0f} % of it is 255 mm: cut to 8 bits; send 16 bits (mm) or floats (m)"
+                f"depth image: {100 * share:.0f} % of pixels are 255 mm: cut to 8 bits; send 16 bits (mm) or floats (m)"
             )
     across, down = (2 * camera.cx + 1) / camera.width, (2 * camera.cy + 1) / camera.height
     off = min(abs(across - 1), abs(down - 1))
@@ -279,7 +279,7 @@ def _check_image(depth: Float[np.ndarray, "pixels"], camera: PinholeCamera) -> N
 
 
 def depth_encoding(name: str) -> tuple[str, float]:
-    """Return the NumPy type of a pixel and the metres per unit. Raises CloudError if `name` is no depth encoding."""
+    """Return the NumPy type of a pixel and the metres per unit. Raises CloudError for other encodings."""
     if name not in ENCODINGS:
         remedy = next((f"; {said}" for begins, said in _REMEDIES.items() if name.startswith(begins)), "")
         raise CloudError(f"depth image: encoding {name[:64]!r}; valid for depth: {', '.join(ENCODINGS)}{remedy}")

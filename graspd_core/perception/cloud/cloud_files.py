@@ -1,8 +1,8 @@
 """Reading of point clouds from files: point formats, arrays, and depth images with their camera.
 
-Open3D does not read ply and pcd files here. It allocates as many points as the header promises, and returns
-uninitialised memory if the file is cut short. Formats: "The PLY Polygon File Format" (Turk, 1994) and "The PCD file
-format", version 0.7 (Point Cloud Library).
+Open3D reads only xyz and compressed pcd files here. For a ply or pcd file that is cut short, Open3D would return
+uninitialised memory. Formats: "The PLY Polygon File Format" (Turk, 1994) and "The PCD file format", version 0.7 (Point
+Cloud Library).
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from graspd_core.perception.cloud.camera import camera_from_calibration, cloud_f
 from graspd_core.perception.cloud.point_cloud import PointCloud, Points, Vector
 from graspd_core.perception.cloud.viewpoint_check import seen_from
 
-# One byte of LZF, the compression of pcd files, expands to at most this many: three bytes make 264.
+# LZF, the compression of pcd files, expands one byte to at most this many bytes: three bytes make 264.
 _DENSEST = 88
 _ORDERS = {"ascii": "", "binary_little_endian": "<", "binary_big_endian": ">"}
 _TYPES = {
@@ -32,13 +32,13 @@ RECORDINGS = ("mcap", "db3", "bag")
 CLOUD_ENDINGS = ("npy", "npz", "pcd", "ply", "xyz")
 
 _ROTATION_TOLERANCE = 1e-4
-# Maximum number of bytes that an archive may unpack to. 100 depth images of two million pixels are a quarter of it.
+# Maximum size of an unpacked archive [bytes]. 100 depth images of two million 16-bit pixels take a fifth of this limit.
 _MAX_UNPACKED_BYTES = 2**31
 
 
 @dataclass
 class _Element:
-    """One element of a ply header: its count, and its properties with their NumPy types, "" for a list."""
+    """One element of a ply header. `codes` holds each property's NumPy type, or "" if the property is a list."""
 
     name: str
     count: int
@@ -52,7 +52,7 @@ def read_ply_points(data: bytes) -> Points:
     Raises ValueError if the file is not a ply file, lacks x, y or z, is cut short, or has list properties in or before
     the vertices.
     """
-    # The word must start a line, because a comment may contain it.
+    # The header ends where end_header starts a line. A comment may contain the same word.
     head, *more = re.split(rb"[\r\n]end_header", data, maxsplit=1)
     rest = more[0] if more else b""
     body = rest[rest.find(b"\n") + 1 :]
@@ -60,7 +60,7 @@ def read_ply_points(data: bytes) -> Points:
     start = 0
     for element in elements:
         if "" in element.codes:
-            raise ValueError(f"element {element.name!r} has a list; none may be in or before the vertices")
+            raise ValueError(f"element {element.name!r} has a list; valid: lists only after the vertices")
         if element.name == "vertex":
             break
         start += element.count * sum(np.dtype(code).itemsize if order else 1 for code in element.codes)
@@ -77,7 +77,7 @@ def read_ply_points(data: bytes) -> Points:
 
 
 def _pcd_header(data: bytes) -> tuple[dict[str, list[str]], int]:
-    """Return the words of a pcd file's header by their key, and the byte offset of the points."""
+    """Return a pcd file's header as a list of words for each key, and the byte offset of the points."""
     header: dict[str, list[str]] = {}
     at = 0
     while at < len(data) and "DATA" not in header:
@@ -91,7 +91,7 @@ def _pcd_header(data: bytes) -> tuple[dict[str, list[str]], int]:
 
 
 def _pcd_points(data: bytes, header: dict[str, list[str]], at: int) -> Points | None:
-    """Read the points of a pcd file, text or binary. NaN is kept. Return None for compressed data.
+    """Read the points of a pcd file, text or binary, from byte `at` on. Keep NaN. Return None for compressed data.
 
     Raises ValueError if the header is incomplete or inconsistent, or if the file is cut short.
     """
@@ -113,7 +113,7 @@ def _pcd_points(data: bytes, header: dict[str, list[str]], at: int) -> Points | 
         return _numbers_of_text(data[at:], 0, points, sum(counts))[:, columns]
     if header["DATA"][0] not in ("binary", "binary_compressed"):
         raise ValueError(f"its DATA {header['DATA'][0][:40]!r} is unknown; valid: ascii, binary, binary_compressed")
-    # Other words could be NumPy types, or even expressions that NumPy evaluates.
+    # Other words must not reach NumPy: they could be other types, or even expressions that NumPy evaluates.
     odd = [kind for kind in header["TYPE"] if kind.upper() not in ("F", "I", "U")]
     if odd:
         raise ValueError(f"its TYPE {odd[0][:40]!r} is unknown; valid: F, I, U")
@@ -128,12 +128,12 @@ def _pcd_points(data: bytes, header: dict[str, list[str]], at: int) -> Points | 
 def _refuse_false_sizes(packed: bytes, needed: int) -> None:
     size, unpacked = np.frombuffer(packed[:8].ljust(8, b"\0"), "<u4").tolist()
     if unpacked != needed or size > len(packed) - 8 or unpacked > _DENSEST * size:
-        there = f"{size} bytes that unpack to {unpacked}, but it has {max(len(packed) - 8, 0)}"
-        raise ValueError(f"its header promises points of {needed} bytes, its data {there}")
+        there = f"{size} packed and {unpacked} unpacked bytes, and the file has {max(len(packed) - 8, 0)} packed ones"
+        raise ValueError(f"its header promises {needed} bytes of points, its data promises {there}")
 
 
 def _ply_header(lines: list[str]) -> tuple[str, list[_Element]]:
-    """Return the byte order (empty for text) and the elements, in the order of the header."""
+    """Return the byte order ("" for a text file) and the elements, in the order of the header."""
     order, elements = None, []
     for words in (line.split() for line in lines[1:]):
         match words:
@@ -142,7 +142,7 @@ def _ply_header(lines: list[str]) -> tuple[str, list[_Element]]:
             case ["element", name, count]:
                 elements.append(_Element(name, int(count)))
                 if elements[-1].count < 0:
-                    raise ValueError(f"element {name!r} has a count of {count}")
+                    raise ValueError(f"element {name!r} has a count of {count}; valid: 0 or more")
             case ["property", "list", _, _, name] if elements:
                 elements[-1].names.append(name)
                 elements[-1].codes.append("")
@@ -191,13 +191,13 @@ def is_cloud_file(path: str | Path) -> bool:
 def load_views(path: str | Path, viewpoint: Vector | None = None) -> tuple[PointCloud, ...]:
     """Read the views of one or several cameras from a file, in one frame.
 
-    `viewpoint` is the camera's position [m] for a file of points. It replaces the position in the file.
+    For a file of points, `viewpoint` [m] replaces the camera's position in the file. It is not valid with depth.
 
     * ply, xyz, npy (n×3 or h×w×3): points [m], seen from the origin.
     * pcd: points [m], seen from its `VIEWPOINT`. The format does not give the camera's direction.
     * npz with `points`, and optionally `viewpoint` [m] and `forward` (the direction of the optical axis).
     * npz with `depth` (h×w, integers in millimetres, floats in metres) and the camera matrix `K` (3×3), and optionally
-      `distortion` (k1 k2 p1 p2 k3) and the camera's pose `T_world_camera` (4×4).
+      `distortion` (up to k1 k2 p1 p2 k3 k4 k5 k6) and the camera's pose `T_world_camera` (4×4).
     * npz with `depths` (views×h×w), `K`, `poses` (views×4×4, each `T_world_camera`), and optionally `distortion`.
 
     Raises:
@@ -227,7 +227,7 @@ def load_views(path: str | Path, viewpoint: Vector | None = None) -> tuple[Point
 
 
 def recording_told(path: Path) -> str:
-    """Return the text that ends an error message: the kind of a recording, and the command to read or convert it."""
+    """Return the end of an error message for a ROS recording: its kind, and the command that reads or converts it."""
     if path.suffix.lower() != ".bag":
         return f"is a recording of ROS 2; read it with graspd replay {path.name}"
     return f"is a bag of ROS 1; convert it first: rosbags-convert --src {path.name} --dst {path.stem}"
@@ -355,7 +355,7 @@ def _read_points(path: Path, ending: str, viewpoint: Vector | None) -> PointClou
         raise CloudError(f"{path}: not a readable {ending} cloud ({first_line(error)})") from error
     points = _read_open3d(path) if points is None else points
     if len(points) == 0 and ending == "xyz" and b"," in data[:4096]:
-        raise CloudError(f"{path}: commas separate its numbers; an xyz file needs blanks; convert it: tr , ' '")
+        raise CloudError(f"{path}: commas separate its numbers; valid: spaces; convert the file: tr , ' '")
     if len(points) == 0:
         raise CloudError(f"{path}: empty, or not a readable {ending} cloud")
     rows = header.get("HEIGHT", [""])[0]
@@ -379,7 +379,7 @@ def _read_open3d(path: Path) -> Points:
     with Extra("clouds"):
         import open3d as o3d
 
-    # Open3D prints errors and returns no points. It is kept silent, because the caller raises its own error.
+    # For a broken file, Open3D prints errors and returns no points. Printing is off: the caller raises an error.
     with o3d.utility.VerbosityContextManager(o3d.utility.VerbosityLevel.Error):
         try:
             cloud = o3d.io.read_point_cloud(path, remove_nan_points=False, remove_infinite_points=False)

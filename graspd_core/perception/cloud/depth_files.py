@@ -29,9 +29,9 @@ from graspd_core.perception.cloud.point_cloud import PointCloud
 
 IMAGE_ENDINGS, DEPTH_ENDINGS = ("png", "tif", "tiff"), ("png", "tif", "tiff", "npy", "npz")
 _UNITS = {"m": 1.0, "cm": 1e-2, "mm": 1e-3, "um": 1e-6}
-# Integers are millimetres by default, as cameras send them.
+# Metres per unit of an integer image, if no unit is given. Cameras send millimetres.
 _WHOLE = 1e-3
-# If the median depth is above this [m], the unit must be another.
+# If the median depth is above this [m], the unit must be wrong.
 _FARTHEST = 50.0
 _SIMPLE = ("fx", "fy", "cx", "cy")
 # A camera, its pose `T_world_camera` (z forward, x right, y down), and metres per unit of its depth images. Pose and
@@ -45,16 +45,16 @@ def is_depth_image(path: str | Path) -> bool:
 
 
 def load_depth_view(image: str | Path, camera: str | Path, unit: float | None = None) -> PointCloud:
-    """Read the points of a depth image and its camera file, in the world frame if the camera file has a pose.
+    """Read the points of a depth image, in the world frame if the camera file has a pose, else in the camera frame.
 
     Args:
         image: a png or tiff of 16 bits or floats, an npy, or an npz with `depth`.
         camera: the camera file, described at the top of this module.
-        unit: metres per unit of the image. None uses the camera file's unit, or else millimetres for integers and
-            metres for floats.
+        unit: metres per unit of the image. If None, the unit of the camera file is used. If the camera file has no
+            unit, integers are millimetres and floats are metres.
 
     Raises:
-        CloudError: a file cannot be read, is not a depth image or a camera, or the two do not fit each other.
+        CloudError: a file cannot be read or has the wrong content, or image and camera do not fit each other.
     """
     taken_by, pose, told = load_depth_camera(camera)
     depth = _metres(_pixels(Path(image)), unit or told, str(image))
@@ -65,7 +65,7 @@ def load_depth_view(image: str | Path, camera: str | Path, unit: float | None = 
 
 
 def load_depth_camera(path: str | Path) -> DepthCamera:
-    """Read a camera file. Raises CloudError: the file is missing, not JSON, or lacks a key, which the error names."""
+    """Read a camera file. Raises CloudError if the file is missing, is not JSON, lacks a key, or has a bad value."""
     try:
         told = json.loads(Path(path).read_text(encoding="utf-8"))
     except OSError as error:

@@ -20,17 +20,17 @@ from graspd_core.se3 import perpendicular
 Places = Float[np.ndarray, "*batch 3"]
 Depths = Float[np.ndarray, "*batch"]
 
-# Maximum number of cells of a depth image across the object. More cells would show no more.
+# Maximum number of cells of a depth image across the object. More cells would show no further detail.
 MAX_IMAGE_CELLS = 160
 # Number of nearest points, including the point itself, that define the spacing at a point.
 SPACING_NEIGHBOURS = 5
 
-# Points this much nearer to the camera than the object's surface there belong to an occluder [m].
+# A point belongs to an occluder if it is nearer to the camera than the object's surface, by more than this [m].
 OCCLUDER_GAP_M = 0.01
 # Hidden parts may lie up to this far beside the seen part [m].
 HIDDEN_REACH_M = 0.1
 
-# A point this much deeper in empty space than the slack is a full contradiction [m].
+# A guessed point contradicts the camera fully if it lies in empty space, deeper than the slack plus this [m].
 CONTRADICTION_DEPTH_M = 0.01
 
 
@@ -41,10 +41,10 @@ class ViewDepth:
     Attributes:
         eye: position of the camera [m].
         frame: axes of the camera, as columns right, down and forward.
-        low, cell: image coordinates of the first cell, and width of a cell, at unit depth.
-        depth: depth of the surface along forward [m]. Beside the outline, it is the depth of the nearest cell inside.
-            Cells that an occluder hides are infinite.
-        nearest: least depth over a cell and its neighbours, or the depth of the occluder [m].
+        low, cell: corner of the first cell, and width of a cell, in image coordinates (x/z and y/z).
+        depth: depth of the object's surface in each cell [m]. Cells beside its outline copy the nearest seen cell, or
+            are infinite if an occluder covers them.
+        nearest: depth up to which the camera saw empty space [m]: the least of 3×3 cells, or the occluder's.
         beside: distance from the outline in cells, 0 inside the outline and where an occluder hides the object.
     """
 
@@ -65,9 +65,9 @@ class FreeSpace:
         view_depths: one depth image per camera, none if the cameras are unknown.
         standing: whether the object stands on a support that fills z < 0.
         lowest: height of the lowest seen points [m]. Segmentation removes lower points together with the
-            support, so seen outlines may end too high by `lowest`.
-        slack: precision of seen outlines and surfaces [m].
-        tolerance: a guessed point this near to a seen surface confirms the guess [m].
+            support, so seen outlines may end up to `lowest` too high.
+        slack: depth in empty space up to which a point does not contradict the cameras [m].
+        tolerance: distance from seen surface up to which the cameras confirm a guessed point [m].
     """
 
     view_depths: tuple[ViewDepth, ...]
@@ -81,7 +81,7 @@ def make_view_depths(views: Sequence[PointCloud], whole: Sequence[PointCloud] = 
     """Return a depth image of the object for each view. Views with too few points are left out.
 
     Args:
-        views: the object's points alone.
+        views: the points of each view that show the object.
         whole: all points that each camera saw, in the same order. If empty, occluders are not considered.
     """
     around = whole or [None] * len(views)
@@ -138,7 +138,7 @@ def _occluders(
     """Return the depth of the occluder in front of the object in each cell [m], infinite if there is none."""
     from scipy.ndimage import binary_closing, distance_transform_edt
 
-    # Only few of the points are in the object's image. Points that are not finite compare as false.
+    # Most points are outside the object's image and are dropped first. For NaN, the comparisons are false.
     x, y, forward = ((whole.points - whole.viewpoint) @ frame).T
     high = low + cell * np.array(depth.shape)
     ahead = (forward > 1e-3) & (x >= low[0] * forward) & (x < high[0] * forward)
@@ -163,7 +163,7 @@ def empty_depth(free_space: FreeSpace, points: Places) -> Depths:
 
 
 def weigh(free_space: FreeSpace, points: Places, normals: Places) -> tuple[Bool[np.ndarray, "*batch"], Depths]:
-    """Return which guesses lie on seen surface and face its camera, and how much they contradict cameras (0 to 1)."""
+    """Return which points lie on seen surface and face its camera, and how much cameras contradict each (0 to 1)."""
     confirmed, deep = _classify(free_space, points, normals)
     return confirmed, np.clip((deep - free_space.slack) / CONTRADICTION_DEPTH_M, 0.0, 1.0)
 

@@ -1,7 +1,7 @@
 """Detection of view meshes: one camera's points with faces between neighbouring pixels, as camera viewers export them.
 
-A view mesh is open, all of it faces the camera, and each triangle is half a pixel. It must not be used as a solid,
-because a table and the objects on it would be one body.
+A view mesh is open, and all its faces turn to the camera. In the image, each face has half the area of a pixel. A view
+mesh must not be used as a solid, because a table and the objects on the table would be one body.
 """
 
 from __future__ import annotations
@@ -16,13 +16,13 @@ from graspd_core.types import TriangleMesh
 
 # A mesh with fewer vertices is not a camera's image.
 MIN_VERTICES = 2000
-# At least this fraction of the faces turn the same side to the camera. All lie within this cosine of its axis.
+# Least fraction of faces that turn the same side to the camera. Least cosine between the view axis and a line of sight.
 FACING_SHARE, MIN_COSINE = 0.98, 0.25
-# Faces of half a pixel have areas in the image that differ by less than this fraction of the median area.
+# Faces of half a pixel have equal areas in the image: the median deviation is below this fraction of the median.
 PIXEL_SPREAD = 0.1
-# In a grid of pixels, six faces meet at this fraction of inner vertices. Depth edges leave at least so many borders.
+# A grid of pixels: least fraction of inner vertices where six faces meet, least number of border loops at depth edges.
 GRID_SHARE, MIN_BORDERS = 0.75, 3
-_MOST_FACES, _STEPS = 20_000, 300
+_MOST_FACES, _STEPS = 20_000, 300  # faces to check, and steps of the search for the camera position
 
 
 def view_in_mesh(mesh: TriangleMesh, source: str) -> PointCloud | None:
@@ -51,7 +51,7 @@ def view_in_mesh(mesh: TriangleMesh, source: str) -> PointCloud | None:
 
 
 def _faces(corners: Float[np.ndarray, "n 3 3"], normals: Points, eye: Vector) -> bool:
-    """Return True if nearly all faces turn the same side to a camera at `eye`, and all lie ahead of it."""
+    """Return True if nearly all faces turn the same side to a camera at `eye`, and all are in front of the camera."""
     way = corners.mean(1) - eye
     distance = np.linalg.norm(way, axis=1)
     if not distance.min() > 0:
@@ -64,7 +64,7 @@ def _faces(corners: Float[np.ndarray, "n 3 3"], normals: Points, eye: Vector) ->
 
 
 def _pixels(corners: Float[np.ndarray, "n 3 3"]) -> bool:
-    """Return True if each face is half a pixel of a camera at the origin that looks along a coordinate axis."""
+    """Return True if most faces have similar areas in the image of a camera at the origin that looks along an axis."""
     for axis in range(3):
         depth = corners[..., axis]
         if np.abs(depth).min() < 1e-9:
@@ -79,7 +79,7 @@ def _pixels(corners: Float[np.ndarray, "n 3 3"]) -> bool:
 
 
 def _camera_place(corners: Float[np.ndarray, "n 3 3"], normals: Points) -> Vector | None:
-    """Return a camera position outside the mesh to which nearly all faces turn the same side, or None."""
+    """Find a camera position to which nearly all faces turn the same side. Return None if there is none."""
     centre, middle = corners.mean(1), corners.mean((0, 1))
     size = float(np.ptp(centre, axis=0).max())
     for side in (1.0, -1.0):

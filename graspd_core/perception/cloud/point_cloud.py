@@ -1,4 +1,4 @@
-"""Point clouds [m] of one camera: transforming and cleaning."""
+"""Point clouds [m] of one camera, and functions that transform and clean them."""
 
 from __future__ import annotations
 
@@ -11,15 +11,15 @@ from jaxtyping import Bool, Float
 from graspd_core.errors import CloudError, Extra
 from graspd_core.mesh.topology import voxel_keys
 
-# Several positions or directions, a single one, and the camera positions of several views.
+# Several positions or directions, a single position or direction, and the camera positions of several views.
 Points = Float[np.ndarray, "n 3"]
 Vector = Float[np.ndarray, "3"]
 Eyes = Float[np.ndarray, "views 3"]
 
 MIN_POINTS = 50
-# Points farther from the cloud's median than this many times its size are outliers.
+# Points are outliers if they are farther from the cloud's median than this many times the cloud's size.
 MAX_DISTANCE_IN_SIZES = 1e3
-# Points this near to the camera [m] are not measured. Some drivers send them for missing depth.
+# Points nearer to the camera than this [m] are not measurements. Some drivers send such points for missing depth.
 CAMERA_PLACE_TOLERANCE_M = 1e-5
 
 
@@ -31,7 +31,7 @@ class PointCloud:
         points: positions [m]. They may hold NaN until cleaned.
         viewpoint: position of the camera, in the same frame [m].
         forward: unit direction of the camera's optical axis, in the same frame, None if unknown.
-        posed: whether the points prove the viewpoint, as the pixels of a depth image do.
+        posed: True if the viewpoint is certain and needs no check, for example for the pixels of a depth image.
     """
 
     points: Float[np.ndarray, "points 3"]
@@ -45,7 +45,7 @@ class PointCloud:
 
 
 def transform_cloud(cloud: PointCloud, T_a_b: Float[np.ndarray, "4 4"]) -> PointCloud:
-    """Return a cloud given in frame b, with its camera's position and axis, in frame a."""
+    """Transform a cloud from frame b to frame a, together with the position and axis of its camera."""
     rotation, position = T_a_b[:3, :3], T_a_b[:3, 3]
     points = cloud.points @ rotation.T
     points += position
@@ -54,7 +54,7 @@ def transform_cloud(cloud: PointCloud, T_a_b: Float[np.ndarray, "4 4"]) -> Point
 
 
 def measured(points: Points, viewpoint: Vector) -> Bool[np.ndarray, "n"]:
-    """Return which points were measured. Drivers set missing points to NaN, infinity, zero or the camera's place."""
+    """Return which points were measured. Drivers set missing points to NaN, infinity, zero or the camera's position."""
     zero = near = finite = np.ones(len(points), dtype=bool)
     # Computed column by column, because NumPy takes ten times as long for `all` over many short rows.
     for column, place in zip(points.T, viewpoint, strict=True):
@@ -80,7 +80,7 @@ def convex_hull(points: Float[np.ndarray, "n k"]) -> Any:
 
 
 def least_axes(spreads: Float[np.ndarray, "n 3 3"]) -> Points:
-    """Return the unit eigenvector of the least eigenvalue of each covariance matrix, any if all eigenvalues are equal.
+    """Return the unit eigenvector of each matrix's least eigenvalue. If all three eigenvalues are equal, take any.
 
     The closed form (trigonometric roots of a cubic) takes a quarter of the time of `eigh` for thousands of matrices.
     """
@@ -93,7 +93,7 @@ def least_axes(spreads: Float[np.ndarray, "n 3 3"]) -> Points:
     cosine = np.clip(half_determinant / np.maximum(size**3, 1e-300), -1.0, 1.0)
     least = 2 * size * np.cos(np.arccos(cosine) / 3 + 2 * np.pi / 3)
     a, b, c = a - least, b - least, c - least
-    # The eigenvector is normal to the plane of the three rows. Take the cross product of the two that differ most.
+    # The eigenvector is normal to the plane of the three rows. Take the longest cross product of two rows.
     normals = np.stack(
         [
             np.column_stack([xy * yz - xz * b, xz * xy - a * yz, a * b - xy * xy]),
@@ -106,7 +106,7 @@ def least_axes(spreads: Float[np.ndarray, "n 3 3"]) -> Points:
     rows = np.arange(len(spreads))
     longest = lengths[best, rows]
     found = normals[best, rows] / np.maximum(longest, 1e-300)[:, None]
-    # If the rows lie on a line, or all eigenvalues are equal, no two rows differ.
+    # If the rows lie on a line, or all eigenvalues are equal, all cross products are almost zero.
     unclear = longest <= 1e-9 * mean**2
     found[unclear] = np.linalg.eigh(spreads[unclear])[1][:, :, 0]
     return found
@@ -115,7 +115,7 @@ def least_axes(spreads: Float[np.ndarray, "n 3 3"]) -> Points:
 def clean_cloud(points: Points) -> Float[np.ndarray, "kept 3"]:
     """Drop points [m] that are not finite, thin the rest to an even density, and drop outliers.
 
-    Raises CloudError if the cloud is empty or all NaN, or if fewer than 50 points are left.
+    Raises CloudError if fewer than 50 points are left, or if the points are all in one place or too far apart.
     """
     with Extra("clouds"):
         import open3d as o3d
@@ -137,7 +137,7 @@ def clean_cloud(points: Points) -> Float[np.ndarray, "kept 3"]:
         raise CloudError(f"cloud: its {len(finite)} points lie too far apart to measure")
     finite = finite[near] if not near.all() else finite
     _refuse_few(len(finite), len(points), "plausible")
-    # A hundredth of the object's diagonal: fine enough for the shape, and at most some 10⁴ points on its surface.
+    # Voxels of a hundredth of the object's diagonal keep the shape, and leave at most about 10⁴ points on its surface.
     cloud = o3d.geometry.PointCloud(o3d.utility.Vector3dVector(finite))
     thinned = cloud.voxel_down_sample(size / 100)
     _refuse_few(len(thinned.points), len(points), "distinct")

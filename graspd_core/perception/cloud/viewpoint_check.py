@@ -1,7 +1,7 @@
 """Check whether a cloud can have been seen from the given position of its camera.
 
-An organised cloud shows this itself: a homography maps the pixels of a pinhole camera to the lines of sight, and depth
-errors only move points along these lines. Without pixels, two things are checked. A camera sees no surface through
+An organised cloud is checked by its pixels: a homography must map the pixels of a pinhole camera to the lines of sight.
+Depth errors only move points along these lines. Without pixels, two rules are checked: a camera sees no surface through
 another surface, and no surface from behind. If the given position is wrong, some points seem to be hidden behind other
 points, and a part of each curved surface seems to face away from the camera.
 """
@@ -19,47 +19,47 @@ from graspd_core.errors import CloudError
 from graspd_core.perception.cloud.point_cloud import PointCloud, Points, Vector, convex_hull, longest_side, measured
 from graspd_core.se3 import perpendicular
 
-# An organised cloud, NaN where nothing was seen.
+# An organised cloud [m], NaN where nothing was seen.
 Pixels = Float[np.ndarray, "height width 3"]
-# Normal of each point, index of the surface that it belongs to, and whether both are certain.
+# For each point: the normal, the index of the surface, and whether both are certain.
 Surfaces = tuple[Float[np.ndarray, "n 3"], Int[np.ndarray, "n"], Bool[np.ndarray, "n"]]
 
-# Limits of the fractions of points that others hide, and of an object's points that face away. Chosen on 91 views by
-# four cameras of the families `CHOSEN_ON` in graspd_bench/studies/cameras.py, some thinned, some cut out.
+# Largest fraction of points that other points may hide, and of an object's points that may face away. Chosen on 91
+# views by four cameras of the families `CHOSEN_ON` in graspd_bench/studies/cameras.py. Some were thinned or cut out.
 MAX_HIDDEN_SHARE, MAX_AWAY_SHARE = 0.006, 0.06
-MAX_MISFIT = 0.5  # pixels
-MAX_STRETCH, MAX_SKEW = 1.15, 0.05  # of a camera's pixels, which are square
-# Maximum numbers of points and pixels to check, and minimum numbers.
+MAX_MISFIT = 0.5  # largest median error of the fitted camera [pixels]
+MAX_STRETCH, MAX_SKEW = 1.15, 0.05  # aspect ratio and skew of pixels: a camera's pixels are nearly square
+# Maximum numbers of points and of pixels to check. With fewer than the minimum numbers, nothing is checked.
 MOST_POINTS, MOST_PIXELS = 4000, 4000
 FEWEST_POINTS, FEWEST_PIXELS = 50, 100
-NEIGHBOURS = 8
-# Cell size of the image of the points, in point spacings, and most cells in a row. A point is hidden if this many of
-# the eight cells around its own show something nearer. Flying pixels behind an edge are no surface, so this fraction of
-# the hidden point's neighbours in space must be hidden too.
+NEIGHBOURS = 8  # nearest points in space around a point
+# Cell size of the image of the points, in point spacings, and most cells in a row. A point is hidden if NEARER_CELLS of
+# the eight cells around its cell show a nearer point. AGREEING_SHARE of the neighbours in space must be hidden too,
+# because flying pixels behind an edge are no surface.
 CELL_SPACINGS, MOST_CELLS, NEARER_CELLS, AGREEING_SHARE = 1.5, 1000, 7, 0.75
-# "Nearer" means by at least this [m], this fraction of the distance (whole scenes), or this multiple of the roughness.
+# Hiding points are nearer by this [m], and by a fraction of the distance (scenes) or a multiple of roughness (objects).
 HIDDEN_DEPTH, HIDDEN_DEPTH_SHARE, ROUGHNESS_TIMES = 0.03, 0.05, 8.0
-# Neighbours belong to one surface if the absolute cosine of their normals is above this. A normal is certain if the
-# spread across the surface is below this fraction of that along it. Grazing points within this cosine do not count.
+# Neighbours share a surface if the absolute cosine of their normals is above SAME_SURFACE. A normal is certain if the
+# variance along it is below FLATNESS times the next variance. Points seen at a cosine below GRAZING do not count.
 SAME_SURFACE, FLATNESS, GRAZING = 0.6, 0.15, 0.1
-LINK_SPACINGS = 3.0
-THING_SPACING = 0.004  # [m]
-ABOUT_THING, FARTHEST = 0.12, 1e7  # [m]
-# Camera positions on other sides of the object are tried too. The given one is doubtful if more than this fraction of
-# them fit as well. For true positions it is 0.2 in nine of ten clouds of scenes, and 0.34 of cut-out objects.
+LINK_SPACINGS = 3.0  # neighbours farther apart than this many median spacings are not linked
+THING_SPACING = 0.004  # an object's points are thinned to one point per voxel of this side [m]
+ABOUT_THING, FARTHEST = 0.12, 1e7  # margin around an object's points, and largest plausible coordinate [m]
+# Positions 45° or more away are tried too. The given position is doubtful if more than this fraction of them fit. For
+# nine of ten clouds with true positions, at most 0.2 of them fit (scenes), or at most 0.34 (cut-out objects).
 OTHER_SIDE, MOST_CHANCE = float(np.cos(np.pi / 4)), 0.3
-# Seen from right behind, an object without its table looks the same, but hollow. Few objects bulge less than this.
+# An object without its table also fits a camera right behind it, but looks hollow. Few objects bulge less than this.
 LEAST_BULGE = 0.05
-# A plane with this fraction of the points is a table. Points up to this height above it are objects on it [m].
+# A table is a plane with PLANE_SHARE of the points. Objects on it are at most THING_HEIGHT high. Lengths are in [m].
 PLANE_SHARE, PLANE_TRIALS, PLANE_TOLERANCE, THING_HEIGHT = 0.25, 200, 0.01, 0.35
-# A camera does not lie in the plane of a table. It is higher by at least this fraction of its distance.
+# A camera is above the plane of a table by at least this fraction of its distance from the table.
 LEAST_ELEVATION = 0.03
-# Largest root mean square of a table seen by a camera [m]. Points spread evenly within the tolerance have 0.0058.
+# Largest RMS distance of a table's points from its plane [m]. Points spread evenly in PLANE_TOLERANCE have 0.0058.
 PLANE_NOISE = 0.004
-# Least ratio of the two smallest singular values of the camera equations. It is smaller if the points are coplanar.
+# Least ratio of the second smallest to the smallest singular value of the camera equations. Coplanar points have less.
 MIN_CONDITION = 100.0
 
-# Even directions on a golden spiral. With only 24, the fraction that fits for a box was 0.25 to 0.5 instead of 0.21.
+# 72 even directions on a golden spiral. With only 24 directions, 0.25 to 0.5 of them fitted a box instead of 0.21.
 _TURNS = np.pi * (3 - np.sqrt(5)) * np.arange(72)
 _HEIGHTS = 1 - (2 * np.arange(72) + 1) / 72
 _DIRECTIONS = np.column_stack([np.cos(_TURNS), np.sin(_TURNS)]) * np.sqrt(1 - _HEIGHTS**2)[:, None]
@@ -72,13 +72,13 @@ def seen_from(pixels: Pixels, viewpoint: Vector, forward: Vector | None = None) 
     NaN points are kept. An image of one row or column is not checked.
 
     Raises:
-        CloudError: the pixels show that the camera stood at another position. The error says where.
+        CloudError: the pixels show that the camera stood at another position, which the error names.
     """
     fits = None if min(pixels.shape[:2]) < 2 else _pinhole_fits(pixels, viewpoint)
     place = _pinhole_place(pixels) if fits is False else None
     if place is not None:
         x, y, z = place
-        raise _refusal(viewpoint, f"its pixels show it at ({x:.3f}, {y:.3f}, {z:.3f})")
+        raise _refusal(viewpoint, f"its pixels show the camera at ({x:.3f}, {y:.3f}, {z:.3f})")
     return PointCloud(pixels.reshape(-1, 3), np.asarray(viewpoint, dtype=float), forward, posed=bool(fits))
 
 
@@ -100,13 +100,13 @@ def check_scene(views: Sequence[PointCloud]) -> None:
         nearer = np.maximum(HIDDEN_DEPTH, HIDDEN_DEPTH_SHARE * distance)
         share = hidden_share(points, view.viewpoint, nearer, KDTree(points))
         if share > MAX_HIDDEN_SHARE:
-            raise _refusal(view.viewpoint, f"{100 * share:.1f} % of its points are hidden from there by others")
+            raise _refusal(view.viewpoint, f"{100 * share:.1f} % of its points are hidden from there by other points")
         if things_behind(points, view.viewpoint):
-            raise _refusal(view.viewpoint, "it lies in the plane of the table, or objects stand on the far side of it")
+            raise _refusal(view.viewpoint, "this place lies in the plane of the table, or objects are behind the table")
 
 
 def check_viewpoint(thing: PointCloud, view: PointCloud, up: Vector | None = None) -> str:
-    """Check that a view of an object can have been seen from its viewpoint: not from behind, nor through surfaces.
+    """Check that an object can have been seen from the view's viewpoint: not from behind, and not through surfaces.
 
     Args:
         thing: the points of the object that was cut out of the view.
@@ -114,7 +114,7 @@ def check_viewpoint(thing: PointCloud, view: PointCloud, up: Vector | None = Non
         up: normal of the support plane of the object, None if the support is not seen.
 
     Returns:
-        A warning if many other positions fit as well or the surface looks hollow. Otherwise an empty string.
+        A warning if many other camera positions fit as well, or if the object looks hollow. Otherwise "".
 
     Raises:
         CloudError: the camera cannot have been at the viewpoint. The error says why.
@@ -125,7 +125,7 @@ def check_viewpoint(thing: PointCloud, view: PointCloud, up: Vector | None = Non
     if view.posed or len(own) < FEWEST_POINTS:
         return ""
     if ((own.min(0) < view.viewpoint) & (view.viewpoint < own.max(0))).all():
-        raise _refusal(view.viewpoint, "it lies within the object")
+        raise _refusal(view.viewpoint, "this place lies within the object")
     near = _some(view.points[_in_box(view.points, own)], view.viewpoint, MOST_POINTS)
     if len(near) < FEWEST_POINTS:
         return ""
@@ -147,7 +147,7 @@ def check_viewpoint(thing: PointCloud, view: PointCloud, up: Vector | None = Non
     ways = [way for way in _DIRECTIONS if way @ said < OTHER_SIDE and (up is None or way @ up > 0)]
     most, fit = int(MOST_CHANCE * len(ways)), 0
     for tried, place in enumerate(middle + far * way for way in ways):
-        # The loop ends as soon as the other positions cannot change the answer.
+        # The loop ends as soon as the remaining positions cannot change the answer.
         if not fit <= most < fit + len(ways) - tried:
             break
         fit += _away_share(own, surfaces, place) <= MAX_AWAY_SHARE and (
@@ -160,7 +160,7 @@ def check_viewpoint(thing: PointCloud, view: PointCloud, up: Vector | None = Non
 
 
 def fits_nowhere(thing: PointCloud) -> bool:
-    """Return True if no camera on any side can see all points of an object, e.g. if they show all its sides."""
+    """Return True if no camera position can see all points of an object, e.g. if the points lie on all its sides."""
     own = _thinned(thing)
     if len(own) < FEWEST_POINTS:
         return False
@@ -170,7 +170,7 @@ def fits_nowhere(thing: PointCloud) -> bool:
 
 
 def _refusal(viewpoint: Vector, reason: str) -> CloudError:
-    hint = "say where it stood: sensor_frame or view_point (--view-point X Y Z); pass several cameras as several views"
+    hint = "give the camera's place: sensor_frame or view_point (--view-point X Y Z); pass each camera as its own view"
     return CloudError(f"cloud: its camera did not stand at {_said(viewpoint)}: {reason}; {hint}")
 
 
@@ -182,15 +182,15 @@ def _said(viewpoint: Vector) -> str:
 def hidden_share(points: Points, viewpoint: Vector, nearer: Float[np.ndarray, "points"], tree: Any) -> float:
     """Return the fraction of points that a surface hides from the viewpoint.
 
-    In the image, points nearer to the camera by over `nearer` [m] surround a hidden point and most of its neighbours.
-    `tree` is the KD-tree of the points.
+    A point is hidden if points around it in the image are nearer by more than `nearer` [m]. Most of its neighbours must
+    be hidden too. `tree` is the KD-tree of the points.
     """
     from scipy.spatial import KDTree
 
     ray = points - viewpoint
     distance = np.linalg.norm(ray, axis=1)
     length = float(np.linalg.norm(ray.mean(0)))
-    # From the mean of the points, any direction is as good as another.
+    # If the viewpoint is the mean of the points, every axis is equally good.
     axis = ray.mean(0) / length if length > 1e-12 else np.array([0.0, 0.0, 1.0])
     right = perpendicular(axis)
     across = np.column_stack([ray @ right, ray @ np.cross(axis, right)])
@@ -209,14 +209,14 @@ def hidden_share(points: Points, viewpoint: Vector, nearer: Float[np.ndarray, "p
     beside = [k * rows + n for k in (-1, 0, 1) for n in (-1, 0, 1) if k or n]
     hidden = np.sum([front[own + step] < distance - nearer for step in beside], axis=0) >= NEARER_CELLS
     if hidden.mean() <= MAX_HIDDEN_SHARE:
-        # The test of neighbours can only lower the fraction.
+        # The check of the neighbours below can only lower the fraction.
         return float(hidden.mean())
     around = tree.query(points[hidden], k=NEIGHBOURS + 1)[1][:, 1:]
     return float((hidden[around].mean(1) >= AGREEING_SHARE).sum() / len(points))
 
 
 def _away_share(points: Points, surfaces: Surfaces, viewpoint: Vector) -> float:
-    """Return the fraction of points that face away from the viewpoint, if each surface mostly faces it."""
+    """Return the fraction of points that face away from the viewpoint. Of each surface, only the smaller side does."""
     normal, surface, clear = surfaces
     ray = viewpoint - points
     cosine = (normal * ray).sum(1) / np.maximum(np.linalg.norm(ray, axis=1), 1e-12)
@@ -235,7 +235,7 @@ def bulge(points: Points, surfaces: Surfaces, viewpoint: Vector) -> float:
 def _surfaces(points: Points) -> Surfaces:
     """Return normals with a consistent sign within each surface, each point's surface, and whether both are certain.
 
-    The graph has two nodes for each point, one for each sign of its normal. Edges join neighbours whose signs agree.
+    In a graph, each point has two nodes, one for each sign of its normal. Edges join neighbours whose normals agree.
     """
     from scipy.sparse import coo_matrix
     from scipy.sparse.csgraph import connected_components
@@ -260,7 +260,7 @@ def _surfaces(points: Points) -> Surfaces:
 
 
 def _roughness(points: Points, tree: Any) -> float:
-    """Return the median over the points of the RMS distance of their neighbours from a fitted plane [m]."""
+    """Return the RMS distance of a point's neighbours from their fitted plane [m], as the median over the points."""
     around = tree.query(points[::8], k=NEIGHBOURS + 1)[1]
     patch = points[around] - points[around].mean(1, keepdims=True)
     spread = np.linalg.eigvalsh(np.einsum("nka,nkb->nab", patch, patch) / (NEIGHBOURS + 1))
@@ -268,9 +268,9 @@ def _roughness(points: Points, tree: Any) -> float:
 
 
 def things_behind(points: Points, viewpoint: Vector) -> bool:
-    """Return True if more points lie behind the seen part of a table than on the viewpoint's side of it.
+    """Return True if more points lie below the seen part of a table than on it. The camera's side counts as above.
 
-    Also return True if the viewpoint lies in the plane of the table, as the origin of a robot's base often does.
+    Return True as well if the viewpoint lies in the table's plane, as the origin of a robot's base often does.
     """
     rng = np.random.default_rng(0)
     if len(points) <= NEIGHBOURS:
@@ -281,7 +281,7 @@ def things_behind(points: Points, viewpoint: Vector) -> bool:
     normals, corners = normals[lengths > 0] / lengths[lengths > 0, None], corners[lengths > 0]
     if not len(normals):
         return False
-    # Written out by coordinates, because BLAS would start threads that wait for each other on a busy machine.
+    # The product is written out, because BLAS would start threads that wait for each other on a busy machine.
     (x, y, z), (a, b, c) = (points[:: 1 + len(points) // 2000, None].T.astype(np.float32), normals.T.astype(np.float32))
     height = np.abs(x.T * a + y.T * b + z.T * c - (corners[:, 0] * normals).sum(1).astype(np.float32))
     best = int(np.argmax(np.count_nonzero(height < PLANE_TOLERANCE, axis=0)))
@@ -307,7 +307,7 @@ def things_behind(points: Points, viewpoint: Vector) -> bool:
 
 
 def _thinned(thing: PointCloud) -> Float[np.ndarray, "m 3"]:
-    """Return some of an object's points [m], or none if the coordinates are too large to be metres."""
+    """Return at most `MOST_POINTS` of an object's points [m]. Return none if a coordinate is too large for metres."""
     known = thing.points[measured(thing.points, thing.viewpoint)]
     if not len(known) or np.abs(known).max() > FARTHEST:
         return np.zeros((0, 3))
@@ -315,7 +315,7 @@ def _thinned(thing: PointCloud) -> Float[np.ndarray, "m 3"]:
 
 
 def _in_box(points: Points, thing: Float[np.ndarray, "k 3"]) -> Int[np.ndarray, "m"]:
-    """Return the indices of points near an object. Axes are checked one by one, because most points are far away."""
+    """Return the indices of points in a padded box around an object, axis by axis, because most points are far away."""
     inside = np.arange(len(points))
     for axis in range(3):
         side = points[inside, axis]
@@ -373,7 +373,7 @@ def _pinhole_place(grid: Pixels) -> Vector | None:
 
 
 def _pixels(grid: Pixels) -> tuple[Points, Points]:
-    """Return some pixels, homogeneous and in units of the image's larger side, and their points [m]."""
+    """Return some pixels and their points [m]. Pixels are homogeneous, with the image's larger side as unit."""
     height, width = grid.shape[:2]
     step = max(1, int(np.sqrt(height * width / MOST_PIXELS)))
     some = grid[::step, ::step]

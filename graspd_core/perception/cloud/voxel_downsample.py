@@ -1,6 +1,6 @@
 """Cropping of point clouds to the workspace, and downsampling to one mean point per voxel.
 
-Segmentation decides on the mean points only. Every full point gets the label of its voxel.
+Segmentation labels the mean points only. Every original point then gets the label of its voxel.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ from graspd_core.errors import CloudError
 from graspd_core.mesh.topology import packed_rows
 from graspd_core.perception.cloud.point_cloud import MIN_POINTS, PointCloud, Points, longest_side, measured
 
-# A mask of a scene's voxels. The object that each voxel is part of, numbered from the largest, -1 for none.
+# Mask: which voxels of a scene are chosen. Labels: the object of each voxel, 0 for the largest, -1 for no object.
 Mask = Bool[np.ndarray, "voxels"]
 Labels = Int[np.ndarray, "voxels"]
 
@@ -33,7 +33,7 @@ class VoxelScene:
     Attributes:
         points: the kept points of all views, one view after another [m].
         distance: distance of each kept point from its camera [m].
-        rows: for each view, the indices of its kept points.
+        rows: for each view, the indices of the kept points among all points of the view.
         voxel: for each kept point, the index of its voxel.
         mean: mean point of each voxel [m].
         mean_distance: mean distance of each voxel's points from their cameras [m].
@@ -52,7 +52,7 @@ class VoxelScene:
 
     @property
     def weight(self) -> Float[np.ndarray, "voxels"]:
-        """Return the point count of each voxel times its squared distance [m²], nearly the same at every distance."""
+        """Return each voxel's point count times squared camera distance [m²], which is similar near and far."""
         return self.count * self.mean_distance**2
 
     def of_view(self, view: int) -> slice:
@@ -64,7 +64,7 @@ class VoxelScene:
 def voxel_downsample(views: Sequence[PointCloud], settings: SegmentationConfig) -> VoxelScene:
     """Crop all views to the workspace and downsample them to one mean point per voxel.
 
-    Raises CloudError if there are no views, no measured points, too few in the workspace, or cameras too far apart.
+    Raises CloudError if views or measured points are missing or too few, or if cameras are too far apart.
     """
     given = sum(len(view.points) for view in views)
     if given == 0:
@@ -97,7 +97,7 @@ def voxel_downsample(views: Sequence[PointCloud], settings: SegmentationConfig) 
 def _inside(
     view: PointCloud, stride: int, settings: SegmentationConfig
 ) -> tuple[Int[np.ndarray, "kept"], Float[np.ndarray, "kept 3"], Float[np.ndarray, "kept"], int]:
-    """Return row, position and camera distance of every `stride`-th point in the workspace, and the number measured."""
+    """Take every `stride`-th point. Return row, position and distance of those in the workspace. Count all measured."""
     rows = stride * np.flatnonzero(measured(view.points[::stride], view.viewpoint))
     points = view.points[rows].astype(float)
     distance = np.linalg.norm(points - view.viewpoint, axis=1)
@@ -135,13 +135,13 @@ def unit_hint(views: Sequence[PointCloud], farthest: float) -> str:
         if farthest < away and MIN_CAMERA_DISTANCE_M <= away / per_metre <= farthest:
             return f"; half of them are beyond {away:.0f} m: if they are in {name}, divide them by {per_metre}"
     if away > farthest:
-        return f"; half of them are beyond {away:.1f} m: are their numbers metres? (--units or --scale for a file)"
+        return f"; half of them are beyond {away:.1f} m: are the coordinates in metres? (--units or --scale for a file)"
     return ""
 
 
 def _voxels(points: Points, size: float, most: int) -> tuple[Int[np.ndarray, "n"], float]:
-    """Return the index of each point's voxel, without gaps, and the side at which there are at most `most` voxels."""
-    # Computed column by column, because NumPy takes seven times as long for the minimum of many short rows.
+    """Return each point's voxel index (no gaps) and the voxel side. Enlarge voxels until at most `most` are left."""
+    # The minimum is computed by columns, because NumPy takes seven times as long for many short rows.
     low = np.array([column.min() for column in points.T])
     # A limit of 2^20 cells per axis lets the three indices fit into one integer.
     size = max(size, longest_side(points) / 2**20)

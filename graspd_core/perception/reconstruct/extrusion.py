@@ -11,22 +11,22 @@ from graspd_core.perception.reconstruct.merge_views import Surfels, join, nothin
 
 # The object ends at an outline point if the space at this distance outwards [m] is seen to be empty.
 OUTLINE_STEP_M = 0.008
-# Least cosines of the surface there: of its normal to the vertical, and of its normal to the direction of a camera.
+# Least cosines at an outline point: of the surface normal to the vertical, and to the direction of a camera.
 MIN_LEVEL_COSINE, MIN_FACING_COSINE = 0.85, 0.3
-# Fraction of the lowest points that must belong to walls, and the greatest vertical part of a wall's normal [cosine].
+# Least fraction of the lowest points that belong to walls, and greatest vertical part of a wall's unit normal.
 MIN_WALL_SHARE, MAX_WALL_COSINE = 0.6, 0.25
-# The lowest seen points must be nearer than this to the support [m], because segmentation cuts points off near it.
+# The foot counts as seen if the lowest points are at most this high [m]. Segmentation removes the points below them.
 MAX_FOOT_HEIGHT_M = 0.015
-# Fraction of a vertical line of a guessed wall that the cameras may contradict.
+# Greatest fraction of a guessed wall's vertical line that the cameras may contradict.
 MAX_CONTRADICTED_WALL = 0.15
-# Fraction of the base's outline that must have walls above it.
+# Least fraction of the base's outline that has walls above it.
 MIN_ENCLOSED_SHARE = 0.6
 
 
 def extrude(seen: Surfels, free_space: FreeSpace, step: float) -> Surfels:
     """Return vertical walls from the object's outline, seen from above, down to the support.
 
-    A part of the outline counts only if the cameras saw empty space beyond it. Walls that they contradict are left out.
+    At each wall's top, cameras must see empty space just outside the outline. They must not contradict the wall.
     """
     from scipy.ndimage import binary_closing, binary_erosion, distance_transform_edt, gaussian_filter, maximum_filter
     from scipy.spatial import KDTree
@@ -46,7 +46,7 @@ def extrude(seen: Surfels, free_space: FreeSpace, step: float) -> Surfels:
     height = maximum_filter(top, 3)[rim]
     place = np.column_stack([low + (np.argwhere(rim) + 0.5) * step, height])
     _, nearest = KDTree(seen.points).query(place)
-    # A surface that turns away from the camera at the outline continues behind it. A horizontal surface ends there.
+    # If the surface turns away from the camera, it continues behind the outline. A horizontal surface ends there.
     level = (seen.normals[nearest, 2] > MIN_LEVEL_COSINE) & (
         facing(free_space, seen.points, seen.normals)[nearest] > MIN_FACING_COSINE
     )
@@ -66,12 +66,12 @@ def _contradicted(
 
 
 def with_foot(surfels: Surfels, free_space: FreeSpace, step: float) -> Surfels:
-    """Return the surfels. If the object stands, add the surface between them and the support."""
+    """Return the surfels. If the object stands on a support, add the guessed surface between them and the support."""
     return join(surfels, stand(surfels, free_space, step)) if free_space.standing else surfels
 
 
 def stand(surfels: Surfels, free_space: FreeSpace, step: float) -> Surfels:
-    """Return walls from the lowest seen points down to the support, and the bottom. Empty if walls are doubtful."""
+    """Guess walls from the lowest surfels down to the support, and the bottom. Return nothing if walls are doubtful."""
     lowest = float(np.percentile(surfels.points[:, 2], 1))
     band = take(surfels, surfels.points[:, 2] < lowest + 3 * step)
     wall = np.abs(band.normals[:, 2]) < MAX_WALL_COSINE
@@ -91,7 +91,7 @@ def stand(surfels: Surfels, free_space: FreeSpace, step: float) -> Surfels:
 
 
 def _column(surfels: Surfels, free_space: FreeSpace, step: float) -> Surfels:
-    """Return walls and bottom of an object seen only high above the support, and walls beneath its higher parts."""
+    """Return walls and bottom beneath surfels that end high above the support. Bridge gaps in height by more walls."""
     order = np.argsort(surfels.points[:, 2])
     height = surfels.points[order, 2]
     level = np.cumsum(np.diff(height, prepend=height[:1]) > MAX_FOOT_HEIGHT_M)
@@ -128,7 +128,7 @@ def _walls(
 
 
 def _base(feet: Float[np.ndarray, "n 2"], free_space: FreeSpace, step: float) -> Surfels:
-    """Return points of the object's hidden bottom, on the support within the hull of the walls' lower ends."""
+    """Return the hidden bottom in the hull of `feet`, the lower ends of walls. Return nothing if walls are missing."""
     from scipy.spatial import KDTree
 
     hull = convex_hull(feet)

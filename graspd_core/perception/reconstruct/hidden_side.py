@@ -1,4 +1,4 @@
-"""The hidden side of an object: the view that would show most of it, and its other possible shapes.
+"""The hidden side of an object: the camera view that would show most of it, and other shapes that it may have.
 
 The other shapes come from the completion rules that the reconstruction did not choose.
 """
@@ -28,9 +28,9 @@ _ELEVATIONS, _AZIMUTHS = np.deg2rad([25.0, 50.0, 75.0]), 12
 _SAMPLES = 1500
 # A surface is visible only if the cosine between its normal and the direction to the camera is above this.
 _FLAT = 0.2
-# A ray that reaches this fraction of the distance to a sample has hit the sample's own face.
+# A ray reaches a sample if its first hit is beyond this fraction of the distance to the sample.
 _NEAR = 0.98
-# Spacing of points [m], cells along the longest side, and faces of other shapes. Trials need no finer detail.
+# Of the other shapes: point spacing [m], cells along the longest side, and faces. Trials need no finer detail.
 _STEP_M, _CELLS, _FACES = 0.003, 40, 4000
 # Two shapes count as equal if their mean distance is below this [m].
 _SAME_M = 5e-4
@@ -39,13 +39,13 @@ _SAME_M = 5e-4
 def next_view(evidence: Evidence, mesh: TriangleMesh, shift: Vector) -> Float[np.ndarray, "4 4"] | None:
     """Return the camera pose that would show most of the hidden side, as `T_views_camera` [m] (z forward, y down).
 
-    Candidate poses lie around the object, above its support, as far away as the first camera. Surface counts as hidden
-    if it is farther from all seen points than the cameras' precision.
+    Candidate poses lie around the object, above its support, as far away as the first camera. Surface is hidden if it
+    is farther from all seen points than the setting `seen_distance` plus the point spacing.
 
     Args:
         evidence: what the cameras saw.
         mesh: the reconstructed object, in the frame of the views [m].
-        shift: offset that is added to the camera's position [m].
+        shift: offset that is added to the position of the returned pose [m].
 
     Returns:
         The pose. None if no candidate shows any hidden surface, or if no camera position is known.
@@ -89,7 +89,7 @@ def _looking(eye: Vector, forward: Vector, up: Vector) -> Float[np.ndarray, "4 4
 
 
 def other_rules(evidence: Evidence) -> tuple[str, ...]:
-    """Return the completion rules that the reconstruction did not use, fastest first. Empty if nothing was hidden."""
+    """Return all completion rules except the one that was used, fastest first. Empty if nothing was hidden."""
     # The later a rule is in `RULES`, the less it searches, and the faster it is.
     return tuple(rule for rule in reversed(RULES) if rule != evidence.chosen) if evidence.hidden else ()
 
@@ -97,7 +97,7 @@ def other_rules(evidence: Evidence) -> tuple[str, ...]:
 def other_shape(evidence: Evidence, rule: str, than: TriangleMesh) -> TriangleMesh | None:
     """Return the object's mesh with its hidden side guessed by `rule`, in the frame of the views [m].
 
-    Return None if the rule makes no guess, if no closed surface fits, or if the shape equals that of `than`.
+    Return None if the rule makes no guess, if no closed surface fits, or if the shape is almost that of `than`.
     """
     step = max(evidence.step, _STEP_M)
     seen = thin(evidence.seen, step)

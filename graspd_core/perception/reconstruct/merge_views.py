@@ -1,10 +1,10 @@
 """Merging of views, or of one cloud that shows an object from all round, into one set of points with normals.
 
 Depth noise runs along the line of sight. So each point is moved along its line of sight to the plane of its neighbours,
-and its normal is turned to its camera. Both keep thin walls apart, which orientation by neighbours does not.
+and its normal is turned to its camera. So the sides of a thin wall stay apart, unlike with orientation by neighbours.
 
-Truncated signed distances (Curless and Levoy 1996) wear thin walls and edges away. On 15 rendered views, Open3D's
-volume of 2 mm cells gave a Chamfer distance of 0.82 mm instead of 0.49 mm and an overlap of 0.87 instead of 0.92.
+Truncated signed distances (Curless and Levoy 1996) would wear thin walls and edges away. On 15 rendered views, Open3D's
+volume of 2 mm cells had a Chamfer distance of 0.82 mm and an overlap of 0.87. This module had 0.49 mm and 0.92.
 """
 
 from __future__ import annotations
@@ -31,22 +31,22 @@ from graspd_core.perception.cloud.point_cloud import (
 )
 from graspd_core.se3 import perpendicular
 
-# Points whose normals have a smaller cosine to the line of sight are flying pixels at an edge.
+# Points are flying pixels at an edge if the cosine between normal and line of sight is below this.
 MIN_VIEW_COSINE = 0.1
-# In a view from one side, depth varies by less than this many cells within a cell on most lines of sight. If over this
-# fraction are exceptions, the cloud shows the object from all round. If the camera's direction is known, the limit is
-# higher, because from above a third of the lines may run along the sides of a cup.
+# In a view from one side, depth varies within most image cells by less than MAX_RISE_CELLS cell widths. If it varies by
+# more in over LAYERED_SHARE of the cells, the cloud shows the object from all round. If the camera's direction is
+# known, the limit is higher: from above, a third of the lines of sight may run along the sides of a cup.
 MAX_RISE_CELLS = 4.0
 LAYERED_SHARE, LAYERED_SHARE_OF_CAMERA = 0.15, 0.45
 
-# Number of points to check whether they enclose a body, and limits. Openness is 0 to 0.056 for shapes from all round
-# (thin walls, 1 mm noise), 0.075 to 0.32 for single views of `CHOSEN_ON` (studies/cameras.py). Normals of a whole scene
-# may cancel, but it is flat: three volumes over area and size are 0.003 to 0.028, and 0.12 or more for bodies.
+# To check whether a body is enclosed: number of points, greatest openness, least volume. Openness is 0 to 0.056 for
+# shapes from all round (thin walls, 1 mm noise), 0.075 to 0.32 for single views of `CHOSEN_ON` (studies/cameras.py).
+# Normals of scenes may cancel. But their 3 · volume / (area · size) is 0.003 to 0.028, and of bodies 0.12 or more.
 ENCLOSING_POINTS, MOST_OPEN, LEAST_VOLUME = 4000, 0.06, 0.06
 # For an all-round cloud: neighbours for a normal, directions from which the cloud is viewed, and passes of orientation.
 NORMAL_NEIGHBOURS, UNPOSED_DIRECTIONS, UNPOSED_PASSES = 24, 150, 3
-# It is thinned to this fraction of the step. Points with opposite normals count as twice this many steps apart. Points
-# this many steps off each other's plane may lie on two sides of a wall.
+# The all-round cloud is thinned to UNPOSED_THINNING steps. Points with opposite normals count as twice UNPOSED_FACING
+# steps apart. Points UNPOSED_DEPTH steps off each other's plane may lie on two sides of a wall.
 UNPOSED_THINNING, UNPOSED_FACING, UNPOSED_DEPTH = 0.6, 4.0, 0.25
 
 
@@ -92,7 +92,7 @@ def merge_views(
     if len(together.points) < MIN_POINTS:
         raise CloudError(
             f"cloud: only {len(together.points)} of its {sum(len(view.points) for view in views)} points lie on a "
-            f"surface; at least {MIN_POINTS} are needed: it is too sparse, or shows no surface"
+            f"surface; at least {MIN_POINTS} are needed: the cloud is too sparse, or shows no surface"
         )
     return thin(together, step) if len(views) > 1 else together
 
@@ -109,7 +109,7 @@ def orient_view(view: PointCloud, step: float, settings: ReconstructionConfig) -
     ray /= np.linalg.norm(ray, axis=1, keepdims=True)
     centre, normals = points[near].mean(1), np.zeros_like(points)
     weights = np.ones(near.shape)
-    # Later passes leave out neighbours that lie across an edge, off the plane of the pass before.
+    # Later passes give little weight to neighbours off the plane of the previous pass, for example across an edge.
     for _ in range(3):
         total = weights.sum(1, keepdims=True)
         centre = np.einsum("nk,nkd->nd", weights, points[near]) / total
@@ -127,7 +127,7 @@ def orient_view(view: PointCloud, step: float, settings: ReconstructionConfig) -
 
 
 def thin(surfels: Surfels, step: float) -> Surfels:
-    """Return one mean surfel for each cube of side `step` [m] and each of six directions that normals face."""
+    """Return the mean surfel of each group: all in one cube of side `step` [m] that face one of six directions."""
     if len(surfels.points) == 0:
         return surfels
     facing = np.abs(surfels.normals).argmax(1)
@@ -141,7 +141,7 @@ def thin(surfels: Surfels, step: float) -> Surfels:
 
 
 def _thin_by_sight(view: PointCloud, step: float) -> Points:
-    """Return the point of median distance in each small cone of sight. So flying pixels are seldom chosen."""
+    """Return the point of median distance in each small cone of sight. A median is seldom a flying pixel."""
     ray = view.points - view.viewpoint
     distance = np.linalg.norm(ray, axis=1)
     width = step / float(np.median(distance))
@@ -156,9 +156,9 @@ def _thin_by_sight(view: PointCloud, step: float) -> Points:
 
 
 def is_unposed(view: PointCloud, axis_known: bool = False) -> bool:
-    """Return True if a cloud shows surface behind surface on many lines of sight, as no single camera can see.
+    """Return True if a cloud shows surface behind surface on many lines of sight, which no single camera can see.
 
-    Also return True if the cloud encloses a body and the camera's position is inside its bounding box.
+    Also return True if the cloud encloses a body and the camera's position is inside the cloud's bounding box.
 
     Args:
         view: the object's points.
@@ -184,13 +184,13 @@ def is_unposed(view: PointCloud, axis_known: bool = False) -> bool:
     return bool((far - near > MAX_RISE_CELLS * cell).mean() > most)
 
 
-# Several checks of one cloud ask this. The cache hashes clouds by identity.
+# Several checks call this function for the same cloud. The cache hashes clouds by identity.
 @lru_cache(maxsize=2)
 def is_all_round(view: PointCloud) -> bool:
     """Return True if points enclose a body.
 
-    Then normals n and positions p have mean n = 0 and mean n pᵀ = volume / area · I, by the divergence theorem. One
-    side of a body has mean n = 0 only by chance, and then fails the second test.
+    By the divergence theorem, normals n and positions p on a closed surface have mean n = 0 and mean
+    n pᵀ = volume / area · I. If one side of a body has mean n = 0 by chance, it fails the second equation.
     """
     points = view.points[measured(view.points, view.viewpoint)]
     if len(points) < MIN_POINTS:
@@ -207,8 +207,8 @@ def is_all_round(view: PointCloud) -> bool:
 def orient_unposed(view: PointCloud, step: float) -> Surfels:
     """Return points of an all-round cloud, about `step` [m] apart, with outward normals.
 
-    The cloud is viewed from many directions. The nearest point in each cell of an image faces that direction. This
-    distinguishes the two sides of a thin wall, which agreement with neighbours does not.
+    View the cloud from many directions. In each image cell, the nearest point is taken to face the viewer. So the two
+    sides of a thin wall stay apart. Agreement with neighbours would mix them.
     """
     from scipy.spatial import KDTree
 
@@ -252,12 +252,12 @@ def _seen_from(points: Points) -> Points:
 
 @dataclass(frozen=True, eq=False)
 class Evidence:
-    """The seen part of an object, from which other guesses of its hidden part are made.
+    """What the cameras saw of an object. Other guesses of its hidden part start from this.
 
     Attributes:
         seen, free_space, step: seen surface, space seen to be empty, and point spacing [m], in the local frame.
         rotation, origin: pose of the local frame in the frame of the views [m].
-        chosen: completion rule that the reconstruction used, empty for none.
+        chosen: name of the completion rule that the reconstruction used, empty for none.
         settings: settings of the reconstruction.
         hidden: whether a large part of the surface was hidden.
         doubts: reasons why the views may not show the true scene. With any doubt, no grasp counts as verified.

@@ -1,11 +1,11 @@
 """Closed surfaces from oriented points: screened Poisson (Kazhdan and Hoppe 2013), cut by the cameras' free space.
 
 Where points are missing, a Poisson surface bulges outwards or stays open. So its distance field is sampled on a grid,
-cut by the space seen to be empty and by the support, and meshed again, which closes the surface.
+cut by the space seen to be empty and by the support, and meshed again. The new mesh is closed.
 
 The field is computed on a regular grid by Fourier transforms (Kazhdan 2005), or by Open3D on an adaptive grid. On small
-grids the former takes a sixth of the time. As in screened Poisson, the field is then drawn to zero at the points. This
-would fit noise too, so the points are first checked to lie on one surface.
+grids, Fourier transforms take a sixth of the time. Their field is then drawn to zero at the points, as in screened
+Poisson. This would also fit noise, so the points are first checked to lie on one surface.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ from graspd_core.types import TriangleMesh
 GRID_CELLS = 60
 # Least thickness of walls, in cells. Thinner walls are made thicker.
 MIN_WALL_CELLS = 2.2
-# Two points are on opposite sides of a wall if the cosine between their normals is below minus this.
+# Two points can be on opposite sides of a wall only if the cosine between their normals is below minus this.
 OPPOSITE_COSINE = 0.7
 # Signed distances are computed within this many cells of the surface. Farther nodes get the sign of their region.
 BAND_CELLS = 2
@@ -38,14 +38,14 @@ MIN_FLOOR_COSINE, MAX_FLOOR_RISE_M = 0.95, 0.002
 _NODES_AT_ONCE = 1000
 # Standard deviations [cells] of the blur of the field, and of the blur that measures the density of the points.
 _BLUR, _DENSITY_BLUR = 1.0, 2.0
-# Sparse points weigh more. The weight stops growing at this fraction of the median density.
+# A point's weight is the inverse of the point density. Densities below this fraction of the median are raised to it.
 _SPARSEST = 0.2
-# Least fraction of points within a cell of the surface before it is drawn to them. On 120 views of shapes and scans it
-# is 0.82 or more, on noise 0.48 or less.
+# Least fraction of points within a cell of the surface, before the field is drawn to the points. On 120 views of shapes
+# and scans, the fraction is 0.82 or more. On noise, it is 0.48 or less.
 _MIN_NEAR = 0.7
 # Steps that draw the field to zero at the points, and the reach of each step [cells].
 _STEPS, _REACH = 3, 2.0
-# Fourier transforms treat the grid as periodic. So many cells separate the object from its periodic image.
+# Fourier transforms treat the grid as periodic. At least this many cells separate the grid from its periodic image.
 _MARGIN = 16
 
 # The nodes of a grid of cubes [m], and values at them.
@@ -56,17 +56,17 @@ Field = Callable[[Surfels, Nodes, float], Grid]
 
 
 def grid_cell(surfels: Surfels, least: float, cells: int = GRID_CELLS) -> float:
-    """Return the cell width [m] of the grid on which a surface through these points is closed, at least `least`."""
+    """Return the cell width [m]: the points' longest side divided by `cells`, but at least `least` [m]."""
     return max(float(np.ptp(surfels.points, axis=0).max()) / cells, least)
 
 
 def part_walls(surfels: Surfels, cell: float) -> Surfels:
-    """Move the two sides of walls too thin for the grid a millimetre or two apart. Otherwise they would cancel."""
+    """Move the two sides of thin walls `MIN_WALL_CELLS` cells apart. On the grid, closer sides would cancel."""
     from scipy.spatial import KDTree
 
     points, normals = surfels.points, surfels.normals
     thinnest = MIN_WALL_CELLS * cell
-    # The other side of a wall is nearest in position and opposite normal. In these six dimensions none is farther.
+    # The other side of a wall is nearest in position and opposite normal. `farthest` is the limit in six dimensions.
     tree = KDTree(np.hstack([points, thinnest * normals]))
     farthest = np.sqrt(2 + 2 * (1 - OPPOSITE_COSINE)) * thinnest
     _, other = tree.query(np.hstack([points, -thinnest * normals]), distance_upper_bound=farthest, workers=-1)
@@ -83,7 +83,7 @@ def poisson_field(surfels: Surfels, nodes: Nodes, cell: float, finest: float) ->
     """Return the signed distance [m] to Open3D's Poisson surface, at grid nodes that are `cell` [m] apart.
 
     The surface is open where it leaves a cube of 1.2 times the points' size. `finest` [m] is the approximate width of
-    the solver's finest cells, which halve from level to level. Raises CloudError if no surface fits the points.
+    the solver's finest cells. Cells halve from level to level. Raises CloudError if no surface fits the points.
     """
     import open3d as o3d
 
@@ -127,7 +127,7 @@ def close_surface(surfels: Surfels, field: Field, free_space: FreeSpace, cell: f
 
 
 def _beneath_floors(surfels: Surfels, lowest: float) -> Points:
-    """Return the points of a low floor, as of a cup, moved down to the support. They thicken the hull."""
+    """Return a low floor's points, such as a cup's, moved down to the support. So the surface can reach the support."""
     floor = (surfels.normals[:, 2] > MIN_FLOOR_COSINE) & (surfels.points[:, 2] < lowest + MAX_FLOOR_RISE_M)
     return surfels.points[floor] * np.array([1.0, 1.0, 0.0])
 
@@ -153,8 +153,8 @@ def march(value: Grid, axes: Sequence[Float[np.ndarray, "_"]]) -> TriangleMesh:
 def _signed(surface: TriangleMesh, nodes: Nodes, cell: float) -> Grid:
     """Return the signed distance [m] at nodes near the surface, and plus or minus `BAND_CELLS` cells at other nodes.
 
-    The surface has no border within the grid, so it divides the grid into regions. Each region takes the sign of most
-    of its nodes next to the surface, which comes from the normal of the nearest face.
+    The surface has no border within the grid, so it divides the grid into regions. Near the surface, the normal of the
+    nearest face gives a node's sign. Each region takes the sign that most of these nodes in it have.
     """
     from scipy.ndimage import label
 
@@ -173,7 +173,7 @@ def _signed(surface: TriangleMesh, nodes: Nodes, cell: float) -> Grid:
 
 
 def _touched(surface: TriangleMesh, nodes: Nodes, cell: float) -> Bool[np.ndarray, "x y z"]:
-    """Return which nodes are within about two cells of the surface. Its faces must be smaller than a cell or two."""
+    """Return which nodes are within about two cells of the surface. The faces must be smaller than two cells."""
     from scipy.ndimage import binary_dilation
 
     points = np.concatenate([surface.vertices, surface.vertices[surface.faces].mean(1)])
@@ -185,17 +185,17 @@ def _touched(surface: TriangleMesh, nodes: Nodes, cell: float) -> Bool[np.ndarra
 
 
 def _outside_hull(points: Points, nodes: Float[np.ndarray, "m 3"], cell: float) -> Float[np.ndarray, "m"]:
-    """Return how far nodes lie outside the convex hull of points [m]. A surface may close anywhere inside it."""
+    """Return how far nodes lie outside the convex hull of points [m]. The surface must close within the hull."""
     hull = convex_hull(np.unique(np.round(points / (3 * cell)), axis=0) * 3 * cell)
     if hull is None:
         return np.zeros(len(nodes))
-    # Computed in parts that stay in the cache. One array of nodes by facets would take 0.5 GB and eight times as long.
+    # The parts stay in the cache. One array of all nodes by all facets would take 0.5 GB and eight times as long.
     parts = np.array_split(np.vstack([nodes.T, np.ones(len(nodes))]), 1 + len(nodes) // _NODES_AT_ONCE, axis=1)
     return np.maximum(np.concatenate([(hull.equations @ part).max(0) for part in parts]), 0.0)
 
 
 def _one_solid(value: Grid, cell: float) -> Grid:
-    """Return the field of the largest body alone, without inner cavities, and clear of the grid's border."""
+    """Return the field with only its largest body. Fill cavities of the body, and close it at the grid's border."""
     from scipy.ndimage import label
 
     border = np.ones(value.shape, dtype=bool)
@@ -231,7 +231,7 @@ def grid_poisson_field(surfels: Surfels, nodes: Nodes, cell: float) -> Grid:
     waves = _waves(shape)
     square = sum(wave**2 for wave in waves)
 
-    # float32 is far more precise than the noise. The transforms dominate the time, and take a third of it in float32.
+    # float32 is far more precise than the noise. The transforms take most of the time, and a third as long in float32.
     def spread(values: Float[np.ndarray, "points"]) -> np.ndarray:
         return fft.rfftn((at.T @ values).astype(np.float32).reshape(shape))
 
@@ -262,7 +262,7 @@ def grid_poisson_field(surfels: Surfels, nodes: Nodes, cell: float) -> Grid:
 
 
 def _trilinear(place: Float[np.ndarray, "points 3"], shape: tuple[int, ...]) -> Any:
-    """Return the matrix (points × nodes) that interpolates a field at positions given in cells."""
+    """Return the matrix (points × nodes) that interpolates a field. `place` holds the points' positions in cells."""
     from scipy.sparse import csr_array
 
     corners = np.array(list(product((0, 1), repeat=3)))

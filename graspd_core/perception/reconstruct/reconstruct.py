@@ -1,8 +1,8 @@
 """Reconstruction of a closed mesh from one or more views of an object, with the confidence of each part.
 
 The hidden part is guessed first, by the symmetry, revolution or extrusion that fits the views best. Then screened
-Poisson fits a surface to the points, with normals towards each camera. The surface is computed on a grid, and again by
-Open3D if the first surface does not fit. Space that the cameras saw to be empty is cut away.
+Poisson reconstruction fits a surface to seen and guessed points. The surface is computed on a grid, and again by Open3D
+if the first surface does not fit. Space that the cameras saw to be empty is cut away.
 """
 
 from __future__ import annotations
@@ -48,13 +48,13 @@ from graspd_core.types import Plane, TriangleMesh
 
 # Least fraction of the seen points that must lie on the mesh.
 MIN_FITTED_SHARE = 0.85
-# An object that is fewer cells across comes out too thick on the grid.
+# An object smaller than this many cells of least width comes out too thick on the grid. Open3D's solver is used then.
 _LEAST_CELLS = 8
-# An all-round cloud gets a finer grid if the usual one would thicken its walls at more than this fraction of points.
-# The finer grid has this many cells, of a least width smaller by this factor. Walls of 4 mm then come out as 4 mm, not
-# 5 mm, in 1.8 s of one core instead of 1.2 s.
+# An all-round cloud gets a finer grid if the usual grid would thicken its walls at more than this fraction of points.
+# The finer grid has _WALL_CELLS cells along the longest side. Its least cell width is _WALL_CELL times the usual one.
+# Walls of 4 mm then come out as 4 mm, not 5 mm, in 1.8 s of one core instead of 1.2 s.
 _THIN_SHARE, _WALL_CELLS, _WALL_CELL = 0.1, 100, 0.7
-# A face of the foot faces down at least by this cosine.
+# A face belongs to the object's foot only if the cosine of its normal to straight down is above this.
 _DOWN = 0.7
 
 
@@ -64,7 +64,7 @@ class Reconstruction:
 
     Attributes:
         mesh: the closed mesh, in the frame of the views [m].
-        confidence: confidence of each vertex, 1 at seen surface, falling to 0 with the distance from seen surface.
+        confidence: confidence of each vertex, from 1 at seen surface down to 0 far from seen surface.
         warnings: what was guessed, one sentence each.
         evidence: what the cameras saw, for other guesses of the hidden side.
     """
@@ -128,7 +128,7 @@ def reconstruct(
 
 
 def _in_frame(view: PointCloud, rotation: Float[np.ndarray, "3 3"], origin: Vector) -> PointCloud:
-    # Some drivers send infinity for missing depth. It becomes NaN here.
+    # Some drivers send infinity for missing depth. Infinity becomes NaN here.
     with np.errstate(invalid="ignore"):
         return PointCloud((view.points - origin) @ rotation, (view.viewpoint - origin) @ rotation)
 
@@ -196,7 +196,7 @@ def _clean(views: Sequence[PointCloud], settings: ReconstructionConfig) -> list[
     result = []
     for points, view in zip(kept, views, strict=True):
         points = points[tree.query(points, distance_upper_bound=near)[0] < near] if len(points) else points
-        # Checked on some thousand points. One place sent many times is no surface, but would mark other space as empty.
+        # About a thousand points are checked. One point sent many times is no surface, but would mark space as empty.
         if len(np.unique(points[:: 1 + len(points) // 1000], axis=0)) > settings.neighbours:
             result.append(PointCloud(points, view.viewpoint.astype(float)))
     if not result:
@@ -213,7 +213,7 @@ def _some(view: PointCloud, most: int) -> Points:
 
 
 def _frame(views: Sequence[PointCloud], support: Plane | None) -> tuple[Float[np.ndarray, "3 3"], Vector]:
-    """Return axes (columns) and origin [m] of a frame: z is the support's normal, or points to the first camera."""
+    """Return axes (columns) and origin [m] of the local frame: z is normal to the support, or towards a camera."""
     points = np.concatenate([view.points for view in views])
     centre = points.mean(0)
     view = views[0].viewpoint - centre
@@ -280,11 +280,11 @@ def _is_guessed(
     standing: bool,
     settings: ReconstructionConfig,
 ) -> bool:
-    """Return True if much of a surface was not seen. Surface on the support at z = 0 counts as known."""
+    """Return True if much surface was unseen, or a rule completed a single view. Surface on the support is known."""
     if views > 1:
-        # Whether a rule was used does not matter. Openness is no measure here: the normals of opposite sides cancel.
+        # The rule does not matter here. Openness is no measure for several views: normals of opposite sides cancel.
         return _unseen_share(mesh, seen, standing, settings.seen_distance) > settings.open_share
-    # In a view from above, the normals of the top and of the foot cancel although no side was seen.
+    # In a view from above, the normals of top and foot cancel although no side was seen. So guessed area counts too.
     area = _open_area(mesh, standing)[0]
     guessed = float((area * (1.0 - confidence[mesh.faces].mean(1))).sum() / max(area.sum(), 1e-12))
     return bool(guess.method) or max(guess.openness, guessed) > settings.open_share

@@ -1,6 +1,6 @@
 """Fitting of bodies of revolution: find the axis, revolve the seen profile about it, and close its ends.
 
-The normals give a first axis, because they all meet it. For a point p with normal n, the axis through c along a obeys
+The normals give a first axis, because all meet the axis. For a point p with normal n, the axis through c along a obeys
 n·(c × a) + (p × n)·a = 0, which is linear in (a, c × a) (Pottmann and Wallner, Computational Line Geometry, 2001).
 Normals are noisy, so the points then refine the axis: rotated into one half-plane, they must form a thin profile.
 """
@@ -21,17 +21,17 @@ from graspd_core.se3 import perpendicular
 
 # A normal whose component around the axis is larger than this belongs to another part, such as a handle or a spout.
 MAX_SKEW = 0.3
-# Gauss-Newton steps to refine an axis, least number of points, and damping. Damping holds directions that the points
-# leave free, such as every axis of a ball.
+# Gauss-Newton steps to refine an axis, least number of points, and damping. Damping keeps an axis that the points leave
+# free: any axis through its centre fits a ball.
 GAUSS_NEWTON_STEPS, MIN_AXIS_POINTS, DAMPING = 6, 30, 1e-3
-# Points around the axis at which each ring of the profile is checked, and the fraction of them that may contradict it.
+# Number of points of each ring around the axis, and greatest fraction of a ring that the cameras may contradict.
 RING_SAMPLES, MAX_CONTRADICTED_SHARE = 24, 0.15
 # If the cosine of its tilt is above this, a standing body is taken to be upright.
 UPRIGHT_COSINE = 0.985
 # Without a support, z points to the first camera, so this direction lies across the view.
 ACROSS_VIEW = np.array([1.0, 0.0, 0.0])
 
-# Height along the axis and distance from it [m], then the normal's components along the axis and away from it.
+# Height along the axis and distance from the axis [m], then the normal's components along the axis and away from it.
 Rows = Float[np.ndarray, "_ 4"]
 
 
@@ -98,15 +98,15 @@ def half_plane(surfels: Surfels, axis: Axis) -> tuple[Points, Float[np.ndarray, 
 
 
 def turned(rows: Float[np.ndarray, "n 4"], step: float) -> Bool[np.ndarray, "n"]:
-    """Return which rows may belong to a body of revolution, because their normals meet the axis."""
+    """Return which rows of `half_plane` fit a body of revolution: off the axis, with normals that almost meet it."""
     return (rows[:, 2] ** 2 + rows[:, 3] ** 2 > 1 - MAX_SKEW**2) & (rows[:, 1] > 0.5 * step)
 
 
 def settle_axis(surfels: Surfels, axis: Axis, step: float) -> Axis:
     """Tilt the axis by Gauss-Newton steps until the profile of the points is as thin as possible.
 
-    Points far from the profile, such as those of a handle, count less and less. Only the tilts of each step are used.
-    The axis position follows from the normals, because points seen from one side do not show it along the view.
+    Points far from the profile, such as those of a handle, count less and less. Of each step, use the tilts but not the
+    shifts. The normals give the axis position, because points from one side do not give it along the view.
     """
     for round_ in range(GAUSS_NEWTON_STEPS):
         right = perpendicular(axis.direction)
@@ -129,10 +129,10 @@ def settle_axis(surfels: Surfels, axis: Axis, step: float) -> Axis:
 def _thinner(
     rows: Float[np.ndarray, "n 4"], rates: Float[np.ndarray, "4 n 2"], step: float, scale: float
 ) -> Float[np.ndarray, "4"]:
-    """Return the Gauss-Newton step of each motion of the axis: two shifts and two tilts.
+    """Return a Gauss-Newton step of four motions of the axis: two shifts [m] and two tilts [rad].
 
-    `rates` holds how fast each motion moves the points along and away from the axis. A point's residual is its distance
-    from the mean of its cell of the profile, along the cell's normal. Residuals beyond `scale` [m] count little.
+    `rates` holds how fast each motion changes a point's height and radius. Cells group points of the profile. A point's
+    residual is its distance from its cell's mean, along the cell's normal. Residuals beyond `scale` [m] count little.
     """
     height, radius, along, across = rows.T
     wall = np.abs(across) > np.abs(along)
@@ -148,7 +148,7 @@ def _thinner(
         moves = np.stack([move - _mean(move, cell, weight) for move in moves])
         weight = 1.0 / (1.0 + np.square(moves[0] / scale)) ** 2
     residual, system = moves[0], moves[1:]
-    # Tilts are measured in metres at the object's radius, so that shifts and tilts are damped alike.
+    # Tilts are measured in metres at the object's radius, so that shifts and tilts are damped equally.
     lever = np.array([1.0, 1.0, *[float(np.median(radius))] * 2])
     held = np.diag(DAMPING * len(rows) * lever**2)
     return -np.linalg.solve((system * weight) @ system.T + held, system @ (weight * residual))
@@ -166,7 +166,7 @@ class Revolution:
     """The surface made by revolving the seen part about an axis.
 
     Attributes:
-        surfels: surfels of the whole surface.
+        axis, surfels: axis of revolution, and surfels of the whole surface.
         agree, wrong: fractions of the surface that the cameras confirm and contradict.
         share: fraction of the seen points that lie on the surface.
     """
@@ -179,13 +179,13 @@ class Revolution:
 
 
 def find_revolution(surfels: Surfels, free_space: FreeSpace, step: float) -> Revolution | None:
-    """Return the best body of revolution, or None.
+    """Return the best body of revolution, or None if none fits.
 
-    Up to two axes are tried: one that all normals meet, and a vertical one (without a support, perpendicular to the
-    view).
+    Try up to two axes: the axis that the normals meet best, and a vertical axis. Without a support, try an axis across
+    the view instead of the vertical axis.
     """
     met = meeting_direction(surfels)
-    # Every axis fits a ball. An axis across the view shows its back.
+    # Every axis through its centre fits a ball. An axis across the view turns the seen side to the hidden side.
     axes = [fit_axis(surfels, UP if free_space.standing else ACROSS_VIEW)]
     # A body that is nearly upright is taken as upright, because the support is known more precisely than the axis.
     if not free_space.standing or abs(met @ UP) < UPRIGHT_COSINE:
@@ -221,7 +221,7 @@ def revolve(surfels: Surfels, free_space: FreeSpace, axis: Axis, step: float) ->
 
 
 def _ends(profile: Rows, axis: Axis, right, up, free_space: FreeSpace, step: float) -> list[Rows]:
-    """Return the rows that close the profile if it ends away from the axis: a flat cap, or a curve down to the support.
+    """Return rows that close each end of the profile that is off the axis: a flat cap, or a curve down to the support.
 
     A cap is added only if the cameras saw empty space beyond the rim. Neither cap nor curve may contradict the cameras.
     """
@@ -250,7 +250,7 @@ def _ends(profile: Rows, axis: Axis, right, up, free_space: FreeSpace, step: flo
 
 
 def _foot(rim, way: float, ground: float, step: float) -> Rows:
-    """Return a parabola that leaves the rim along its tangent and ends where the axis meets the support, or no rows."""
+    """Return rows of a parabola from the rim, along its tangent, to where the axis meets the support, or no rows."""
     height, radius = way * -rim[0] + ground, rim[1]
     along, across = way * rim[2], rim[3]
     if along < 0.15 or height < 2 * step:
@@ -271,7 +271,7 @@ def _confirmed_and_wrong(rows: Rows, axis: Axis, right, up, free_space: FreeSpac
 
 
 def _profile(rows: Float[np.ndarray, "n 4"], step: float) -> Float[np.ndarray, "m 4"]:
-    """Group rows by height, radius and facing direction. Return the mean row of each group."""
+    """Group rows of `half_plane` by height, radius and facing direction. Return the mean row of each group."""
     side = np.where(np.abs(rows[:, 2]) > np.abs(rows[:, 3]), 2 + (rows[:, 2] > 0), rows[:, 3] > 0)
     cells = np.column_stack([np.floor(rows[:, :2] / step).astype(int), side.astype(int)])
     _, which, count = np.unique(packed_rows(cells), return_inverse=True, return_counts=True)
@@ -282,7 +282,7 @@ def _profile(rows: Float[np.ndarray, "n 4"], step: float) -> Float[np.ndarray, "
 
 
 def _ring(profile, axis: Axis, right, up, counts) -> Surfels:
-    """Return the surfels made by turning each profile row about the axis, to as many positions as `counts` gives."""
+    """Turn each profile row about the axis. Return the surfels. `counts` gives the number of surfels for each row."""
     rows = np.repeat(np.arange(len(profile)), counts)
     place = np.arange(len(rows)) - np.repeat(np.cumsum(counts) - counts, counts)
     turn = 2 * np.pi * place / np.repeat(counts, counts)

@@ -20,9 +20,9 @@ from graspd_core.perception.reconstruct.symmetry import Symmetry, find_centre, f
 
 REVOLUTION, MIRROR, POINT_SYMMETRY, EXTRUSION = "revolution", "mirror", "point symmetry", "extrusion"
 RULES = (REVOLUTION, MIRROR, POINT_SYMMETRY, EXTRUSION, "")
-# Weight of the contradicted fraction of a body of revolution, against the fraction that it explains.
+# Weight of the contradicted fraction of a body of revolution, relative to the fraction of seen points on the body.
 FAULT_WEIGHT = 5.0
-# Symmetries that the cameras contradict at more than this fraction of points are chance.
+# If the cameras contradict a symmetry at more than this fraction of its points, the symmetry is taken for chance.
 MAX_SYMMETRY_FAULTS = 0.02
 # A centre of symmetry is preferred if its worth is over this many times that of mirror planes.
 TIE = 1.1
@@ -37,7 +37,7 @@ class Completion:
     Attributes:
         method: the rule, e.g. "mirror and extrusion". Empty if no rule was used.
         surfels: the guessed points, without those that contradict or repeat the seen surface.
-        openness: fraction of the surface that was missing before.
+        openness: fraction of the surface that was missing before the guess.
     """
 
     method: str

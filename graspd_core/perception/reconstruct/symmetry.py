@@ -1,7 +1,7 @@
 """Search for symmetries of a partly seen object: mirror planes and centres of symmetry.
 
-Each search moves the seen points by many candidates at once. The images of a good candidate fall on seen surface, not
-into space seen to be empty, and add new surface.
+Each search moves the seen points by many candidate symmetries at once. A good candidate moves points onto seen surface,
+not into space seen to be empty, and adds new surface.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ from graspd_core.se3 import perpendicular
 FINE_SAMPLES, COARSE_SAMPLES = 240, 90
 # Weight of a contradiction relative to a confirmation.
 CONTRADICTION_WEIGHT = 3.0
-# Directions of mirror planes to try for a standing object and for other objects, and offsets of each.
+# How many normals of mirror planes to try for a standing object and for other objects, and offsets per normal.
 UPRIGHT_DIRECTIONS, SPHERE_DIRECTIONS, PLANE_OFFSETS = 30, 70, 29
 
 UP = np.array([0.0, 0.0, 1.0])
@@ -39,7 +39,7 @@ class Symmetry:
     Attributes:
         linear, shift: A and b [m].
         agree, wrong: fractions of the moved points that the cameras confirm and contradict.
-        worth: score of how much hidden surface the symmetry shows, and how certainly.
+        worth: score that grows with the hidden surface that the symmetry shows, and with its certainty.
     """
 
     linear: Float[np.ndarray, "3 3"]
@@ -63,12 +63,12 @@ def image(symmetry: Symmetry, surfels: Surfels) -> Surfels:
 
 
 def worth(agree: Shares, wrong: Shares, meets: Shares, closes: Shares) -> Shares:
-    """Return how useful symmetries are. If all images fall on seen surface, a symmetry is true but useless.
+    """Return how useful symmetries are. If all moved points fall on seen surface, a symmetry is true but useless.
 
     Args:
         agree, wrong: fractions of the moved points that the cameras confirm and contradict.
-        meets: fraction of the rim of the seen part at which the image continues the surface.
-        closes: fraction of the open side that the image closes.
+        meets: fraction of the seen part's rim at which the moved surface continues the seen surface.
+        closes: fraction of the open side that the moved surface closes.
     """
     return (4 * agree * (1 - agree - wrong) + closes) * (0.3 + meets) - CONTRADICTION_WEIGHT * wrong
 
@@ -79,7 +79,7 @@ def truth(agree: Shares, wrong: Shares, meets: Shares, closes: Shares) -> Shares
 
 
 def find_mirrors(surfels: Surfels, free_space: FreeSpace) -> list[Symmetry]:
-    """Return the most useful mirror plane, and the best one perpendicular to it if the cameras confirm it too."""
+    """Return the most useful mirror plane, and the best perpendicular plane if the cameras confirm that plane too."""
     sample = _sample(surfels)
     first, normal = _best_plane(_directions(free_space.standing), sample, free_space, worth)
     if free_space.standing:
@@ -163,7 +163,7 @@ def _closes(linear: Float[np.ndarray, "k 3 3"], side: Vector, standing: bool) ->
 
 
 def _sample(surfels: Surfels) -> _Sample:
-    """Return a random choice (with a fixed seed) of points, and of rim points, whose neighbours lie on one side."""
+    """Return random points and random rim points, by fixed seeds. A rim point has neighbours on one side only."""
     from scipy.spatial import KDTree
 
     answer: Any = KDTree(surfels.points).query(surfels.points, k=17)
@@ -183,7 +183,7 @@ def _some(surfels: Surfels, count: int) -> Surfels:
 
 
 def _directions(standing: bool) -> Float[np.ndarray, "k 3"]:
-    """Return horizontal directions over half a turn for a standing object, else directions over half a sphere."""
+    """Return normals of planes to try: horizontal ones over 180° for a standing object, else over half a sphere."""
     if standing:
         turn = np.pi * np.arange(UPRIGHT_DIRECTIONS) / UPRIGHT_DIRECTIONS
         return np.column_stack([np.cos(turn), np.sin(turn), np.zeros(UPRIGHT_DIRECTIONS)])

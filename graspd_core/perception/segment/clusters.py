@@ -1,14 +1,14 @@
 """Objects in a scene: cluster points, join clusters of one object, and find clusters that may be several objects.
 
-Occlusion splits one object into several clusters: the far wall of a cup lies behind the near wall, a rim above the
-bottom. Two clusters are joined only if they touch in some camera's image, because the edge between them is then an
-occlusion. They must also be near each other, or one must lie within the other's outline on the support. A cluster that
-ends above the support belongs to the nearest standing cluster, unless it may be an object with a hidden foot.
+Occlusion splits one object into several clusters, for example into the near wall and the far wall of a cup. Two
+clusters are joined only if they touch in some camera's image, because the edge between them is then an occlusion. They
+must also be near each other, or one must lie within the outline of the other on the support. A cluster that ends above
+the support belongs to the nearest standing cluster, except if it may be an object with a hidden foot.
 
 Touching objects form one cluster. A concave seam or a narrow waist between two standing parts suggests two objects.
-Objects of equal height that touch along a line are connected by a narrow bridge of points across their tops. One object
-may also have seams and waists, for example where a leg meets a body. Therefore a seam only causes a warning. Two boxes
-that stand flush look like one object to a camera.
+Objects of equal height that touch along a line are connected by a narrow bridge of points across their tops. A single
+object can have seams and waists too, for example where a leg meets a body. Therefore, without a target, a seam only
+causes a warning. Two boxes that stand flush look like one object to a camera.
 """
 
 from __future__ import annotations
@@ -25,50 +25,50 @@ from graspd_core.config import SegmentationConfig
 from graspd_core.perception.cloud.point_cloud import Eyes, Points, Vector, convex_hull, least_axes, longest_side
 from graspd_core.perception.segment.planes import FlatPart
 
-# Flying pixels lie along lines of sight between two surfaces. The weight around them is below this fraction of the
-# usual weight, even where many views fill the space around an edge with them.
+# Flying pixels lie along lines of sight between two surfaces. The weight around a flying pixel is below this fraction
+# of the usual weight, even if many views have flying pixels at the same edge.
 MIN_WEIGHT_SHARE = 0.04
-# Points are linked over this fraction of the gap between objects. The rest is for noise.
+# The link length is this fraction of the least gap between objects. The rest of the gap allows for noise.
 LINK_SHARE_OF_GAP = 0.75
 # Points are dense if the link length is at least this many times the distance to the fourth neighbour.
 DENSE_SPACING_RATIO = 1.6
-# Sparse points are linked over this many times the distance to the fourth neighbour. On surfaces seen at a grazing
-# angle, points are far apart along the line of sight.
+# For sparse points, the link length is this many times the distance to the fourth neighbour. On surfaces seen at a
+# grazing angle, points are far apart along the line of sight.
 SPARSE_LINK_RATIO = 2.5
-SPACING_SAMPLES = 2000
+SPACING_SAMPLES = 2000  # points for which the distance to the fourth neighbour is measured
 # Greatest distance of point pairs for measuring curvature [m], and concave curvature from which a surface is a seam
-# [1/m]. The inside of a bowl with a radius over 5 cm is not a seam, nor is camera noise.
+# [1/m]. Neither camera noise nor the inside of a bowl with a radius over 5 cm is a seam.
 _REACH_M, _SEAM_BEND = 0.013, 20.0
-# Points on one side of a seam are linked over this many spacings.
+# Points on one side of a seam are linked up to this many spacings apart.
 _LINK_SPACINGS = 1.7
-# Greatest width of a waist as a fraction of the parts on either side, and half of the tried widths [m].
+# Greatest width of a waist, as a fraction of the width of the parts on either side. Then half of each width to try [m].
 _WAIST, _WAISTS_M = 0.3, (0.0, 0.003, 0.005, 0.007, 0.009, 0.012)
-# Each of two touching objects has at least this fraction of the points, and visible surface within this height of the
-# support [m]. The inside of a bowl is no object of its own, because it is concave.
+# A part of a cluster is an object if it has at least this fraction of the cluster's points, and its lowest points are
+# within this height of the support [m]. A concave part is no object, because it may be the inside of a bowl.
 _MIN_SHARE, _FOOT_M = 0.12, 0.03
-_NEIGHBOURS = 24
-# A point is on the outline of the visible surface if a sector of this angle around it has no neighbour: of this many
-# neighbours within this many spacings.
+_NEIGHBOURS = 24  # points to which the plane at a point is fitted, including the point
+# A point is on the outline of the visible surface if a sector wider than _OUTLINE_ANGLE around it has no neighbour.
+# Only the nearest neighbours count, up to this number and up to this many spacings away.
 _OUTLINE_NEIGHBOURS, _OUTLINE_SPACINGS, _OUTLINE_ANGLE = 16, 2.2, np.deg2rad(110.0)
-# Only the largest clusters up to this number are joined. The rest is noise.
+# Only this many clusters, the largest, are joined. Smaller clusters stay separate.
 MAX_PIECES = 40
-# A cluster that ends this many link lengths above the support does not stand on it, unless it hides this fraction of
-# the place below it from a camera.
+# A cluster hangs if it ends more than FLOATING_LINKS link lengths above the support. If it hides HIDDEN_FOOT_SHARE of
+# the place below it from a camera, it may stand.
 FLOATING_LINKS, HIDDEN_FOOT_SHARE = 0.5, 0.5
-# A cluster that ends above the support may be an object with a hidden foot. Then it has at least this fraction of the
-# other cluster's points. It is also visible over this fraction of its height, or its top differs from the other's by
-# this height [m]. Handles fail the first condition, walls of cups the other two.
+# A hanging cluster may be an object with a hidden foot if it has OWN_SURFACE_SHARE of the other cluster's points. It
+# must also be visible over SEEN_HEIGHT_SHARE of its height, or its top must differ from the other cluster's top by
+# LEVEL_TOPS_M [m]. Handles have too few points. Walls of cups fail both other conditions.
 OWN_SURFACE_SHARE, SEEN_HEIGHT_SHARE, LEVEL_TOPS_M = 0.12, 0.5, 0.01
-# Even then, it is part of the other cluster if it is within this many link lengths of it.
+# Even then, the hanging cluster is joined if it is at most this many link lengths away from the other cluster.
 NEAR_LINKS = 1.5
-# Outlines within this many link lengths touch in an image, because pixels at edges are lost.
+# Clusters touch in an image if they are at most this many link lengths apart, because pixels at edges are lost.
 IMAGE_GAP_LINKS = 1.5
-# Least fraction of a cluster that lies within another cluster's outline.
+# Two clusters may be one object if at least this fraction of the smaller one lies within the outline of the larger.
 OUTLINE_SHARE = 0.6
 
 
 def link_length(points: Points, settings: SegmentationConfig) -> float:
-    """Return the distance up to which points are linked [m]. It is below `gap` unless the points are sparse."""
+    """Return the distance up to which points are linked [m]. For dense points, it is below the gap between objects."""
     if len(points) < 5:
         return settings.gap
     some = points[:: max(1, len(points) // SPACING_SAMPLES)]
@@ -82,7 +82,7 @@ def link_points(
 ) -> Int[np.ndarray, "n"]:
     """Cluster points of even density. Return the cluster of each point. The largest cluster is 0, and noise is -1.
 
-    As in DBSCAN, only core points, which have enough neighbours, extend a cluster. Others join the nearest core point.
+    As in DBSCAN, only core points (with enough neighbours) extend a cluster. Other points join the nearest core point.
 
     Args:
         points: one point per voxel [m].
@@ -121,7 +121,7 @@ def extent(points: Points) -> float:
 
 
 def renumber(label: Int[np.ndarray, "n"]) -> Int[np.ndarray, "n"]:
-    """Renumber clusters from the largest, without gaps. Noise stays -1."""
+    """Renumber clusters by falling size, from 0 without gaps. Noise stays -1."""
     answer = np.full(len(label), -1)
     known = label >= 0
     count = np.bincount(label[known])
@@ -178,7 +178,7 @@ def _normals(points: Points, near: Int[np.ndarray, "n near"], eyes: Eyes) -> Poi
 
 
 def _outline(points: Points, normals: Points, near: Int[np.ndarray, "n near"]) -> Bool[np.ndarray, "n"]:
-    """Return which points have a wide sector without neighbours in the surface. -1 in `near` is no neighbour."""
+    """Return which points have no neighbour in a wide sector of their plane. In `near`, -1 means no neighbour."""
     near = near[:, 1 : 1 + _OUTLINE_NEIGHBOURS]
     way = points[near] - points[:, None]
     right = np.cross(normals, np.eye(3)[np.abs(normals).argmin(1)])
@@ -194,7 +194,7 @@ def _outline(points: Points, normals: Points, near: Int[np.ndarray, "n near"]) -
 def _bend(
     points: Points, normals: Points, one: Int[np.ndarray, "pairs"], other: Int[np.ndarray, "pairs"]
 ) -> Float[np.ndarray, "n"]:
-    """Return the mean curvature at each point [1/m] over its neighbour pairs (`one`, `other`), negative if concave."""
+    """Return each point's curvature [1/m], negative if concave: the mean over its pairs in `one` and `other`."""
     way = points[other] - points[one]
     squared = np.einsum("pd,pd->p", way, way)
     # Close pairs measure noise rather than curvature.
@@ -223,16 +223,16 @@ def merge_occluded(
     settings: SegmentationConfig,
     support: FlatPart | None,
 ) -> Int[np.ndarray, "n"]:
-    """Join clusters that occlusion split. Return cluster numbers, from the largest, and -1 for noise.
+    """Join clusters that occlusion split. Return each point's cluster: 0 for the largest, -1 for noise.
 
     Args:
         points: evenly dense points [m].
         distance: distance of each point from its camera [m].
-        label: cluster number of each point, from the largest, -1 for noise.
+        label: cluster of each point, 0 for the largest, -1 for noise.
         viewpoints: camera positions [m].
         link: distance up to which points were linked [m].
         settings: sizes and distances. Clusters are not joined if the result would exceed the largest object.
-        support: support plane, or None. Clusters that end well above it belong to other clusters.
+        support: support plane, or None if not seen. Clusters that end well above it are joined to other clusters.
     """
     many = min(int(label.max(initial=-1)) + 1, MAX_PIECES)
     pieces = [points[label == k] for k in range(many)]
@@ -267,8 +267,8 @@ def _near(
     settings: SegmentationConfig,
     support: FlatPart | None,
 ) -> bool:
-    """Return True if clusters `apart` [m] are near enough to be one object. If one hangs (`hang`), more is allowed."""
-    if support is None:  # two objects behind each other look like two sides of one object
+    """Return True if clusters `apart` [m] are near enough for one object. A cluster that hangs may be farther away."""
+    if support is None:  # One object behind another looks like a second side of the first object.
         return apart <= settings.unsupported_reach
     if apart <= max(link, settings.gap) or _share_within(b, a, support) >= OUTLINE_SHARE:
         return True
@@ -281,7 +281,7 @@ def _near(
 
 
 def _hangs(piece: Points, distance: Float[np.ndarray, "n"], support: FlatPart, viewpoints: Eyes, link: float) -> bool:
-    """Return True if a cluster ends above the support and does not hide the place below it from any camera."""
+    """Return True if a cluster floats above the support and hides the place below it from no camera."""
     height = support.height(piece)
     if (height - support.tolerance(distance)).min() <= FLOATING_LINKS * link:
         return False

@@ -1,7 +1,7 @@
 """Large flat parts of a scene, found by RANSAC and refined by weighted least squares.
 
 The noise of a depth camera grows with the square of the distance, because stereo and structured light measure
-disparity. A plane's tolerance grows likewise, at a rate estimated from its residuals.
+disparity. A plane's tolerance grows with the square of the distance too, by a factor estimated from the residuals.
 """
 
 from __future__ import annotations
@@ -17,10 +17,10 @@ from graspd_core.mesh.topology import packed_rows
 from graspd_core.perception.cloud.point_cloud import Eyes, Points, Vector, convex_hull, longest_side
 from graspd_core.types import Plane
 
-# Number of evenly chosen points for RANSAC.
+# Greatest number of points for RANSAC, chosen evenly.
 RANSAC_POINTS = 10_000
-# For a plane, the median residual is at most this fraction of the search width, and the needed tolerance is at most
-# this factor wider. The residuals of a curved surface fill any search width.
+# For a true plane, the median residual is at most this fraction of the search width, and the tolerance at most this
+# multiple of the search width. The residuals of a curved surface fill any search width.
 MAX_MEDIAN_RESIDUAL_SHARE, MAX_GATE_GROWTH = 0.4, 1.5
 # Points within this many standard deviations are on the plane.
 INLIER_DEVIATIONS = 4.0
@@ -41,9 +41,9 @@ class FlatPart:
     Attributes:
         plane: the plane, its normal towards the cameras.
         axes: two unit vectors in the plane, as columns.
-        noise: standard deviation of the points from the plane over their squared distance from the camera [1/m].
-        least: lower limit of the tolerance [m].
-        most: upper limit of the tolerance [m].
+        noise: standard deviation of the points from the plane, divided by their squared distance from the camera [1/m].
+        least: lower limit of `tolerance`, the height up to which points belong to the plane [m].
+        most: upper limit of `tolerance` [m].
         inliers: which of the scene's points lie on the plane.
         sides: length and width of the visible part [m].
         hull: convex hull of the visible part: rows (n, c) with n·x + c <= 0, in the coordinates of `axes`.
@@ -71,11 +71,11 @@ class FlatPart:
         return np.clip(INLIER_DEVIATIONS * self.noise * distance**2, self.least, self.most)
 
     def as_support(self, distance: Float[np.ndarray, "n"]) -> Plane:
-        """Return the plane as support of an object at these distances from the camera [m]. Noise sets its `margin`."""
+        """Return the plane as a support. Its `margin` is the noise [m] at an object's distances from the camera [m]."""
         return replace(self.plane, margin=float(np.median(self.tolerance(distance))) / INLIER_DEVIATIONS)
 
     def beneath(self, points: Points, margin: float) -> Bool[np.ndarray, "n"]:
-        """Return which points project into the visible part's hull, or at most `margin` [m] outside."""
+        """Return which points project into the hull of the visible part, or to at most `margin` [m] outside."""
         flat = points @ self.axes
         return np.asarray((flat @ self.hull[:, :2].T + self.hull[:, 2] <= margin).all(1))
 
@@ -89,7 +89,7 @@ def find_planes(
         points: evenly dense points [m].
         distance: distance of each point from its camera [m].
         viewpoints: camera positions [m].
-        settings: sizes and tolerances. Parts smaller than a support are ignored.
+        settings: sizes and tolerances. Parts too small for a support are ignored.
     """
     with Extra("clouds"):
         import open3d as o3d
@@ -102,7 +102,7 @@ def find_planes(
         some = left[:: 1 + len(left) // RANSAC_POINTS]
         cloud = o3d.geometry.PointCloud(o3d.utility.Vector3dVector(points[some]))
         part, guess, gate = None, np.zeros(4), wide
-        # A wide gate may fit one slope to both levels of a stepped table. The narrow gate is tried next.
+        # A wide search may fit one sloped plane to both levels of a stepped table. Then a narrow search is tried.
         for gate in (wide, min(settings.plane_tolerance, 0.5 * wide)):
             # Run all trials (probability 1). If threads could stop early, the plane would differ between runs.
             o3d.utility.random.seed(0)
@@ -127,7 +127,7 @@ def _refine(
     gate: float,
     settings: SegmentationConfig,
 ) -> FlatPart | None:
-    """Fit the plane `guess` (n, d with n·x + d = 0) to the points `left`. None: few inliers or a curved surface."""
+    """Fit the plane `guess` (n·x + d = 0) to the points `left`. Return None for few inliers or a curved surface."""
     least, most = settings.plane_tolerance, settings.max_plane_tolerance
     size = float(np.linalg.norm(guess[:3]))
     if not size > 0:
@@ -152,7 +152,7 @@ def _refine(
         runs_away = INLIER_DEVIATIONS * noise * np.median(far[inlier] / coarse[inlier]) > MAX_GATE_GROWTH
         if runs_away or (step == 0 and np.median(residual / width[inlier]) > MAX_MEDIAN_RESIDUAL_SHARE):
             return None
-        # This is tighter than the tolerance. Otherwise the feet of objects on the plane would tilt it.
+        # The width is below the tolerance. Otherwise the feet of objects on the plane would tilt the plane.
         width = np.clip(FIT_DEVIATIONS * noise * far, 0.25 * least, most)
     if normal @ viewpoint < offset:
         normal, offset = -normal, -offset
@@ -164,7 +164,7 @@ def _refine(
 def _measure(
     points: Points, inliers: Bool[np.ndarray, "n"], plane: Plane, noise: float, settings: SegmentationConfig
 ) -> FlatPart | None:
-    """Return the flat part with only the largest connected region of the inliers. None if it has no hull."""
+    """Return the largest connected region of the inliers as a flat part, or None if the region has no hull."""
     from scipy.ndimage import binary_dilation, label
 
     axes = np.linalg.svd(plane.normal[None])[2][1:].T

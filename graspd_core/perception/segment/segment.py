@@ -38,8 +38,8 @@ from graspd_core.types import Plane
 # A scene nearer than this to its cameras is probably not in metres [m].
 MIN_SCENE_DISTANCE_M = 0.02
 # Greatest offset of a target point from the middle of its object's visible part, as fractions of half the object's
-# length: sideways, and towards the camera. A point within the third fraction of the centroid is also valid. Chosen on
-# 90 touching pairs and 60 single objects, seeds from 0 (docs/inputs.md).
+# length: sideways, and towards the camera. A point nearer to the centroid than the third fraction is valid too. Chosen
+# on 90 touching pairs and 60 single objects, seeds from 0 (docs/inputs.md).
 _MOST_ASIDE, _MOST_AHEAD, _AT_CENTROID = 0.3, 0.25, 0.25
 
 
@@ -53,7 +53,7 @@ class Segmentation:
         obstacles: downsampled points of each other object or surface nearby [m].
         warnings: warnings for the user.
         cut: whether the object reaches the border of an image or of the workspace.
-        beside: why the segment may be only a part of the object, or more than it. Empty if there is no doubt.
+        beside: why `views` may show only a part of the object, or several objects. Empty if there is no doubt.
     """
 
     views: tuple[PointCloud, ...]
@@ -71,8 +71,8 @@ def segment(
 
     Args:
         views: point cloud of each camera, in one frame. Points may be NaN.
-        target: selects the object. Without a target, take the object nearest the first view's optical axis. If the axis
-            is unknown, it points to the mean of the points.
+        target: selects the object. If None, the object nearest the first view's optical axis is taken. An unknown axis
+            is assumed to point to the mean of the points.
         settings: sizes and tolerances.
 
     Raises:
@@ -104,7 +104,7 @@ def segment(
     touching = () if marked else _touching(scene, chosen, parts)
     beside = "" if target.point is None or len(views) > 1 else _beside(parted, chosen, target.point)
     if parted.settings.piled and target.point is not None and touching:
-        # In a pile no part needs to stand, so a seam may as well lie within an object.
+        # In a pile, a part need not stand on the support, so the seam may also lie within one object.
         touching, beside = (), "a seam divides the target from its neighbour, and both may be one object"
     return Segmentation(found, support, obstacles, (*doubts, *touching), cut, beside)
 
@@ -146,7 +146,7 @@ class _Parted:
     settings: SegmentationConfig
 
 
-# The last scene, by a hash of its clouds and settings. A request for any object needs it once for each object.
+# The last scene, by a hash of its clouds and settings. If any object may be grasped, it serves each of them.
 _LAST: dict[bytes, _Parted] = {}
 
 
@@ -183,7 +183,7 @@ def _things(scene: VoxelScene, ground: Ground, eyes: Eyes, settings: Segmentatio
 
 
 def _candidates(parted: _Parted) -> list[int]:
-    """Return the objects of graspable size that stand on the support. If none does, return all of graspable size."""
+    """Return indices of objects of graspable size that stand on the support. If none does, ignore the support."""
     scene, label, settings, part = parted.scene, parted.label, parted.settings, parted.ground.support
     things = {k: label == k for k in range(int(label.max(initial=-1)) + 1)}
     fits = [k for k, mine in things.items() if extent(scene.mean[mine]) <= settings.largest_object]
@@ -221,19 +221,19 @@ def _obstacles(parted: _Parted, chosen: Mask) -> tuple[Float[np.ndarray, "_ 3"],
 
 
 def _doubts(parted: _Parted, chosen: Mask, crowded: bool) -> tuple[str, ...]:
-    """Return warnings about the segmentation. `crowded`: whether there are obstacles."""
+    """Return warnings about the segmentation. `crowded` is True if there are obstacles."""
     scene, ground, settings = parted.scene, parted.ground, parted.settings
     doubts = []
     if scene.size > 0.5 * settings.gap:
         doubts.append(
-            f"cloud: {len(scene.points)} points thinned to one per {1e3 * scene.size:.1f} mm; finer gaps are not seen"
+            f"cloud: {len(scene.points)} points were thinned to one per {1e3 * scene.size:.1f} mm; finer gaps are lost"
         )
     blind = [str(k) for k, rows in enumerate(scene.rows, 1) if len(rows) == 0]
     if blind:
         doubts.append(f"cloud: of {len(scene.rows)} views these show nothing within range: {', '.join(blind)}")
     if ground.support is None and crowded:
         doubts.append("cloud: no support is seen; the object may include what is behind it in the image")
-    # Without surroundings, the object itself is the outline of the view.
+    # Without surroundings, the object's own outline is the outline of the view.
     surrounded = ground.support is not None or len(ground.background) > 0
     for k in range(len(scene.rows) if surrounded else 0):
         part = scene.of_view(k)
@@ -245,7 +245,7 @@ def _doubts(parted: _Parted, chosen: Mask, crowded: bool) -> tuple[str, ...]:
 
 
 def _parts(parted: _Parted, chosen: Mask) -> Labels:
-    """Return the part of each voxel of the chosen object, split at seams if it is on a support. Others are -1."""
+    """Split the chosen object at seams if there is a support. Return each voxel's part number, -1 outside."""
     scene, support = parted.scene, parted.ground.support
     part = np.where(chosen, 0, -1)
     if support is not None:
@@ -271,10 +271,10 @@ def _touching(scene: VoxelScene, chosen: Mask, part: Labels) -> tuple[str, ...]:
 
 
 def _beside(parted: _Parted, chosen: Mask, point: Vector) -> str:
-    """Return why the segment may be wrong for a target point inside it: the point is too far from the segment's middle.
+    """Return a warning if a target point inside the chosen object is far from its middle. Else, return "".
 
-    A target point on the surface may be anywhere on the object. A point inside is taken for the object's middle, as
-    pose estimators give it.
+    A target point on the surface may be anywhere on the object. A point inside should be the object's middle, because
+    pose estimators give the middle.
     """
     points, part = parted.scene.mean[chosen], parted.ground.support
     if part is None or np.linalg.norm(points - point, axis=1).min() <= SURFACE_VOXELS * parted.scene.size:
@@ -282,7 +282,7 @@ def _beside(parted: _Parted, chosen: Mask, point: Vector) -> str:
     flat, middle = (one @ part.axes for one in (points, point))
     half = 0.5 * float(np.ptp(flat, axis=0).max())
     if np.linalg.norm(np.median(flat, axis=0) - middle) < _AT_CENTROID * half:
-        # The point is the centroid of visible points, for example of a mask, which is nearer to the camera.
+        # The point is the centroid of visible points, for example of a mask. So it is nearer to the camera.
         return ""
     sight = flat.mean(0) - parted.eyes[0] @ part.axes
     sight /= max(float(np.linalg.norm(sight)), 1e-9)
@@ -308,7 +308,7 @@ def _cut_off(scene: VoxelScene, chosen: Mask, settings: SegmentationConfig) -> b
 def _nothing(parted: _Parted) -> str:
     """Return the error message for a scene without a graspable object. It describes what was seen instead."""
     scene, label, ground, settings = parted.scene, parted.label, parted.ground, parted.settings
-    told = f"cloud: no object among {len(scene.points)} points:"
+    told = f"cloud: no graspable object among {len(scene.points)} points:"
     if label.max(initial=-1) >= 0:
         sizes = [extent(scene.mean[label == k]) for k in range(int(label.max()) + 1)]
         limit = f"longer than largest_object={settings.largest_object:g} m (the shortest {min(sizes):.2f} m)"

@@ -1,8 +1,8 @@
 """Classification of a scene's flat parts: support, background, or face of an object.
 
-A support faces the cameras, is larger than the objects on it, and has at least one object on it. This object reaches
-down to the support, lies over its visible part, and has a graspable size. A face of a convex body has nothing above it.
-The floor of a tray has only a rim above it, as wide as the floor. Objects in front of a wall do not reach it.
+A support faces the cameras, is larger than the objects on it, and has at least one object on it. The object reaches
+down to the support, lies over the visible part of the support, and has a graspable size. Other flat parts differ: no
+object is above a convex body's face, and none reaches a wall. Above a tray's floor is only a rim as wide as the floor.
 """
 
 from __future__ import annotations
@@ -22,19 +22,19 @@ from graspd_core.perception.segment.planes import FlatPart
 
 # Greatest height of an object's lowest visible point above the support, as a fraction of the object's width.
 HIDDEN_HEIGHT_SHARE = 0.5
-# From lines of sight within 15° of vertical (this is the cosine), an object's sides are not visible. Then the lowest
-# visible point may be high above the support.
+# Cosine of 15°. If the line of sight is within 15° of the support's normal, an object's sides are not visible. Then the
+# object's lowest visible point may be high above the support.
 MIN_UPRIGHT_COSINE = 0.966
 # If less than this fraction of its hull is visible, a plane is a slice through several objects.
 MIN_SEEN_SHARE = 0.3
-# A flat part is a face of a body if the points up to this many tolerances below it exceed this fraction of its own.
+# A flat part is a face of a body if the points within this many tolerances below exceed this fraction of its points.
 EDGE_BAND_TOLERANCES, EDGE_BAND_SHARE = 4.0, 0.25
-# A plane may cut through an object. A point is on the flat part only if, of the points within this many tolerances, at
-# least this fraction is also on the plane. On a wall that the plane cuts at right angles it is 0.4.
+# A plane may cut through an object. A point is on the flat part only if ON_PLANE_SHARE of its neighbours are on the
+# plane too. Neighbours lie within this many tolerances. On a wall that the plane cuts at right angles, 0.4 of them are.
 NEIGHBOURHOOD_TOLERANCES, ON_PLANE_SHARE = 3.0, 0.6
-# Number of neighbours for this check. If there are more, because noise widens the tolerance, a random sample is used.
+# Number of neighbours to check. If noise widens the tolerance, there are more neighbours, and a random sample is used.
 NEIGHBOUR_SAMPLES = 50
-# Only the largest clusters up to this number count. The rest is noise.
+# Only this many clusters, the largest, are checked. Smaller clusters are noise.
 MAX_CLUSTERS = 20
 
 
@@ -58,7 +58,7 @@ def find_ground(scene: VoxelScene, parts: list[FlatPart], viewpoints: Eyes, sett
     margin = settings.support_margin
     parts = [part for part in parts if part.filled > MIN_SEEN_SHARE and not _falls_off(scene, part, margin)]
     large = [part for part in parts if part.sides[0] > settings.largest_object]
-    # Computed when needed. For a lone table in view, which is the support, it is never needed.
+    # Covered voxels are computed only when needed. For a support that is the only large flat part, they are not needed.
     known: dict[int, Mask] = {}
 
     def covered(others: Sequence[FlatPart]) -> list[Mask]:
@@ -118,7 +118,7 @@ def _falls_off(scene: VoxelScene, part: FlatPart, margin: float) -> bool:
 def _standing(
     scene: VoxelScene, part: FlatPart, left: Mask, viewpoints: Eyes, settings: SegmentationConfig
 ) -> tuple[int, int]:
-    """Count the voxels of objects that touch a flat part, and of objects that may stand on it."""
+    """Count the voxels of objects that may stand on a flat part: first of those that touch it, then of all."""
     points, distance = scene.mean[left], scene.mean_distance[left]
     label = link_points(points, scene.weight[left], link_length(points, settings), settings.neighbour_share)
     touching, standing = 0, 0

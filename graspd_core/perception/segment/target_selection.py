@@ -16,9 +16,9 @@ from graspd_core.perception.segment.clusters import extent
 
 # Greatest number of objects in an error message.
 MAX_LISTED_THINGS = 4
-# Distances in voxels: a point this near to a voxel is on its object, and a voxel this near to a line of sight is on it.
+# Greatest distance between a point and its object's surface, and between a line of sight and voxels on it, in voxels.
 SURFACE_VOXELS, RAY_VOXELS = 3.0, 1.5
-MIDDLE_SHARE = 0.4
+MIDDLE_SHARE = 0.4  # greatest depth of a point well inside an object, as a fraction of the object's length
 
 
 @dataclass(frozen=True)
@@ -28,7 +28,7 @@ class Target:
     Attributes:
         point: a point on or near the object, in the clouds' frame [m].
         box: two opposite corners of a box around the object, along the axes of the clouds' frame [m].
-        mask: which points of the first view, as given, show the object.
+        mask: one value for each point of the first view, True if the point shows the object.
     """
 
     point: Vector | None = None
@@ -75,9 +75,9 @@ def select_target(
 
     Args:
         label: object number of each voxel, -1 for none.
-        free: numbers of the objects to choose from if the target is empty.
+        free: indices of the objects to choose from if the target is empty.
         target: a valid target (`check_target`).
-        settings: greatest distance of a point from its object, and least fraction of an object in a box or mask.
+        settings: `target_reach` for a point. `target_share`: fraction in a box or mask that selects the whole object.
 
     Raises:
         NoObjectError: no object is at the target. The message lists the objects.
@@ -143,10 +143,10 @@ def seen(scene: VoxelScene, label: Labels) -> str:
 def _thing_of(
     point: Vector, scene: VoxelScene, label: Labels, views: Sequence[PointCloud], settings: SegmentationConfig
 ) -> int:
-    """Return the object that a point selects: the one that contains it, else the nearest within `target_reach`.
+    """Return the index of the object that contains a point, else of the nearest object within `target_reach`.
 
-    An object contains a point that is in its hull or hidden by it, at most half its length away from its seen points.
-    If this distance is over `MIDDLE_SHARE` of the length, the nearest object within `target_reach` is preferred.
+    An object contains points in its hull or hidden behind its surface, down to a depth of half its length. For a point
+    deeper than `MIDDLE_SHARE` of the length, the nearest object within `target_reach` is preferred.
     """
     away = np.linalg.norm(scene.mean - point, axis=1)
     things = [np.flatnonzero(label == k) for k in range(int(label.max(initial=-1)) + 1)]
@@ -170,7 +170,7 @@ def _thing_of(
 
 
 def _hiding(point: Vector, scene: VoxelScene, views: Sequence[PointCloud]) -> Mask:
-    """Return the voxels that hide a point from a camera. If a camera sees through the point, return none."""
+    """Return voxels that hide a point from a camera. If a camera sees only surface behind the point, return none."""
     hiding = np.zeros(len(scene.mean), dtype=bool)
     for view in views:
         ray = point - view.viewpoint
@@ -191,7 +191,7 @@ def _holds(points: Points, point: Vector) -> bool:
 
 
 def _masked(scene: VoxelScene, label: Labels, many: int, meant: Mask, least: float) -> Mask:
-    """Return voxels of objects that mask `meant` covers most or by half: all above share `least`, else the masked."""
+    """Select the object with most masked points and all at least half masked. Below `least`, only masked voxels."""
     of_first = scene.voxel[scene.of_view(0)]
     shown, covered = (
         np.bincount(label[rows][label[rows] >= 0], minlength=many) for rows in (of_first, of_first[meant[of_first]])
@@ -209,7 +209,7 @@ def _covered(label: Labels, meant: Mask, things: list[int], share: Float[np.ndar
 
 
 def _off_axis(thing: Points, scene: VoxelScene, views: Sequence[PointCloud]) -> float:
-    """Return the 5th percentile of the angles [rad] between an object's points and the first non-empty view's axis."""
+    """Return the 5th percentile of an object's angles [rad] from the axis of the first non-empty view."""
     first = next(k for k, rows in enumerate(scene.rows) if len(rows))
     axis, viewpoint = views[first].forward, views[first].viewpoint
     if axis is None:

@@ -151,7 +151,7 @@ def test_geoms_limits_and_warnings(folder: Path) -> None:
 def test_visual_geoms_stand_in_where_none_collides(folder: Path) -> None:
     hand = _read(folder, MJCF.replace('<geom pos="0 0 .02"/>', "", 1))
     assert hand.primitives_of[hand.link_index["a2"]][0].kind == "hull"
-    assert any("visual ones are taken: a2" in text for text in hand.warnings)
+    assert any("visual geoms are used: a2" in text for text in hand.warnings)
 
 
 def test_a_base_that_turns_hangs_in_the_world(folder: Path) -> None:

@@ -81,7 +81,7 @@ def test_sloppy_xml_is_read(tmp_path: Path, text: bytes) -> None:
 @pytest.mark.parametrize(
     ("old", "new", "warning"),
     [
-        ("<collision>", "<visual>", r"the <visual> is taken: palm"),
+        ("<collision>", "<visual>", r"the <visual> is used: palm"),
         ('type="revolute"', 'type="continuous"', r"joint 'hinge' has no limits: restricted to \[-3.14, 3.14\] rad"),
         ('upper="1"', 'upper="1e9"', r"joint 'hinge' has no limits: restricted to \[-0.5, "),
         (
@@ -181,7 +181,7 @@ MIMIC = '<mimic joint="outer_knuckle_joint"/>'
         (f'<robot name="two"><link name="torso"/>{TWINS}</robot>', "fingers hang from 'left_palm' and 'right_palm'"),
         (
             f'<robot name="open"><link name="palm">{BOX}</link>{KNUCKLES.format("", "", "")}</robot>',
-            "joints 'outer_knuckle_joint' and 'inner_knuckle_joint' look like those of a closed linkage",
+            "joints 'outer_knuckle_joint' and 'inner_knuckle_joint' look like parts of a closed linkage",
         ),
     ],
     ids=["degrees", "effort", "two hands", "open linkage"],

@@ -228,7 +228,7 @@ def test_the_number_of_views_and_their_size_are_bounded():
     few = sensor_frame(np.zeros((3, 3)))
     for _ in range(MOST_VIEWS - 1):
         views = views.add(few, few.read(), settings, lambda *_: np.eye(4))
-    with pytest.raises(RequestError, match="64 views are stored, the most possible"):
+    with pytest.raises(RequestError, match="64 views are stored, which is the limit"):
         views.add(few, few.read(), settings, lambda *_: np.eye(4))
 
 
@@ -380,7 +380,7 @@ def test_what_may_not_be_read_is_refused_by_name(root: Path, uri: str, culprit: 
 
 
 def test_without_a_usable_root_nothing_may_be_read(root: Path):
-    with pytest.raises(MeshError, match="names no directory"):
+    with pytest.raises(MeshError, match="names no existing directory"):
         resolve_mesh("mug.obj", [str(root / "nowhere"), "package://nothing"])
 
 

@@ -158,7 +158,7 @@ def test_an_image_takes_the_last_calibration_of_its_frame_and_size():
     assert pairs.unpaired() == ""
     now[0] = UNPAIRED
     assert pairs.unpaired() == (
-        "depth images: 1 images and 2 CameraInfos received, but no two match; last image: 64 x 48 in 'camera', "
+        "depth images: 1 images and 2 CameraInfos received, but no pair matches; last image: 64 x 48 in 'camera', "
         "last CameraInfo: 64 x 48 in 'elsewhere'; valid: a CameraInfo of the same frame and size"
     )
     # Once, without a stamp, and long before or after: it holds for all images.
@@ -213,7 +213,7 @@ def test_a_cloud_without_a_frame_or_with_a_stamp_of_another_clock_is_refused(sce
     assert refused.value.code is ErrorCode.STALE_CLOUD
     cloud.header.stamp.sec = NOW.sec + 2
     (told, *_) = taker.from_message("r", Settings(), GraspRequest(cloud=cloud)).load().object.warnings
-    assert told == "the cloud came 2.0 s before its stamp: its clock is ahead of the node's"
+    assert told == "the cloud came 2.0 s before its stamp: the sensor's clock is ahead of the node's"
     cloud.header.stamp = NOW
     assert "clock" not in str(taker.from_message("r", Settings(), GraspRequest(cloud=cloud)).load().object.warnings)
 

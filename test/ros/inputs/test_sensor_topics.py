@@ -140,7 +140,7 @@ def test_a_camera_that_offers_less_is_heard_too_and_its_losses_are_told(node, pu
     watch(node, [topic], lambda told: topic._lost)
     written = "".join(capfd.readouterr())
     assert "/points: " in written
-    assert "were lost on the way: Fast DDS loses large messages" in written
+    assert "were lost on the way: Fast DDS loses messages" in written
     assert "config/fastdds.xml" in written
 
 

@@ -225,7 +225,7 @@ def test_hands_are_listed_and_a_reset_leaves_late_joiners_nothing_but_the_last_a
 def test_a_grasp_that_is_less_sure_is_told_with_the_next_view_and_not_presented():
     hand = load_hand("parallel_gripper")
     posture = Posture(np.zeros(3), np.array([1.0, 0.0, 0.0, 0.0]), np.zeros(len(hand.joint_names)))
-    trials = (TrialResult("hold", True, 0.0, 0.0), TrialResult(ROBUSTNESS, False, 0.0, 0.0, "fails under 3"))
+    trials = (TrialResult("hold", True, 0.0, 0.0), TrialResult(ROBUSTNESS, False, 0.0, 0.0, "fails with 3"))
     grasp = Grasp(posture, posture, posture, trials=trials, probability=0.51)
     view, T_table_camera = np.eye(4), np.eye(4)
     view[2, 3], T_table_camera[0, 3] = 0.5, 1.0
@@ -235,7 +235,7 @@ def test_a_grasp_that_is_less_sure_is_told_with_the_next_view_and_not_presented(
     message = array_message(ending, "mine", Header(frame_id="table"), 1.0, hand, Pace())
     assert message.status == GraspArray.PARTIAL
     (told,) = message.grasps
-    assert (told.verdict, told.probability, told.reason) == (GraspMessage.UNVERIFIED, 0.51, "fails under 3")
+    assert (told.verdict, told.probability, told.reason) == (GraspMessage.UNVERIFIED, 0.51, "fails with 3")
     assert message.next_view.header.frame_id == "table"
     assert place(message.next_view.pose) == pytest.approx([1.0, 0.0, 0.5])
 

@@ -1,4 +1,4 @@
-// Signed distance and outward normal from a grid, and their adjoints (mesh/sdf.py, `sample_sdf`).
+// Interpolates signed distance and outward normal from a grid, with adjoints (mesh/sdf.py, `sample_sdf`).
 //
 // With b the point clamped to the grid, φ and g the interpolated channels there, r = max(φ, 1 mm), o = x - b:
 //     f = o + r g,   distance = φ + |f| - r |g|,   normal = f / |f|.
@@ -8,20 +8,20 @@
 namespace graspd {
 
 constexpr float LEAST_REACH = 1e-3f, TINY = 1e-24f;
-// The channels of a place far from everything.
+// Channels (distance and normal) of a point far from everything.
 constexpr float FAR[4] = {1e3f, 1, 0, 0};
 
-// How far u lies from [0, most], whose nearest value is b. Exactly zero inside, where a fused u - b may not be.
+// Returns u - b, where b is the value of [0, most] nearest to u. Exactly zero inside, where a fused u - b may differ.
 INLINE Floats beyond(Floats u, Floats b, float most) { return (u >= 0.f) & (u <= most) ? Floats{} : u - b; }
 
-// Where each point lies: its cell, its place within, and its offset from the grid.
+// Finds for each point its cell, its position in the cell, and its offset from the grid.
 static void find_cells(const Grid& grid, int count, Samples& at) {
     const int row = 4 * grid.nz, plane = row * grid.ny;
     const float mx = grid.nx - 1, my = grid.ny - 1, mz = grid.nz - 1, inverse = 1.f / grid.spacing;
     for (int i = 0; i < count; i += LANES) {
         Floats ux = (load(at.x + i) - grid.origin[0]) * inverse, uy = (load(at.y + i) - grid.origin[1]) * inverse,
                uz = (load(at.z + i) - grid.origin[2]) * inverse;
-        // A point that is not a number goes to the first node: no read leaves the grid. Its offset keeps the NaN.
+        // A NaN point gets the first node, so that no read leaves the grid. The offset of the point keeps the NaN.
         Floats bx = lesser(greater(ux, all(0)), all(mx)), by = lesser(greater(uy, all(0)), all(my)),
                bz = lesser(greater(uz, all(0)), all(mz));
         store(at.ox + i, beyond(ux, bx, mx) * grid.spacing);
@@ -37,7 +37,7 @@ static void find_cells(const Grid& grid, int count, Samples& at) {
     }
 }
 
-// The four channels and their slopes at each point, interpolated along y and x first, two neighbours in z at a time.
+// Interpolates the four channels and their slopes at each point: first y and x, for two neighbours in z at once.
 static void interpolate(const Grid& grid, int count, Samples& at) {
     const int row = 4 * grid.nz, plane = row * grid.ny;
     for (int i = 0; i < count; i++) {
@@ -59,7 +59,7 @@ static void interpolate(const Grid& grid, int count, Samples& at) {
     }
 }
 
-// Distance and unit normal of at.x, at.y, at.z; the rest of the last vector is far from everything.
+// Computes distance and unit normal at (at.x, at.y, at.z). Lanes after the last point are far from everything.
 static void sample(const Grid& grid, int count, Samples& at) {
     const int whole = padded(count);
     find_cells(grid, whole, at);
@@ -80,7 +80,7 @@ static void sample(const Grid& grid, int count, Samples& at) {
     }
 }
 
-// Gradients with respect to the points, from the adjoints of their distances and normals. Those beyond `count` have none.
+// Computes gradients in the points from the adjoints of distances and normals. Points after `count` get zero.
 static void sample_adjoint(const Grid& grid, int count, Samples& at) {
     const float inverse = 1.f / grid.spacing;
     alignas(Floats) float channel[4][LANES], offset[3][LANES];
@@ -112,7 +112,7 @@ static void sample_adjoint(const Grid& grid, int count, Samples& at) {
             const int lane = __builtin_ctz(some), point = i + lane;
             const float* slope = at.slopes + 12 * point;
             const Four c = {channel[0][lane], channel[1][lane], channel[2][lane], channel[3][lane]};
-            // Beyond the grid along an axis the interpolated channels stay what they are, inside it the offset does.
+            // Beyond the grid along an axis, only the offset depends on the point. Inside, only the channels do.
             at.gx[point] = at.ox[point] != 0 ? offset[0][lane] : sum_four(c * *(const Four*)slope) * inverse;
             at.gy[point] = at.oy[point] != 0 ? offset[1][lane] : sum_four(c * *(const Four*)(slope + 4)) * inverse;
             at.gz[point] = at.oz[point] != 0 ? offset[2][lane] : sum_four(c * *(const Four*)(slope + 8)) * inverse;
@@ -120,7 +120,7 @@ static void sample_adjoint(const Grid& grid, int count, Samples& at) {
     }
 }
 
-// Trilinear confidence at a point that `find_cells` has placed, and its gradient; constant beyond the grid.
+// Returns the trilinear confidence at a point after `find_cells`, and its gradient. It is constant beyond the grid.
 INLINE float sample_scalar(const Grid& grid, const float* values, const Samples& at, int i, float* gradient) {
     const int row = grid.nz, plane = row * grid.ny;
     const float* v = values + at.cell[i] / 4;

@@ -1,4 +1,4 @@
-// How deep a placed hand is in an object and in itself, and the volume that hand and object share.
+// Measures how deep points are in a hand, and the volume that a hand and an object share.
 #pragma once
 #include <array>
 #include <map>
@@ -7,7 +7,7 @@
 
 namespace graspd {
 
-// A convex solid where it is: a box, sphere, capsule or cylinder in one common form, or the planes of a hull.
+// A convex solid at its pose: a box, sphere, capsule or cylinder in one common form, or the planes of a hull.
 struct PlacedBody {
     PlacedBody(const Bodies& bodies, int k, const double* links) : core(at(bodies.core + 3 * k)) {
         const double *in = bodies.pose + 12 * k, *link = links + 12 * bodies.link[k], *local = bodies.ball + 4 * k;
@@ -29,7 +29,7 @@ struct PlacedBody {
                 turn[2][0] * v.x + turn[2][1] * v.y + turn[2][2] * v.z};
     }
 
-    // Signed distance, negative inside. Outside a hull it is a lower bound.
+    // Returns the signed distance, negative inside. Outside a hull it is a lower bound.
     double distance(const Vec3& p) const {
         const Vec3 off = p - origin;
         Vec3 l = {turn[0][0] * off.x + turn[1][0] * off.y + turn[2][0] * off.z,
@@ -61,15 +61,15 @@ inline std::vector<PlacedBody> placed_bodies(const Bodies& bodies, const double*
     return placed;
 }
 
-// Greatest depth of a point inside a solid, at least zero. Where `link_of` is given, a solid meets only points of links
-// that its own may not touch (`apart`, links x links).
+// Returns the greatest depth of a point inside a solid, at least zero. If `link_of` (link of each point) is given, a
+// solid is tested only with points of links that its own link must not touch (`apart`, links x links).
 inline double depth_in_bodies(const Bodies& bodies, const double* links, int count, const double* points,
                               const int32_t* link_of, const uint8_t* apart) {
     const std::vector<PlacedBody> placed = placed_bodies(bodies, links);
     std::vector<int> near;
     double deepest = 0;
     for (int k = 0; k < bodies.count;) {
-        // All solids of a link: its points are found once.
+        // The points near a link are found once for all solids of the link.
         int end = k;
         Vec3 low = {INFINITY, INFINITY, INFINITY}, high = low * -1;
         for (; end < bodies.count && bodies.link[end] == bodies.link[k]; end++) {
@@ -94,8 +94,8 @@ inline double depth_in_bodies(const Bodies& bodies, const double* links, int cou
     return deepest;
 }
 
-// The volume that hand and object share, in cells of a lattice in the base's frame: an octree finds them. In a cell, both
-// are half-spaces that face each other.
+// Sums the volume that hand and object share over cells of a lattice in the base frame. An octree finds the cells. In a
+// cell, hand and object count as half-spaces that face each other.
 class SharedVolume {
    public:
     SharedVolume(const Bodies& bodies, const double* links, const Surface& surface, double cell)
@@ -116,15 +116,15 @@ class SharedVolume {
     }
 
    private:
-    // Of the coarsest cells, in the finest.
+    // Width of a coarsest cell, in finest cells.
     static constexpr int SIZE = 8;
-    // A cell's place, in cells of its size.
+    // Position of a cell, in cells of the same size.
     using Cell = std::array<int, 3>;
 
-    // Above this winding number at its middle, a cell that no face comes near is inside everywhere.
+    // A cell without near faces is entirely inside if the winding number at its middle exceeds this.
     static constexpr double SURELY = 0.95;
 
-    // The coarsest cells about a solid that may touch the object's box.
+    // Finds the coarsest cells around a solid that may touch the object's box.
     void range(const PlacedBody& body, int* from, int* to) const {
         const SurfaceNode& all = ((const SurfaceNode*)surface_.nodes)[0];
         const Vec3 box = (all.low + all.high) * 0.5, half = (all.high - all.low) * 0.5;
@@ -142,10 +142,10 @@ class SharedVolume {
         for (int i = 0; i < 3; i++) p = p + Vec3{base_[i], base_[4 + i], base_[8 + i]} * ((cell[i] + 0.5) * size * cell_);
         return p;
     }
-    // A surface this far from the middle of a cell touches no finest cell in it. With a margin for rounding.
+    // Returns a distance from a cell's middle. Farther surfaces touch no finest cell in the cell. Has a margin.
     double reach_of(int size) const { return (0.8660254 * 1.001 * (size - 1) + 0.5) * cell_; }
 
-    // `inside`: every cell in this one is filled by the object.
+    // Adds the shared volume in a cell. `inside`: the object fills the whole cell.
     void descend(const Cell& cell, int size, const std::vector<int>& which, bool inside) {
         const Vec3 p = middle_of(cell, size);
         const double reach = reach_of(size);
@@ -162,7 +162,7 @@ class SharedVolume {
         const double filled = share(deepest);
         if (size == 1) {
             if (filled <= 0) return;
-            // Deeper than half a cell or farther away, it is full or empty.
+            // The distance is limited to half a cell, because a cell farther inside or outside is full or empty.
             const double off = inside ? 0 : probe_.unsigned_distance(p, reach);
             sum_ += std::max(0.0, filled + (inside ? 1 : share(probe_.inside(p) ? off : -off)) - 1);
             return;
@@ -177,7 +177,7 @@ class SharedVolume {
             descend({2 * cell[0] + (i >> 2), 2 * cell[1] + (i >> 1 & 1), 2 * cell[2] + (i & 1)}, size / 2, near, inside);
     }
 
-    // The share of a cell that a half-space fills, by the depth of the cell's middle.
+    // Returns the share of a cell that a half-space fills, from the depth of the cell's middle.
     double share(double depth) const { return std::min(1.0, std::max(0.0, 0.5 + depth / cell_)); }
 
     const Surface& surface_;

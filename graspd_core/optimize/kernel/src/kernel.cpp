@@ -1,4 +1,4 @@
-// The C interface. Functions return 0, or 1 where memory is short; they never throw, and write only where told.
+// The C interface. Functions return 0, or 1 if there is too little memory. They never throw, and write only to outputs.
 #include "hand_overlap.hpp"
 #include "stages.hpp"
 #include "threads.hpp"
@@ -20,7 +20,7 @@ int32_t guarded(Body body) {
 
 extern "C" {
 
-// Sizes of the structures, for the caller to compare with its own; returns how many there are.
+// Writes the sizes of all structures, for the caller to compare with its own structures. Returns their number.
 int32_t graspd_sizes(int32_t* sizes) {
     int32_t known[] = {sizeof(Hand),      sizeof(Points),  sizeof(Grid),    sizeof(Solids),   sizeof(Spheres), sizeof(Object),
                        sizeof(Obstacles), sizeof(Weights), sizeof(Problem), sizeof(Schedule), sizeof(State),
@@ -31,7 +31,7 @@ int32_t graspd_sizes(int32_t* sizes) {
 
 int32_t graspd_lanes() { return LANES; }
 
-// Loss, gradient (rows x variables) and unweighted terms (rows x 6) of every row of x.
+// Computes loss, gradient (rows x variables) and unweighted terms (rows x 6) of every row of x (rows x variables).
 int32_t graspd_evaluate(const Problem* p, const Weights* weights, int32_t rows, const float* x, const float* radius,
                         float delta, int32_t fine, int32_t sharp, int32_t soft, float* loss, float* gradient, float* terms,
                         int32_t threads) {
@@ -45,7 +45,7 @@ int32_t graspd_evaluate(const Problem* p, const Weights* weights, int32_t rows, 
     });
 }
 
-// Least distance of the coarse candidates of every row to the object.
+// Computes for every row of x the least distance of the coarse candidates to the object [m].
 int32_t graspd_least_distance(const Problem* p, int32_t rows, const float* x, float* distance, int32_t threads) {
     return guarded([&] {
         const int variables = 7 + p->hand.joints;
@@ -54,7 +54,7 @@ int32_t graspd_least_distance(const Problem* p, int32_t rows, const float* x, fl
     });
 }
 
-// Steps [from, to) of every row. `poll` is called with the steps done, every few milliseconds; true stops all.
+// Runs the steps [from, to) of every row. Every few milliseconds `poll` gets the number of steps done. True stops all.
 int32_t graspd_run_steps(const Problem* p, const Schedule* schedule, const State* state, int32_t rows, int32_t from,
                          int32_t to, int32_t threads, Stop::Poll poll) {
     return guarded([&] {
@@ -66,7 +66,7 @@ int32_t graspd_run_steps(const Problem* p, const Schedule* schedule, const State
     });
 }
 
-// Pregrasps (rows x (3 + joints)) of the grasps in x (rows x variables, places those of the base), and how clear each way is.
+// Finds pregrasps `out` (rows x (3 + joints)) of grasps x (rows x variables, with base positions), by `find_pregrasp`.
 int32_t graspd_find_pregrasps(const Problem* p, const Pregrasp* settings, int32_t rows, const float* x, float* out,
                               float* share, int32_t threads, Stop::Poll poll) {
     return guarded([&] {
@@ -79,7 +79,7 @@ int32_t graspd_find_pregrasps(const Problem* p, const Pregrasp* settings, int32_
     });
 }
 
-// Grasps (rows x (3 + joints)) near those in x (rows x variables, places those of the base) that sink in less.
+// Writes to `out` (rows x (3 + joints)) grasps near those in x (with base positions) that penetrate the object less.
 int32_t graspd_settle(const Problem* p, const Pregrasp* settings, int32_t rows, const float* x, float* out,
                       int32_t threads, Stop::Poll poll) {
     return guarded([&] {
@@ -91,8 +91,8 @@ int32_t graspd_settle(const Problem* p, const Pregrasp* settings, int32_t rows, 
     });
 }
 
-// Of every row of x (places those of the base) and every solid the nearest sharp point, its distance and the gradient of
-// that (rows x solids x 3).
+// Finds for every row of x (with base positions) and every solid the nearest sharp point (index `pick`), its distance
+// [m], and the gradient of this distance (rows x solids x 3).
 int32_t graspd_nearest_features(const Problem* p, int32_t rows, const float* x, int32_t* pick, float* distance,
                                 float* gradient, int32_t threads) {
     return guarded([&] {
@@ -103,7 +103,7 @@ int32_t graspd_nearest_features(const Problem* p, int32_t rows, const float* x, 
     });
 }
 
-// Greatest depth of the hand's solids in each other at every row of joints.
+// Computes for every row of joints the greatest depth of the hand's solids in each other [m].
 int32_t graspd_self_overlap(const Problem* p, int32_t rows, const float* joints, float* depth, int32_t threads) {
     return guarded([&] {
         for_rows(*p, rows, threads, [&](int row, Scratch& s, bool) {
@@ -112,8 +112,8 @@ int32_t graspd_self_overlap(const Problem* p, int32_t rows, const float* joints,
     });
 }
 
-// The convex hull of joggled wrenches (count x 6, at most 256). `out`: distance and unit normal of the facet nearest the
-// origin, volume, and error of the planes, which is infinite where there is no hull.
+// Computes the convex hull of perturbed wrenches (count x 6, at most 256). `out`: distance and unit normal of the facet
+// nearest the origin, volume, and error of the planes. The error is infinite if there is no hull.
 int32_t graspd_wrench_hull(int32_t count, const double* wrenches, double* out) {
     return guarded([&] {
         WrenchHull hull(wrenches, count);
@@ -124,15 +124,15 @@ int32_t graspd_wrench_hull(int32_t count, const double* wrenches, double* out) {
     });
 }
 
-// The tree of a mesh of triangles (faces x 9): fewer than 2 faces x SurfaceNode, and the triangles in its order.
+// Builds the tree of a mesh (faces x 9): fewer than 2 nodes per face, and the triangles in the order of the tree.
 int32_t graspd_build_surface(int32_t faces, const double* corners, void* nodes, void* triangles) {
     return guarded([&] {
         SurfaceBuilder((const Triangle*)corners, faces, (SurfaceNode*)nodes, (Triangle*)triangles).build();
     });
 }
 
-// Signed distances of points to a mesh, in an order in which neighbours follow each other (null: as they stand). Outside
-// they are at most `reach`.
+// Computes signed distances of points to a mesh. `order` lists the points such that neighbours follow each other, or is
+// null. Distances outside are at most `reach`.
 int32_t graspd_signed_distance(const Surface* surface, int32_t count, const double* points, const int32_t* order,
                                double reach, double* out) {
     return guarded([&] {
@@ -144,14 +144,14 @@ int32_t graspd_signed_distance(const Surface* surface, int32_t count, const doub
     });
 }
 
-// Greatest depth of points in the solids of a hand. `links`: their poses (links x 12). `link_of` (count) and `apart`
-// (links x links) say which solids a point meets; null for all.
+// Computes the greatest depth of points in the solids of a hand. `links`: link poses (links x 12). `link_of` (count)
+// and `apart` (links x links): see `depth_in_bodies`. Null: all points meet all solids.
 int32_t graspd_hand_depth(const Bodies* bodies, const double* links, int32_t count, const double* points,
                           const int32_t* link_of, const uint8_t* apart, double* depth) {
     return guarded([&] { *depth = depth_in_bodies(*bodies, links, count, points, link_of, apart); });
 }
 
-// Volume of a hand inside a mesh, in cells of this width.
+// Computes the volume of a hand inside a mesh, with cells of width `cell` [m].
 int32_t graspd_shared_volume(const Bodies* bodies, const double* links, const Surface* surface, double cell,
                              double* volume) {
     return guarded([&] { *volume = SharedVolume(*bodies, links, *surface, cell).measure(); });

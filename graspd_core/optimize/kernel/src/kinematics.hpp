@@ -1,10 +1,10 @@
-// Forward kinematics, and forces on links pulled back to the pose (docs/method.md, hands/kinematics.py).
+// Forward kinematics, and gradients of the pose from forces on links (docs/method.md, hands/kinematics.py).
 #pragma once
 #include "scratch.hpp"
 
 namespace graspd {
 
-// 3x4 times 3x4, both with an implied last row 0 0 0 1.
+// Multiplies two 3x4 matrices, both with an implied last row 0 0 0 1.
 INLINE void compose(const float* a, const float* b, float* out) {
     for (int r = 0; r < 3; r++)
         for (int c = 0; c < 4; c++)
@@ -12,7 +12,7 @@ INLINE void compose(const float* a, const float* b, float* out) {
                 a[4 * r] * b[c] + a[4 * r + 1] * b[4 + c] + a[4 * r + 2] * b[8 + c] + (c == 3 ? a[4 * r + 3] : 0.f);
 }
 
-// The base's pose from x: the pivot is at x[0:3], turned by the unit quaternion along x[3:7].
+// Computes the base pose. The pivot is at x[0:3]. x[3:7] is a quaternion of any length.
 static void base_pose(const Hand& hand, const float* x, float* base) {
     float scale = 1.f / sqrtf(x[3] * x[3] + x[4] * x[4] + x[5] * x[5] + x[6] * x[6]);
     float w = x[3] * scale, i = x[4] * scale, j = x[5] * scale, k = x[6] * scale;
@@ -27,7 +27,7 @@ static void base_pose(const Hand& hand, const float* x, float* base) {
     }
 }
 
-// T_object_link of every link.
+// Computes T_object_link of every link.
 static void place_links(const Hand& hand, const float* base, const float* joints, float* link) {
     for (int l = 0; l < hand.links; l++) {
         const float *constant = hand.constant + 12 * l, *sine = hand.sine + 12 * l, *cosine = hand.cosine + 12 * l;
@@ -47,12 +47,12 @@ static void place_links(const Hand& hand, const float* base, const float* joints
     }
 }
 
-// Link-frame points to the object frame; what lies between `count` and the next whole vector is far away.
+// Transforms link-frame points to the object frame. Lanes after the last point get a point far away.
 static void place_points(const Points& points, const float* link, float* x, float* y, float* z) {
     const float *px = points.xyz, *py = px + points.stride, *pz = py + points.stride;
     for (int run = 0; run < points.runs; run++) {
         const float* t = link + 12 * points.run_link[run];
-        // A vector may reach past the end of its run: the next run writes over that.
+        // A vector may reach past the end of its run. The next run overwrites these lanes.
         for (int i = points.run_start[run]; i < points.run_start[run + 1]; i += LANES) {
             Floats a = load_unaligned(px + i), b = load_unaligned(py + i), c = load_unaligned(pz + i);
             store_unaligned(x + i, t[0] * a + t[1] * b + t[2] * c + t[3]);
@@ -63,7 +63,7 @@ static void place_points(const Points& points, const float* link, float* x, floa
     for (int i = points.count; i < padded(points.count); i++) x[i] = y[i] = z[i] = 1e3f;
 }
 
-// A force at a point of the object frame, added to a link's wrench about the origin.
+// Adds a force at a point of the object frame to a link's wrench about the origin.
 INLINE void push(float* wrench, float x, float y, float z, float fx, float fy, float fz) {
     wrench[0] += fx;
     wrench[1] += fy;
@@ -73,7 +73,7 @@ INLINE void push(float* wrench, float x, float y, float z, float fx, float fy, f
     wrench[5] += x * fy - y * fx;
 }
 
-// Forces on points, added to the wrenches of their links.
+// Adds the forces on points to the wrenches of their links.
 static void gather_wrenches(const Points& points, const Samples& at, float* wrench) {
     for (int run = 0; run < points.runs; run++) {
         float total[6] = {0};
@@ -83,7 +83,7 @@ static void gather_wrenches(const Points& points, const Samples& at, float* wren
     }
 }
 
-// Joint gradients from the wrenches on links, tips first; afterwards the base's wrench is that on the whole hand.
+// Adds joint gradients from the wrenches on links, tips first. Then the base's wrench is the wrench on the whole hand.
 static void pull_back_joints(const Hand& hand, const float* link, float* wrench, float* joints) {
     for (int l = hand.links - 1; l >= 0; l--) {
         const float* f = wrench + 6 * l;
@@ -106,7 +106,7 @@ static void pull_back_joints(const Hand& hand, const float* link, float* wrench,
     }
 }
 
-// Gradient of the pivot's place and of the quaternion (of any length) from the wrench on the whole hand.
+// Computes the gradient in pivot position and quaternion (of any length) from the wrench on the whole hand.
 static void pull_back_base(const float* x, const float* f, float* gradient) {
     float inverse = 1.f / sqrtf(x[3] * x[3] + x[4] * x[4] + x[5] * x[5] + x[6] * x[6]);
     float w = x[3] * inverse, i = x[4] * inverse, j = x[5] * inverse, k = x[6] * inverse;

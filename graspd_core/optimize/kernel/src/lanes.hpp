@@ -1,6 +1,5 @@
-// Vectors of `LANES` floats, as wide as the target has them. GCC's and Clang's vector extensions give arithmetic and
-// comparison on every target; what they lack (roots, masks as bits) is said here once, with a plain loop where the
-// target is not x86.
+// Vectors of `LANES` floats, as wide as the target supports. GCC's and Clang's vector extensions give arithmetic and
+// comparison on every target. This file adds roots and masks as bits, with a plain loop if the target is not x86.
 #pragma once
 #include <cmath>
 #include <cstdint>
@@ -22,7 +21,7 @@ constexpr int LANES = GRASPD_LANES;
 typedef float Floats __attribute__((vector_size(4 * LANES)));
 typedef int32_t Ints __attribute__((vector_size(4 * LANES)));
 typedef float Unaligned __attribute__((vector_size(4 * LANES), aligned(4)));
-// The four channels of a node of the distance grid, and of two neighbours along z.
+// The four channels of one node of the distance grid, and the eight of two neighbours along z.
 typedef float Four __attribute__((vector_size(16)));
 typedef float FourUnaligned __attribute__((vector_size(16), aligned(4)));
 typedef float Eight __attribute__((vector_size(32)));
@@ -36,7 +35,7 @@ INLINE void store(float* to, Floats v) { *(Floats*)to = v; }
 INLINE Floats load_unaligned(const float* from) { return *(const Unaligned*)from; }
 INLINE void store_unaligned(float* to, Floats v) { *(Unaligned*)to = v; }
 INLINE Floats all(float v) { return v - Floats{}; }
-// Where `a` is not a number, `b`: what these bound is always finite.
+// If `a` is NaN, these return `b`. So a finite `b` gives a bound that is never NaN.
 INLINE Floats greater(Floats a, Floats b) { return a > b ? a : b; }
 INLINE Floats lesser(Floats a, Floats b) { return a < b ? a : b; }
 INLINE Floats magnitude(Floats a) { return (Floats)((Ints)a & 0x7fffffff); }
@@ -54,7 +53,7 @@ INLINE Floats root(Floats a) {
 #endif
 }
 
-// 1/√a to float32 precision: the estimate of the hardware and one step of Newton.
+// Returns 1/√a to float32 precision, by the hardware's estimate and one Newton step.
 INLINE Floats inverse_root(Floats a) {
 #if defined(__AVX512F__)
     Floats y = (Floats)_mm512_rsqrt14_ps((__m512)a);
@@ -70,7 +69,7 @@ INLINE Floats inverse_root(Floats a) {
 #endif
 }
 
-// Bit i is set where lane i of the mask is.
+// Returns a number whose bit i is set if lane i of the mask is set.
 INLINE unsigned bits(Ints mask) {
 #if defined(__AVX512F__)
     return _mm512_test_epi32_mask((__m512i)mask, (__m512i)mask);
@@ -92,10 +91,10 @@ INLINE float sum(Floats v) {
 }
 INLINE float sum_four(Four v) { return (v[0] + v[2]) + (v[1] + v[3]); }
 
-// eˣ for x ≤ 0, to 2e-7 of its value: 2ⁿ times a polynomial in the remainder (Cephes' coefficients).
+// Returns eˣ for x ≤ 0, with a relative error of 2e-7: 2ⁿ times a polynomial in the remainder (Cephes' coefficients).
 INLINE Floats exponential(Floats x) {
     x = greater(x, all(-87.f));
-    Ints n = __builtin_convertvector(x * 1.44269504f - 0.5f, Ints);  // towards zero: rounds, since x ≤ 0
+    Ints n = __builtin_convertvector(x * 1.44269504f - 0.5f, Ints);  // Rounds, because x ≤ 0 and conversion truncates.
     Floats whole = __builtin_convertvector(n, Floats);
     Floats r = (x - whole * 0.693359375f) + whole * 2.12194440e-4f;
     Floats p = all(1.9875691500e-4f);

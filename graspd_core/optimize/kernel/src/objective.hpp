@@ -1,4 +1,4 @@
-// The closed-form loss of one pose and its gradient (docs/method.md; optimize/problem.py, `evaluate`).
+// Closed-form loss of one pose, and its gradient (docs/method.md, `evaluate` of optimize/problem.py).
 #pragma once
 #include "obstacles.hpp"
 #include "sharp_points.hpp"
@@ -6,14 +6,14 @@
 
 namespace graspd {
 
-// How one evaluation looks: padding and contact width [m]; all candidates; all sharp points, with a short reach; whether
-// contact fades over its width.
+// Settings of one evaluation: padding and contact width [m], all candidates or the coarse ones, all sharp points with a
+// short reach, and contact that decays over its width.
 struct Look {
     float radius, delta;
     bool fine, sharp, soft;
 };
 
-// The weighted loss at x; fills `gradient` (7 + joints) and s.terms (unweighted, in the order of `Weights`).
+// Returns the weighted loss at x. Writes `gradient` (7 + joints) and s.terms (unweighted, in the order of `Weights`).
 static float evaluate(const Problem& p, const Weights& w, const float* x, Look look, float* gradient, Scratch& s) {
     const Hand& hand = p.hand;
     const Points& points = look.fine ? p.fine : p.coarse;
@@ -53,7 +53,7 @@ static float evaluate(const Problem& p, const Weights& w, const float* x, Look l
            w.self_collision * collision + w.posture * bent + w.obstacle * blocked;
 }
 
-// Least distance of the coarse candidates to the object.
+// Returns the least distance of the coarse candidates to the object [m].
 static float least_distance(const Problem& p, const float* x, Scratch& s) {
     float base[12], nearest = INFINITY;
     base_pose(p.hand, x, base);

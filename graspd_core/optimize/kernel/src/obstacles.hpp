@@ -1,10 +1,10 @@
-// Depth of the hand in its support and its neighbours (optimize/obstacle_distance.py).
+// Penetration of support and obstacles by the hand (optimize/obstacle_distance.py).
 #pragma once
 #include "terms.hpp"
 
 namespace graspd {
 
-// Balls about the corners of the hand's solids against the support's half-space.
+// Returns the loss of the balls at the corners of the hand's solids in the support, and adds forces to the links.
 static float support_depth(const Problem& p, float weight, Scratch& s) {
     const Obstacles& o = p.obstacles;
     Samples& at = s.obstacle;
@@ -21,7 +21,7 @@ static float support_depth(const Problem& p, float weight, Scratch& s) {
     return total;
 }
 
-// Balls about placed points against one neighbour.
+// Returns the loss of the balls at placed points in one obstacle, and adds forces to the links.
 static float neighbour_depth(
     const Grid& grid, const Points& points, const float* radius, float margin, float weight, Scratch& s) {
     Samples& at = s.obstacle;
@@ -40,7 +40,7 @@ static float neighbour_depth(
     return total;
 }
 
-// Unweighted loss; forces go to the links.
+// Returns the unweighted loss, and adds the weighted forces to the links.
 static float obstacle_depth(const Problem& p, float weight, Scratch& s) {
     const Obstacles& o = p.obstacles;
     if (!o.has_support && o.grids == 0) return 0;

@@ -1,4 +1,4 @@
-// Memory of one thread for one evaluation after the other, laid out once from the problem's sizes.
+// Memory of one thread for all its evaluations, allocated once from the sizes of the problem.
 #pragma once
 #include <algorithm>
 #include <cstdlib>
@@ -10,7 +10,7 @@
 
 namespace graspd {
 
-// An array of so many, aligned for vectors, zeroed, with room for a vector that begins at its last element.
+// An array of `count` zeros, aligned for vectors. A vector may begin at the last element.
 template <class T>
 class Array {
    public:
@@ -30,24 +30,24 @@ class Array {
     T* data_;
 };
 
-// Points of the object frame, the signed distance and normal there, and what is needed to pull adjoints back.
+// Points in the object frame, their signed distances and normals, and intermediate values for the adjoints.
 struct Samples {
     explicit Samples(int n)
         : x(n), y(n), z(n), phi(n), nx(n), ny(n), nz(n), fx(n), fy(n), fz(n), ox(n), oy(n), oz(n), cell(n),
           channel{Array<float>(n), Array<float>(n), Array<float>(n), Array<float>(n)}, slopes(12 * n),
           a_phi(n), a_nx(n), a_ny(n), a_nz(n), gx(n), gy(n), gz(n) {}
-    Array<float> x, y, z;        // where [m]
+    Array<float> x, y, z;        // positions [m]
     Array<float> phi, nx, ny, nz;
-    Array<float> fx, fy, fz;     // place within the cell
+    Array<float> fx, fy, fz;     // position in the cell
     Array<float> ox, oy, oz;     // offset from the grid [m], zero inside
     Array<int32_t> cell;         // index of the cell's first node
-    Array<float> channel[4];     // interpolated there
-    Array<float> slopes;         // 12 a point: of the channels, per cell along x, y, z
+    Array<float> channel[4];     // interpolated channels
+    Array<float> slopes;         // 12 per point: slopes of the channels per cell along x, y, z
     Array<float> a_phi, a_nx, a_ny, a_nz;  // adjoints of distance and normal
     Array<float> gx, gy, gz;     // gradient with respect to the points
 };
 
-// The candidates that the task looks at, and every disturbance at each.
+// Candidates of the wrench resistance term, and values for each disturbance at each candidate.
 struct Task {
     Task(int n, int directions)
         : index(n), ax(n), ay(n), az(n), nx(n), ny(n), nz(n), s(n), known(n), cx(n), cy(n), cz(n),
@@ -55,14 +55,14 @@ struct Task {
           support(LANES * directions), slope(directions), gax(n), gay(n), gaz(n), gnx(n), gny(n), gnz(n), gs(n) {}
     Array<int32_t> index;
     Array<float> ax, ay, az, nx, ny, nz, s;  // arm, normal, activation
-    Array<float> known, cx, cy, cz;          // confidence and its gradient
+    Array<float> known, cx, cy, cz;          // confidences and their gradients
     Array<float> normal_speed, inverse_speed, resisted;
     Array<float> support, slope;
     Array<float> gax, gay, gaz, gnx, gny, gnz, gs;  // gradients of arm, normal, activation
     int count = 0;
 };
 
-// Sharp points that follow each other lie near each other: the middle of each vector of them, and how far they reach.
+// Successive sharp points lie near each other. A block is a vector of them, with its middle and radius.
 struct Blocks {
     explicit Blocks(const Object& object)
         : count((object.feature_count + LANES - 1) / LANES), x(padded(count)), y(padded(count)), z(padded(count)),
@@ -83,7 +83,7 @@ struct Blocks {
     Array<float> x, y, z, reach;  // [m]
 };
 
-// A sharp point of the object and the solid that it is near to.
+// A sharp point of the object, and a solid near the point.
 struct Pair {
     int32_t solid, feature;
     float distance, gradient[3], adjoint;
@@ -106,18 +106,18 @@ struct Scratch {
           sphere(padded(p.spheres.centers.count)),
           obstacle(padded(std::max(p.obstacles.corners.count, p.obstacles.spheres.count))) {}
     Array<float> link;    // T_object_link
-    Array<float> wrench;  // force on each link and its moment about the object frame's origin
+    Array<float> wrench;  // force on each link, and moment about the origin of the object frame
     Samples candidates;
     Array<float> key;
     Task task;
-    Array<float> gap;          // of each group
-    Array<int32_t> gap_at, gap_pair;  // candidate or pair that has it
+    Array<float> gap;          // least distance of each group
+    Array<int32_t> gap_at, gap_pair;  // candidate or pair with the least distance
     Array<float> solid;        // T_object_solid
-    Array<float> middle[3];    // of the solids
+    Array<float> middle[3];    // middles of the solids
     Blocks blocks;
-    Array<float> bound;        // of the pairs of some solids and blocks
-    Array<int32_t> bounded;    // the first pair of each
-    float cut_of_task = 0, cut_of_pairs = INFINITY;  // up to where the last choice went
+    Array<float> bound;        // lower bounds of distance for pairs of solids and blocks
+    Array<int32_t> bounded;    // first pair of each vector of bounds
+    float cut_of_task = 0, cut_of_pairs = INFINITY;  // largest key of the last choice
     Array<int32_t> picked;
     Array<Pair> pair;
     Samples sphere, obstacle;

@@ -1,4 +1,4 @@
-// The schedule of one start: coarse to fine, Adam with projection (optimize/closed_form/closed_form.py).
+// Steps of one start: coarse to fine, by projected Adam (optimize/closed_form/closed_form.py).
 #pragma once
 #include "objective.hpp"
 
@@ -6,7 +6,7 @@ namespace graspd {
 
 constexpr float BETA1 = 0.9f, BETA2 = 0.98f, ADAM_EPSILON = 1e-8f, FINAL_RATE = 0.05f;
 
-// One Adam step (Kingma & Ba 2015) with a rate for every kind of variable; joints are projected onto their limits.
+// Takes one Adam step (Kingma & Ba 2015) with a rate for every kind of variable. Joints are clamped to their limits.
 static void adam(const Hand& hand, const Schedule& schedule, float rate, int count, const float* gradient, float* x,
                  float* mean, float* square) {
     const float first = 1.f / (1.f - powf(BETA1, count)), second = 1.f / (1.f - powf(BETA2, count));
@@ -23,7 +23,7 @@ static void adam(const Hand& hand, const Schedule& schedule, float rate, int cou
     for (int j = 0; j < hand.joints; j++) x[7 + j] = std::min(std::max(x[7 + j], hand.lower[j]), hand.upper[j]);
 }
 
-// Steps [from, to) of one row; `go` is asked before each.
+// Runs the steps [from, to) of one row. Before each step, `go` returns false to stop.
 template <class Go>
 static void run_steps(const Problem& p, const Schedule& schedule, const State& state, int row, int from, int to,
                       float* gradient, Scratch& s, Go go) {
@@ -43,11 +43,11 @@ static void run_steps(const Problem& p, const Schedule& schedule, const State& s
         float loss = evaluate(p, look.sharp ? schedule.polish_weights : schedule.weights, x, look, gradient, s);
         bool finite = std::isfinite(loss);
         for (int i = 0; i < variables; i++) finite = finite && std::isfinite(gradient[i]);
-        if (!finite) {  // a start whose gradient is not finite stands still
+        if (!finite) {  // A start without finite loss and gradient gets a zero gradient.
             loss = INFINITY;
             for (int i = 0; i < variables; i++) gradient[i] = 0;
         }
-        // Judged at the end values only, so that early, padded iterates never win.
+        // Only the last stage is scored, so that an iterate on a padded surface never becomes the best.
         bool scored = look.fine || (schedule.fine_steps == 0 && polish) || (schedule.polish_steps == 0 && remaining == 0);
         if (scored && loss < state.best_loss[row]) {
             state.best_loss[row] = loss;

@@ -1,13 +1,13 @@
-// The object's sharp points against the hand's solids (optimize/problem.py, `feature_distance`).
+// Penetration of the hand's solids by sharp points of the object (optimize/problem.py, `feature_distance`).
 #pragma once
 #include "terms.hpp"
 
 namespace graspd {
 
-// How much farther than before the nearest pairs are looked for [m].
+// Margin beyond the distance of the last farthest pair, within which the nearest pairs are searched [m].
 constexpr float CUT_MARGIN = 0.005f;
 
-// Signed distance of a point to a solid, both in the solid's frame, and its gradient there.
+// Returns the signed distance of a point `at` to a solid, and writes the gradient. Both are in the solid's frame.
 static float solid_distance(const float* core, float radius, bool round, const float* at, float* gradient) {
     float side[3] = {at[0] < 0 ? -1.f : 1.f, at[1] < 0 ? -1.f : 1.f, at[2] < 0 ? -1.f : 1.f};
     float across = round ? sqrtf(at[0] * at[0] + at[1] * at[1]) : 0.f;
@@ -35,13 +35,13 @@ static float solid_distance(const float* core, float radius, bool round, const f
     return length + (past[most] < 0 ? past[most] : 0.f) - radius;
 }
 
-// The hand's solids where they are.
+// Computes the pose of every solid of the hand.
 static void place_solids(const Problem& p, Scratch& s) {
     for (int k = 0; k < p.solids.count; k++)
         compose(s.link + 12 * p.solids.link[k], p.solids.pose + 12 * k, s.solid + 12 * k);
 }
 
-// A lower bound of the distance of points to a solid: the largest coordinate beyond its bounding box.
+// A lower bound of the distance of points to a solid: the greatest signed distance to a face of its bounding box.
 struct Bound {
     Bound(const Solids& solids, int k, const float* placed) : t(placed) {
         const float *core = solids.core + 3 * k, radius = solids.radius[k];
@@ -60,7 +60,7 @@ struct Bound {
     float origin[3], half[3];
 };
 
-// Bounds of the pairs of solids and blocks that may be as near as `most`; returns how many pairs these are.
+// Computes bounds of all pairs in solids and blocks that may be nearer than `most`. Returns the number of these pairs.
 static int bound_distances(const Problem& p, int features, float most, Scratch& s) {
     const float *fx = p.object.features, *fy = fx + p.object.feature_stride, *fz = fy + p.object.feature_stride;
     const int whole = padded(features), blocks = whole / LANES;
@@ -81,8 +81,8 @@ static int bound_distances(const Problem& p, int features, float most, Scratch& 
     return found * LANES;
 }
 
-// The nearest pairs, as solid · points + point: what is farther than they were a moment ago is left out, unless they
-// turn out to be farther now.
+// Finds the nearest pairs, as index solid · points + point. First it searches up to the last cut plus a margin. If this
+// gives too few pairs, it searches everywhere.
 static int nearest_pairs(const Problem& p, int features, Scratch& s) {
     const int wanted = std::min(p.feature_pairs, features * p.solids.count);
     const float most = s.cut_of_pairs + CUT_MARGIN;
@@ -93,7 +93,7 @@ static int nearest_pairs(const Problem& p, int features, Scratch& s) {
     return found;
 }
 
-// Signed distance of a sharp point to a solid, and its gradient at the point.
+// Returns the signed distance of a sharp point to a solid, and writes the gradient in the point, object frame.
 static float feature_distance(const Problem& p, int solid, int feature, float* gradient, Scratch& s) {
     const Solids& solids = p.solids;
     const float *t = s.solid + 12 * solid, *at = p.object.features + feature;
@@ -105,7 +105,7 @@ static float feature_distance(const Problem& p, int solid, int feature, float* g
     return distance;
 }
 
-// For every solid the sharp point nearest to it, its distance, and the gradient of that. The solids are placed.
+// Finds for every placed solid the nearest sharp point, its distance, and the gradient of the distance.
 static void nearest_features(const Problem& p, int32_t* pick, float* distance, float* gradient, Scratch& s) {
     const Object& object = p.object;
     for (int k = 0; k < p.solids.count; k++) {
@@ -129,7 +129,7 @@ static void nearest_features(const Problem& p, int32_t* pick, float* distance, f
     }
 }
 
-// The sharp point that is deepest in a solid, its depth, and the gradient of its distance; -1 where none is inside.
+// Returns the sharp point deepest in a solid, or -1 if no point is inside. Writes its depth and distance gradient.
 static int deepest_feature(const Problem& p, int k, float* depth, float* gradient, Scratch& s) {
     const Object& object = p.object;
     const float *x = object.features, *y = x + object.feature_stride, *z = y + object.feature_stride;
@@ -157,7 +157,7 @@ static int deepest_feature(const Problem& p, int k, float* depth, float* gradien
     return found;
 }
 
-// Depth of the nearest pairs; their adjoints begin, and groups learn of pairs that are nearer than their candidates.
+// Adds the loss of the nearest pairs, and sets their adjoints. A pair nearer than a group's candidates gives its gap.
 static int sharp_points(const Problem& p, int features, float weight, float* penetration, Scratch& s) {
     const Solids& solids = p.solids;
     if (features == 0 || solids.count == 0) return 0;
@@ -180,7 +180,7 @@ static int sharp_points(const Problem& p, int features, float weight, float* pen
     return pairs;
 }
 
-// The hand moves, the point stays: the link is pushed against the gradient, at the point.
+// Adds the forces of the pairs to the links. The point is fixed, so a link is pushed against the gradient.
 static void push_pairs(const Problem& p, int pairs, Scratch& s) {
     const Object& object = p.object;
     for (int m = 0; m < pairs; m++) {

@@ -1,4 +1,4 @@
-// How deep the hand's solids are in each other, by separating axes (hands/self_collision.py).
+// Measures overlaps of the hand's solids by the separating axis test (hands/self_collision.py).
 #pragma once
 #include "sharp_points.hpp"
 
@@ -6,7 +6,7 @@ namespace graspd {
 
 constexpr float PARALLEL = 1e-3f, SQUARE = 1e-4f, RATHER_FACES = 1e-6f;
 
-// A solid where it is, in the object frame.
+// A solid at its pose in the object frame.
 struct PlacedSolid {
     PlacedSolid(const Solids& solids, int k, const float* placed)
         : t(placed + 12 * k), core(solids.core + 3 * k), radius(solids.radius[k]), round(solids.round[k] != 0) {}
@@ -14,15 +14,15 @@ struct PlacedSolid {
     float radius;
     bool round;
 
-    // Half the extent along a direction.
+    // Returns half the extent along a unit direction u.
     float width(const float* u) const {
         float x = along(0, u), y = along(1, u), z = along(2, u);
         float flat = round ? core[0] * sqrtf(x * x + y * y) : core[0] * fabsf(x) + core[1] * fabsf(y);
         return flat + core[2] * fabsf(z) + radius;
     }
-    // The component of a direction along an axis.
+    // Returns the component of a direction u along an axis of the solid.
     float along(int axis, const float* u) const { return t[axis] * u[0] + t[4 + axis] * u[1] + t[8 + axis] * u[2]; }
-    // The farthest point to one side along a direction; that of a face or an edge is its middle.
+    // Computes the farthest point along u, or along -u if `side` is -1. A farthest face or edge gives its middle.
     void support(const float* u, float side, float* point) const {
         float v[3];
         for (int i = 0; i < 3; i++) v[i] = fabsf(along(i, u)) < SQUARE ? 0.f : along(i, u);
@@ -34,14 +34,14 @@ struct PlacedSolid {
     }
 };
 
-// The least overlap of two solids that is known so far, and the direction of it from b to a.
+// The least overlap of two solids found so far, and its direction u from b to a.
 struct LeastOverlap {
     const PlacedSolid &a, &b;
-    const float* apart;  // from the middle of b to that of a
+    const float* apart;  // from the middle of b to the middle of a
     float rated = INFINITY, depth = INFINITY, u[3] = {0, 0, 0};
     int which = -1;
 
-    // Looks along a direction of any length; false where the solids are clear of each other along it.
+    // Tests a direction of any length. Returns false if the direction separates the solids.
     bool look(int direction, float x, float y, float z, float shortest) {
         float length = sqrtf(x * x + y * y + z * z);
         if (!(length > shortest)) return true;
@@ -57,7 +57,7 @@ struct LeastOverlap {
         return deep > 0;
     }
 
-    // Whether they are clear of each other along the line between their middles: most that are near are.
+    // Returns true if the line between the middles separates the solids, as for most near pairs.
     bool clear_between() const {
         float squared = apart[0] * apart[0] + apart[1] * apart[1] + apart[2] * apart[2];
         float across = a.width(apart) - a.radius + b.width(apart) - b.radius;
@@ -85,7 +85,7 @@ struct LeastOverlap {
         return true;
     }
 
-    // Where they overlap.
+    // Computes a point in the overlap, at which forces act.
     void place(float* point) const {
         float of_a[3], of_b[3];
         a.support(u, -1.f, of_a);
@@ -96,7 +96,7 @@ struct LeastOverlap {
         }
         for (int i = 0; i < 3; i++) point[i] = of_a[i];
         if (which < 6) return;
-        // The point of a's edge that is nearest to b's.
+        // Takes the point of a's edge nearest to b's edge.
         const float *e = a.t + (which - 6) / 3, *f = b.t + (which - 6) % 3;
         float slope = 0, on_a = 0, on_b = 0, reach = a.core[(which - 6) / 3];
         for (int i = 0; i < 3; i++) {
@@ -110,7 +110,7 @@ struct LeastOverlap {
     }
 };
 
-// One pair: its overlap squared, in mm², over 10; its slope goes to the links. `deepest` is brought up to date [m].
+// Returns a tenth of the squared overlap of a pair [mm²], adds forces to the links, and updates `deepest` [m].
 static float pair_overlap(const Problem& p, int i, int j, float weight, float* deepest, Scratch& s) {
     const Solids& solids = p.solids;
     PlacedSolid a(solids, i, s.solid), b(solids, j, s.solid);
@@ -126,7 +126,7 @@ static float pair_overlap(const Problem& p, int i, int j, float weight, float* d
     return 0.1f * depth * depth;
 }
 
-// Overlap of the solids of links that are not adjacent.
+// Returns the sum of `pair_overlap` over the solids of links that are not adjacent.
 static float solid_overlap(const Problem& p, float weight, float* deepest, Scratch& s) {
     const int count = p.solids.count, whole = padded(count);
     place_solids(p, s);

@@ -1,15 +1,15 @@
-// From an optimised pose to its pregrasp, and how deep a hand lies in itself (optimize/grasp_postures.py, hands/self_collision.py).
+// Pregrasp, settling and self-collision of optimised poses (optimize/grasp_postures.py, hands/self_collision.py).
 #pragma once
 #include "search.hpp"
 #include "solid_overlap.hpp"
 
 namespace graspd {
 
-// Shares of the way from pregrasp to grasp that are still to go where it is kept clear.
+// The path from pregrasp to grasp is kept clear where these shares of the path are still to go.
 constexpr int WAY = 3;
 constexpr float TO_GO[WAY] = {1.f, 0.6f, 0.2f};
 
-// The base turned as x[3:7] says, at a place of its own.
+// Computes the base pose from a quaternion and the position of the base origin.
 static void turned_base(const float* quaternion, const float* place, float* base) {
     static const float origin[3] = {0, 0, 0};
     float x[7] = {place[0], place[1], place[2], quaternion[0], quaternion[1], quaternion[2], quaternion[3]};
@@ -18,17 +18,17 @@ static void turned_base(const float* quaternion, const float* place, float* base
     base_pose(at_origin, x, base);
 }
 
-// What the search for a pregrasp remembers between its steps; variables are the base's place and the joints.
+// State of `find_pregrasp` and `settle` between steps. The variables are base position and joints.
 struct Opening {
     explicit Opening(const Problem& p)
         : variables(3 + p.hand.joints), start(variables), y(variables), at(variables), mean(variables),
           square(variables), gradient(variables), slope(variables), wanted(std::max(WAY * padded(p.coarse.count), p.fine.count)) {}
     int variables;
     Array<float> start, y, at, mean, square, gradient, slope;
-    Array<float> wanted;  // least distance of every candidate at every share of the way
+    Array<float> wanted;  // wanted distance of every candidate, at every `TO_GO`
 };
 
-// The hand `to_go` before the grasp: link poses and the distances of its coarse candidates.
+// Computes link poses and candidate distances on the path, where the share `to_go` to the grasp is left.
 static void place_on_way(const Problem& p, const float* quaternion, float to_go, Opening& o, Scratch& s) {
     for (int i = 0; i < o.variables; i++) o.at[i] = to_go * o.y[i] + (1 - to_go) * o.start[i];
     float base[12];
@@ -38,7 +38,7 @@ static void place_on_way(const Problem& p, const float* quaternion, float to_go,
     sample(p.object.grid, p.coarse.count, s.candidates);
 }
 
-// Adds the slope of one place on the way: candidates nearer than wanted, obstacles, and the hand in itself.
+// Adds the gradient of one point of the path: candidates nearer than wanted, obstacles, and self-collision.
 static void add_way_slope(
     const Problem& p, const float* wanted, float to_go, float self_weight, bool spheres, Opening& o, Scratch& s) {
     Samples& at = s.candidates;
@@ -67,7 +67,7 @@ static void add_way_slope(
     for (int i = 0; i < o.variables; i++) o.gradient[i] += to_go * o.slope[i];
 }
 
-// Begins the gradient: what travel from the grasp costs.
+// Sets the gradient to that of the cost of travel from the grasp.
 static void add_travel_slope(const Hand& hand, const Pregrasp& settings, Opening& o) {
     for (int i = 0; i < o.variables; i++) {
         float scale = i < 3 ? 1.f : hand.joint_scale[i - 3];
@@ -76,7 +76,7 @@ static void add_travel_slope(const Hand& hand, const Pregrasp& settings, Opening
     }
 }
 
-// A step of Adam whose rate fades; a slope that is not a number counts as none.
+// Takes an Adam step with a decaying rate. An entry of the gradient that is not finite counts as zero.
 static void opening_step(const Hand& hand, const Pregrasp& settings, int count, Opening& o) {
     const float first = 1.f / (1.f - powf(BETA1, count)), second = 1.f / (1.f - powf(BETA2, count));
     const float fade = 1.f - 0.9f * count / settings.steps;
@@ -90,8 +90,8 @@ static void opening_step(const Hand& hand, const Pregrasp& settings, int count, 
     }
 }
 
-// x: the base's place, quaternion and joints of a grasp; `out` gets place and joints of the pregrasp. Returns the least
-// distance on the way over what it should be there, one where all is clear.
+// Finds the pregrasp `out` (base position, joints) of a grasp x (base position, quaternion, joints). Returns the
+// fraction of the wanted clearance that the path keeps: 1 if it keeps all.
 template <class Go>
 static float find_pregrasp(const Problem& p, const Pregrasp& settings, const float* x, float* out, Scratch& s, Go go) {
     const Hand& hand = p.hand;
@@ -99,7 +99,7 @@ static float find_pregrasp(const Problem& p, const Pregrasp& settings, const flo
     Opening o(p);
     for (int i = 0; i < o.variables; i++) o.start[i] = o.y[i] = i < 3 ? x[i] : x[4 + i];
     place_on_way(p, x + 3, 0.f, o, s);
-    // Where the grasp itself sinks in, the way out starts from that depth.
+    // If the grasp penetrates the object, the path may end at this depth.
     for (int k = 0; k < WAY; k++)
         for (int i = 0; i < p.coarse.count; i++)
             o.wanted[k * stride + i] = std::min(s.candidates.phi[i], 0.f) * (1 - TO_GO[k]) + TO_GO[k] * settings.clearance;
@@ -107,7 +107,7 @@ static float find_pregrasp(const Problem& p, const Pregrasp& settings, const flo
         add_travel_slope(hand, settings, o);
         for (int k = 0; k < WAY; k++) {
             place_on_way(p, x + 3, TO_GO[k], o, s);
-            // The pregrasp alone is kept out of itself: the grasp is already.
+            // Only the pregrasp gets the self-collision term, because the optimiser has applied it to the grasp.
             const float self_weight = k == 0 ? settings.self_collision : 0.f;
             add_way_slope(p, o.wanted + k * stride, TO_GO[k], self_weight, settings.spheres != 0, o, s);
         }
@@ -125,8 +125,8 @@ static float find_pregrasp(const Problem& p, const Pregrasp& settings, const flo
     return 1.f - worst / settings.clearance;
 }
 
-// Adds the slope of what is sunk in, squared, in mm²: candidates in the object, and of each solid the deepest point of
-// the object in it.
+// Adds the gradient of squared depths [mm²] of candidates in the object, of the deepest object point in each solid, of
+// solids in each other, and of obstacles. Also adds the gradient that keeps contacts.
 static void add_sunk_slope(const Problem& p, float weight, float keep, Opening& o, Scratch& s) {
     Samples& at = s.candidates;
     for (int i = 0; i < 6 * p.hand.links; i++) s.wrench[i] = 0;
@@ -159,7 +159,7 @@ static void add_sunk_slope(const Problem& p, float weight, float keep, Opening& 
     for (int i = 0; i < o.variables; i++) o.gradient[i] += o.slope[i];
 }
 
-// x: the base's place, quaternion and joints of a grasp; `out` gets place and joints of one near it that sinks in less.
+// Finds near a grasp x (base position, quaternion, joints) a grasp `out` (base position, joints) that penetrates less.
 template <class Go>
 static void settle(const Problem& p, const Pregrasp& settings, const float* x, float* out, Scratch& s, Go go) {
     Opening o(p);
@@ -180,7 +180,7 @@ static void settle(const Problem& p, const Pregrasp& settings, const float* x, f
     for (int i = 0; i < o.variables; i++) out[i] = o.y[i];
 }
 
-// The sharp points nearest to the solids of a hand at x, the base's place, quaternion and joints.
+// Finds the sharp points nearest to the solids of a hand at x (base position, quaternion, joints).
 static void nearest_features(const Problem& p, const float* x, int32_t* pick, float* distance, float* gradient, Scratch& s) {
     float base[12];
     turned_base(x + 3, x, base);
@@ -189,7 +189,7 @@ static void nearest_features(const Problem& p, const float* x, int32_t* pick, fl
     nearest_features(p, pick, distance, gradient, s);
 }
 
-// Greatest depth of a solid in one of a link that is not adjacent.
+// Returns the greatest overlap depth of two solids of links that are not adjacent [m].
 static float self_overlap(const Problem& p, const float* joints, Scratch& s) {
     const float standing[7] = {0, 0, 0, 1, 0, 0, 0};
     float base[12], deepest;

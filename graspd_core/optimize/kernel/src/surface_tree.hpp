@@ -1,4 +1,4 @@
-// Exact distances to a mesh, and its generalised winding number (Barill et al. 2018), by one tree of boxes.
+// Exact distances to a mesh and its generalised winding number (Barill et al. 2018), both by one tree of boxes.
 #pragma once
 #include <algorithm>
 #include <cmath>
@@ -30,8 +30,8 @@ struct Triangle {
     Vec3 a, b, c;
 };
 
-// Its box, and the triangles in it as one: centroid, sum of area vectors, and the radius about the centroid. A leaf has
-// triangles; the first child of another stands after it.
+// A node: its box, and centroid, sum of area vectors and radius about the centroid of all its triangles. A leaf has
+// `count` triangles. Other nodes have the first child directly after them, and the second at index `second`.
 struct SurfaceNode {
     Vec3 low, high, middle, area;
     double radius;
@@ -39,7 +39,7 @@ struct SurfaceNode {
 };
 static_assert(sizeof(Triangle) == 72 && sizeof(SurfaceNode) == 120, "verify/compiled_overlap.py allocates them");
 
-// Triangles come into the order of the leaves. There are fewer than two nodes a triangle.
+// Builds the tree, and sorts the triangles in the order of the leaves. There are fewer than two nodes per triangle.
 class SurfaceBuilder {
    public:
     SurfaceBuilder(const Triangle* from, int count, SurfaceNode* nodes, Triangle* to)
@@ -64,7 +64,7 @@ class SurfaceBuilder {
         for (int i = begin; i < end; i++) {
             const Triangle& t = from_[order_[i]];
             const Vec3 area = cross(t.b - t.a, t.c - t.a) * 0.5;
-            // Faces without area have a place all the same.
+            // The small number gives faces without area a weight in the centroid.
             const double size = norm(area) + 1e-30;
             node.low = least(node.low, least(t.a, least(t.b, t.c)));
             node.high = most(node.high, most(t.a, most(t.b, t.c)));
@@ -103,7 +103,7 @@ class SurfaceBuilder {
     int made_ = 0;
 };
 
-// Squared distance to a triangle (Ericson, Real-Time Collision Detection, 5.1.5).
+// Returns the squared distance to a triangle (Ericson, Real-Time Collision Detection, 5.1.5).
 inline double squared_distance(const Triangle& t, const Vec3& p) {
     const Vec3 ab = t.b - t.a, ac = t.c - t.a, ap = p - t.a;
     const double d1 = dot(ab, ap), d2 = dot(ac, ap);
@@ -134,7 +134,7 @@ inline double box_squared(const SurfaceNode& node, const Vec3& p) {
 
 constexpr int DEEPEST = 64;
 
-// Distance to the nearest triangle, `reach` where that is farther.
+// Returns the distance to the nearest triangle, or `reach` if the triangle is farther.
 inline double surface_distance(const Surface& s, const Vec3& p, double reach) {
     struct Entry {
         int node;
@@ -159,7 +159,7 @@ inline double surface_distance(const Surface& s, const Vec3& p, double reach) {
     return std::sqrt(best);
 }
 
-// A node that is more than `accuracy` of its radii away counts as one face.
+// Returns the winding number. A node farther away than `accuracy` times its radius counts as one face.
 inline double winding_number(const Surface& s, const Vec3& p, double accuracy) {
     const SurfaceNode* nodes = (const SurfaceNode*)s.nodes;
     const Triangle* triangles = (const Triangle*)s.triangles;
@@ -187,7 +187,7 @@ inline double winding_number(const Surface& s, const Vec3& p, double accuracy) {
     return std::fabs(angle) / (4 * M_PI);
 }
 
-// Numbers this near to one half are computed again at the fine accuracy.
+// A number within DOUBT of one half at accuracy COARSE is computed again at accuracy FINE.
 constexpr double COARSE = 1.5, FINE = 6, DOUBT = 0.3;
 
 inline double winding_number(const Surface& s, const Vec3& p) {
@@ -196,19 +196,19 @@ inline double winding_number(const Surface& s, const Vec3& p) {
     return std::fabs(coarse - 0.5) < DOUBT ? winding_number(s, p, FINE) : coarse;
 }
 
-// Distances of points of which each is near the one before it: that one bounds its distance, and may give its side.
+// Measures distances of successive points. The previous point bounds the distance, and may give the side if near.
 class SurfaceProbe {
    public:
     explicit SurfaceProbe(const Surface& surface) : surface_(surface) {}
 
-    // Negative inside. Outside it is at most `reach`.
+    // Returns the distance, negative inside. Outside it is at most `reach`.
     double signed_distance(const Vec3& p, double reach) {
         const double distance = unsigned_distance(p, reach);
         if (!inside(p)) return distance;
         return distance < reach ? -distance : -surface_distance(surface_, p, INFINITY);
     }
 
-    // Distance to the nearest triangle, `reach` where that is farther.
+    // Returns the distance to the nearest triangle, or `reach` if the triangle is farther.
     double unsigned_distance(const Vec3& p, double reach) {
         const double step = norm(p - place_), known = farthest_ + step;
         here_ = false;
@@ -223,9 +223,9 @@ class SurfaceProbe {
         return distance;
     }
 
-    // Of the point whose distance was asked for last: its generalised winding number.
+    // Returns the generalised winding number of p. If p is the last point measured, earlier results are used.
     double number(const Vec3& p) {
-        // No face is between the points, and far from a hole the number hardly changes.
+        // No face lies between the two points, and far from a hole the number hardly changes.
         if (same_) return number_;
         const double number = winding_number(surface_, p);
         if (here_) number_ = number, known_ = std::fabs(number - 0.5) > SURELY;
@@ -240,7 +240,7 @@ class SurfaceProbe {
     const Surface& surface_;
     Vec3 place_ = {0, 0, 0};
     double nearest_ = 0, farthest_ = INFINITY, number_ = 0.5;
-    // Whether the last point's distance was sought, its number is that of its place, and the number there is known.
+    // True if the last distance was computed, if the number of `place_` holds for the last point, and if it is clear.
     bool here_ = false, same_ = false, known_ = false;
 };
 

@@ -1,4 +1,4 @@
-// The loss terms that look at one thing each (optimize/losses.py), and the choice of the nearest few.
+// The simple loss terms (optimize/losses.py), and the choice of the least keys.
 #pragma once
 #include "distance_grid.hpp"
 #include "kinematics.hpp"
@@ -6,19 +6,19 @@
 namespace graspd {
 
 constexpr float MILLIMETRES = 1000.f, PER_CENTIMETRE = 100.f;
-// How far from the last cut the next is looked for, of the range of the keys.
+// Distance of the second trial cut from the last cut, as a share of the range of the keys.
 constexpr float NEAR_CUT = 1 / 64.f;
 
-// Tempered depth d²/(1 + d/10) for d in mm, over 10, and its slope per metre.
+// Returns the penetration loss of a depth d: a tenth of d² / (1 + d/10), d in mm. Writes the slope per metre.
 INLINE float tempered(float depth, float* slope) {
     float d = depth > 0.f ? depth * MILLIMETRES : depth != depth ? depth : 0.f, shrink = 1.f / (1.f + 0.1f * d);
     *slope = 0.1f * MILLIMETRES * (2.f * d + 0.1f * d * d) * shrink * shrink;
     return 0.1f * d * d * shrink;
 }
 
-// Indices of the `wanted` least keys; NaN is never among them. Halves between bounds until as many lie below, or the
-// bounds meet: then equal keys fill up from the first. It begins at `cut`, up to which the last choice went: keys change
-// little from step to step. Returns how many there are.
+// Finds the indices of the `wanted` least keys, without NaN, and returns their number. Bisects for a cut with exactly
+// as many keys below. If the bounds meet, the first of equal keys fill up. The first trial is `cut`, the last result,
+// because keys change little from step to step.
 static int least(const float* key, int count, int wanted, float* cut, int32_t* out) {
     const int whole = padded(count);
     Floats low = all(INFINITY), high = all(-INFINITY);
@@ -32,7 +32,7 @@ static int least(const float* key, int count, int wanted, float* cut, int32_t* o
         below = std::min(below, low[i]);
         upto = std::max(upto, high[i]);
     }
-    below = std::nextafter(below, -INFINITY);  // no key is at or under `below`; `upto` has all
+    below = std::nextafter(below, -INFINITY);  // No key is at or below `below`. All keys are at or below `upto`.
     for (int round = 0; round < 64; round++) {
         float middle = round > 0 ? 0.5f * (below + upto) : *cut;
         if (round == 1) middle = *cut + (*cut == below ? NEAR_CUT : -NEAR_CUT) * (upto - below);
@@ -60,12 +60,12 @@ static int least(const float* key, int count, int wanted, float* cut, int32_t* o
     return picked;
 }
 
-// Depth of the candidates below the padded surface. Begins their adjoints, and the keys of the nearest.
+// Returns the loss of candidates below the padded surface. Sets their adjoints, and their keys for `least`.
 static float candidate_penetration(int count, float radius, float weight, Samples& at, float* key) {
     Floats total = {};
     for (int i = 0; i < padded(count); i += LANES) {
         Floats gap = load(at.phi + i) - radius, d = gap * -MILLIMETRES;
-        d = d < 0.f ? Floats{} : d;  // keeps what is not a number
+        d = d < 0.f ? Floats{} : d;  // Keeps NaN.
         Floats shrink = 1.f / (1.f + 0.1f * d);
         total += d * d * shrink;
         store(key + i, magnitude(gap));
@@ -78,7 +78,7 @@ static float candidate_penetration(int count, float radius, float weight, Sample
     return 0.1f * sum(total);
 }
 
-// Least distance of every group's candidates from the padded surface.
+// Finds the least distance of every group's candidates from the padded surface.
 static void find_gaps(const Hand& hand, const Points& points, float radius, Scratch& s) {
     for (int g = 0; g < hand.groups; g++) {
         float least_yet = INFINITY;
@@ -94,7 +94,7 @@ static void find_gaps(const Hand& hand, const Points& points, float radius, Scra
     }
 }
 
-// Attraction of every group to the surface, saturating beyond its reach; its slope goes to who has the least distance.
+// Returns the mean distance of the groups [cm], saturating beyond the reach. Adds adjoints to the nearest points.
 static float touch(const Hand& hand, float sharp_reach, float weight, Scratch& s) {
     float total = 0;
     for (int g = 0; g < hand.groups; g++) {
@@ -110,7 +110,7 @@ static float touch(const Hand& hand, float sharp_reach, float weight, Scratch& s
     return total * PER_CENTIMETRE / hand.groups;
 }
 
-// Overlap of the proxy spheres of links that are not adjacent: (R² - d²) / 2R, squared, in mm².
+// Returns a tenth of the squared overlaps (R² - d²) / 2R of spheres of non-adjacent links [mm²], and adds forces.
 static float self_collision(const Spheres& spheres, float weight, const float* link, Samples& at, float* wrench) {
     const int count = spheres.centers.count, stride = spheres.centers.stride;
     place_points(spheres.centers, link, at.x, at.y, at.z);
@@ -141,7 +141,7 @@ static float self_collision(const Spheres& spheres, float weight, const float* l
     return total;
 }
 
-// Squared distance of the joints from mid-range in half ranges; begins their gradient.
+// Returns the squared distance of the joints from mid-range, in half ranges, and sets their gradient.
 static float posture(const Hand& hand, float weight, const float* joints, float* gradient) {
     float total = 0;
     for (int j = 0; j < hand.joints; j++) {

@@ -1,4 +1,4 @@
-// Rows of a batch over threads. Every row is done by itself, so that results do not depend on how many there are.
+// Distributes independent rows of a batch over threads. Results do not depend on the number of threads.
 #pragma once
 #include <atomic>
 #include <chrono>
@@ -12,13 +12,13 @@
 
 namespace graspd {
 
-// Asks the caller now and then whether to stop, from the caller's own thread: it may hold an interpreter's lock.
+// Asks the caller every 2 ms whether to stop. Asks only in the caller's thread, which may hold an interpreter's lock.
 class Stop {
    public:
     typedef int32_t (*Poll)(int64_t done);
     explicit Stop(Poll poll) : poll_(poll), next_(Clock::now()) {}
 
-    // Counts a step; false where it is not to be done.
+    // Counts a step. Returns false if the step must not run.
     bool go(bool caller) {
         done_.fetch_add(1, std::memory_order_relaxed);
         if (caller && poll_ && Clock::now() >= next_) {
@@ -37,8 +37,8 @@ class Stop {
     std::atomic<bool> stopped_{false};
 };
 
-// work(row, scratch, whether this is the caller's thread) for every row; the caller's thread takes part. What a thread
-// throws, for want of memory, ends the others and is thrown to the caller.
+// Calls work(row, scratch, true in the caller's thread) for every row. The caller's thread takes part. If a thread
+// throws, because memory is short, the other threads end and the caller gets the exception.
 template <class Work>
 static void for_rows(const Problem& p, int rows, int threads, Work work) {
     std::atomic<int> next{0};
@@ -57,7 +57,7 @@ static void for_rows(const Problem& p, int rows, int threads, Work work) {
     std::vector<std::thread> others;
     try {
         for (int k = 1; k < std::min(threads, rows); k++) others.emplace_back(run, false);
-    } catch (const std::system_error&) {  // no thread to be had: fewer do the same
+    } catch (const std::system_error&) {  // If no more threads can start, fewer do the work.
     }
     run(true);
     for (auto& other : others) other.join();

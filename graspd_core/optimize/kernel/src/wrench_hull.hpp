@@ -1,4 +1,4 @@
-// The convex hull of wrenches, one point after the other (Barber, Dobkin and Huhdanpaa, The Quickhull Algorithm, 1996).
+// The convex hull of wrenches, which adds point by point (Barber, Dobkin and Huhdanpaa, The Quickhull Algorithm, 1996).
 #pragma once
 #include <algorithm>
 #include <cmath>
@@ -7,7 +7,7 @@
 
 namespace graspd {
 
-// The hull of at most 256 points in general position in six dimensions: the caller joggles them.
+// The hull of at most 256 points in six dimensions. The caller perturbs them, so that at most six lie on a facet.
 class WrenchHull {
    public:
     static constexpr int D = 6;
@@ -15,7 +15,7 @@ class WrenchHull {
 
     WrenchHull(const double* points, int count) : points_(points), count_(count) {}
 
-    // Whether there is a hull with volume, and rounding has not spoilt it.
+    // Builds the hull. Returns false if it has no volume, or if rounding has broken it.
     bool build() {
         int simplex[D + 1];
         if (!first_simplex(simplex)) return false;
@@ -30,7 +30,7 @@ class WrenchHull {
         }
         for (int i = 0; i < count_; i++)
             if (std::find(simplex, simplex + D + 1, i) == simplex + D + 1) find_above(i);
-        // The farthest point first: fewer facets are made that give way later.
+        // Taking the farthest point first makes fewer facets that are removed later.
         while (!outside_.empty() && !broken_) {
             const auto next = std::max_element(outside_.begin(), outside_.end(),
                                                [](const Outside& a, const Outside& b) { return a.height < b.height; });
@@ -41,7 +41,7 @@ class WrenchHull {
         return !broken_;
     }
 
-    // Of the facet nearest the origin: its outward unit normal, and its distance, negative where the origin is outside.
+    // Returns the nearest facet's distance to the origin, negative if the origin is outside. Writes its unit normal.
     double nearest(double* normal) const {
         const Facet* best = nullptr;
         for (const Facet& facet : facets_)
@@ -50,7 +50,7 @@ class WrenchHull {
         return best->plane[D];
     }
 
-    // The volume. `error` is the largest distance of a vertex from the plane of its facet, infinite where facets fold.
+    // Returns the volume. `error`: greatest distance of a vertex from its facet's plane, infinite if dented.
     double volume(double* error) const {
         double sum = *error = 0, rows[D][D][BATCH] = {};
         int filled = 0;
@@ -69,23 +69,23 @@ class WrenchHull {
     }
 
    private:
-    // Its outward unit normal and offset, how far the point that comes now is above it, and which point that was.
-    // Vertices stand in the order in which they came. Neighbor k lies across the ridge without vertex k.
+    // A facet: outward unit normal and offset, height of the point `looked` above the plane, and vertices in the order
+    // in which they were added. Neighbor k lies across the ridge without vertex k.
     struct Facet {
         double plane[D + 1], height;
         int32_t neighbor[D], looked;
         uint8_t vertex[D];
     };
-    // A point outside the hull, a facet that it is above, and how far.
+    // A point outside the hull, the new facet that it is highest above, and its height.
     struct Outside {
         int point, facet;
         double height;
     };
-    // A ridge between a facet below a point, by the place of its vertex beyond the ridge, and one that is not.
+    // A ridge between a seen `facet` and an unseen facet `beyond`. The vertex `side` of `facet` is not on the ridge.
     struct Rim {
         int32_t facet, side, beyond;
     };
-    // A ridge of new facets, by its four old vertices: ONE for each of them and the sum of their numbers.
+    // A ridge of new facets. `key`: its four old vertices. `sum`: ONE for each of its facets, plus the facets' numbers.
     struct Ridge {
         uint32_t key, sum;
     };
@@ -120,10 +120,10 @@ class WrenchHull {
         return sum;
     }
 
-    // Whether the vertex that a neighbor does not share is above that neighbor.
+    // Returns true if the hull is dented: vertex k, which neighbor k does not share, is above neighbor k.
     bool dented(const Facet& facet, int k) const { return height(facets_[facet.neighbor[k]], at(facet.vertex[k])) > 0; }
 
-    // Seven points, each the farthest from the flat through those before it.
+    // Chooses seven points. Each is farthest from the flat through the points before.
     bool first_simplex(int* chosen) const {
         std::vector<double> rest(points_, points_ + D * count_);
         chosen[0] = 0;
@@ -149,7 +149,7 @@ class WrenchHull {
         return true;
     }
 
-    // The plane of a facet of the first simplex, by cofactors.
+    // Computes the plane of a facet of the first simplex by cofactors. Returns false if the plane is degenerate.
     bool set_first_plane(Facet& facet) {
         const uint8_t* vertex = facet.vertex;
         double plane[D + 1] = {};
@@ -167,7 +167,7 @@ class WrenchHull {
         return side != 0 && std::isfinite(side);
     }
 
-    // Notes the new facet that a point is highest above, if it is above one.
+    // Stores the new facet that a point is highest above, if it is above any.
     void find_above(int point) {
         Outside best = {point, DEAD, 0};
         for (int f : made_)
@@ -175,7 +175,7 @@ class WrenchHull {
         if (best.facet != DEAD) outside_.push_back(best);
     }
 
-    // Facets that see the point, of which one is known, give way to those between it and their rim.
+    // Replaces the facets that the point sees by new facets between the point and their rim. `first` is one seen facet.
     void insert(int index, int first) {
         find_seen(index, first);
         made_.clear();
@@ -197,7 +197,7 @@ class WrenchHull {
 
     bool sees(int f, int index) const { return facets_[f].looked == index && facets_[f].height > 0; }
 
-    // Facets that see the point hang together.
+    // Finds all facets that the point sees. They are connected, so the search goes from neighbor to neighbor.
     void find_seen(int index, int first) {
         facets_[first].looked = index;
         facets_[first].height = height(facets_[first], at(index));
@@ -218,13 +218,13 @@ class WrenchHull {
         }
     }
 
-    // A facet from a ridge of the rim to a new vertex.
+    // Adds a facet from a ridge of the rim to a new vertex.
     void add_cone(int index, const Rim& rim) {
         const int made = add();
         made_.push_back(made);
         Facet &facet = facets_[made], &beyond = facets_[rim.beyond];
         const Facet& seen = facets_[rim.facet];
-        // A plane through the ridge is a sum of the planes that meet there.
+        // A plane through the ridge is a weighted sum of the two planes that meet there.
         double plane[D + 1];
         for (int d = 0; d <= D; d++) plane[d] = seen.height * beyond.plane[d] - beyond.height * seen.plane[d];
         set_plane(facet, plane);
@@ -239,7 +239,7 @@ class WrenchHull {
             *place = made;
     }
 
-    // New facets are neighbors where they share a ridge: four old vertices and the new one.
+    // Connects new facets that share a ridge: four old vertices and the new vertex.
     void connect() {
         int bits = 6;
         while ((size_t(1) << bits) < 2 * (D - 1) * made_.size()) bits++;
@@ -265,7 +265,7 @@ class WrenchHull {
         for (int f : made_)
             for (int k = 0; k < D - 1; k++, slot++) {
                 const uint32_t sum = ridges_[*slot].sum;
-                // Rounding can leave a ridge to one facet, or to three.
+                // Because of rounding, a ridge may belong to one facet or to three.
                 broken_ |= sum / ONE != 2;
                 facets_[f].neighbor[k] = int32_t(sum % ONE) - f;
             }
@@ -278,7 +278,7 @@ class WrenchHull {
         return sum;
     }
 
-    // Determinants of several matrices at once, by their minors of three rows (Laplace).
+    // Computes the determinants of several matrices at once, by minors of three rows (Laplace).
     template <int N>
     static void determinants(const double (&rows)[D][D][N], double* out) {
         std::fill(out, out + N, 0.0);
@@ -310,7 +310,7 @@ class WrenchHull {
     std::vector<int> free_, seen_, made_, freed_;
     std::vector<Rim> rim_;
     std::vector<Ridge> ridges_;
-    std::vector<uint32_t> slots_;  // in `ridges_`, of each new facet's
+    std::vector<uint32_t> slots_;  // index in `ridges_` of each ridge of the new facets
     bool broken_ = false;
 };
 

@@ -8,7 +8,7 @@ namespace graspd {
 
 constexpr float TANGENT_FLOOR = 1e-6f, SUPPORT_FLOOR = 1e-3f, SHARPNESS = 4.f;
 
-// The nearest candidates with their arms, normals and activations; the rest of the last vector counts nothing.
+// Copies arms, normals and activations of the nearest candidates. Lanes after the last candidate count as zero.
 static int choose_contacts(const Problem& p, const Points& points, float delta, bool soft, Scratch& s) {
     Task& t = s.task;
     const Object& object = p.object;
@@ -46,12 +46,12 @@ static int choose_contacts(const Problem& p, const Points& points, float delta, 
     return count;
 }
 
-// v = w_lin + w_ang × a for one disturbance d and a vector of arms.
+// Computes v = w_lin + w_ang × a for one disturbance d and a vector of arms.
 #define GRASPD_VELOCITY(d, ax, ay, az)                                                     \
     Floats vx = d[0] + d[4] * az - d[5] * ay, vy = d[1] + d[5] * ax - d[3] * az, \
            vz = d[2] + d[3] * ay - d[4] * ax
 
-// h of every disturbance, in t.support by lane; what the adjoint needs is kept.
+// Computes h of every disturbance, per lane, in t.support. Stores the values that the adjoint needs.
 static void support(const Problem& p, int whole, Task& t) {
     for (int k = 0; k < p.directions * LANES; k++) t.support[k] = 0;
     for (int b = 0; b < whole; b += LANES) {
@@ -75,7 +75,7 @@ static void support(const Problem& p, int whole, Task& t) {
     }
 }
 
-// The loss, and in t.slope its derivative with respect to every h, times the weight.
+// Returns the loss. Writes the derivative of the weighted loss in every h to t.slope.
 static float soft_worst(const Problem& p, float weight, Task& t) {
     float top = -INFINITY, total = 0;
     for (int k = 0; k < p.directions; k++) {
@@ -89,7 +89,7 @@ static float soft_worst(const Problem& p, float weight, Task& t) {
     return (top + logf(total) - logf((float)p.directions)) / SHARPNESS;
 }
 
-// Gradients with respect to arms, normals and activations.
+// Computes the gradients in arms, normals and activations.
 static void support_adjoint(const Problem& p, int whole, Task& t) {
     for (int b = 0; b < whole; b += LANES) {
         Floats ax = load(t.ax + b), ay = load(t.ay + b), az = load(t.az + b);
@@ -124,7 +124,7 @@ static void support_adjoint(const Problem& p, int whole, Task& t) {
 }
 #undef GRASPD_VELOCITY
 
-// Unweighted loss; adjoints of distance and normal are added to the candidates', and t.ga* holds those of places.
+// Returns the unweighted loss. Adds adjoints of distance and normal to the candidates, of points to t.ga*.
 static float wrench_resistance(
     const Problem& p, const Points& points, float radius, float delta, bool soft, float weight, Scratch& s) {
     Task& t = s.task;
