@@ -62,7 +62,7 @@ def add_command(commands: Any) -> None:
 
 
 def run(options: argparse.Namespace) -> int:
-    """Run the command and keep finished cases. Return the exit status: 0, 1 if a case has faults, 130 after Ctrl-C."""
+    """Run the command. Store finished cases. Return the exit status: 0, 1 if a case has faults, 130 after Ctrl-C."""
     from graspd_bench.result_store import read_results, results_document, write_results
     from graspd_bench.run_studies import faults_of, make_plan, records_of, run_plan, studies_of
     from graspd_bench.study import Request

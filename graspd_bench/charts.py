@@ -260,7 +260,7 @@ def draw_speed(presets: dict[str, list[Row]], path: Path, about: str = "") -> Pa
 
 
 def points_of(presets: dict[str, list[Row]], time: str, panel: Panel) -> list[Point]:
-    """Return the points of all presets with both values: `time`, and the panel's value in the unit of its label."""
+    """Return a point for each preset that has both values: `time`, and the panel's in the unit of its label."""
     points = []
     for name, group in presets.items():
         x, y = spread(group, time), spread(group, panel.figure)

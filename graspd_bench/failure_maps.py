@@ -352,7 +352,7 @@ _CELL, _EDGE = 0.52, "#D55E00"
 
 
 def draw_map(drawn: Map, methods: Mapping[str, Shares], path: Path) -> Path:
-    """Draw a map with one panel per method, from the `shares` by panel caption in `methods`. Return the PNG's path.
+    """Draw a map with one panel per method. `methods` has the caption and `shares` of each. Return the PNG's path.
 
     Cells without a record are white. Rows and columns without any record are left out.
     """
@@ -404,7 +404,7 @@ def _panel(axis: Any, drawn: Map, shares: Shares) -> Any:
 
 
 def _border(axis: Any, grid: Any) -> None:
-    """Draw a line between two neighbouring cells if at least half of the grasps held in only one of them."""
+    """Draw a line between two neighbouring cells if at least half of the grasps held in one, but not in the other."""
     works, known = grid >= 50, np.isfinite(grid)
     beside = (works[:, 1:] != works[:, :-1]) & known[:, 1:] & known[:, :-1]
     above = (works[1:] != works[:-1]) & known[1:] & known[:-1]

@@ -233,7 +233,7 @@ class Move:
 
 
 def moves(old: Sequence[Record], new: Sequence[Record]) -> list[Move]:
-    """Return the changes between two runs. For each name, compare means over shared objects ("all"), then each one."""
+    """Return the changes between two runs: for each name, of means over shared objects ("all"), then of each object."""
     found: list[Move] = []
     for kind in ("raw", "verified"):
         before = {(row.name, row.object): row for row in rows(old, kind)}

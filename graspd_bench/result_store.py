@@ -92,5 +92,5 @@ def read_results(path: Path) -> list[Record]:
 
 
 def bench_version(sources: tuple[str, ...]) -> str:
-    """Return a study's code version: package version, and hash of graspd_core and files `_COUNTED` and `sources`."""
+    """Return a study's code version: package version, and a hash of graspd_core and files `_COUNTED` and `sources`."""
     return code_version(tuple(f"graspd_bench/{pattern}" for pattern in (*_COUNTED, *sources)))

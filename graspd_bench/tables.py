@@ -101,7 +101,7 @@ def summary_table(records: Sequence[Record]) -> str:
 
 
 def hands_table(records: Sequence[Record]) -> str:
-    """Return a table with a row for each hand: means over objects, and the object on which the smallest share held."""
+    """Return a table with a row per hand: means over objects, and the object with the smallest share of held grasps."""
     found = by_name(row for row in rows(records) if is_hand(row.name))
     worst = [min(group, key=lambda row: row.held / row.count) for group in found.values()]
     hands = {name.removeprefix("hand:"): group for name, group in found.items()}

@@ -91,7 +91,7 @@ def build_frozen_world(hand: HandModel, target: ObjectModel, parts: Sequence[Tri
 def displacement_trial(
     world: FrozenWorld, posture: Posture, *, directions: Float[np.ndarray, "directions 3"] = DIRECTIONS
 ) -> float:
-    """Return how far gravity moves the object's centre of mass in 35 steps of 1/240 s [m], mean over its directions."""
+    """Return how far gravity moves the object's centre of mass in 35 steps of 1/240 s [m], mean over `directions`."""
     import mujoco
 
     moved = []
@@ -134,7 +134,7 @@ def gravity_trial(world: World, grasp: Grasp, protocol: Protocol, *, stop: Calla
 
     The hand closes and squeezes as in the hold trial. Then gravity acts on the object along ±x, ±y, ±z in turn for 2 s.
     An object that moves 10 cm is lost and counts as 10 cm. If the hand fails to close, the result is also 10 cm.
-    A direction ends early when its prediction for 2 s is constant within 0.1 mm. Then the prediction counts.
+    A direction ends early if the displacement predicted for 2 s is constant within 0.1 mm. Then the prediction counts.
     With `protocol.full_length` no direction ends early. If `stop` returns true, the displacement so far counts.
     """
     import mujoco

@@ -76,7 +76,7 @@ def dropped_box(thing: Points) -> Box:
 
 
 def release_posture(mover: Mover, q: Joints, thing: Points, bin_: Bin, number: int) -> Joints | None:
-    """Return a collision-free posture near `q` with the object above a bin, or None. Only turn it about the vertical.
+    """Return a collision-free posture near `q` with the object above a bin, or None. Turn the object about z only.
 
     Args:
         mover: arm and hand with the object in the hand.

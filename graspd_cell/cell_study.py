@@ -188,7 +188,7 @@ class AttemptWatch:
         return record
 
     def _target(self, place: np.ndarray) -> str:
-        """Return the name of the object in the pick bin nearest to `place`, base frame [m]. "" if the bin is empty."""
+        """Return which object in the pick bin is nearest to `place`, base frame [m]. Return "" if the bin is empty."""
         world = self._robot.world
         surfaces = [
             (np.linalg.norm((thing.seen.vertices @ pose[:3, :3].T + pose[:3, 3]) - place, axis=1).min(), thing.name)

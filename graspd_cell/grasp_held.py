@@ -2,7 +2,7 @@
 
 A joint presses if its squeeze target lies beyond the grasp. An object in the hand stops the joint before the target. A
 joint that reaches its target presses on nothing, and its effort drops. Joints also stop early if fingers press on each
-other, or if an object rotates between jaws. Surface points of the fingers distinguish these two cases.
+other, or if an object rotates between jaws. Only in the first case do surface points of two fingers meet.
 """
 
 from __future__ import annotations
@@ -89,7 +89,7 @@ def still_holds(hold: Hold, hand: HandModel, reading: JointReading) -> Held:
 
 
 def _stopped(hold: Hold, hand: HandModel, positions: Joints, meeting: float) -> Held:
-    """Decide whether an object stops the joints. Touching fingers that covered more than `meeting` hold no object."""
+    """Decide whether an object is held: not if fingers touch each other beyond the share `meeting` of the squeeze."""
     if not hold.presses.any():
         return Held(True)
     way = (hold.target - hold.touch)[hold.presses]

@@ -258,9 +258,9 @@ class Mover:
         return float(self.shape.links(q[None])[1][0, self.shape.arm.tip, 2])
 
     def clearances(self, q: Path) -> Float[np.ndarray, "rows balls"]:
-        """Return distances of the robot's balls to obstacles, then distances between pairs of these balls [m].
+        """Return distances of the robot's balls to obstacles, then distances of the pairs of balls from `_own` [m].
 
-        The distances of pairs include `margin`, because two balls of the robot may come close, but not overlap.
+        `margin` is added to the distances of pairs, because two balls of the robot may come close, but not overlap.
         """
         shape = self.shape
         coarse, pairs, with_carried = self._own

@@ -301,7 +301,7 @@ class Picker:
         return lost or still_holds(hold, self._hand, self._robot.joints()).reason
 
     def let_go(self, taking: _Taking) -> None:
-        """Open the hand to the pregrasp and store a box where the object was released."""
+        """Open the hand to the pregrasp. Store a box as an obstacle where the object was released."""
         self._move_hand(taking.execution.hand[0])
         self._wait(self._pace.settle)
         self._picked += 1
@@ -318,7 +318,7 @@ class Picker:
             self._stop_if_cancelled()
 
     def _learn(self, attempt: Attempt, offer: Offer) -> None:
-        """Store a failed grasp. After a success, retry objects without a grasp, because they may be reachable now."""
+        """Store a failed grasp. After a success, forget objects without a grasp, as they may be reachable now."""
         if attempt.ending is Ending.PICKED:
             self._failures = [failure for failure in self._failures if failure.grasp is not None]
         elif offer.grasp is not None:

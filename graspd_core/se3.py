@@ -86,7 +86,7 @@ def axis_rotation(axis: Float[np.ndarray, "3"], angle: float) -> Float[np.ndarra
 def quaternion_between(
     source: Float[np.ndarray, "3"], target: Float[np.ndarray, "3"], *, around: Float[np.ndarray, "3"]
 ) -> Float[np.ndarray, "4"]:
-    """Return the shortest rotation from `source` to `target`, unit vectors, wxyz. Opposites turn π about `around`."""
+    """Return the shortest rotation (wxyz) between unit vectors. Opposite vectors get half a turn about `around`."""
     quaternion = np.array([1.0 + source @ target, *np.cross(source, target)])
     length = np.linalg.norm(quaternion)
     return quaternion / length if length > EPSILON else np.array([0.0, *around])

@@ -67,7 +67,7 @@ class TransformBuffer:
             self._insert(link, stamp, pose)
 
     def lookup(self, target: str, source: str, stamp: int | None = None) -> Float[np.ndarray, "4 4"]:
-        """Return `T_target_source` at `stamp` [ns]. None is the newest time that all transforms between them cover.
+        """Return `T_target_source` at `stamp` [ns]. None takes the newest time that all transforms on the way cover.
 
         Raises TransformError: a frame is unknown, the frames are not connected, or the time is outside the known span.
         """

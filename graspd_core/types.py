@@ -300,8 +300,8 @@ class GraspResult:
     stands, None for a floating object. `audits` is always zero, and version 0.3 removes it. `next_view` is
     `T_object_camera` [m] of a camera pose that shows more of the hidden side. `next_view` is set only if grasps hold on
     the likeliest shape but none is verified. `refused` counts the candidates that restrictions refused, by reason.
-    `tried_mass` is the object's mass in the trials [kg]. If the hand could not hold the assumed mass, `mass` equals
-    this lower mass, else None. `count` is the requested number of grasps.
+    `tried_mass` is the object's mass in the trials [kg]. `mass` equals it if the hand could not hold the assumed mass,
+    else it is None. `count` is the requested number of grasps.
     """
 
     outcome: Outcome

@@ -37,7 +37,7 @@ _loaded: OrderedDict[str, Any] = OrderedDict()
 def make_ready(thing: DatasetObject, content: bytes | None, config: PlanConfig) -> ReadyObject:
     """Load an object, and compute the arrays that the optimiser and the trials need.
 
-    `content` is the content of the object's file, if this machine may not have the file. Otherwise it is None.
+    `content` is the content of the object's file, if this machine may lack the file. Otherwise it is None.
     Raises GraspdError: the object cannot be read or used.
     """
     _one_thread()
@@ -106,7 +106,7 @@ def _one_thread() -> None:
 
 
 def _kept(key: str, pickled: bytes) -> Any:
-    """Return the unpickled value of a key. Return the same instance again, because worlds are cached by instance."""
+    """Return the unpickled value of a key. Keep recent instances for later calls, as worlds are cached by instance."""
     if key not in _loaded:
         _loaded[key] = pickle.loads(pickled)
     _loaded.move_to_end(key)

@@ -62,7 +62,7 @@ class DatasetObject:
 
 @dataclass(frozen=True)
 class Block:
-    """One call of `plan_grasps`. One file gets all candidates that it tried.
+    """One call of `plan_grasps`. All candidates that the call tried are in one file.
 
     Attributes:
         object: the object to grasp.

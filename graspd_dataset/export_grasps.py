@@ -31,7 +31,7 @@ Row = dict[str, Any]
 
 
 def export(store: DatasetStore, kind: str, out: Path) -> tuple[int, int]:
-    """Write the grasps of each hand on each object, and the meshes. Return how many such pairs and grasps there are.
+    """Write the grasps of each pair of hand and object, and the meshes. Return the counts of pairs and of grasps.
 
     Raises:
         ConfigError: the format `kind` is unknown, or does not support a hand.
@@ -124,7 +124,7 @@ def write_dexgraspbench(
 ) -> None:
     """Write the grasps of one hand on one object. Also write the object: mesh, convex parts, mass and centre of mass.
 
-    `objects` is the path of the object folder in the grasp files. DexGraspBench looks for it in its code folder.
+    Grasp files name the object folder by the path `objects`. DexGraspBench looks for this path in its code folder.
     """
     name = rows[0]["object_sha256"]
     for number, row in enumerate(rows):

@@ -151,7 +151,7 @@ def moved_links(hand: HandModel) -> Bool[np.ndarray, "joints links"]:
 
 
 def finger_of(hand: HandModel) -> Int[np.ndarray, "joints"]:
-    """Return the finger number of each joint. Joints of a finger move common links, or are connected by such joints."""
+    """Return each joint's finger index. Joints that move a common link are connected. Connected joints are a finger."""
     from scipy.sparse import csr_array
     from scipy.sparse.csgraph import connected_components
 

@@ -98,7 +98,7 @@ def quaternion_of(value: Any, where: str) -> Float[np.ndarray, "4"]:
 def joints_by_name(values: Any, hand: HandModel, where: str) -> Float[np.ndarray, "joints"]:
     """Return the values of the actuated joints [rad] or [m] from a mapping. It may also contain coupled joints.
 
-    Raises FormatError: a name is unknown, an actuated joint is missing, or a coupled joint has another value.
+    Raises FormatError: a name is unknown, an actuated joint is missing, or a coupled joint's value does not fit.
     """
     if not isinstance(values, Mapping):
         raise FormatError(f"{where}: {short_repr(values)}; expected joint values by name")
@@ -144,7 +144,7 @@ _WHAT = "file of DexGraspBench"
 
 
 def order_of(hand: HandModel, order: Sequence[str]) -> tuple[str, ...]:
-    """Return the joint order of a qpos, a pose with joint values: `order`, or if empty the hand's known order.
+    """Return the joint order of a qpos (pose and joint values): `order`, or if it is empty the hand's known order.
 
     Raises ConfigError: the order is not known, or does not fit the hand.
     """

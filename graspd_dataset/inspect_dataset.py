@@ -36,7 +36,7 @@ class DatasetStats:
         hands: counts of each hand, by its name.
         reasons: number of failed grasps for each text of `kind_of_reason`.
         codes: versions of the code that made the rows.
-        failed: records of failed blocks and objects. Without blocks that were made later.
+        failed: records of failed objects, and of failed blocks that were not made later.
     """
 
     hands: dict[str, HandCount] = field(default_factory=dict)

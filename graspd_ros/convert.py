@@ -92,7 +92,7 @@ def matrix_of_pose(pose: Pose) -> Matrix:
 
 
 def near(point: Point, name: str, what: str = "") -> Float[np.ndarray, "3"]:
-    """Return a point [m]. Raises RequestError with `name` and `what`: a coordinate is not finite or over 1 km."""
+    """Return a point [m]. Raises RequestError (text: `name`, `what`): a coordinate is not finite or over 1 km."""
     place = array_of(point)
     if not (np.abs(place) <= _FARTHEST).all():
         raise bad_request(f"{name}: {what}{place.tolist()}; valid: finite, within {_FARTHEST:g} m")

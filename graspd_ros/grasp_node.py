@@ -232,7 +232,7 @@ class GraspNode(Node):
         return response
 
     def _watch_sensors(self) -> None:
-        """Log once why a sensor topic is silent. Store the reasons, which errors of `RequestBuilder.latest` repeat."""
+        """Log once why a sensor topic is silent. Store the reasons for error messages of `RequestBuilder.latest`."""
         before = self._request_builder.missing
         missing = {sensor.name: reason for sensor in self._sensors if (reason := sensor.check())}
         for name in missing.keys() - before.keys():  # only a warning, because some cameras publish only on demand

@@ -165,7 +165,7 @@ class Worker(Generic[R, V]):
         return dropped
 
     def state(self) -> tuple[str | None, int]:
-        """Return the running request's id (or None), and the number of waiting requests without `only_newest` ones."""
+        """Return the running request's id (or None), and how many requests wait, `only_newest` ones not counted."""
         with self._condition:
             running = self._running.id if self._running else None
             return running, len(self._waiting)

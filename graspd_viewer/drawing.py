@@ -196,7 +196,7 @@ def placed_links(
 
 
 def skeletons(hand: HandModel, seen: Snapshot) -> Float[np.ndarray, "hands bones 2 3"]:
-    """Return each hand as line segments: one from each link's parent to the link (their origins), object frame [m]."""
+    """Return each hand as line segments from the origin of a link's parent to the link's origin, object frame [m]."""
     joints = torch.as_tensor(seen.joint_positions).float()
     links = forward(make_kinematics(hand), joints).translation
     quaternions = torch.as_tensor(seen.quaternions_wxyz).float()

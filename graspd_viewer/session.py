@@ -78,7 +78,7 @@ def make_session(
     seen: Float[np.ndarray, "points 3"],
     notes: tuple[str, ...],
 ) -> Session:
-    """Make a session. Far from the origin a browser's float32 is too coarse, so a distant object is moved to it."""
+    """Make a session. Move a distant object to the origin, as a browser's float32 is too coarse far from it."""
     scene, far = planning_scene(scene, config.resolution)
     return Session(title, hand, tuple(moved_grasp(g, -far) for g in grasps), scene, seen - far, notes, far)
 

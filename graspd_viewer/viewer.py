@@ -118,7 +118,7 @@ class Viewer:
         self._jobs.submit(kind, work)
 
     def run(self, work: Callable[[StopHook], None]) -> None:
-        """Stop the run in progress. Start a thread that calls `work`. Do nothing if visitors may not plan."""
+        """Stop the run in progress. Start a thread that calls `work`. Do nothing if the page has no tab Plan."""
         if self._planner is not None:
             self._planner.close()
             self._planner.begin(work)

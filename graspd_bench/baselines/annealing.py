@@ -1,8 +1,8 @@
 """Planner like GraspIt!'s eigengrasp planner (Ciocarlie and Allen, IJRR 2009): annealing, then closing of the fingers.
 
 Eigengrasps are the principal components of human hand postures. No recordings of postures exist for an arbitrary hand.
-Here seeded random postures between open and closed replace the recordings. In them the fingers mostly close together.
-The first component closes the hand. The next components are differences between fingers.
+Here seeded random postures between open and closed replace the recordings. In each posture, the fingers are closed by
+similar shares. The first component closes the hand. The next components are differences between fingers.
 
 A chain steps from one hand state to the next. A state is the base pose and the amplitudes of a few eigengrasps.
 GraspIt!'s energy of a state is a mean over contact locations i on the inside of the hand:
@@ -123,7 +123,7 @@ def inner_contacts(hand: HandModel, per_link: int) -> Int[np.ndarray, "contacts"
     """Choose up to `per_link` contact candidates on the inside of each rigid group of links. Return their indices.
 
     Fixed joints connect the links of a group. The inside faces along the palm's normal or a finger's closing motion.
-    First choose the candidate nearest to the middle of the inside, then always the one farthest from those before.
+    First choose the candidate nearest to the middle of the inside, then repeatedly the one farthest from all chosen.
     """
     chosen: list[int] = []
     facing = _facing(hand)
@@ -148,7 +148,7 @@ def inner_contacts(hand: HandModel, per_link: int) -> Int[np.ndarray, "contacts"
 
 
 def _facing(hand: HandModel) -> Float[np.ndarray, "candidates"]:
-    """Return the cosine of each candidate's normal with its closing motion, or on the palm with the palm's normal."""
+    """Return the cosine of each candidate's normal and closing motion. On the palm, the palm's normal is the motion."""
     links = hand.candidate_link
     early, late = (
         link_poses(hand, hand.open_posture + share * (hand.closed_posture - hand.open_posture)) for share in (0.4, 0.6)

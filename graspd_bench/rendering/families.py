@@ -1,4 +1,4 @@
-"""Random household objects of irregular shape. The reconstruction completes hidden sides by rules that do not fit them.
+"""Random household objects of irregular shape. The reconstruction's rules for hidden sides do not fit them.
 
 The mesh of an object is the zero level set of a signed distance grid, so it is one watertight body. The body consists
 of round cones, boxes and bodies of revolution, with smooth blends. The density is drawn from a typical range for such

@@ -107,8 +107,8 @@ def lowest_pose(mesh: TriangleMesh) -> Float[np.ndarray, "4 4"]:
 def resting_pose(mesh: TriangleMesh, rng: np.random.Generator) -> Float[np.ndarray, "4 4"]:
     """Draw a stable pose of a mesh on z = 0, with a random yaw.
 
-    A mesh that can stand upright stands with a probability of 0.5. Otherwise, any stable pose is drawn. A pose is as
-    likely as a fall from a random orientation is to end in it.
+    A mesh that can stand upright stands with a probability of 0.5. Otherwise, any stable pose is drawn. Each pose
+    is as likely as after a fall from a random orientation.
     """
     import trimesh
 

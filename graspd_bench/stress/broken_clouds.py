@@ -100,7 +100,7 @@ def _refused() -> Iterator[Case]:
 
 
 def _special() -> tuple[Case, ...]:
-    """Return cases with other arguments of `scene_from_views`, other limits, or more than one valid ending."""
+    """Return cases with special arguments of `scene_from_views`, special limits, or more than one valid ending."""
     return (
         _case(
             "lone-object",
@@ -306,7 +306,7 @@ def thrice(shape: str) -> Views:
 
 
 def zero_filled(shape: str) -> Views:
-    """Return a view with two thirds of its points at the camera, which some drivers write for missing depth."""
+    """Return a view with two thirds of its points at the camera. Some drivers write such points for missing depth."""
     (view,) = _seen(tabletop(shape, yaw=_YAW))
     lost = np.random.default_rng(_SEED).random(len(view.points)) < 2 / 3
     return [replace(view, points=np.where(lost[:, None], view.viewpoint, view.points))]

@@ -38,7 +38,7 @@ class Case:
         about: the fault, in one line.
         scene: makes the input in a given folder and loads it as a user would. It may raise a GraspdError.
         expect: valid endings: "grasp", names of `Outcome` ("TOO_FEW"), or classes of errors ("MeshError").
-        whole: whether the input describes a graspable object. Summaries give the share of these with a verified grasp.
+        whole: whether the input has a graspable object. Summaries give the share of these cases with a verified grasp.
         hand: name or path of the hand.
         deadline: time limit of planning [s].
         loading: time limit of loading [s].
@@ -76,7 +76,7 @@ class StressEnding:
         tried: number of returned grasps.
         verified: number of verified grasps.
         again: number of verified grasps that hold in the second trial.
-        finite: whether all postures, and all numbers of grasps that did not fail, are finite.
+        finite: whether all postures are finite, and also all values of grasps that did not fail.
         true: number of verified grasps that hold on the true object. None if the case has no `truth`.
     """
 

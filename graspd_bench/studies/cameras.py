@@ -217,7 +217,7 @@ def _row(own: Sequence[Record]) -> list[str]:
 
 
 def _share(own: Sequence[Record], name: str) -> str:
-    """Describe how many verified grasps held. The 90 % interval resamples views, as errors within a view correlate."""
+    """Describe how many verified grasps held. Resample views for the 90 % interval, as errors in a view correlate."""
     pairs = np.array([(r[name], r["verified"]) for r in own])
     if not pairs[:, 1].sum():
         return "–"

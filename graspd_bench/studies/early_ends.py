@@ -82,7 +82,7 @@ def run_early(case: EarlyEnds) -> Record:
 
 
 def trials_of(hand: HandModel, scene: Scene) -> Mapping[str, Trial]:
-    """Return the trials by name. "noisy" is "displaced" with shorter pulls, as when grasps are ranked by robustness."""
+    """Return the trials by name. "noisy" is "displaced" with the shorter pulls of the robustness ranking."""
     parts, center = object_parts(scene.object), scene.object.center_of_mass
     standard, hard = PROTOCOLS["standard"], PROTOCOLS["hard"]
     slippery, brief = at_friction(standard, 0.3), replace(standard, hold_time=RobustConfig().hold_time)
@@ -138,7 +138,7 @@ def _run(trial: Trial, grasp: Grasp, full: bool, error: Any) -> Record:
 
 
 def _figures(rows: Sequence[Record]) -> list[str]:
-    """Return a trial's table cells. If it measures a length, they show the greatest difference by stopping early."""
+    """Return a trial's table cells. If the trial measures a length, they show the greatest change by stopping early."""
     from scipy.stats import beta
 
     if "figure" in rows[0]["early"]:

@@ -1,6 +1,6 @@
 """Study `robust`: verified grasps ranked by score, the same grasps ranked by noisy trials, and the cost of both.
 
-Further noisy trials evaluate both rankings. Their pose errors are used by no plan, and their pulls last 2 s.
+Further noisy trials evaluate both rankings. No plan uses their pose errors. Their pulls last 2 s.
 """
 
 from __future__ import annotations

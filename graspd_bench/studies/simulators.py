@@ -1,7 +1,7 @@
 """Study `simulators`: hold and displacement trials of the same grasps in MuJoCo and in PyBullet. Do they agree?
 
 The study uses the first grasps of the optimiser's own ranking. No trial filters them. Each grasp is also tried with the
-hand displaced by up to 5 mm along each axis and 5°, so that some grasps fail.
+hand displaced by up to 5 mm along each axis and turned by up to 5°, so that some grasps fail.
 """
 
 from __future__ import annotations

@@ -136,7 +136,7 @@ def _some_paths(task: ArmTask, grasps: Sequence[Grasp]) -> list[ArmPath | str]:
 
 
 def _best_of_each(followed: _Followed, owner: Int[Tensor, "postures"], count: int) -> list[int]:
-    """Return the row of each grasp's first valid path. Without one, return its first row, or -1 if it has no row."""
+    """Return the row of each grasp's first valid path. Else return the grasp's first row, or -1 if there is no row."""
     best = [-1] * count
     for row in reversed(range(len(owner))):
         grasp, good = int(owner[row]), followed.good(row)
@@ -242,7 +242,7 @@ def _followed(
 def _hits_on_path(
     task: ArmTask, path: Float[Tensor, "postures way joints"], joints: Float[Tensor, "postures hand_joints"]
 ) -> Hits:
-    """Return how deep each path collides: with the scene at any waypoint, with arm or hand at any of four stages."""
+    """Return the arm's collision depths: with the scene at all waypoints, with itself and the hand at four stages."""
     count = len(path)
     scene = hits_of_scene(task.arm, task.scene, task.base, arm_links(task.arm, path.flatten(0, 1)))
     links = arm_links(task.arm, path[:, list(STAGE_ROWS)].flatten(0, 1))

@@ -153,7 +153,7 @@ def lift_time(grasp: Grasp, mass: float | None, pace: ExecutionPace) -> float:
 def squeeze_efforts(
     grasp: Grasp, hand: HandModel, settings: GraspStagesConfig | None = None
 ) -> Float[np.ndarray, "joints"]:
-    """Return efforts of joints that stay at the grasp but are driven to the squeeze [N·m] or [N], within limits."""
+    """Return the joint efforts, within limits, if the hand is at the grasp but its targets are the squeeze [N·m, N]."""
     settings = settings or GraspStagesConfig()
     gain = np.where(hand.slides, settings.slide_stiffness, settings.stiffness)
     return np.clip(gain * (grasp.squeeze.joint_positions - grasp.grasp.joint_positions), -hand.effort, hand.effort)
@@ -166,7 +166,7 @@ def _both(arm: np.ndarray, hand: np.ndarray) -> np.ndarray:
 def _from_rest_to_rest(
     rows: np.ndarray, limits: np.ndarray, least: float, shortest: float
 ) -> tuple[Float[np.ndarray, "rows"], Float[np.ndarray, "rows joints"]]:
-    """Return times [s] and speeds of evenly spaced `rows` within `limits`. Take at least `least` and `shortest` [s]."""
+    """Return times and speeds of evenly spaced `rows` within `limits`, over at least max(`least`, `shortest`) [s]."""
     share = np.linspace(0.0, 1.0, len(rows))
     # At time t from 0 to 1, the cubic covers the fraction 3t² − 2t³ of the path. Solve for t.
     time = 0.5 - np.sin(np.arcsin(1.0 - 2.0 * share) / 3.0)

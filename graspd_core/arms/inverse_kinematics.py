@@ -63,7 +63,7 @@ def pose_error(target: SE3, tip: SE3) -> Float[Tensor, "batch 6"]:
 def rotation_vector(
     target: Float[Tensor, "batch 3 3"], current: Float[Tensor, "batch 3 3"]
 ) -> Float[Tensor, "batch 3"]:
-    """Return the rotation vector from `current` to `target`, base frame [rad]. For half a turn the axis is x."""
+    """Return the rotation vector from `current` to `target`, base frame [rad]. Every half turn gets the axis x."""
     turn = target @ current.transpose(-1, -2)
     # `sine` and `cosine` are twice the sine and twice the cosine of the angle.
     axis = turn[:, _ROWS, _COLUMNS] - turn[:, _COLUMNS, _ROWS]
@@ -199,7 +199,7 @@ def tip_features(tip: SE3) -> Float[Tensor, "batch 12"]:
 def nearest_postures(
     table: StartTable, tip: SE3, count: int, usable: Bool[Tensor, "entries"] | None = None
 ) -> Float[Tensor, "batch count joints"]:
-    """Return the `count` nearest postures to each `T_base_tip`, nearest first, of `usable` entries (else of all)."""
+    """Return the `count` postures nearest to each `T_base_tip`, nearest first. Only `usable` ones count, if any."""
     q, features = table.q, table.features
     if usable is not None and usable.any():
         q, features = q[usable], features[usable]

@@ -102,7 +102,7 @@ class BoundReach(BoundRestriction):
         )
 
     def why_none(self, others: BoundRestrictions) -> str:
-        """Return a sentence that counts why the arm cannot reach hand poses that `others` allow around the object."""
+        """Return, as text, why and how often the arm cannot reach hand poses at the object that `others` allow."""
         task = self.task
         starts = draw_starts(task.scene, task.hand, _PROBES, 0, "cpu", torch.float64, restrictions=others)
         rows = zip(*(rows.numpy() for rows in (starts.translation, starts.quaternion, starts.joints)), strict=True)

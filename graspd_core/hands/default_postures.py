@@ -109,7 +109,7 @@ def around_ball(
 def _missed(
     fingers: Fingers, goal: FingertipGoal, away: Float[Tensor, "starts tips 3"]
 ) -> tuple[Float[Tensor, "starts"], Float[Tensor, "starts"]]:
-    """Return how far fingertips miss the goal [finger lengths²], and how one-sided they are. `away`: ball to tip."""
+    """Return the tips' squared miss [finger lengths²], and how one-sided they are, from 0 to 1. `away`: ball to tip."""
     if goal.directions is not None:
         missed = ((away - goal.radius * torch.as_tensor(goal.directions)) / fingers.length).square().sum(-1)
         mean = missed.mean(-1) if goal.weights is None else missed @ torch.as_tensor(goal.weights)
@@ -187,7 +187,7 @@ def default_postures(hand: HandModel, which: tuple[str, ...] = ("open", "closed"
 
 
 def _along(hand: HandModel, fingers: Fingers) -> Float[np.ndarray, "3"]:
-    """Return a gripper's finger direction at mid-range. If nearly normal to the plane of the joints, make it normal."""
+    """Return a gripper's mid-range finger direction, made normal to the plane or line of joints if over 30° from it."""
     middle = middle_joints(hand, fingers)
     half_way = placed_tips(hand, fingers, middle) - fingers.roots
     along = units(half_way.mean(0), 1e-6)

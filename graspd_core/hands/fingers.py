@@ -95,7 +95,7 @@ def find_fingers(hand: HandModel) -> Fingers:
 def _far_end(
     reached: Float[np.ndarray, "points 3"], root: Float[np.ndarray, "3"], middle: Float[np.ndarray, "3"]
 ) -> Float[np.ndarray, "3"]:
-    """Return the mean of the points farthest from the root. If it is near the root, use the farthest from the palm."""
+    """Return the mean of the points farthest from the root. If this mean is near the root, measure from the palm."""
     for origin in (root, middle):
         distance = np.linalg.norm(reached - origin, axis=1)
         end = reached[distance >= np.quantile(distance, 0.85)].mean(0)
@@ -129,7 +129,7 @@ def _mates(
 
 
 def _stand_up(roots: Float[np.ndarray, "3 3"], pair: Float[np.ndarray, "2 3"]) -> bool:
-    """Return True if the directions `pair` are nearly normal to the plane of the finger roots, as in a gripper."""
+    """Return True if the mean direction of `pair` is within 60° of the normal to the roots' plane, as in a gripper."""
     across = np.cross(roots[1] - roots[0], roots[2] - roots[0])
     return bool(abs(pair.mean(0) @ units(across, 1e-6)) > _UPRIGHT)
 

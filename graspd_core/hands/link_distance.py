@@ -45,7 +45,7 @@ def primitive_sdf(primitive: Primitive, points: _Places) -> _Distances:
 
 
 def core_of(primitive: Primitive) -> tuple[tuple[float, ...], float]:
-    """Return a core [m], and a radius [m] by which it grows to the primitive (`CollisionTensors`). Zeros for a hull."""
+    """Return a core and the radius by which it grows to the primitive [m], see `CollisionTensors`. Hulls give zeros."""
     size = primitive.size
     if primitive.kind == "hull":
         return (0.0, 0.0, 0.0), 0.0

@@ -185,7 +185,7 @@ class _Pool:
 
 @lru_cache(maxsize=8)
 def with_candidates(hand: HandModel, count: int) -> HandModel:
-    """Return the hand with `count` contact candidates. Unchanged if it has as many. Raises HandError: count < 1."""
+    """Return the hand with `count` contact candidates, unchanged if it has that many. Raises HandError: count < 1."""
     if count < 1:
         raise HandError(f"candidates: {count}; valid: 1 or more")
     if count == len(hand.candidate_link):
@@ -371,8 +371,8 @@ def parent_groups(hand: HandModel) -> Int[np.ndarray, "links"]:
 def _weights(hand: HandModel, pool: _Pool) -> tuple[Float[np.ndarray, "points"], Bool[np.ndarray, "points"]]:
     """Return the density of candidates around each point, and True for each point that faces the grasp.
 
-    A point on a finger faces the grasp if closing the hand moves it outwards along its normal. The palm faces along the
-    palm normal. Density is higher on fingertips: the outer half of a finger's last rigid group.
+    A point on a finger faces the grasp if closing the hand moves it outwards along its normal. On the palm, the palm
+    normal replaces this motion. Density is higher on fingertips: the outer half of a finger's last rigid group.
     """
     poses = rotations, origins = link_poses(hand, hand.open_posture)
     groups = hand.link_group[pool.links]

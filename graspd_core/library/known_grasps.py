@@ -67,7 +67,7 @@ class Physics:
 def entry_by_name(library: GraspLibrary, hand: HandModel | None, name: str, physics: Physics) -> LibraryEntry:
     """Return the entry of the object with this name, for this hand (None for any hand).
 
-    If all entries of the object have one mass and friction, the mass and friction of `physics` may differ.
+    If all entries of the object have the same mass and friction, `physics` may have other values of both.
 
     Raises:
         ConfigError: the name is unknown, has no entry for this hand or physics, or several objects have this name.
@@ -325,7 +325,7 @@ def _held(
 
 
 def clearance(scene: Scene, hand: HandModel, grasps: Sequence[Grasp]) -> Float[np.ndarray, "grasps"]:
-    """Return the hand's least distance to support and obstacles from pregrasp to squeeze [m], infinity without any."""
+    """Return each hand's least distance to support and obstacles, retreat to squeeze [m]. Infinite if none exist."""
     obstacles = make_obstacle_tensors(scene, hand, "cpu", torch.float64)
     if obstacles is None or not grasps:
         return np.full(len(grasps), np.inf)

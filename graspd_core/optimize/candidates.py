@@ -101,7 +101,7 @@ def find_candidates(task: PlannerInput, *, searches: int | None = None) -> Candi
 
     If too few candidates are expected to pass the hold trial, the search is repeated from new starts. This helps on
     small, large and long objects. `searches` limits the number of searches. None takes the limit of the method's
-    settings. Restrictions act here only on the starts. The caller must check the candidates against them.
+    settings. Restrictions limit only the starts here. The caller must check the candidates against the restrictions.
     """
     config, count = task.config, task.count
     found = _searched(task)

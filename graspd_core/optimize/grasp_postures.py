@@ -309,7 +309,7 @@ def _descended(
 def approach_depth(problem: Problem, obstacles: ObstacleTensors, pregrasp: Poses) -> Values:
     """Return how deep the hand penetrates the object on the straight path from the retreat to the pregrasp [m].
 
-    0 if the path is free. The retreat is the pregrasp drawn back. The samples (`RETREAT_SHARES`) exclude it.
+    0 if the path is free. The retreat is the pregrasp drawn back. `RETREAT_SHARES` leaves out the pregrasp itself.
     """
     rotation = rotation_from_quaternion(pregrasp.quaternion)
     begun = [drawn_back(pregrasp.translation, rotation, obstacles.approach, RETREAT * s) for s in RETREAT_SHARES]
@@ -364,7 +364,7 @@ def squeeze(
 
 
 def by_link(contact_set: ContactSet, values: Float[Tensor, "batch slots n"]) -> Float[Tensor, "batch links n"]:
-    """Return the sum of the values over the slots of each link. The result ends at the last link with a slot."""
+    """Return the sum of the values over the slots of each link, up to the last link that has a slot."""
     links = int(contact_set.link.max()) + 1
     return values.new_zeros(len(values), links, values.shape[-1]).index_add(1, contact_set.link, values)
 
@@ -372,7 +372,7 @@ def by_link(contact_set: ContactSet, values: Float[Tensor, "batch slots n"]) -> 
 def joint_torques(
     problem: Problem, poses: Poses, contact_set: ContactSet, forces: Float[Tensor, "batch slots 3"]
 ) -> Joints:
-    """Return the joint torques τ = JᵀF [N·m] or [N]: the gradient of Σ F·x(q) over the contact points x."""
+    """Return the joint torques τ = JᵀF [N·m] or [N]: the gradient of Σ F·x. The joints move the contact points x."""
     base = poses.base
     x = base.apply_inverse(contact_set.position)
     joints = poses.joints.detach().requires_grad_(True)

@@ -86,9 +86,9 @@ def draw_starts(
 
     As in Grasp'D, the palm faces a random surface point with a random roll. Points are on the hull, so that no palm
     starts inside a hollow. Narrow cross-sections are preferred. A share `fingertips` of the starts has half-closed
-    fingers, with the fingertips at the point, because an open hand does not reach small or low objects. Poses are
-    rarely drawn if the hand, or its retreat, penetrates an obstacle. With restrictions, poses are drawn in at most
-    `_MOST_POOLS` pools. If these contain too few allowed poses, fewer than `count` starts are returned, perhaps none.
+    fingers, with the fingertips at the point, because an open hand does not reach small or low objects. A pose is
+    rarely chosen if the hand penetrates an obstacle there or at the retreat. With restrictions, at most `_MOST_POOLS`
+    pools are drawn. If these contain too few allowed poses, fewer than `count` starts are returned, perhaps none.
     """
     generator = torch.Generator().manual_seed(seed)
     obstacles = make_obstacle_tensors(scene, hand, "cpu", torch.float64)
@@ -208,7 +208,7 @@ def _allowed(draw: Callable[[int], StartPool], wanted: int, seed: int, restricti
 def raise_clear(obstacles: ObstacleTensors, base: SE3, links: SE3) -> tuple[Positions, Values]:
     """Lift hands out of the support by at most `_HIGHEST_LIFT`. `links` are the link poses in the base frame.
 
-    Returns the lifted base origins [m], and how deep each lifted hand or its retreat penetrates obstacles [m].
+    Returns the lifted base origins [m], and each hand's greatest depth in obstacles there or at its retreat [m].
     """
     translation = base.translation
     if obstacles.normal is not None:
@@ -220,7 +220,7 @@ def raise_clear(obstacles: ObstacleTensors, base: SE3, links: SE3) -> tuple[Posi
 
 
 def depth_of_starts(scene: Scene, hand: HandModel, count: int, restrictions: BoundRestrictions) -> float:
-    """Return how deep the best of `count` starts, or its retreat, penetrates obstacles [m]. 0 without obstacles."""
+    """Return the hand's depth in obstacles at the best of `count` starts or its retreat [m]. 0 without obstacles."""
     obstacles = make_obstacle_tensors(scene, hand, "cpu", torch.float64)
     if obstacles is None:
         return 0.0

@@ -51,7 +51,7 @@ class Arrays:
         return self._keep(values, np.int32)
 
     def rows(self, columns: np.ndarray, width: int) -> int:
-        """Copy the k columns of an (n, k) array to rows of `width` floats, padded by zeros. Return the address."""
+        """Copy each column of an (n, k) array to a row of `width` floats, padded by zeros. Return the address."""
         padded = np.zeros((columns.shape[1], width), dtype=np.float32)
         padded[:, : len(columns)] = columns.T
         return self.floats(padded)

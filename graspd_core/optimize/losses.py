@@ -69,7 +69,7 @@ def wrench_support(
 
 
 def soft_contact(distance: Distances, radius: Values, delta: float) -> Distances:
-    """Return exp(−|`distance` − `radius`| / `delta`). It is 1 at the distance `radius`, with a gradient elsewhere."""
+    """Return exp(−|`distance` − `radius`| / `delta`). It is 1 at distance `radius`. Elsewhere it has a gradient."""
     return (-(distance - radius[:, None]).abs() / delta).exp()
 
 

@@ -138,7 +138,7 @@ def extreme_points(hand: HandModel) -> tuple[Float[np.ndarray, "corners 3"], Flo
 
 
 def extreme_points_of_solids(hand: HandModel) -> list[tuple[Float[np.ndarray, "n 3"], float, int]]:
-    """Return balls for each primitive, whose convex hull it is: centres in the link frame [m], radius [m], link."""
+    """Return balls that span each primitive as their convex hull: centres in the link frame [m], radius [m], link."""
     found = ((*_extremes(primitive), primitive) for primitive in hand.primitives)
     return [(at @ solid.rotation.T + solid.translation, radius, solid.link) for at, radius, solid in found]
 
@@ -180,7 +180,7 @@ def obstacle_gaps(obstacles: ObstacleTensors, base: SE3, links: SE3, wide: float
 def least_gap(obstacles: ObstacleTensors, base: SE3, links: SE3, wide: float = WIDE) -> Values:
     """Return the least of `obstacle_gaps` of each hand [m].
 
-    Obstacles beyond `wide` are ignored. Only links near an obstacle's grid are tested (in a bin, a tenth of the links).
+    Obstacles beyond `wide` are ignored. Only links near an obstacle's grid are tested, in a bin a tenth of the links.
     """
     least = base.translation.new_full(base.translation.shape[:1], wide)
     if obstacles.normal is not None:

@@ -41,7 +41,7 @@ class Method:
         colour, marker: colour and marker in charts, as Matplotlib takes them.
         benchmark_count: number of grasps that the benchmark requests in a batch.
         at_budget: returns the settings for a multiple of the usual budget. The default keeps the settings.
-        searches: returns the greatest number of searches per round. They end when enough grasps are expected to hold.
+        searches: returns the greatest number of searches per round. Fewer run if enough grasps are expected to hold.
     """
 
     module: str
@@ -87,7 +87,7 @@ def _registered() -> dict[str, EntryPoint]:
 
 @cache
 def _run_plugins() -> None:
-    """Load the plugins of the parent process. Plugins import this module, so its import cannot load them."""
+    """Load the parent process's plugins. The import of this module cannot do so, because plugins import this module."""
     for path in filter(None, os.environ.get(_PLUGINS, "").split(os.pathsep)):
         load_plugin(path)
 
@@ -113,7 +113,7 @@ class PlanConfig:
     """Settings of a run, apart from the scene, the hand and the seed.
 
     Attributes:
-        resolution: the object's distance grid has at most `resolution`³ nodes. If it is a cube, `resolution` per side.
+        resolution: the object's distance grid has at most `resolution`³ nodes. A cubic grid has `resolution` per side.
         method: name of the method, one of `method_names`.
         settings: settings of the method, an instance of `Method.config`. None takes the defaults.
         problem: settings for converting scene and hand to tensors.

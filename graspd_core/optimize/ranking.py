@@ -50,10 +50,10 @@ class Staged(NamedTuple):
 
 
 def score(problem: Problem, staged: Staged) -> Values:
-    """Return the log-odds of passing the hold trial, minus costs for faults that the trial tolerates.
+    """Return the log-odds of passing the hold trial, minus costs for faults of the candidate.
 
-    Costs are for penetration of the object beyond 2 mm, self-collision beyond 1 mm, and no contact force. Candidates
-    that the trial would refuse get the lowest scores.
+    Faults are penetration of the object beyond 2 mm, self-collision beyond 1 mm, and a hand without contact force.
+    Self-collision beyond 1.8 mm costs most, because the trial would refuse the candidate.
     """
     odds = log_odds(_fitted(), ranking_figures(problem, staged)).to(staged.clearance)
     idle = (staged.pressed.forces == 0.0).all(-1).all(-1)

@@ -186,7 +186,7 @@ def restrictions_in_words(restrictions: BoundRestrictions, refused: Mapping[str,
     """Return a sentence that counts the refused candidates by reason, most frequent reason first.
 
     Example: "12 candidates held, 9 refused: 7 outside the approach cone, 2 with a contact outside the region".
-    If no candidate was found, the sentence names the restrictions. If all candidates were admitted, it is empty.
+    If no candidate was found, the text names the restrictions. If all candidates were admitted, the text is empty.
     `held` counts the candidates that held in the trials, and `tried` the admitted candidates.
     """
     if refused:

@@ -167,7 +167,7 @@ def _hull_corners(points: Float[np.ndarray, "_ 3"]) -> Float[np.ndarray, "_ 3"]:
 
 
 def _points_within(shape: TriangleMesh, low: Vector, high: Vector) -> Float[np.ndarray, "_ 3"]:
-    """Return points whose hull is that of a shape's part in a box: surface points, and box corners inside the shape."""
+    """Clip a shape to a box. Return surface points and inner box corners. Their hull is that of the clipped shape."""
     from trimesh.intersections import slice_faces_plane
 
     vertices, faces = shape.vertices, shape.faces

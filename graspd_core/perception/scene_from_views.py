@@ -150,7 +150,7 @@ def _camera_doubts(seen: Segmentation, views: Sequence[PointCloud]) -> tuple[str
 
 
 def _is_whole_object(views: Sequence[PointCloud]) -> bool:
-    """Return True if `check_scene` fails for the only cloud, but it shows all sides. Otherwise, let the error pass."""
+    """Return False if `check_scene` passes, True if it fails for a single all-round cloud. Else, raise its error."""
     try:
         check_scene(views)
     except CloudError:

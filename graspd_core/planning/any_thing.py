@@ -1,9 +1,9 @@
 """Plan for any object of a scene: find an object with a verified grasp, else rank the objects by their best grasp.
 
 Objects with fewer earlier failures come first. At equal numbers of failures, higher objects come first, because nothing
-lies on them. An object gets one round of the planner. After an earlier failure at this or an unknown object, it gets
-all rounds. The first verified grasp ends the search. After `enough` objects, a grasp with a probability of at least 0.5
-also ends it, to limit the time. `result_of_things` returns the result of one request.
+lies on them. An object gets one round of the planner. It gets all rounds if an earlier try failed with it or with an
+unknown object. The first verified grasp ends the search. After `enough` objects, a grasp with a probability of at least
+0.5 also ends it, to limit the time. `result_of_things` returns the result of one request.
 """
 
 from __future__ import annotations
@@ -130,7 +130,7 @@ def plan_any_thing(
         deadline: time after which the whole search ends [s]. None for no limit.
         enough: number of objects after which a grasp with a probability of at least 0.5 ends the search.
         most: greatest number of objects to plan for. None for all objects.
-        plan: other keyword arguments of `plan_grasps`. Each failure of this or an unknown object adds 1 to `seed`.
+        plan: other keyword arguments of `plan_grasps`. `seed` grows by 1 per failure with this or an unknown object.
 
     Raises:
         CloudError: a cloud is empty, all NaN, or has too few points.

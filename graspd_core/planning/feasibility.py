@@ -91,7 +91,7 @@ def kind_of(reason: str) -> str:
 # The cache keeps the last eight hands. Hands are hashed by identity.
 @lru_cache(maxsize=8)
 def reach_of(hand: HandModel) -> tuple[float, float]:
-    """Return the open hand's greatest distance of two contact candidates, and widest gap between fingertips [m]."""
+    """Return the open hand's greatest distance between two contact candidates, and its widest fingertip gap [m]."""
     poses = forward(make_kinematics(hand, dtype=torch.float64), torch.as_tensor(hand.open_posture)[None])
     links = poses[0, torch.as_tensor(hand.candidate_link)]
     points = (links.rotation @ torch.as_tensor(hand.candidate_points)[..., None]).squeeze(-1) + links.translation
@@ -116,7 +116,7 @@ def _surface(scene: Scene) -> tuple[Float[np.ndarray, "n 3"], Float[np.ndarray, 
 def _one_sided(
     points: Float[np.ndarray, "n 3"], normals: Float[np.ndarray, "n 3"], radius: float, least: float
 ) -> bool:
-    """Return True if all friction-cone forces of each patch of `radius` [m] lie in one half-space (`_separated`)."""
+    """Return True if in every patch of `radius` [m], all friction-cone forces lie in one half-space (`_separated`)."""
     tree = KDTree(points)
     _, first = np.unique(packed_rows(np.round(points / (radius / 4)).astype(np.int64)), return_index=True)
     return all(_separated(normals[tree.query_ball_point(points[k], radius)], least) for k in first)

@@ -68,7 +68,7 @@ class Maker:
 
 
 def makers(*rows: tuple[str, tuple[str, ...], tuple[str, ...]]) -> dict[tuple[str, str], Maker]:
-    """Return a maker for each pair of module and name. A row holds a kind, modules and names, in all combinations."""
+    """Return a maker for each (module, name). A row (kind, modules, names) covers each module with each name."""
     return {(module, name): Maker(kind) for kind, modules, names in rows for module in modules for name in names}
 
 

@@ -1,4 +1,4 @@
-"""End a hold early, once the object drifts too slowly to reach a limit. In a hold, the closed hand keeps the object.
+"""End a hold early, once the object drifts too slowly to reach a limit. A hold is a pull, or the wait after a lift.
 
 Up to the stop, a shortened trial has the same states as a full trial. A grasp may pass the shortened trial although it
 would fail the full trial. The opposite never happens. A slowly sliding object may reach an edge and slip suddenly, so

@@ -220,7 +220,7 @@ def place_hand(world: World, data: Any, posture: Posture) -> None:
 
 
 def set_joints(world: World, data: Any, values: np.ndarray) -> None:
-    """Set the actuated joints to `values` [rad] or [m]. Set each coupled joint to the value set by its leader."""
+    """Set the actuated joints to `values` [rad] or [m]. Each coupled joint follows its leader."""
     data.qpos[world.joint_addresses] = values
     for address, mimic in zip(world.coupled_addresses, world.mimics, strict=True):
         data.qpos[address] = mimic.multiplier * values[mimic.joint] + mimic.offset

@@ -261,7 +261,7 @@ def doubted_if_weak(checks: RobustnessChecks, most: float, heavy: float) -> Robu
 def less_sure(checks: RobustnessChecks, most: float, heavy: float) -> RobustnessChecks:
     """Scale all probabilities by the fraction of objects of this volume that weigh at most the payload `most` [kg].
 
-    `doubted_if_weak` runs first and may add a doubt. `heavy` has the same meaning there.
+    First, `doubted_if_weak` may replace the checks by a doubt. `heavy` is the greatest mass the volume allows [kg].
     """
     checks, share = doubted_if_weak(checks, most, heavy), share_as_light(most, heavy)
     stages = tuple(replace(stage, though_failed=share * stage.though_failed) for stage in checks.stages)

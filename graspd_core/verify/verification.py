@@ -148,7 +148,7 @@ def lighter(
 
 
 def payloads(context: VerificationContext, grasps: Sequence[Grasp], stop: StopHook) -> list[float]:
-    """Return the payload of each grasp [kg]. Return 0 if it is less than 10 % above the greatest earlier payload."""
+    """Return each grasp's payload [kg]. Return 0 for a grasp that does not beat the best earlier payload by 10 %."""
     trials, found = context.trials, list[float]()
     for grasp in grasps:
         least = FINENESS * max(found, default=LEAST_PAYLOAD)

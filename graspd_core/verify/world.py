@@ -171,8 +171,8 @@ class Protocol:
         timestep: simulation time step [s].
         stiffness: position gain of every revolute joint [N·m/rad].
         damping: damping of every revolute joint [N·m·s/rad].
-        slide_stiffness: position gain of every prismatic joint [N/m], as of a revolute joint at 5 cm from its axis.
-        slide_damping: damping of every prismatic joint [N·s/m], as of a revolute joint at 5 cm from its axis.
+        slide_stiffness: position gain of every prismatic joint [N/m]. It equals `stiffness` at a lever arm of 5 cm.
+        slide_damping: damping of every prismatic joint [N·s/m]. It equals `damping` at a lever arm of 5 cm.
         armature: rotor inertia of every joint [kg·m²] or [kg].
         stage_time: duration of pregrasp → grasp and of grasp → squeeze [s].
         hold_time: duration of each pull [s].

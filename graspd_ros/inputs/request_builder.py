@@ -392,7 +392,7 @@ def frame_loader(
 
 
 def frame_views(frame: SensorFrame, settings: Settings, place: CameraPlace, lookup: Lookup) -> SeenViews:
-    """Return a function that reads a sensor frame as one view, and warnings. The worker's thread calls `lookup`."""
+    """Return a function that reads the frame. It returns one view and warnings. The worker's thread calls `lookup`."""
 
     def read() -> tuple[tuple[PointCloud, ...], tuple[str, ...]]:
         cloud = seen.seen_by_camera(frame, place, lookup)

@@ -95,7 +95,7 @@ class SensorFrame:
         raise RequestError(ErrorCode.STALE_CLOUD, f"the {self.kind} in {self.frame!r} {text}, {more}")
 
     def warnings(self, cloud: PointCloud) -> tuple[str, ...]:
-        """Return one sentence for each fault: a stamp in the future, a view direction unlike the frame's name."""
+        """Return a sentence for each fault: a stamp in the future, a frame name that contradicts the view direction."""
         ahead = (nanoseconds(self.stamp) - self.arrived) * 1e-9
         early = f"the {self.kind} came {ahead:.1f} s before its stamp: the sensor's clock is ahead of the node's"
         # The orientation is checked only if the camera is at the frame's origin.
@@ -261,7 +261,7 @@ class Views:
 def scene_of_views(
     views: tuple[PointCloud, ...], settings: Settings, target: Target | None, warnings: tuple[str, ...] = ()
 ) -> Scene:
-    """Return the scene that clouds in a common frame show. `target` selects the object, in this frame too.
+    """Return the scene that clouds in a common frame show. `target`, in the same frame, selects the object.
 
     `warnings` become warnings of the object. Raises GraspdError if the clouds show no usable object, or the
     `scene_config` file is no longer valid.

@@ -89,7 +89,7 @@ def bad_message(owner: str, message: str) -> RequestError:
 
 
 def plane_of(surface: PlaneMessage, T_object_frame: Matrix | None = None) -> Plane | None:
-    """Return the support plane in the object's frame. None if all coefficients are 0. Raises RequestError: no plane."""
+    """Return the support plane in the object's frame. None if all coefficients are 0. Raises RequestError: invalid."""
     a, b, c, d = map(float, surface.coef)
     if not any((a, b, c, d)):
         return None
@@ -166,7 +166,7 @@ def _changed(there: SceneObject | None, message: Any, owner: str) -> SceneObject
 
 
 def with_collision_objects(request: Request, lookup: FrameLookup) -> Request:
-    """Return the request with its collision objects as obstacles. `solids` has their meshes, and `load` adds them.
+    """Return the request with its collision objects: `load` adds them as obstacles, and `solids` has their meshes.
 
     `lookup` transforms between frames at the request's time. Raises TransformError: an object's frame is unknown.
     """

@@ -89,7 +89,7 @@ class TransformListener:
 
 
 def reach_of(request: Request, lookup: FrameLookup, robot_description: str = "") -> Reach:
-    """Return a restriction, in the object's frame, that allows only grasps within reach of the settings' arm.
+    """Return a restriction, in the object's frame, that allows only grasps within reach of the arm in the settings.
 
     `lookup` transforms between frames at the request's time. `robot_description` is the URDF of a robot with the arm.
     """

@@ -302,7 +302,7 @@ def trajectory_of(grasp: Grasp, hand: HandModel, pace: Pace) -> JointTrajectory:
     """Return the trajectory through pregrasp, grasp and squeeze. Its stamp is zero, so it starts on receipt.
 
     The trajectory has only the driven joints, because controllers refuse others. The hand may start in any posture.
-    Positions are within the joint limits. The last point is a target inside the object, which stops the joints.
+    Positions are within the joint limits. The last point is a target inside the object. The object stops the joints.
     """
     times = posture_times(grasp, hand, pace)
     return JointTrajectory(
@@ -320,7 +320,7 @@ def base_poses(grasp: Grasp, frame: str, stamp: Time) -> list[PoseStamped]:
 def posture_times(grasp: Grasp, hand: HandModel, pace: Pace) -> tuple[float, float, float]:
     """Return the times of pregrasp, grasp and squeeze from the start of the trajectory [s].
 
-    The first time lets every joint cross its whole range. The arm must bring the base to the pregrasp by then.
+    The first time lets every joint cross its whole range. By then, the arm must bring the base to the pregrasp.
     """
     speed = _greatest_speeds(hand, pace)
     first = max(pace.shortest, _PEAK * float(np.max((hand.upper - hand.lower) / speed, initial=0.0)))
@@ -413,7 +413,7 @@ def result_markers(
     parts: Sequence[str] = USUAL_PARTS,
     solids: Sequence[Primitive] | None = None,
 ) -> MarkerArray:
-    """Return markers of the best `most` grasps: the `parts`, by names of `PARTS`. `rejected` shows all failed grasps.
+    """Return markers of the best `most` grasps. `parts` are names of `PARTS`. Part `rejected` shows all failed grasps.
 
     The first marker deletes all earlier markers. The hand is drawn as `solids`, or as its collision shapes if None.
     """

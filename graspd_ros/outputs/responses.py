@@ -316,7 +316,7 @@ class Responses:
             self.not_made(request_id, "cloud", error)
 
     def refused(self, request_id: str, source: str, code: ErrorCode, message: str) -> None:
-        """Report on `~/status` and in the log why a message is not used. `request_id` is empty for other messages."""
+        """Report on `~/status` and in the log why a message is not used. `request_id` is "" if it is no request."""
         self.publishers.emit("refused", request_id, source, code=code, message=message)
         self._log().warning(f"{request_id or source}: refused: {message}")
 
@@ -463,7 +463,7 @@ class Responses:
         self._log().error(f"{request_id or source}: {message}{detail}")
 
     def _report_superseded(self, request_id: str) -> None:
-        """Publish how many clouds newer clouds have replaced since the last report. The event has `request_id`."""
+        """Publish how many waiting clouds were replaced since the last report, in an event with `request_id`."""
         count, self._superseded = self._superseded, 0
         if count:
             self._superseded_reported = time.monotonic()

@@ -92,9 +92,9 @@ def rows_kept(settings: ClosedFormConfig, keep: int, rows: int, index: int) -> i
 
 
 def at_budget(settings: ClosedFormConfig, budget: float) -> ClosedFormConfig:
-    """Return the settings for `budget` times the usual effort. Above 1 it multiplies the starts, for hard objects.
+    """Return the settings for `budget` times the usual effort. A budget above 1 multiplies starts, for hard objects.
 
-    Below 1 it multiplies the steps and allows one search. Fewer starts would save hardly any time in a small batch.
+    A budget below 1 multiplies the steps and allows one search. Fewer starts would hardly save time in a small batch.
     """
     share, times = min(budget, 1.0), max(budget, 1.0)
     steps = {

@@ -21,7 +21,7 @@ computed. All values are in SI units and in the object frame. Torques and angula
 mass.
 
 Gradients are exact with four exceptions. Points out of contact get a gradient too (`leaky_min`). The tangential speed
-has a floor, so that friction is smooth without sliding. L_task has no gradient in the pose. `into_cone` has none.
+has a floor, so that friction is smooth at rest. L_task has no gradient in the pose. `into_cone` has no gradient.
 """
 
 from __future__ import annotations
@@ -299,7 +299,7 @@ class Evaluation(NamedTuple):
 
 
 class Slope(NamedTuple):
-    """Cost, constraint violations, gradients of the Lagrangian in pose and desired forces (or None), and normals."""
+    """Cost, constraint violations, Lagrangian's gradients in pose and in forces (None if `pose_only`), and normals."""
 
     cost: Values
     broken: Float[Tensor, "batch constraints"]
@@ -434,7 +434,7 @@ class Graspd2022:
         return fade * min(1.0, index / config.warm_up) if config.warm_up else fade
 
     def moved(self, problem: Problem, pose: Adamax, gradient: Rows, when: tuple[int, int]) -> Adamax:
-        """Move the pose. `when` is the step's index and the turn: 0, or with `in_turns` also 1 for the second move.
+        """Move the pose once. `when` is (step, turn). With `in_turns`, a step has the turns 0 and 1, otherwise only 0.
 
         As in the released code, the moments of all variables are updated, also of variables that do not move this turn.
         """

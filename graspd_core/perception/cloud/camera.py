@@ -180,7 +180,7 @@ def reaches_image_border(
 ) -> bool:
     """Return True if an object reaches an image border of the camera at `eye`. `mine` marks the object's points.
 
-    A border is a long side of the hull of all lines of sight. Object and other points lie within `width` [rad] of it.
+    A long side of the points' hull in the image is a border. Object and other points must be within `width` [rad].
     """
     if not mine.any():
         return False

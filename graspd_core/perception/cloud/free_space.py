@@ -44,7 +44,7 @@ class ViewDepth:
         low, cell: corner of the first cell, and width of a cell, in image coordinates (x/z and y/z).
         depth: depth of the object's surface in each cell [m]. Cells beside its outline copy the nearest seen cell, or
             are infinite if an occluder covers them.
-        nearest: depth up to which the camera saw empty space [m]: the least of 3×3 cells, or the occluder's.
+        nearest: depth up to which the camera saw empty space [m]: the least depth of 3×3 cells, or the occluder's.
         beside: distance from the outline in cells, 0 inside the outline and where an occluder hides the object.
     """
 
@@ -65,7 +65,7 @@ class FreeSpace:
         view_depths: one depth image per camera, none if the cameras are unknown.
         standing: whether the object stands on a support that fills z < 0.
         lowest: height of the lowest seen points [m]. Segmentation removes lower points together with the
-            support, so seen outlines may end up to `lowest` too high.
+            support, so seen outlines may be too high by up to `lowest`.
         slack: depth in empty space up to which a point does not contradict the cameras [m].
         tolerance: distance from seen surface up to which the cameras confirm a guessed point [m].
     """

@@ -216,7 +216,7 @@ def hidden_share(points: Points, viewpoint: Vector, nearer: Float[np.ndarray, "p
 
 
 def _away_share(points: Points, surfaces: Surfaces, viewpoint: Vector) -> float:
-    """Return the fraction of points that face away from the viewpoint. Of each surface, only the smaller side does."""
+    """Return the fraction of points that face away from the viewpoint. Most of a surface is assumed to face it."""
     normal, surface, clear = surfaces
     ray = viewpoint - points
     cosine = (normal * ray).sum(1) / np.maximum(np.linalg.norm(ray, axis=1), 1e-12)
@@ -268,7 +268,7 @@ def _roughness(points: Points, tree: Any) -> float:
 
 
 def things_behind(points: Points, viewpoint: Vector) -> bool:
-    """Return True if more points lie below the seen part of a table than on it. The camera's side counts as above.
+    """Return True if more points lie below the seen part of a table than on it. Below is the side away from the camera.
 
     Return True as well if the viewpoint lies in the table's plane, as the origin of a robot's base often does.
     """
@@ -315,7 +315,7 @@ def _thinned(thing: PointCloud) -> Float[np.ndarray, "m 3"]:
 
 
 def _in_box(points: Points, thing: Float[np.ndarray, "k 3"]) -> Int[np.ndarray, "m"]:
-    """Return the indices of points in a padded box around an object, axis by axis, because most points are far away."""
+    """Return the indices of points in a padded box around an object. Test axes in turn to drop far points early."""
     inside = np.arange(len(points))
     for axis in range(3):
         side = points[inside, axis]

@@ -97,7 +97,7 @@ def voxel_downsample(views: Sequence[PointCloud], settings: SegmentationConfig) 
 def _inside(
     view: PointCloud, stride: int, settings: SegmentationConfig
 ) -> tuple[Int[np.ndarray, "kept"], Float[np.ndarray, "kept 3"], Float[np.ndarray, "kept"], int]:
-    """Take every `stride`-th point. Return row, position and distance of those in the workspace. Count all measured."""
+    """Take every `stride`-th point. Return rows, points and distances in the workspace, and how many were measured."""
     rows = stride * np.flatnonzero(measured(view.points[::stride], view.viewpoint))
     points = view.points[rows].astype(float)
     distance = np.linalg.norm(points - view.viewpoint, axis=1)

@@ -91,7 +91,7 @@ def stand(surfels: Surfels, free_space: FreeSpace, step: float) -> Surfels:
 
 
 def _column(surfels: Surfels, free_space: FreeSpace, step: float) -> Surfels:
-    """Return walls and bottom beneath surfels that end high above the support. Bridge gaps in height by more walls."""
+    """Return walls and bottom beneath surfels that end high above the support. Add walls across vertical gaps."""
     order = np.argsort(surfels.points[:, 2])
     height = surfels.points[order, 2]
     level = np.cumsum(np.diff(height, prepend=height[:1]) > MAX_FOOT_HEIGHT_M)

@@ -127,7 +127,7 @@ def close_surface(surfels: Surfels, field: Field, free_space: FreeSpace, cell: f
 
 
 def _beneath_floors(surfels: Surfels, lowest: float) -> Points:
-    """Return a low floor's points, such as a cup's, moved down to the support. So the surface can reach the support."""
+    """Return the points of low floors, such as a cup's, moved down to the support, so the hull reaches it."""
     floor = (surfels.normals[:, 2] > MIN_FLOOR_COSINE) & (surfels.points[:, 2] < lowest + MAX_FLOOR_RISE_M)
     return surfels.points[floor] * np.array([1.0, 1.0, 0.0])
 

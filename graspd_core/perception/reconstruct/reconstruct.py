@@ -294,7 +294,7 @@ def _unseen_share(mesh: TriangleMesh, seen: Surfels, standing: bool, reach: floa
     """Return the fraction of a surface that is not near to seen surface in position and normal.
 
     Args:
-        reach: largest distance that counts as near [m]. A difference of 60° between normals counts as this distance.
+        reach: largest distance that counts as near [m]. Normals 60° apart count like a distance of `reach`.
     """
     from scipy.spatial import KDTree
 

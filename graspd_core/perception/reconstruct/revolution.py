@@ -105,8 +105,8 @@ def turned(rows: Float[np.ndarray, "n 4"], step: float) -> Bool[np.ndarray, "n"]
 def settle_axis(surfels: Surfels, axis: Axis, step: float) -> Axis:
     """Tilt the axis by Gauss-Newton steps until the profile of the points is as thin as possible.
 
-    Points far from the profile, such as those of a handle, count less and less. Of each step, use the tilts but not the
-    shifts. The normals give the axis position, because points from one side do not give it along the view.
+    Points far from the profile, such as those of a handle, count less and less. Use only the tilts of each step. Take
+    the position from the normals, because points seen from one side leave it uncertain along the view.
     """
     for round_ in range(GAUSS_NEWTON_STEPS):
         right = perpendicular(axis.direction)

@@ -281,7 +281,7 @@ def _near(
 
 
 def _hangs(piece: Points, distance: Float[np.ndarray, "n"], support: FlatPart, viewpoints: Eyes, link: float) -> bool:
-    """Return True if a cluster floats above the support and hides the place below it from no camera."""
+    """Return True if a cluster floats above the support and does not hide the place below it from any camera."""
     height = support.height(piece)
     if (height - support.tolerance(distance)).min() <= FLOATING_LINKS * link:
         return False

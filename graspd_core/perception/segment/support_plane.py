@@ -1,8 +1,8 @@
 """Classification of a scene's flat parts: support, background, or face of an object.
 
 A support faces the cameras, is larger than the objects on it, and has at least one object on it. The object reaches
-down to the support, lies over the visible part of the support, and has a graspable size. Other flat parts differ: no
-object is above a convex body's face, and none reaches a wall. Above a tray's floor is only a rim as wide as the floor.
+down to the support, lies over the visible part of the support, and has a graspable size. Other flat parts fail this:
+nothing is above a convex body's face, and no object touches a wall. A tray's rim is no smaller than the tray's floor.
 """
 
 from __future__ import annotations
@@ -118,7 +118,7 @@ def _falls_off(scene: VoxelScene, part: FlatPart, margin: float) -> bool:
 def _standing(
     scene: VoxelScene, part: FlatPart, left: Mask, viewpoints: Eyes, settings: SegmentationConfig
 ) -> tuple[int, int]:
-    """Count the voxels of objects that may stand on a flat part: first of those that touch it, then of all."""
+    """Count voxels of objects that may stand on a flat part. Return the count for those that touch it, then for all."""
     points, distance = scene.mean[left], scene.mean_distance[left]
     label = link_points(points, scene.weight[left], link_length(points, settings), settings.neighbour_share)
     touching, standing = 0, 0

@@ -191,7 +191,7 @@ def _holds(points: Points, point: Vector) -> bool:
 
 
 def _masked(scene: VoxelScene, label: Labels, many: int, meant: Mask, least: float) -> Mask:
-    """Select the object with most masked points and all at least half masked. Below `least`, only masked voxels."""
+    """Take the object with most masked points and all at least half masked. If below `least`, drop unmasked voxels."""
     of_first = scene.voxel[scene.of_view(0)]
     shown, covered = (
         np.bincount(label[rows][label[rows] >= 0], minlength=many) for rows in (of_first, of_first[meant[of_first]])
