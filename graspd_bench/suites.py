@@ -88,7 +88,7 @@ def main_suite(request: Request) -> tuple[Cell, ...]:
 
 
 def sweep_suite(request: Request) -> tuple[Cell, ...]:
-    """Return raw cells that sweep four settings, one at a time. All other settings are those of `balanced`."""
+    """Return `raw` cells that sweep four settings, one at a time. Other settings are those of `balanced`."""
     base = load_preset(_SWEEP_PRESET)
     count, trials = _count(request, base), _trials(request, _SWEEP_TRIALS)
     return tuple(
@@ -101,7 +101,7 @@ def sweep_suite(request: Request) -> tuple[Cell, ...]:
 
 
 def decades_suite(request: Request) -> tuple[Cell, ...]:
-    """Return raw cells that sweep contact settings over three decades. They show how exact a setting must be."""
+    """Return `raw` cells that sweep contact settings over three decades. They show how exact a setting must be."""
     count, trials = request.count or HAND_COUNT, _trials(request, _SWEEP_TRIALS)
     return tuple(
         cell
@@ -121,7 +121,7 @@ def decades_suite(request: Request) -> tuple[Cell, ...]:
 
 
 def hands_suite(request: Request) -> tuple[Cell, ...]:
-    """Return raw cells of every built-in hand with the preset `balanced`."""
+    """Return `raw` cells of each built-in hand with preset `balanced`."""
     base, count = load_preset(_SWEEP_PRESET), request.count or (_QUICK_COUNT if request.quick else HAND_COUNT)
     trials = _trials(request, _SWEEP_TRIALS)
     return tuple(

@@ -68,7 +68,7 @@ _HEIGHTS = (0.08, 0.12, 0.17, 0.22, 0.28)
 
 
 def dropped_box(thing: Points) -> Box:
-    """Return a box on the table as obstacle for a released object. `thing` has its surface points at release [m]."""
+    """Return a released object's bounding box, put on the table. `thing` has its surface points at release [m]."""
     low, high = thing.min(0), thing.max(0)
     half, rise = 0.5 * (high - low)[:2], 0.5 * float(high[2] - low[2])
     x, y = (0.5 * (low + high))[:2].tolist()

@@ -284,7 +284,7 @@ def _of_their_types(parameters: list[Parameter]) -> list[Parameter]:
 
 
 def check_parameters(parameters: list[Parameter]) -> SetParametersResult:
-    """Return whether all values are valid, and the reason if not. ROS itself checks the other types and ranges."""
+    """Return whether all values are valid, and the reason if not. ROS checks types and ranges not checked here."""
     try:
         for parameter in parameters:
             _check_value(parameter.name, parameter.value)

@@ -70,7 +70,7 @@ Lookup = Callable[[str, str, Time, StopHook], Matrix]
 
 @dataclass(frozen=True)
 class Planned:
-    """Result of a request. Grasps and positions are in the frame of its answer.
+    """Result of a request. Grasps and positions are in the answer's frame.
 
     Attributes:
         result: the grasps.
@@ -78,7 +78,7 @@ class Planned:
         worked_on: False if the deadline passed while the request waited in the queue.
         mass: object's mass for planning and trials [kg]. 0 if unknown.
         mass_assumed: True if the request gave no mass.
-        objects: for a request for any object, each object's position [m], and the reason if no grasp is verified. The
+        objects: if the request allows any object: each object's position [m], and why it has no verified grasp. The
             grasps belong to the first object.
         surface: the object's mesh in its own frame [m]. None if it was not loaded.
         held: the object's hull in the base link's frame at the first grasp [m]. None without a usable grasp or mesh.

@@ -60,7 +60,7 @@ def run_simulators(case: ObjectCase) -> Record:
 
 
 def simulator_sections(records: Sequence[Record], chart: Path | None) -> Sections:
-    """Return a table of verdicts, each disagreement with both results, and mean displacements of both simulators."""
+    """Return a table of verdicts, a list of the trials with different verdicts, and both mean displacements."""
     rows = [(r["object"], trial) for r in records for trial in r["trials"]]
     if not rows:
         return {}

@@ -16,7 +16,7 @@ _MINIMA = {"max_voxels": 1000, "neighbours": 4, "max_points": 1000, "max_faces":
 
 @dataclass(frozen=True)
 class SegmentationConfig:
-    """Settings for cutting the object to grasp out of a scene that depth cameras saw.
+    """Settings to separate the object to grasp from a scene that depth cameras saw.
 
     Attributes:
         roi_low: lower corner of the workspace, in the cloud's frame [m]. None means no bound.
@@ -31,7 +31,7 @@ class SegmentationConfig:
         support_size: least width of the visible part of a support plane [m].
         support_margin: a support is assumed to continue this far beyond its visible part [m].
         support_area_ratio: least ratio of the area of a support to the area of the objects on the support.
-        contact: an object up to this far above the support still touches it [m]. Noise and occlusion allow more.
+        contact: an object up to this far above the support touches it [m]. Noise or occlusion raises the limit.
         gap: points at least this far apart belong to two objects [m].
         max_link: points farther apart than this never belong to one object, even in a sparse cloud [m].
         neighbour_share: points with fewer neighbours than this fraction of the median number are flying pixels.
@@ -44,8 +44,8 @@ class SegmentationConfig:
         target_reach: a target point selects an object within this distance [m].
         target_share: a box or mask that covers this fraction of an object selects the whole object.
         obstacle_range: other objects up to this distance from the object to grasp become obstacles [m].
-        piled: whether objects lie on each other. If so, parts divided by a seam are objects even if stacked. A
-            grasp of a part that a target point selects is never verified. A heap of any size may stand on the support.
+        piled: True if objects lie on each other. Parts divided by a seam are then separate objects, even if stacked. If
+            a target point selects such a part, its grasps are never verified. The heap may have any size.
     """
 
     roi_low: tuple[float, float, float] | None = None

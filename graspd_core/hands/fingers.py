@@ -129,7 +129,7 @@ def _mates(
 
 
 def _stand_up(roots: Float[np.ndarray, "3 3"], pair: Float[np.ndarray, "2 3"]) -> bool:
-    """Return True if the mean direction of `pair` is within 60° of the normal to the roots' plane, as in a gripper."""
+    """Return True if two fingers' mean direction is within 60° of the normal to the roots' plane, as in a gripper."""
     across = np.cross(roots[1] - roots[0], roots[2] - roots[0])
     return bool(abs(pair.mean(0) @ units(across, 1e-6)) > _UPRIGHT)
 

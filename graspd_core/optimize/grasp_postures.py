@@ -329,7 +329,7 @@ class Squeeze:
 
     Attributes:
         joints: position targets [rad] or [m].
-        forces: contact force on the object at each slot [N], as if no joint were at its effort limit.
+        forces: contact force on the object at each possible contact [N], before the effort limits.
         imbalance: norm of the net wrench divided by the sum of the normal forces. 1 with fewer than two contacts.
     """
 

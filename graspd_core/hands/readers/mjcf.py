@@ -350,7 +350,7 @@ def _reference(parts: _Parts, joint: int) -> float:
 
 def _refuse_far(parts: _Parts, element: Any, position: Float[np.ndarray, "3"]) -> None:
     if not np.abs(position).max() <= FARTHEST:
-        text = f"pos={short_repr(position.tolist())}: more than {FARTHEST:g} m away; lengths are in metres"
+        text = f"pos={short_repr(position.tolist())}: exceeds {FARTHEST:g} m; lengths are in metres"
         raise fault(parts.path, element, text)
 
 

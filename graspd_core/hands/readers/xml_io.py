@@ -170,7 +170,7 @@ def read_origin(path: Path, element: ET.Element) -> tuple[Float[np.ndarray, "3 3
     rpy, position = (read_numbers(path, origin, key, 3, "0 0 0") for key in ("rpy", "xyz"))
     if np.abs(position).max() > FARTHEST:
         text = f"<{origin.tag} xyz={origin.get('xyz')!r}>"
-        raise wrong(path, origin, f"{text}: more than {FARTHEST:g} m away; lengths are in metres")
+        raise wrong(path, origin, f"{text}: exceeds {FARTHEST:g} m; lengths are in metres")
     return rotation_from_rpy(rpy), position
 
 
