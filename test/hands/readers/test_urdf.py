@@ -240,7 +240,7 @@ def test_warnings_of_a_hand_come_with_the_grasps_and_into_the_file(tmp_path: Pat
         ('name="finger"', 'name="palm"', "link 'palm' is defined twice"),
         ('name="finger"', 'name=""', "a <link> has no name"),
         ('name="finger"', 'name="fin&#10;ger"', r"tiny.urdf:1: link 'fin\\nger' has a name with a line end"),
-        ('xyz="0 0 0.03"', 'xyz="0 0 30"', r"joint 'hinge': <origin xyz='0 0 30'>: more than 10 m away"),
+        ('xyz="0 0 0.03"', 'xyz="0 0 30"', r"joint 'hinge': <origin xyz='0 0 30'>: exceeds 10 m"),
         ("<box", "<blob", "link 'palm': unknown collision shape <blob>; known: box, sphere, cylinder, capsule, mesh"),
         ('size="0.02 0.02 0.04"', 'size="20 20 40"', "link 'palm': <box size='20 20 40'>: larger than 2 m"),
         ('<box size="0.02 0.02 0.04"/>', "", "link 'palm': a <collision> has no <geometry> with a shape; valid: box,"),
