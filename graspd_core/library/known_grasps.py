@@ -39,7 +39,7 @@ from graspd_core.optimize.obstacle_distance import extreme_points, gap_on_path, 
 from graspd_core.optimize.plan_config import PlanConfig, load_preset
 from graspd_core.optimize.restrictions import BoundRestrictions, Restriction, restrictions_in_words
 from graspd_core.perception.scene import Scene, moved_grasp, near_scene
-from graspd_core.planning.plan_grasps import check_request, plan_grasps
+from graspd_core.planning.plan_grasps import SEEDS, check_request, plan_grasps
 from graspd_core.se3 import SE3, rotation_from_quaternion
 from graspd_core.types import Grasp, GraspResult, Outcome, Posture, StopHook, Timing, Verdict
 from graspd_core.verify.lift_trial import LiftSettings
@@ -246,6 +246,7 @@ def known_or_planned(
     the result has a warning.
     """
     began, deadline, stop = time.perf_counter(), request.pop("deadline", None), request.get("stop")
+    check_request(count=count, seed=seed, verify=verify, deadline=deadline, device=request.get("device", "cpu"))
     left = lambda: None if deadline is None else deadline - (time.perf_counter() - began)  # noqa: E731
     over = lambda: (stop is not None and stop()) or (left() or 1.0) <= 0  # noqa: E731
     options: dict[str, Any] = {"verify": verify, "restrictions": restrictions}
@@ -256,7 +257,7 @@ def known_or_planned(
     config = load_preset(preset) if isinstance(preset, str) else preset
     rest = None if deadline is None else max(left() or 0.0, 1e-3)
     # The seed that found the stored grasps would find them again, so use another seed.
-    options |= {"count": count - found, "seed": seed + found, "preset": config, "deadline": rest}
+    options |= {"count": count - found, "seed": (seed + found) % SEEDS, "preset": config, "deadline": rest}
     planned = plan_grasps(scene, hand, **options, **request)
     warnings = planned.warnings
     try:

@@ -361,6 +361,30 @@ def test_a_trial_that_was_stopped_refuses_no_grasp(library, scene, hand, planned
     assert "that failed near the support or an obstacle" not in ended.refused
 
 
+def test_of_an_unknown_mass_the_heaviest_are_given_first(library, scene, hand, planned):
+    masses = [0.05, 0.8, 0.4, 0.2]
+    for mass in masses:
+        target = load_scene("shape:sphere", mass=mass).object
+        library.add(entry_of(target, hand, "standard"), target, hand, load_preset("fast"), planned.tried[:1])
+    unknown = entry_of(load_scene("shape:sphere").object, hand, "standard")
+    found = [entry.mass for entry in library.of_mesh(unknown, any_mass=True)]
+    assert found == sorted([*masses, 0.1], reverse=True)
+
+
+@pytest.mark.parametrize(
+    ("asked", "told"),
+    [({"deadline": -1.0}, "deadline: -1.0 s"), ({"seed": -1}, "seed: -1"), ({"device": "tpu"}, "device: 'tpu'")],
+)
+def test_a_request_is_checked_though_the_library_answers_it(library, scene, hand, asked: dict[str, object], told: str):
+    with pytest.raises(ConfigError, match=re.escape(told)):
+        known_or_planned(library, scene, hand, count=2, **asked)
+
+
+def test_the_greatest_seed_is_valid_though_some_are_known(library, scene, hand):
+    result = known_or_planned(library, scene, hand, count=5, seed=2**63 - 1, preset="fast", deadline=1e-3)
+    assert len(result.grasps) == 4
+
+
 def test_what_was_planned_on_a_table_is_kept_as_a_grasp_of_the_object_alone(library, scene, hand, planned):
     about = at_height(scene, hand, planned, 0.1)
     lifted = replace(planned.tried[0].trials[0], name="lift")
