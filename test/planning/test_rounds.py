@@ -209,3 +209,13 @@ def test_a_posture_that_fits_no_hand_is_refused(change: dict, culprit: str):
     bad = replace(good, squeeze=replace(good.squeeze, **change))
     with pytest.raises(ConfigError, match=culprit):
         verify_grasps(load_scene("shape:box"), HAND, [good, bad])
+
+
+def test_postures_of_lists_are_refused_in_one_line():
+    given = gripper_at(0.15)
+    # The type checks of the tests would refuse a list before.
+    object.__setattr__(given.pregrasp, "position", [0.0, 0.0, 0.2])
+    with pytest.raises(
+        ConfigError, match=r"grasp 0: pregrasp.position is \[0.0, 0.0, 0.2\]; valid: 3 finite numbers in an array"
+    ):
+        verify_grasps(load_scene("shape:box"), HAND, [given])
