@@ -375,7 +375,7 @@ def test_of_an_unknown_mass_the_heaviest_are_given_first(library, scene, hand, p
     ("asked", "told"),
     [({"deadline": -1.0}, "deadline: -1.0 s"), ({"seed": -1}, "seed: -1"), ({"device": "tpu"}, "device: 'tpu'")],
 )
-def test_a_request_is_checked_though_the_library_answers_it(library, scene, hand, asked: dict[str, object], told: str):
+def test_a_request_is_checked_though_the_library_answers_it(library, scene, hand, asked: dict, told: str):
     with pytest.raises(ConfigError, match=re.escape(told)):
         known_or_planned(library, scene, hand, count=2, **asked)
 

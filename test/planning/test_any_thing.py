@@ -128,7 +128,8 @@ def test_failures_make_no_valid_number_invalid(views, first, monkeypatch: pytest
 
     monkeypatch.setattr(module, "plan_grasps", plan)
     lost = [Failure(thing.place, thing.grasp.grasp if thing.grasp else None, executed=False) for thing in first]
-    plan_any_thing(views, HAND, failures=lost, **ASKED | {"count": 1024, "seed": 2**63 - 1})
+    greatest = {**ASKED, "count": 1024, "seed": 2**63 - 1}
+    plan_any_thing(views, HAND, failures=lost, **greatest)
     assert asked == [(1024, 0)] * len(first)
 
 
