@@ -6,12 +6,15 @@ Quaternions are wxyz. The object frame is the frame of the mesh as loaded (after
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field
 from enum import Enum, StrEnum
 
 import numpy as np
 from jaxtyping import Float, Int
+
+from graspd_core.errors import ConfigError, short_repr
 
 
 class Verdict(StrEnum):
@@ -61,6 +64,10 @@ def joined(*meshes: TriangleMesh) -> TriangleMesh:
     return TriangleMesh(np.vstack([mesh.vertices for mesh in meshes]), np.vstack(faces))
 
 
+# Greatest deviation of a unit vector's length from 1.
+_UNIT_TOLERANCE = 1e-3
+
+
 @dataclass(frozen=True)
 class Plane:
     """A flat support surface. The half-space n·x < offset below it is solid.
@@ -69,11 +76,23 @@ class Plane:
         normal: unit normal n, pointing away from the solid side.
         offset: n·x of every point x on the plane [m].
         margin: least height of the hand above the plane [m], equal to the noise of the camera that saw the plane.
+
+    Raises:
+        ConfigError: the normal is no unit vector, or a number is not finite, or the margin is below 0.
     """
 
     normal: Float[np.ndarray, "3"]
     offset: float
     margin: float = 0.0
+
+    def __post_init__(self) -> None:
+        normal, given = np.asarray(self.normal, dtype=float), short_repr(np.asarray(self.normal).tolist())
+        if normal.shape != (3,) or not abs(np.linalg.norm(normal) - 1.0) <= _UNIT_TOLERANCE:
+            raise ConfigError(f"plane normal: {given}; valid: three numbers x, y, z of length 1")
+        if not math.isfinite(self.offset):
+            raise ConfigError(f"plane offset: {self.offset} m; valid: a finite number")
+        if not 0.0 <= self.margin < math.inf:
+            raise ConfigError(f"plane margin: {self.margin} m; valid: a finite number, 0 or more")
 
 
 @dataclass(frozen=True)

@@ -25,6 +25,7 @@ from graspd_core.config import load_scene_config
 from graspd_core.perception.obstacles import held_hull
 from graspd_core.planning.any_thing import Failure, plan_any_thing, result_of_things
 from graspd_core.planning.any_thing import unlike as unlike_postures
+from graspd_core.planning.plan_grasps import SEEDS
 from graspd_core.types import (
     Grasp,
     GraspResult,
@@ -284,7 +285,7 @@ class Planner:
         restrictions = (*steering, *reach)
         plan: dict[str, Any] = {"preset": config, "device": settings.device, "progress": report, "stop": stop}
         # Another seed makes grasps similar to the excluded grasps less likely.
-        plan["seed"], objects = settings.seed + len(excluded), ()
+        plan["seed"], objects = (settings.seed + len(excluded)) % SEEDS, ()
         if request.views is not None:
             failures = self._runs.failures(request, excluded, self._lookup_at(Time(), stop))
             plan |= {"restrictions": restrictions, "verify": settings.verify}

@@ -294,7 +294,11 @@ def read_arm_file(name_or_path: str | Path) -> tuple[Path, ArmFile]:
 def _make_arm(entries: ArmFile, urdf: Path, root: ET.Element, where: str) -> Arm:
     """Build an arm from its description and URDF. `root` is modified. Raises the errors of `load_arm`."""
     _keep_chain(root, entries.base, entries.tip, where)
-    chain = read_urdf(urdf, root)
+    # The pose of the arm's base is that of the first link, so a `world` link with a fixed offset must stay.
+    chain = read_urdf(urdf, root, keep_world=True)
+    if entries.base and chain.base_link != entries.base:
+        above = f"{entries.base!r} is above a floating or planar joint"
+        raise ConfigError(f"{where}.base: {above}; valid: {chain.base_link}, or a link between it and the tip")
     if chain.mimics:
         raise ConfigError(
             f"{where}: joint {chain.mimics[0].name!r} is coupled by <mimic>; valid: independent joints of the arm"

@@ -27,6 +27,7 @@ from graspd_core.mesh.shapes import make_shape
 from graspd_core.optimize.plan_config import PlanConfig
 from graspd_core.perception.load_scene import SHAPE_PREFIX
 from graspd_core.perception.scene import ObjectModel
+from graspd_core.planning.plan_grasps import MOST_GRASPS
 from graspd_core.runtime.disk_cache import digest
 from graspd_core.types import Grasp, GraspResult, Outcome, Timing, Verdict
 
@@ -124,8 +125,6 @@ def hand_hash(hand: HandModel) -> str:
 VERSION = 1
 # Application id in SQLite's header ("grsp"). It marks the file as a library of graspd.
 _APPLICATION = 0x67727370
-# Greatest number of grasps in a record. No request may ask for more grasps.
-MOST_GRASPS = 1024
 # Greatest time that a writer waits for another writer [s].
 _PATIENCE = 30.0
 _COLUMNS = tuple(item.name for item in fields(LibraryEntry))
@@ -182,11 +181,12 @@ class GraspLibrary:
     def of_mesh(self, wanted: LibraryEntry, *, any_mass: bool = False) -> list[LibraryEntry]:
         """Return the entries with mesh, hand, friction and mass of `wanted`. With `any_mass`, the mass may differ.
 
-        Their trials are at least as strict as those of `wanted`. The strictest entries come first.
+        Their trials are at least as strict as those of `wanted`. The strictest entries come first, then the heaviest.
         """
         names = ("mesh_sha256", "hand_content", "friction", *(() if any_mass else ("mass",)))
         same = {name: getattr(wanted, name) for name in names}
-        return strict_enough([entry for entry, _ in self.entries(**same)], wanted.verify)
+        heaviest_first = sorted((entry for entry, _ in self.entries(**same)), key=lambda entry: -entry.mass)
+        return strict_enough(heaviest_first, wanted.verify)
 
     def grasps(self, entry: LibraryEntry, hand: HandModel) -> tuple[Grasp, ...]:
         """Return the verified grasps of an entry, object frame. Return no grasps for an unknown entry.

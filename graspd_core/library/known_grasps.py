@@ -1,8 +1,8 @@
 """Find stored grasps of a known object for the present scene. Missing grasps are planned and added to the library.
 
 A name or a mesh file identifies the object. If the library lacks the object, the error lists valid names. A stored
-grasp is refused if the hand would collide with support or obstacles. If hand or object is near them, the trials are
-repeated. Otherwise the stored trials remain valid.
+grasp is refused if the hand would collide with support or obstacles. If hand or object is near them, also while they
+rise, the trials are repeated. Otherwise the stored trials remain valid.
 """
 
 from __future__ import annotations
@@ -20,8 +20,9 @@ import torch
 from jaxtyping import Float
 
 from graspd_core.errors import ConfigError, FormatError, MeshError
-from graspd_core.hands.kinematics import make_kinematics
+from graspd_core.hands.kinematics import forward, make_kinematics, place_points, placement
 from graspd_core.hands.model import HandModel
+from graspd_core.hands.self_collision import collision_spheres
 from graspd_core.library.grasp_library import (
     GraspLibrary,
     LibraryEntry,
@@ -31,14 +32,17 @@ from graspd_core.library.grasp_library import (
     source_hash,
     strict_enough,
 )
+from graspd_core.mesh.mesh_files import surface_samples
 from graspd_core.mesh.sdf import sample_sdf
 from graspd_core.optimize.loop import Poses
-from graspd_core.optimize.obstacle_distance import gap_on_path, make_obstacle_tensors
+from graspd_core.optimize.obstacle_distance import extreme_points, gap_on_path, make_obstacle_tensors
 from graspd_core.optimize.plan_config import PlanConfig, load_preset
 from graspd_core.optimize.restrictions import BoundRestrictions, Restriction, restrictions_in_words
 from graspd_core.perception.scene import Scene, moved_grasp, near_scene
-from graspd_core.planning.plan_grasps import check_request, plan_grasps
+from graspd_core.planning.plan_grasps import SEEDS, check_request, plan_grasps
+from graspd_core.se3 import SE3, rotation_from_quaternion
 from graspd_core.types import Grasp, GraspResult, Outcome, Posture, StopHook, Timing, Verdict
+from graspd_core.verify.lift_trial import LiftSettings
 from graspd_core.verify.run_clock import result_of
 from graspd_core.verify.trial_registry import grasp_trials
 from graspd_core.verify.verification import trial_context
@@ -161,6 +165,8 @@ def _changed(library: GraspLibrary, entry: LibraryEntry) -> MeshError:
 NEAR = 0.03
 # A stored grasp is refused if the hand is deeper than this in an obstacle [m]. The search allows equal depth.
 _DEEP = 0.005
+# Fractions of the lift at which hand and object are checked, less than 2 · `NEAR` apart, and points of the object.
+_LIFT_SHARES, _LIFTED_POINTS = (0.0, 0.25, 0.5, 0.75, 1.0), 1000
 
 Wanted = Callable[[Sequence[Grasp]], Sequence[Grasp]]
 
@@ -240,6 +246,7 @@ def known_or_planned(
     the result has a warning.
     """
     began, deadline, stop = time.perf_counter(), request.pop("deadline", None), request.get("stop")
+    check_request(count=count, seed=seed, verify=verify, deadline=deadline, device=request.get("device", "cpu"))
     left = lambda: None if deadline is None else deadline - (time.perf_counter() - began)  # noqa: E731
     over = lambda: (stop is not None and stop()) or (left() or 1.0) <= 0  # noqa: E731
     options: dict[str, Any] = {"verify": verify, "restrictions": restrictions}
@@ -250,7 +257,7 @@ def known_or_planned(
     config = load_preset(preset) if isinstance(preset, str) else preset
     rest = None if deadline is None else max(left() or 0.0, 1e-3)
     # The seed that found the stored grasps would find them again, so use another seed.
-    options |= {"count": count - found, "seed": seed + found, "preset": config, "deadline": rest}
+    options |= {"count": count - found, "seed": (seed + found) % SEEDS, "preset": config, "deadline": rest}
     planned = plan_grasps(scene, hand, **options, **request)
     warnings = planned.warnings
     try:
@@ -306,9 +313,7 @@ def _held(
     scene, far = near_scene(scene)
     near = [moved_grasp(grasp, -far) for grasp in grasps]
     gaps = clearance(scene, hand, near)
-    vertices = torch.as_tensor(scene.object.mesh.vertices)
-    if any(float(sample_sdf(o.sdf, vertices.to(o.sdf.field))[0].min()) < NEAR for o in scene.obstacles):
-        gaps = np.minimum(gaps, NEAR / 2)
+    gaps = np.where(lift_clearance(scene, hand, near) < NEAR, np.minimum(gaps, NEAR / 2), gaps)
     # Grasps that need no trial come first.
     for index in np.argsort(gaps < NEAR, kind="stable"):
         grasp, gap = grasps[index], gaps[index]
@@ -321,6 +326,9 @@ def _held(
                 return
             worlds = trial_context(scene, hand, "standard" if verify == "none" else verify)
             tried = replace(grasp, trials=grasp_trials(worlds, near[index], stop))
+            if tried.verdict is not Verdict.VERIFIED and stop():
+                # An interrupted trial says nothing about the grasp.
+                return
             yield tried, "" if tried.verdict is Verdict.VERIFIED else "that failed near the support or an obstacle"
 
 
@@ -340,6 +348,29 @@ def clearance(scene: Scene, hand: HandModel, grasps: Sequence[Grasp]) -> Float[n
     moves = [("pregrasp", "grasp"), ("grasp", "squeeze")]
     gaps = [gap_on_path(obstacles, kinematics, ends(a), ends(b), NEAR) for a, b in moves]
     return torch.stack(gaps).amin(0).numpy()
+
+
+def lift_clearance(scene: Scene, hand: HandModel, grasps: Sequence[Grasp]) -> Float[np.ndarray, "grasps"]:
+    """Return the least distance of hand and object to the obstacles from squeeze to lift [m], infinity without any."""
+    least = torch.full((len(grasps),), torch.inf, dtype=torch.float64)
+    if not scene.obstacles or not grasps:
+        return least.numpy()
+    balls = (np.concatenate(pair) for pair in zip(extreme_points(hand), collision_spheres(hand), strict=True))
+    # Order of both: centres, radii, links.
+    centers, radii, links = map(torch.as_tensor, balls)
+    rotation = rotation_from_quaternion(_rows([grasp.squeeze.quaternion_wxyz for grasp in grasps]))
+    base = SE3(rotation, _rows([grasp.squeeze.position for grasp in grasps]))
+    poses = forward(make_kinematics(hand, dtype=torch.float64), _rows([g.squeeze.joint_positions for g in grasps]))
+    fingers = base.apply(place_points(placement(hand.num_links, centers, links), poses))
+    target = torch.as_tensor(surface_samples(scene.object.mesh, _LIFTED_POINTS, 0)[0])
+    # Without a support the hand moves back against the approach, as in the lift trial.
+    back = -(rotation @ torch.as_tensor(hand.approach))
+    up = back if scene.support is None else torch.as_tensor(scene.support.normal).expand_as(back)
+    for sdf in (obstacle.sdf.to("cpu", torch.float64) for obstacle in scene.obstacles):
+        for shift in (share * LiftSettings.lift_height * up[:, None] for share in _LIFT_SHARES):
+            hands = (sample_sdf(sdf, fingers + shift)[0] - radii).amin(-1)
+            least = torch.minimum(least, torch.minimum(hands, sample_sdf(sdf, target + shift)[0].amin(-1)))
+    return least.numpy()
 
 
 def _rows(values: Sequence[np.ndarray]) -> torch.Tensor:

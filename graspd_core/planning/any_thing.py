@@ -27,7 +27,7 @@ from graspd_core.perception.obstacles import with_neighbours
 from graspd_core.perception.scene import Scene
 from graspd_core.perception.scene_from_views import scene_from_views, things_from_views
 from graspd_core.perception.segment.target_selection import Target
-from graspd_core.planning.plan_grasps import check_request, plan_grasps
+from graspd_core.planning.plan_grasps import MOST_GRASPS, SEEDS, check_request, plan_grasps
 from graspd_core.types import Grasp, GraspResult, Outcome, Plane, Posture, Timing, TriangleMesh, Verdict
 from graspd_core.verify.robustness import begin_other_shapes
 
@@ -235,7 +235,7 @@ def _thing_plan(
     lost, config = [failure.grasp for failure in failed if failure.grasp is not None], plan["preset"]
     if not failed:
         config = replace(config, rounds=replace(config.rounds, most=1))
-    count, seed = plan["count"] + 2 * len(lost), plan["seed"] + len(failed)
+    count, seed = min(plan["count"] + 2 * len(lost), MOST_GRASPS), (plan["seed"] + len(failed)) % SEEDS
     try:
         result = plan_grasps(scene, hand, **{**plan, "preset": config, "count": count, "seed": seed})
     except ConfigError as error:  # The object cannot meet a restriction.

@@ -40,6 +40,8 @@ from graspd_core.verify.limits import LEAST_PAYLOAD
 from graspd_core.verify.run_clock import Run, result_of
 from graspd_core.verify.verification import payloads, prefetch, rank_by_robustness
 
+# Greatest number of grasps of a request, and number of valid seeds.
+MOST_GRASPS, SEEDS = 1024, 2**63
 # Number of grasps whose payload is measured if no grasp is verified.
 _WEIGHED = 8
 
@@ -215,9 +217,9 @@ def _timing(run: Run, scene: Scene, found: RoundsResult) -> Timing:
 
 def check_request(*, count: int, seed: int, verify: str, deadline: float | None, device: str) -> None:
     """Check those arguments of `plan_grasps` that need no scene. Raises ConfigError: a value is not valid."""
-    if not 1 <= count <= 1024:
-        raise ConfigError(f"count: {count} grasps; valid: 1 to 1024")
-    if not 0 <= seed < 2**63:
+    if not 1 <= count <= MOST_GRASPS:
+        raise ConfigError(f"count: {count} grasps; valid: 1 to {MOST_GRASPS}")
+    if not 0 <= seed < SEEDS:
         raise ConfigError(f"seed: {seed}; valid: 0 to 2^63 - 1")
     if verify not in VERIFICATIONS:
         raise ConfigError(f"verify: {verify!r}; valid: {', '.join(VERIFICATIONS)}")

@@ -227,7 +227,7 @@ def _tried_lighter(
         return state
     heavy = scene.object.mass
     best, others = state.grasps[:_WEIGHED], state.grasps[_WEIGHED:]
-    lifted = payloads(state.context, best, run.known_over)
+    lifted = payloads(state.context, best, run.over)
     most = max(lifted, default=0.0)
     mass = min(_LIFTED * most, light_end(heavy))
     if most <= LEAST_PAYLOAD or run.over():

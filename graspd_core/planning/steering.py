@@ -113,7 +113,8 @@ class Steering:
                 raise ConfigError(f"{name}: {getattr(self, name):.4g} rad; valid: above 0, at most pi (180 degrees)")
         if self.region is not None and not isinstance(self.region, Box | Sphere | NearPoints):
             raise ConfigError(f"region: {type(self.region).__name__}; valid: Box, Sphere, NearPoints")
-        if any(not isinstance(box, Box) for box in self.avoid):
+        # A generator would be empty after this check.
+        if not isinstance(self.avoid, Sequence) or any(not isinstance(box, Box) for box in self.avoid):
             raise ConfigError(f"avoid: {short_repr(self.avoid)}; valid: a sequence of Box")
         if self.roll is None:
             return

@@ -18,7 +18,7 @@ import numpy as np
 import torch
 
 from graspd_core.config import VERIFICATIONS, CertaintyConfig, RobustConfig
-from graspd_core.errors import ConfigError
+from graspd_core.errors import ConfigError, short_repr
 from graspd_core.hands.model import HandModel
 from graspd_core.perception.scene import Scene, moved_grasp, near_scene, object_parts
 from graspd_core.types import Grasp, GraspMetrics, Snapshot, Stage, StopHook, Verdict
@@ -395,9 +395,11 @@ def _refuse_posture(grasp: Grasp, hand: HandModel, name: str) -> None:
         posture = getattr(grasp, stage)
         joints = len(hand.joint_names)
         for key, size in (("position", 3), ("quaternion_wxyz", 4), ("joint_positions", joints)):
-            values = np.asarray(getattr(posture, key))
-            if values.shape != (size,) or not np.isfinite(values).all():
-                raise ConfigError(f"{name}: {stage}.{key} is {values.tolist()}; valid: {size} finite numbers")
+            values = getattr(posture, key)
+            numeric = isinstance(values, np.ndarray) and values.dtype.kind in "fiu"
+            if not numeric or values.shape != (size,) or not np.isfinite(values).all():
+                given = values.tolist() if isinstance(values, np.ndarray) else short_repr(values)
+                raise ConfigError(f"{name}: {stage}.{key} is {given}; valid: {size} finite numbers in an array")
         length = float(np.linalg.norm(posture.quaternion_wxyz))
         if abs(length - 1) > _UNIT_TOLERANCE:
             raise ConfigError(f"{name}: {stage}.quaternion_wxyz has length {length:.3g}; valid: 1")

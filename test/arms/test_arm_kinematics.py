@@ -218,6 +218,23 @@ def test_an_arm_is_cut_out_of_a_robot(tmp_path: Path):
     assert arm.capsules.radius[0] >= 0.01
 
 
+@pytest.mark.parametrize("base", ["world", None])
+def test_a_base_that_is_the_world_keeps_the_place_of_what_stands_in_it(tmp_path: Path, base: str | None):
+    raised = ROBOT.replace('<child link="pedestal"/>', '<child link="pedestal"/><origin xyz="0 0 0.8"/>')
+    arm = load_arm(write(tmp_path, urdf="robot_description", base=base), raised)
+    assert arm.chain.base_link == "world"
+    tip = arm_links(arm, torch.zeros(1, 2, dtype=torch.float64))[0, arm.tip].translation
+    assert tip.tolist() == pytest.approx([0.4, 0.0, 0.8])
+    loose = raised.replace('name="stand" type="fixed"', 'name="stand" type="floating"')
+    if base is None:
+        assert load_arm(tmp_path / "cell.yaml", loose).chain.base_link == "pedestal"
+        return
+    with pytest.raises(
+        ConfigError, match=r"cell.yaml.base: 'world' is above a floating or planar joint; valid: pedest"
+    ):
+        load_arm(tmp_path / "cell.yaml", loose)
+
+
 @pytest.mark.parametrize(
     ("keys", "told"),
     [

@@ -86,6 +86,6 @@ def test_replay_of_a_recording_answers_the_same(row: Situation, tmp_path: Path, 
         assert re.search(f"refused: .*(?:{row.expect})", told.out)
         return
     assert status == EXIT_OK
-    (volume,) = re.findall(r"its volume of (\d+) cm³", told.err)
+    (volume,) = re.findall(r"plausible mass for (\d+) cm³", told.err)
     assert 1e-6 * int(volume) == pytest.approx(row.expect, rel=row.near)
     assert re.search(row.warns, told.err)

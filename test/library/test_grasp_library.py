@@ -12,6 +12,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import torch
 
 from graspd_core import (
     GraspResult,
@@ -25,6 +26,7 @@ from graspd_core import (
     plan_grasps,
 )
 from graspd_core.errors import ConfigError, FormatError, MeshError
+from graspd_core.hands.kinematics import hand_mesh
 from graspd_core.library import known_grasps as module
 from graspd_core.library.grasp_library import GraspLibrary, LibraryEntry, entry_of, hand_hash
 from graspd_core.library.known_grasps import (
@@ -36,13 +38,18 @@ from graspd_core.library.known_grasps import (
     entry_by_name,
     known_grasps,
     known_or_planned,
+    lift_clearance,
 )
 from graspd_core.mesh.mesh_files import save_mesh
+from graspd_core.mesh.sdf import build_sdf
 from graspd_core.mesh.shapes import make_shape
 from graspd_core.optimize.plan_config import load_preset
+from graspd_core.perception.scene import Obstacle
 from graspd_core.planning.steering import angle_of_approach
+from graspd_core.se3 import rotation_from_quaternion
 from graspd_core.types import Grasp, Plane, Verdict
 from graspd_core.verify.trial_registry import grasp_trials
+from graspd_core.verify.verification import trial_context
 
 
 @pytest.fixture(scope="session")
@@ -322,6 +329,60 @@ def test_only_what_comes_near_something_is_tried_again(library, scene, hand, pla
         # What was tried again has the trial of the scene too.
         assert {len(grasp.trials) for grasp in result.grasps} <= {1, 2}
         assert sum(len(grasp.trials) == 2 for grasp in result.grasps) <= len(tried)
+
+
+def test_what_would_rise_into_an_obstacle_is_tried_again(library, scene, hand, planned):
+    """A ceiling clear of the hand at the grasp, and within the lift."""
+    grasps = planned.tried[:4]
+    placed = [
+        hand_mesh(hand, at.joint_positions).vertices
+        @ rotation_from_quaternion(torch.as_tensor(at.quaternion_wxyz)).numpy().T
+        + at.position
+        for at in (grasp.grasp for grasp in grasps)
+    ]
+    highest = max(float(points[:, 2].max()) for points in placed)
+    ceiling = make_shape("box").vertices / np.ptp(make_shape("box").vertices, axis=0) * [0.5, 0.5, 0.02]
+    mesh = TriangleMesh(ceiling + np.array([0.0, 0.0, highest + 0.16]), make_shape("box").faces)
+    low = float(scene.object.mesh.vertices[:, 2].min()) - 0.3
+    about = replace(
+        scene, support=Plane(np.array([0.0, 0.0, 1.0]), low), obstacles=(Obstacle(mesh, build_sdf(mesh, padding=0.02)),)
+    )
+    assert lift_clearance(about, hand, grasps).min() < 0.0
+    assert np.isinf(lift_clearance(replace(about, obstacles=()), hand, grasps)).all()
+    held = known_grasps(library, about, hand, count=4)
+    assert held.refused["that failed near the support or an obstacle"] > 0
+    worlds = trial_context(about, hand, "standard")
+    assert all(trial.passed for grasp in held.grasps for trial in grasp_trials(worlds, grasp))
+
+
+def test_a_trial_that_was_stopped_refuses_no_grasp(library, scene, hand, planned):
+    about, calls = at_height(scene, hand, planned, 0.01), []
+    ended = known_grasps(library, about, hand, count=4, stop=lambda: calls.append(1) or len(calls) > 2)
+    assert "that failed near the support or an obstacle" not in ended.refused
+
+
+def test_of_an_unknown_mass_the_heaviest_are_given_first(library, scene, hand, planned):
+    masses = [0.05, 0.8, 0.4, 0.2]
+    for mass in masses:
+        target = load_scene("shape:sphere", mass=mass).object
+        library.add(entry_of(target, hand, "standard"), target, hand, load_preset("fast"), planned.tried[:1])
+    unknown = entry_of(load_scene("shape:sphere").object, hand, "standard")
+    found = [entry.mass for entry in library.of_mesh(unknown, any_mass=True)]
+    assert found == sorted([*masses, 0.1], reverse=True)
+
+
+@pytest.mark.parametrize(
+    ("asked", "told"),
+    [({"deadline": -1.0}, "deadline: -1.0 s"), ({"seed": -1}, "seed: -1"), ({"device": "tpu"}, "device: 'tpu'")],
+)
+def test_a_request_is_checked_though_the_library_answers_it(library, scene, hand, asked: dict, told: str):
+    with pytest.raises(ConfigError, match=re.escape(told)):
+        known_or_planned(library, scene, hand, count=2, **asked)
+
+
+def test_the_greatest_seed_is_valid_though_some_are_known(library, scene, hand):
+    result = known_or_planned(library, scene, hand, count=5, seed=2**63 - 1, preset="fast", deadline=1e-3)
+    assert len(result.grasps) == 4
 
 
 def test_what_was_planned_on_a_table_is_kept_as_a_grasp_of_the_object_alone(library, scene, hand, planned):

@@ -10,6 +10,7 @@ from graspd_bench.rendering.tabletop import CAMERA, ring_poses, tabletop, views_
 from graspd_core import Grasp, Outcome, PointCloud, Posture, Sphere, Steering, Verdict, load_hand, load_preset
 from graspd_core.config.planning_config import DOUBTED_SHARE, CertaintyConfig
 from graspd_core.errors import CloudError, ConfigError, NoObjectError
+from graspd_core.planning import any_thing as module
 from graspd_core.planning.any_thing import (
     NOT_LOOKED_AT,
     OUT_OF_TRIES,
@@ -116,6 +117,20 @@ def test_a_grasp_like_one_that_was_lost_is_not_given_again(views: tuple[PointClo
     assert spared[0].grasp is not None
     assert unlike([spared[0].grasp], [first[0].grasp.grasp])
     assert spared[0].grasp.verdict is Verdict.VERIFIED
+
+
+def test_failures_make_no_valid_number_invalid(views, first, monkeypatch: pytest.MonkeyPatch):
+    asked = []
+
+    def plan(scene, hand, *, count: int, seed: int, **others: object):
+        asked.append((count, seed))
+        raise ConfigError("no grasp is needed here")
+
+    monkeypatch.setattr(module, "plan_grasps", plan)
+    lost = [Failure(thing.place, thing.grasp.grasp if thing.grasp else None, executed=False) for thing in first]
+    greatest = {**ASKED, "count": 1024, "seed": 2**63 - 1}
+    plan_any_thing(views, HAND, failures=lost, **greatest)
+    assert asked == [(1024, 0)] * len(first)
 
 
 def test_nothing_on_the_table_is_no_thing_and_an_empty_cloud_is_told(views: tuple[PointCloud, ...]):

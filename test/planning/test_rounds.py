@@ -9,17 +9,18 @@ import torch
 
 from graspd_bench.studies.robust_ranking import correlation, orders
 from graspd_core import TriangleMesh, load_hand, load_scene, make_shape, plan_grasps, verify_grasps
-from graspd_core.config import RobustConfig
+from graspd_core.config import CertaintyConfig, RobustConfig
 from graspd_core.errors import ConfigError
 from graspd_core.io.grasps_json import result_document
 from graspd_core.optimize.candidates import Candidates
 from graspd_core.optimize.plan_config import PlanConfig, load_preset
 from graspd_core.perception.scene import Obstacle, Scene, object_parts
 from graspd_core.planning import rounds as planning_rounds
-from graspd_core.planning.rounds import rounds_of
+from graspd_core.planning.rounds import RoundsResult, rounds_of
 from graspd_core.types import Grasp, GraspMetrics, Outcome, Plane, Posture, Progress, Snapshot, Stage, Verdict
 from graspd_core.verify.hold_trial import noisy_share, pose_errors
-from graspd_core.verify.verification import most_robust_first
+from graspd_core.verify.run_clock import Run
+from graspd_core.verify.verification import Prefetched, VerificationContext, most_robust_first
 from graspd_core.verify.world import PROTOCOLS, build_world
 
 
@@ -61,6 +62,22 @@ def test_where_nothing_is_found_more_is_sought_however_few_are_asked_for(scene, 
     asked.clear()
     plan_grasps(scene, load_hand("parallel_gripper"), count=20)
     assert asked == [2, *7 * [20]]
+
+
+def test_a_cancel_is_noticed_while_grasps_are_weighed_for_a_lower_mass(scene, monkeypatch):
+    cancelled = []
+
+    def weigh(context, grasps, stop):
+        cancelled.append(stop())
+        return [1.0 for _ in grasps]
+
+    monkeypatch.setattr(planning_rounds, "payloads", weigh)
+    run, settings = Run(0.0, None, None, lambda: True), CertaintyConfig()
+    # Neither is looked at, because the run ends before.
+    context, ahead = object.__new__(VerificationContext), object.__new__(Prefetched)
+    state = RoundsResult(0.0, (Grasp(POSTURE, POSTURE, POSTURE),), context)
+    assert planning_rounds._tried_lighter(run, scene, ahead, state, settings, 1) is state
+    assert cancelled == [True]
 
 
 POSTURE = Posture(np.zeros(3), np.array([1.0, 0.0, 0.0, 0.0]), np.zeros(1))
@@ -192,3 +209,13 @@ def test_a_posture_that_fits_no_hand_is_refused(change: dict, culprit: str):
     bad = replace(good, squeeze=replace(good.squeeze, **change))
     with pytest.raises(ConfigError, match=culprit):
         verify_grasps(load_scene("shape:box"), HAND, [good, bad])
+
+
+def test_postures_of_lists_are_refused_in_one_line():
+    given = gripper_at(0.15)
+    # The type checks of the tests would refuse a list before.
+    object.__setattr__(given.pregrasp, "position", [0.0, 0.0, 0.2])
+    with pytest.raises(
+        ConfigError, match=r"grasp 0: pregrasp.position is \[0.0, 0.0, 0.2\]; valid: 3 finite numbers in an array"
+    ):
+        verify_grasps(load_scene("shape:box"), HAND, [given])

@@ -47,6 +47,12 @@ def test_a_request_is_steered_and_earlier_runs_do_not_answer_it(hand):
     assert unlike(found.tried, [matrix_of_posture(free.tried[0].grasp)]) == list(found.tried)
 
 
+def test_the_greatest_seed_is_valid_though_a_pose_is_excluded(hand):
+    asked = request(lambda: load_scene("shape:sphere"), replace(SETTINGS, seed=2**63 - 1))
+    planned = planner(hand).plan(replace(asked, exclude_poses=(("object", np.eye(4)),)), never, lambda _: None)
+    assert planned.result.outcome is Outcome.SUCCEEDED
+
+
 def test_a_result_is_told_in_the_frame_that_the_object_was_placed_in(hand):
     stages: list[Progress] = []
     pose = np.eye(4)

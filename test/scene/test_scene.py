@@ -2,6 +2,7 @@
 
 import io
 import os
+import re
 
 import numpy as np
 import pytest
@@ -9,11 +10,12 @@ import torch
 from shape_volumes import shape_volume
 
 from graspd_core import TriangleMesh, load_scene
-from graspd_core.errors import MeshError
+from graspd_core.errors import ConfigError, MeshError
 from graspd_core.mesh.sdf import sample_sdf
 from graspd_core.mesh.shapes import SPHERE_RADIUS
 from graspd_core.perception.scene import build_scene, heavy_mass, object_parts
 from graspd_core.runtime import disk_cache as cache
+from graspd_core.types import Plane
 
 
 @pytest.fixture(autouse=True)
@@ -160,3 +162,19 @@ def test_a_reconstructed_object_has_coarser_parts_than_the_same_mesh():
     assert seen.sha256 == known.sha256
     assert seen.reconstructed > known.reconstructed
     assert len(object_parts(seen)) <= 32 < len(object_parts(known)) <= 64
+
+
+@pytest.mark.parametrize(
+    ("numbers", "told"),
+    [
+        (((0.0, 1.0, 1.0), 0.0), "plane normal: [0.0, 1.0, 1.0]; valid: three numbers x, y, z of length 1"),
+        (((0.0, 0.0, np.nan), 0.0), "plane normal: [0.0, 0.0, nan]"),
+        (((0.0, 0.0, 1.0), np.inf), "plane offset: inf m; valid: a finite number"),
+        (((0.0, 0.0, 1.0), 0.0, -0.01), "plane margin: -0.01 m; valid: a finite number, 0 or more"),
+    ],
+)
+def test_a_plane_that_is_none_is_refused(numbers, told: str):
+    """Trials would tilt the table by another angle than the search, and gravity would be stronger."""
+    normal, *others = numbers
+    with pytest.raises(ConfigError, match=re.escape(told)):
+        Plane(np.array(normal), *others)

@@ -119,7 +119,7 @@ _MOMENTS = ("xx", "xy", "xz", "yy", "yz", "zz")
 _HEAVIEST = 1e3
 
 
-def read_urdf(path: Path, root: ET.Element | None = None) -> HandModel:
+def read_urdf(path: Path, root: ET.Element | None = None, *, keep_world: bool = False) -> HandModel:
     """Read a hand from a URDF. Contact candidates are not set.
 
     Open and closed posture are both mid-range. The palm is at the base's origin. A missing or zero effort or velocity
@@ -129,6 +129,7 @@ def read_urdf(path: Path, root: ET.Element | None = None) -> HandModel:
     Args:
         path: path of the file.
         root: root element, if it has been read already.
+        keep_world: whether to keep a `world` link above a fixed joint, because poses refer to it.
 
     Raises:
         HandError: the file is missing, malformed or not a tree, has no moving joint, or has an unknown joint type.
@@ -143,7 +144,7 @@ def read_urdf(path: Path, root: ET.Element | None = None) -> HandModel:
         if not element.get("name"):
             raise wrong(path, element, f"a <{element.tag}> has no name; give it a unique one")
     _refuse_xacro(path, root)
-    links, joints, dropped = _below_world(path, links, joints)
+    links, joints, dropped = _below_world(path, links, joints, keep_world)
     specs = [_read_joint(path, joint) for joint in joints]
     corners = corners_each(sum(shape.find("geometry/mesh") is not None for link in links for shape in _colliding(link)))
     hull = partial(mesh_hull, corners=corners)
@@ -245,7 +246,7 @@ def _refuse_xacro(path: Path, root: ET.Element) -> None:
 
 
 def _below_world(
-    path: Path, links: list[ET.Element], joints: list[ET.Element]
+    path: Path, links: list[ET.Element], joints: list[ET.Element], keep_world: bool
 ) -> tuple[list[ET.Element], list[ET.Element], list[str]]:
     """Drop links and joints that only place the hand in the world. Return the other links and joints, and warnings."""
     dropped: list[str] = []
@@ -255,7 +256,7 @@ def _below_world(
         below = [joint for joint in joints if len(roots) == 1 and joint_end(joint, "parent") == roots[0].get("name")]
         if len(below) != 1 or any(roots[0].find(tag) is not None for tag in ("visual", "collision", "inertial")):
             break
-        is_world = roots[0].get("name") == "world" and below[0].get("type") == "fixed"
+        is_world = not keep_world and roots[0].get("name") == "world" and below[0].get("type") == "fixed"
         if not is_world and below[0].get("type") not in _FREE:
             break
         links = [link for link in links if link is not roots[0]]

@@ -187,6 +187,17 @@ def test_a_region_off_the_object_or_in_an_avoided_box_is_refused(bottle, hand):
         plan(bottle, hand, both)
 
 
+def test_avoided_boxes_that_are_no_sequence_are_refused():
+    box = Box((0.0, 0.0, 0.0), (1.0, 1.0, 1.0))
+    # A generator would be used up by the check, and nothing would be avoided.
+    for boxes in (box, (each for each in [box]), None):
+        # The type checks of the tests would refuse it before.
+        steering = Steering()
+        object.__setattr__(steering, "avoid", boxes)
+        with pytest.raises(ConfigError, match=r"avoid: .*; valid: a sequence of Box"):
+            steering.__post_init__()
+
+
 def test_steering_is_in_the_frame_of_the_scene_far_from_the_origin_too(hand):
     away = np.array([300.0, -200.0, 50.0])
     scene = load_scene(moved_mesh(make_shape("bottle"), away))

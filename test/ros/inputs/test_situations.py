@@ -88,6 +88,6 @@ def test_the_node_answers_the_same(row: Situation, client, node, tmp_path: Path)
         assert "\n" not in answer.message
         return
     assert answer.status == GraspArray.SUCCEEDED, answer.message
-    (volume,) = re.findall(r"its volume of (\d+) cm³", told)
+    (volume,) = re.findall(r"plausible mass for (\d+) cm³", told)
     assert 1e-6 * int(volume) == pytest.approx(row.expect, rel=row.near)
     assert re.search(row.warns, told), told
