@@ -99,6 +99,7 @@ class _Run:
     object_key: str
     frame: str
     T_frame_object: Matrix | None
+    terms: tuple[str, str, bool]
     planned: Planned
 
     @property
@@ -114,7 +115,8 @@ class RecentRuns:
 
     def keep(self, request: Request, planned: Planned) -> None:
         """Store a result under the id of its request, so that later requests can exclude its grasps."""
-        self._runs[request.id] = _Run(request.object_key, request.frame, request.T_frame_object, planned)
+        about = request.object_key, request.frame, request.T_frame_object, _terms(request)
+        self._runs[request.id] = _Run(*about, planned)
         while len(self._runs) > MOST_RUNS:
             self._runs.popitem(last=False)
 
@@ -149,14 +151,20 @@ class RecentRuns:
     def _grasp(self, name: str) -> tuple[_Run, Grasp]:
         run_id, _, rank = name.rpartition("/")
         run = self._runs.get(run_id)
-        if run is None or not rank.isdecimal() or int(rank) >= len(run.grasps):
+        rows = () if run is None else run.grasps
+        found = next((grasp for row, grasp in enumerate(rows) if str(row) == rank), None)
+        if run is None or found is None:
             kept = ", ".join(self._runs) or "none"
             raise bad_request(f"exclude: no grasp {name[:128]!r} in the last {MOST_RUNS} runs; kept: {kept}")
-        return run, run.grasps[int(rank)]
+        return run, found
 
     def next_best(self, request: Request, excluded: Sequence[Matrix]) -> Planned | None:
-        """Return good grasps of earlier runs on the same object, none similar to `excluded`. None if none is left."""
-        runs = [run for run in self._runs.values() if run.object_key == request.object_key and request.object_key]
+        """Return good grasps of earlier runs on the same object, none similar to `excluded`. None if none is left.
+
+        The runs had the same trials and preset as the request.
+        """
+        same = [run for run in self._runs.values() if run.object_key == request.object_key and request.object_key]
+        runs = [run for run in same if run.terms == _terms(request)]
         known = {id(grasp): grasp for run in runs for grasp in run.grasps}
         wanted = Verdict.UNVERIFIED if request.settings.verify == "none" else Verdict.VERIFIED
         left = [grasp for grasp in unlike(known.values(), excluded) if grasp.verdict is wanted]
@@ -165,8 +173,14 @@ class RecentRuns:
             return None
         outcome = Outcome.SUCCEEDED if len(left) >= count else Outcome.TOO_FEW
         message = f"{min(count, len(left))} grasps of an earlier run, none similar to the {len(excluded)} excluded"
-        result = GraspResult(outcome, tuple(left[:count]), Timing(), request.settings.seed, "", message)
+        warnings = runs[-1].planned.result.warnings
+        result = GraspResult(outcome, tuple(left[:count]), Timing(), request.settings.seed, "", message, warnings)
         return replace(runs[-1].planned, result=result, file="")
+
+
+def _terms(request: Request) -> tuple[str, str, bool]:
+    """Return what decides, for one object, which grasps are verified and what is known of each."""
+    return request.settings.verify, request.settings.preset, request.closes_late
 
 
 def unlike(grasps: Iterable[Grasp], excluded: Sequence[Matrix]) -> list[Grasp]:

@@ -409,10 +409,12 @@ def _from_cloud(given: SourceInput) -> Request:
 
 
 def _from_mesh(given: SourceInput) -> Request:
-    settings, uri = given.settings, given.message.mesh_uri
-    path = resolve_mesh(uri, settings.mesh_roots)
+    settings = given.settings
+    path = resolve_mesh(given.message.mesh_uri, settings.mesh_roots)
     # Equal keys mean: same unchanged file, scale, mass and friction.
-    key = f"mesh {uri} {path.stat().st_mtime_ns} {settings.mesh_scale} {settings.mass} {settings.friction}"
+    about = path.stat()
+    file = f"{path} {about.st_mtime_ns} {about.st_size}"
+    key = f"mesh {file} {settings.mesh_scale} {settings.mass} {settings.friction}"
     found = _placed(given, mesh_loader(path, settings), key, known_mesh(path, settings))
     if found.surface is None:
         return found
@@ -484,10 +486,17 @@ def _of_frame(given: SourceInput, frame: SensorFrame) -> Request:
     if message.any_object:
         views = frame_views(frame, given.settings, place, lookup)
         return given.request(frame.frame, frame.stamp, load, region_points=region_points, views=views)
-    physics = f"{given.settings.mass} {given.settings.friction}"
-    meant = "" if mask is not None else f"{point} {place} {given.settings.segment} {physics}"
-    key = f"{frame.kind} {frame.frame} {nanoseconds(frame.stamp)} {meant}" if nanoseconds(frame.stamp) and meant else ""
+    key = ""
+    if nanoseconds(frame.stamp) and mask is None:
+        key = f"{frame.kind} {frame.frame} {nanoseconds(frame.stamp)} {frame.content()} {point} {place} {_cut(given)}"
     return given.request(frame.frame, frame.stamp, load, object_key=key, region_points=region_points)
+
+
+def _cut(given: SourceInput) -> str:
+    """Return the settings that decide which object a cloud shows."""
+    used = given.settings
+    workspace = f"{used.roi_min} {used.roi_max} {used.voxel_size}"
+    return f"{used.segment} {used.mass} {used.friction} {workspace} {used.scene_config}"
 
 
 def _region_points(frame: SensorFrame, mask: Image) -> Float[np.ndarray, "points 3"]:

@@ -153,5 +153,32 @@ def test_the_next_best_grasp_comes_at_once_from_the_candidates_of_the_same_run(h
     fifth = ask("fifth", "first/0", key="cloud 2")
     assert len(loaded) == before + 2
     assert unlike(fifth.tried, lost[:1]) == list(fifth.tried)
-    with pytest.raises(RequestError, match="exclude: no grasp 'nobody/0' in the last 16 runs; kept: first, second"):
-        ask("sixth", "nobody/0")
+    for unknown in ("nobody/0", "first/99", "first/" + "9" * 5000):
+        with pytest.raises(RequestError, match=f"exclude: no grasp '{unknown[:100]}.* in the last 16 runs; kept: first, "):
+            ask("sixth", unknown)
+
+
+@pytest.mark.parametrize(
+    "change", [{"closes_late": True}, {"settings": replace(SETTINGS, verify="full")}], ids=["arrival", "trials"]
+)
+def test_a_run_with_other_terms_does_not_answer(hand, change):
+    plans, scene = planner(hand), load_scene("shape:sphere")
+    first = replace(request(lambda: scene, replace(SETTINGS, num_grasps=3)), id="first", object_key="sphere")
+    assert plans.plan(first, never, lambda _: None).result.outcome is Outcome.SUCCEEDED
+    asked = replace(first, id="second", exclude=("first/0",), settings=SETTINGS)
+    found = plans.plan(replace(asked, **change), never, lambda _: None).result
+    assert "of an earlier run" not in found.message
+    assert (found.tried[0].arrival is not None) == ("closes_late" in change)
+
+
+def test_an_answer_of_an_earlier_run_keeps_the_warnings_about_the_object(hand):
+    scene = load_scene("shape:sphere")
+    scene = replace(scene, object=replace(scene.object, warnings=("half of it is guessed",)))
+    plans, settings = planner(hand), replace(SETTINGS, num_grasps=3)
+    first = replace(request(lambda: scene, settings), id="first", object_key="sphere")
+    told = plans.plan(first, never, lambda _: None).result.warnings
+    again = replace(first, id="second", exclude=("first/0",), settings=SETTINGS)
+    found = plans.plan(again, never, lambda _: None).result
+    assert "of an earlier run" in found.message
+    assert "half of it is guessed" in found.warnings
+    assert found.warnings == told

@@ -2,6 +2,7 @@
 
 import array
 import math
+import os
 from dataclasses import replace
 from pathlib import Path
 
@@ -314,9 +315,32 @@ def test_what_was_lost_and_which_object_it_was_of_reach_the_worker(tmp_path):
     again = request(tmp_path, object_pose=Pose(position=Point(z=2.0)))
     assert again.object_key == asked.object_key != ""
     assert request(tmp_path, mesh_scale=2.0).object_key != asked.object_key
+    (tmp_path / "can.obj").write_text("# another object, whose file is as old")
+    os.utime(tmp_path / "can.obj", ns=(0, 0))
+    (tmp_path / "left").mkdir()
+    (tmp_path / "left" / "can.obj").touch()
+    os.utime(tmp_path / "left" / "can.obj", ns=(0, 0))
+    roots = [Settings(mesh_roots=[str(root)]) for root in (tmp_path, tmp_path / "left")]
+    message = GraspRequest(source=GraspRequest.MESH, mesh_uri="can.obj")
+    assert len({intake().from_message("r", settings, message).object_key for settings in roots}) == 2
     assert "exclude: 257 ids, 0 poses; valid: at most 256 together" in str(refusal(exclude=["a/0"] * 257))
     with pytest.raises(RequestError, match="exclude_poses: position"):
         request(tmp_path, exclude_poses=[PoseStamped(pose=FAR)])
+
+
+def test_clouds_of_one_image_are_one_object_only_where_they_show_the_same(make_cloud):
+    def key(points: np.ndarray, **settings: object) -> str:
+        cloud = make_cloud(points)
+        cloud.header.stamp = NOW
+        message = GraspRequest(cloud=cloud, alone=True)
+        return intake().from_message("r", replace(Settings(), **settings), message).object_key
+
+    ball = np.random.default_rng(0).normal(size=(100, 3))
+    assert key(ball) == key(ball) != ""
+    # A segmenter gives each object of an image as its own cloud, all with the image's stamp.
+    assert key(ball + [0.2, 0.0, 0.0]) != key(ball)
+    assert key(ball, roi_min=[0.0, 0.0, 0.0]) != key(ball)
+    assert key(ball, voxel_size=0.01) != key(ball)
 
 
 @pytest.fixture
