@@ -307,6 +307,9 @@ class Planner:
             from graspd_ros.known_objects import answer_known
 
             result, scene = answer_known(request, request.known, self._hand, excluded, restrictions, **plan)
+            if request.closes_late:
+                scene = scene or request.load()
+                result = replace(result, tried=tuple(map(_arrivals(scene, self._hand), result.tried)))
         else:
             scene = request.load()
             arrived = _arrivals(scene, self._hand) if request.closes_late else lambda grasp: grasp
