@@ -298,7 +298,7 @@ class Planner:
         restrictions = (*steering, *reach)
         plan: dict[str, Any] = {"preset": config, "device": settings.device, "progress": report, "stop": stop}
         # Another seed makes grasps similar to the excluded grasps less likely.
-        plan["seed"], objects = settings.seed + len(excluded), ()
+        plan["seed"], objects = (settings.seed + len(excluded)) % 2**63, ()
         if request.views is not None:
             failures = self._runs.failures(request, excluded, self._lookup_at(Time(), stop))
             plan |= {"restrictions": restrictions, "verify": settings.verify}
@@ -330,7 +330,11 @@ class Planner:
         # Grasps in the file are in the planning frame. For a mesh this is the mesh's own frame.
         frame = request.frame if request.T_frame_object is None else settings.mesh_frame
         seconds, scene = 1e-9 * nanoseconds(request.stamp), scene or request.load()
-        save_result(path, result, scene.object, self._hand, config, frame=frame, stamp=seconds)
+        try:
+            save_result(path, result, scene.object, self._hand, config, frame=frame, stamp=seconds)
+        except OSError as error:  # the grasps are good although the disk is full or output_dir is read-only
+            told = f"output_dir: {path} is not written ({error.strerror or error}); valid: a directory for files"
+            return replace(planned, result=replace(result, warnings=(*result.warnings, told)))
         return replace(planned, file=str(path))
 
 

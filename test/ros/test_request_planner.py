@@ -171,6 +171,21 @@ def test_a_run_with_other_terms_does_not_answer(hand, change):
     assert (found.tried[0].arrival is not None) == ("closes_late" in change)
 
 
+def test_a_result_file_that_cannot_be_written_costs_no_grasp(hand, tmp_path):
+    (tmp_path / "taken").touch()
+    settings = replace(SETTINGS, output_dir=str(tmp_path / "taken"))
+    planned = planner(hand).plan(request(lambda: load_scene("shape:sphere"), settings), never, lambda _: None)
+    assert planned.result.outcome is Outcome.SUCCEEDED
+    assert planned.file == ""
+    assert any(told.startswith("output_dir: ") and "taken/r.json" in told for told in planned.result.warnings)
+
+
+def test_the_greatest_seed_leaves_room_for_what_is_excluded(hand):
+    settings = replace(SETTINGS, seed=2**63 - 1, verify="none")
+    asked = replace(request(lambda: load_scene("shape:sphere"), settings), exclude_poses=(("object", np.eye(4)),))
+    assert planner(hand).plan(asked, never, lambda _: None).result.outcome is Outcome.SUCCEEDED
+
+
 def test_an_answer_of_an_earlier_run_keeps_the_warnings_about_the_object(hand):
     scene = load_scene("shape:sphere")
     scene = replace(scene, object=replace(scene.object, warnings=("half of it is guessed",)))
