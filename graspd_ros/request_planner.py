@@ -266,7 +266,7 @@ class Planner:
             reach = (reach_of(request, seen, self._robot_description),)
         if request.collision_objects:
             request = with_collision_objects(request, seen)
-        excluded = self._runs.excluded(request, self._lookup_at(Time(), stop))
+        excluded = self._runs.excluded(request, self._placing(request, stop))
         # Do not reuse an earlier run if its constraints, arm pose or obstacles may differ. With a library do not reuse
         # a run either, because the library contains its grasps.
         free = request.steering is None and not reach and not request.collision_objects
@@ -288,6 +288,11 @@ class Planner:
     def _lookup_at(self, stamp: Time, stop: StopHook) -> FrameLookup:
         return lambda target, source: self._lookup(target, source, stamp, stop)
 
+    def _placing(self, request: Request, stop: StopHook) -> FrameLookup:
+        """Return the lookup for excluded poses: at the time of the cloud, because its camera may have moved since."""
+        one_cloud = request.region_points is not None and not request.timeless
+        return self._lookup_at(request.stamp if one_cloud else Time(), stop)
+
     def _search(
         self, request: Request, excluded: list[Matrix], reach: tuple[Reach, ...], stop: StopHook, report: ProgressHook
     ) -> Planned:
@@ -300,7 +305,7 @@ class Planner:
         # Another seed makes grasps similar to the excluded grasps less likely.
         plan["seed"], objects = (settings.seed + len(excluded)) % 2**63, ()
         if request.views is not None:
-            failures = self._runs.failures(request, excluded, self._lookup_at(Time(), stop))
+            failures = self._runs.failures(request, excluded, self._placing(request, stop))
             plan |= {"restrictions": restrictions, "verify": settings.verify}
             result, scene, objects = _any_object(request, self._hand, failures, **plan)
         elif settings.grasp_library and request.known is not None:

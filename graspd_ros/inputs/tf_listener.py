@@ -85,7 +85,9 @@ class TransformListener:
                 self._node.get_logger().warning(str(error), throttle_duration_sec=_COMPLAIN_AGAIN)
 
     def _on_jump(self, jump: TimeJump) -> None:
-        self._node.get_logger().info(f"time jumped by {jump.delta.nanoseconds * 1e-9:.3f} s: moving transforms are deleted")
+        self._node.get_logger().info(
+            f"time jumped by {jump.delta.nanoseconds * 1e-9:.3f} s: moving transforms are deleted"
+        )
         self._buffer.clear()
 
 

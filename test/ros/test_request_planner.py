@@ -154,7 +154,9 @@ def test_the_next_best_grasp_comes_at_once_from_the_candidates_of_the_same_run(h
     assert len(loaded) == before + 2
     assert unlike(fifth.tried, lost[:1]) == list(fifth.tried)
     for unknown in ("nobody/0", "first/99", "first/" + "9" * 5000):
-        with pytest.raises(RequestError, match=f"exclude: no grasp '{unknown[:100]}.* in the last 16 runs; kept: first, "):
+        with pytest.raises(
+            RequestError, match=f"exclude: no grasp '{unknown[:100]}.* in the last 16 runs; kept: first, "
+        ):
             ask("sixth", unknown)
 
 
@@ -169,6 +171,20 @@ def test_a_run_with_other_terms_does_not_answer(hand, change):
     found = plans.plan(replace(asked, **change), never, lambda _: None).result
     assert "of an earlier run" not in found.message
     assert (found.tried[0].arrival is not None) == ("closes_late" in change)
+
+
+def test_lost_grasps_are_placed_where_the_camera_stood_when_it_saw(hand):
+    asked: list[tuple[str, str, int]] = []
+
+    def lookup(target: str, source: str, stamp: Time, stop) -> np.ndarray:
+        asked.append((target, source, stamp.sec))
+        return np.eye(4)
+
+    mesh = replace(request(lambda: load_scene("shape:sphere")), stamp=Time(sec=7), exclude_poses=(("map", np.eye(4)),))
+    cloud = replace(mesh, region_points=lambda: np.zeros((0, 3)))
+    for one in (mesh, cloud):
+        Planner(hand, lookup).plan(one, never, lambda _: None)
+    assert asked == [("object", "map", 0), ("object", "map", 7)]
 
 
 def test_a_result_file_that_cannot_be_written_costs_no_grasp(hand, tmp_path):

@@ -21,6 +21,7 @@ from graspd_core import Box, PointCloud, Sphere, load_scene, preset_names
 from graspd_core.errors import CloudError, GraspdError, MeshError, NoObjectError, ResourceError, TransformError
 from graspd_ros.convert import pose_matrix
 from graspd_ros.error_codes import ErrorCode, RequestError, code_of, sentence_of
+from graspd_ros.inputs import sensor_frames
 from graspd_ros.inputs.request_builder import (
     MOST_MESH_BYTES,
     SOURCES,
@@ -338,7 +339,7 @@ def test_clouds_of_one_image_are_one_object_only_where_they_show_the_same(make_c
     ball = np.random.default_rng(0).normal(size=(100, 3))
     assert key(ball) == key(ball) != ""
     # A segmenter gives each object of an image as its own cloud, all with the image's stamp.
-    assert key(ball + [0.2, 0.0, 0.0]) != key(ball)
+    assert key(ball + np.array([0.2, 0.0, 0.0])) != key(ball)
     assert key(ball, roi_min=[0.0, 0.0, 0.0]) != key(ball)
     assert key(ball, voxel_size=0.01) != key(ball)
 
@@ -481,6 +482,25 @@ def test_wishes_in_another_frame_than_the_cloud_go_by_tf():
         steering = intake(lambda *_: T).from_message("r", Settings(), message).steering
         assert steering is not None
         assert np.allclose(np.asarray(steering().approach_direction), direction)
+
+
+def test_point_and_wishes_are_placed_where_the_camera_stood_when_it_saw(make_cloud, monkeypatch):
+    def lookup(target: str, source: str, stamp: Time) -> np.ndarray:
+        T = np.eye(4)
+        T[2, 3] = 5.0 if stamp == SEEN else -1.0  # the camera has moved since
+        return T
+
+    cloud, targets = make_cloud(np.ones((100, 3))), []
+    cloud.header.stamp = SEEN
+    monkeypatch.setattr(sensor_frames, "scene_of_views", lambda views, settings, target, told: targets.append(target))
+    fields = {"cloud": cloud, "use_target_point": True, "target_point": Point(x=0.5), "region": solid(BALL, 0.1)}
+    asked = intake(lookup).from_message("r", Settings(), GraspRequest(header=Header(frame_id="map"), **fields))
+    asked.load()
+    assert np.allclose(targets[0].point, [0.5, 0, 5])
+    assert asked.steering is not None
+    region = asked.steering().region
+    assert isinstance(region, Sphere)
+    assert np.allclose(np.asarray(region.center), [0, 0, 5])
 
 
 def test_a_box_may_be_the_region(tmp_path):
