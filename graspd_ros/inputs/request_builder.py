@@ -257,8 +257,8 @@ def _check_range(name: str, value: float, limits: tuple[float, float], unit: str
 
 def _has_constraints(message: GraspRequest) -> bool:
     angles = message.approach_angle, message.roll, message.roll_tolerance
-    masked = message.region_mask.height > 0
-    return any((_direction(message), message.use_roll, *angles, message.region.dimensions, masked, message.avoid))
+    masked, boxes = message.region_mask.height > 0, message.avoid or message.avoid_poses
+    return any((_direction(message), message.use_roll, *angles, message.region.dimensions, masked, boxes))
 
 
 def steering_of(message: GraspRequest, T_object_header: Matrix) -> Steering:

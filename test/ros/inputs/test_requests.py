@@ -525,6 +525,7 @@ def test_a_box_may_be_the_region(tmp_path):
         ({"region_mask": Image(height=1)}, "region_mask: given with source 1; valid with CLOUD=0"),
         ({"region_mask": Image(height=1), "region": solid(BALL, 0.1)}, "region_mask: region is given too"),
         ({"avoid": [solid(BOX, 1, 1, 1)]}, "avoid: 1 boxes, 0 poses; valid: one pose for each box, at most 64"),
+        ({"avoid_poses": [Pose()]}, "avoid: 0 boxes, 1 poses; valid: one pose for each box"),
         ({"avoid": [solid(BALL, 1)], "avoid_poses": [Pose()]}, "avoid: type 2 of 1 dimensions; valid: BOX=1"),
         ({"avoid": [solid(BOX, 1, 0, 1)], "avoid_poses": [Pose()]}, "box size: .*three lengths above 0"),
     ],
