@@ -158,12 +158,11 @@ class RequestBuilder:
         return Request(request_id, "grasp_planning", frame, stamp, settings, load, **more)
 
     def from_cluster(
-        self, request_id: str, settings: Settings, cloud: PointCloud2, header: Header, listener: Listener | None
+        self, request_id: str, settings: Settings, cloud: PointCloud2, listener: Listener | None
     ) -> Request:
         """Return the request for a cloud of one object. Raises RequestError: the cloud is too large or too old."""
-        frame = replace(cloud_frame(cloud, nanoseconds(self._now())), frame=header.frame_id, stamp=header.stamp)
-        load = self._frame_loader(settings, frame)
-        return self.from_loader(request_id, header, settings, load, listener)
+        load = self._frame_loader(settings, cloud_frame(cloud, nanoseconds(self._now())))
+        return self.from_loader(request_id, cloud.header, settings, load, listener)
 
     def _frame_loader(self, settings: Settings, frame: SensorFrame) -> Callable[[], Scene]:
         frame.check(nanoseconds(self._now()), settings.cloud_max_age)
