@@ -176,6 +176,10 @@ class ImagePairs:
         self._waiting = None
         return image, info
 
+    def forget(self) -> None:
+        """Delete the image that waits. Calibrations stay, because many cameras send them only once."""
+        self._waiting, self._images, self._calibrations = None, 0, 0
+
     def unpaired(self) -> str:
         """Return a line about images that wait longer than `UNPAIRED` [s] for a matching CameraInfo, or ""."""
         if self._waiting is None or self._clock() - self._alone_since < UNPAIRED:
