@@ -98,9 +98,9 @@ class TransformBuffer:
             return tuple(sorted({*self._links, *(link.parent for link in self._links.values())}))
 
     def clear(self) -> None:
-        """Remove all transforms, for example after a jump back in time."""
+        """Remove all moving transforms, for example after a jump back in time. Static ones are valid at all times."""
         with self._lock:
-            self._links.clear()
+            self._links = {child: link for child, link in self._links.items() if link.static}
 
     def _chain(self, name: str) -> list[str]:
         chain = [name]

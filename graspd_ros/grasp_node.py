@@ -213,6 +213,7 @@ class GraspNode(Node):
     def _on_reset(self, _: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
         cancelled, views = self._worker.cancel(""), len(self._request_builder.views.clouds)
         self._request_builder.forget()
+        self._pairs.forget()
         self._responses.forget()
         response.success, response.message = True, f"cancelled {cancelled} requests, dropped {views} views"
         return response

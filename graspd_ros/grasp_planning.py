@@ -95,7 +95,8 @@ def request_from_goal(
     if plane is not None and target.header.frame_id not in ("", header.frame_id):
         fault = f"surface: frame {target.header.frame_id!r}, point_cluster: {header.frame_id!r}; give both in one frame"
         raise bad_message("object", fault)
-    request = builder.from_cluster(request_id, replace(settings, segment=False), cluster, header, listener)
+    cluster.header = header
+    request = builder.from_cluster(request_id, replace(settings, segment=False), cluster, listener)
     return replace(request, load=with_support(request.load, plane))
 
 

@@ -12,8 +12,10 @@ from typing import Any, TypeGuard
 
 import numpy as np
 from rcl_interfaces.msg import FloatingPointRange, IntegerRange, ParameterDescriptor, SetParametersResult
+from rclpy.exceptions import InvalidTopicNameException
 from rclpy.node import Node
 from rclpy.parameter import Parameter
+from rclpy.validate_topic_name import validate_topic_name
 
 from graspd_core import load_preset
 from graspd_core.config import VERIFICATIONS, load_scene_config
@@ -80,6 +82,14 @@ def _check_library(path: str) -> None:
             GraspLibrary(Path(path)).checked()
         except FormatError as error:
             raise ConfigError(str(error)) from None
+
+
+def _check_topic(name: str) -> None:
+    if name:
+        try:
+            validate_topic_name(name)
+        except InvalidTopicNameException:
+            raise ConfigError(f"{name!r} is no topic; valid: a name such as /collision_object") from None
 
 
 def _check_corner(corner: Any) -> None:
@@ -153,6 +163,7 @@ class Settings:
         "",
         "topic of moveit_msgs/CollisionObject, such as /collision_object; its objects are obstacles of later requests; "
         "empty: no topic",
+        check=_check_topic,
         read_only=True,
     )
     grasp_library: str = _setting(

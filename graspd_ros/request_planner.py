@@ -100,6 +100,7 @@ class _Run:
     object_key: str
     frame: str
     T_frame_object: Matrix | None
+    terms: tuple[str, str, bool]
     planned: Planned
 
     @property
@@ -115,7 +116,8 @@ class RecentRuns:
 
     def keep(self, request: Request, planned: Planned) -> None:
         """Store a result under the id of its request, so that later requests can exclude its grasps."""
-        self._runs[request.id] = _Run(request.object_key, request.frame, request.T_frame_object, planned)
+        about = request.object_key, request.frame, request.T_frame_object, _terms(request)
+        self._runs[request.id] = _Run(*about, planned)
         while len(self._runs) > MOST_RUNS:
             self._runs.popitem(last=False)
 
@@ -150,14 +152,20 @@ class RecentRuns:
     def _grasp(self, name: str) -> tuple[_Run, Grasp]:
         run_id, _, rank = name.rpartition("/")
         run = self._runs.get(run_id)
-        if run is None or not rank.isdecimal() or int(rank) >= len(run.grasps):
+        rows = () if run is None else run.grasps
+        found = next((grasp for row, grasp in enumerate(rows) if str(row) == rank), None)
+        if run is None or found is None:
             kept = ", ".join(self._runs) or "none"
             raise bad_request(f"exclude: no grasp {name[:128]!r} in the last {MOST_RUNS} runs; kept: {kept}")
-        return run, run.grasps[int(rank)]
+        return run, found
 
     def next_best(self, request: Request, excluded: Sequence[Matrix]) -> Planned | None:
-        """Return good grasps of earlier runs on the same object, none similar to `excluded`. None if none is left."""
-        runs = [run for run in self._runs.values() if run.object_key == request.object_key and request.object_key]
+        """Return good grasps of earlier runs on the same object, none similar to `excluded`. None if none is left.
+
+        The runs had the same trials and preset as the request.
+        """
+        same = [run for run in self._runs.values() if run.object_key == request.object_key and request.object_key]
+        runs = [run for run in same if run.terms == _terms(request)]
         known = {id(grasp): grasp for run in runs for grasp in run.grasps}
         wanted = Verdict.UNVERIFIED if request.settings.verify == "none" else Verdict.VERIFIED
         left = [grasp for grasp in unlike(known.values(), excluded) if grasp.verdict is wanted]
@@ -166,8 +174,14 @@ class RecentRuns:
             return None
         outcome = Outcome.SUCCEEDED if len(left) >= count else Outcome.TOO_FEW
         message = f"{min(count, len(left))} grasps of an earlier run, none similar to the {len(excluded)} excluded"
-        result = GraspResult(outcome, tuple(left[:count]), Timing(), request.settings.seed, "", message)
+        warnings = runs[-1].planned.result.warnings
+        result = GraspResult(outcome, tuple(left[:count]), Timing(), request.settings.seed, "", message, warnings)
         return replace(runs[-1].planned, result=result, file="")
+
+
+def _terms(request: Request) -> tuple[str, str, bool]:
+    """Return what decides, for one object, which grasps are verified and what is known of each."""
+    return request.settings.verify, request.settings.preset, request.closes_late
 
 
 def unlike(grasps: Iterable[Grasp], excluded: Sequence[Matrix]) -> list[Grasp]:
@@ -253,7 +267,7 @@ class Planner:
             reach = (reach_of(request, seen, self._robot_description),)
         if request.collision_objects:
             request = with_collision_objects(request, seen)
-        excluded = self._runs.excluded(request, self._lookup_at(Time(), stop))
+        excluded = self._runs.excluded(request, self._placing(request, stop))
         # Do not reuse an earlier run if its constraints, arm pose or obstacles may differ. With a library do not reuse
         # a run either, because the library contains its grasps.
         free = request.steering is None and not reach and not request.collision_objects
@@ -275,6 +289,11 @@ class Planner:
     def _lookup_at(self, stamp: Time, stop: StopHook) -> FrameLookup:
         return lambda target, source: self._lookup(target, source, stamp, stop)
 
+    def _placing(self, request: Request, stop: StopHook) -> FrameLookup:
+        """Return the lookup for excluded poses: at the time of the cloud, because its camera may have moved since."""
+        one_cloud = request.region_points is not None and not request.timeless
+        return self._lookup_at(request.stamp if one_cloud else Time(), stop)
+
     def _search(
         self, request: Request, excluded: list[Matrix], reach: tuple[Reach, ...], stop: StopHook, report: ProgressHook
     ) -> Planned:
@@ -287,13 +306,16 @@ class Planner:
         # Another seed makes grasps similar to the excluded grasps less likely.
         plan["seed"], objects = (settings.seed + len(excluded)) % SEEDS, ()
         if request.views is not None:
-            failures = self._runs.failures(request, excluded, self._lookup_at(Time(), stop))
+            failures = self._runs.failures(request, excluded, self._placing(request, stop))
             plan |= {"restrictions": restrictions, "verify": settings.verify}
             result, scene, objects = _any_object(request, self._hand, failures, **plan)
         elif settings.grasp_library and request.known is not None:
             from graspd_ros.known_objects import answer_known
 
             result, scene = answer_known(request, request.known, self._hand, excluded, restrictions, **plan)
+            if request.closes_late:
+                scene = scene or request.load()
+                result = replace(result, tried=tuple(map(_arrivals(scene, self._hand), result.tried)))
         else:
             scene = request.load()
             arrived = _arrivals(scene, self._hand) if request.closes_late else lambda grasp: grasp
@@ -314,7 +336,11 @@ class Planner:
         # Grasps in the file are in the planning frame. For a mesh this is the mesh's own frame.
         frame = request.frame if request.T_frame_object is None else settings.mesh_frame
         seconds, scene = 1e-9 * nanoseconds(request.stamp), scene or request.load()
-        save_result(path, result, scene.object, self._hand, config, frame=frame, stamp=seconds)
+        try:
+            save_result(path, result, scene.object, self._hand, config, frame=frame, stamp=seconds)
+        except OSError as error:  # the grasps are good although the disk is full or output_dir is read-only
+            told = f"output_dir: {path} is not written ({error.strerror or error}); valid: a directory for files"
+            return replace(planned, result=replace(result, warnings=(*result.warnings, told)))
         return replace(planned, file=str(path))
 
 

@@ -90,7 +90,8 @@ class Follower:
         if not message.grasps:
             return
         try:
-            hand = _hand(self._hand or message.grasps[0].hand, named_by_message=self._hand is None)
+            first = message.grasps[0]
+            hand = _hand(self._hand or first.hand, first.base_link, named_by_message=self._hand is None)
             grasps = tuple(grasp_of(grasp, hand.joint_names) for grasp in message.grasps)
         except (GraspdError, ValueError) as error:
             self._node.get_logger().warning(f"the answer to {message.request_id} is not shown: {error}")
@@ -117,12 +118,15 @@ class Follower:
 
 
 @lru_cache(maxsize=4)
-def _hand(name: str, *, named_by_message: bool) -> Any:
+def _hand(name: str, base_link: str, *, named_by_message: bool) -> Any:
+    """Return a hand, with the prefix that the message's `base_link` has because of the node's `hand_prefix`."""
     from graspd_core import hand_names, load_hand
 
     if named_by_message and name not in hand_names():
         raise HandError(f"hand {name[:80]!r} is not one of {', '.join(hand_names())}; give its file with --hand")
-    return load_hand(name)
+    hand = load_hand(name)
+    prefix = base_link.removesuffix(hand.base_link)
+    return load_hand(name, prefix=prefix) if prefix and prefix != base_link else hand
 
 
 def grasp_of(message: Any, joint_names: tuple[str, ...]) -> Grasp:

@@ -167,6 +167,12 @@ def test_a_new_parent_or_a_jump_in_time_forgets():
         buffer.lookup("map", "base")
     buffer.clear()
     assert buffer.frames() == ()
+    # What is static comes once only, and holds after the jump too.
+    buffer.add("table", "base", pose((2, 0, 0)), 2 * SECOND)
+    buffer.add("base", "camera", pose((3, 0, 0)), 2 * SECOND, static=True)
+    buffer.clear()
+    assert buffer.frames() == ("base", "camera")
+    assert buffer.lookup("base", "camera", SECOND)[0, 3] == 3
 
 
 def test_what_is_given_and_what_is_answered_can_be_changed_afterwards():

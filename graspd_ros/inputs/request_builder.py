@@ -11,6 +11,7 @@ import re
 import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 from urllib.parse import unquote, urlsplit
@@ -132,12 +133,19 @@ class RequestBuilder:
         """Check the constraint fields. Return a function that makes the constraints, or None without constraints."""
         if not _has_constraints(message):
             return None
-        stamp, region_points = message.header.stamp, request.region_points
-        lookup = lambda target, source: self.lookup(target, source, stamp)  # noqa: E731
-        steering = steering_of(message, request.to_object(message.header.frame_id, np.eye(4), lookup))
-        if not message.region_mask.height or region_points is None:
+
+        def made(lookup: Lookup, stamp: Time) -> Steering:
+            to_frame = lambda target, source: lookup(target, source, stamp)  # noqa: E731
+            return steering_of(message, request.to_object(message.header.frame_id, np.eye(4), to_frame))
+
+        steering, region_points = made(self.lookup, message.header.stamp), request.region_points
+        if region_points is None:
             return lambda: steering
-        return lambda: replace(steering, region=NearPoints(region_points()))
+        # The camera may have moved since. Its transforms at the cloud's time may still be on the way.
+        seen = lambda: made(self.lookup_in_time, Time() if request.timeless else request.stamp)  # noqa: E731
+        if not message.region_mask.height:
+            return seen
+        return lambda: replace(seen(), region=NearPoints(region_points()))
 
     def from_loader(
         self, request_id: str, header: Header, settings: Settings, load: Callable[[], Scene], listener: Listener | None
@@ -150,12 +158,11 @@ class RequestBuilder:
         return Request(request_id, "grasp_planning", frame, stamp, settings, load, **more)
 
     def from_cluster(
-        self, request_id: str, settings: Settings, cloud: PointCloud2, header: Header, listener: Listener | None
+        self, request_id: str, settings: Settings, cloud: PointCloud2, listener: Listener | None
     ) -> Request:
         """Return the request for a cloud of one object. Raises RequestError: the cloud is too large or too old."""
-        frame = replace(cloud_frame(cloud, nanoseconds(self._now())), frame=header.frame_id, stamp=header.stamp)
-        load = self._frame_loader(settings, frame)
-        return self.from_loader(request_id, header, settings, load, listener)
+        load = self._frame_loader(settings, cloud_frame(cloud, nanoseconds(self._now())))
+        return self.from_loader(request_id, cloud.header, settings, load, listener)
 
     def _frame_loader(self, settings: Settings, frame: SensorFrame) -> Callable[[], Scene]:
         frame.check(nanoseconds(self._now()), settings.cloud_max_age)
@@ -249,8 +256,8 @@ def _check_range(name: str, value: float, limits: tuple[float, float], unit: str
 
 def _has_constraints(message: GraspRequest) -> bool:
     angles = message.approach_angle, message.roll, message.roll_tolerance
-    masked = message.region_mask.height > 0
-    return any((_direction(message), message.use_roll, *angles, message.region.dimensions, masked, message.avoid))
+    masked, boxes = message.region_mask.height > 0, message.avoid or message.avoid_poses
+    return any((_direction(message), message.use_roll, *angles, message.region.dimensions, masked, boxes))
 
 
 def steering_of(message: GraspRequest, T_object_header: Matrix) -> Steering:
@@ -368,18 +375,20 @@ def frame_loader(
     settings: Settings,
     place: CameraPlace,
     lookup: Lookup,
-    point: Float[np.ndarray, "3"] | None = None,
+    point: Callable[[], Float[np.ndarray, "3"] | None] = lambda: None,
     mask: Image | None = None,
 ) -> Callable[[], Scene]:
-    """Return a function that makes a scene from one sensor frame. The worker's thread calls `lookup`.
+    """Return a function that makes a scene from one sensor frame. The worker's thread calls `lookup` and `point`.
 
-    `point` [m] is on or near the target object, in the frame of the points. Or `mask` marks the target's pixels.
+    `point` returns a point [m] on or near the target object, in the frame of the points, or None. Or `mask` marks the
+    target's pixels.
     """
 
     def load() -> Scene:
         if mask is None:
             views, warnings = frame_views(frame, settings, place, lookup)()
-            return seen.scene_of_views(views, settings, None if point is None else Target(point=point), warnings)
+            near_it = point()
+            return seen.scene_of_views(views, settings, None if near_it is None else Target(point=near_it), warnings)
         cloud = seen.seen_by_camera(frame, place, lookup)
         warnings = frame.warnings(cloud)
         points, marks = seen.masked_points(frame, mask)
@@ -409,10 +418,12 @@ def _from_cloud(given: SourceInput) -> Request:
 
 
 def _from_mesh(given: SourceInput) -> Request:
-    settings, uri = given.settings, given.message.mesh_uri
-    path = resolve_mesh(uri, settings.mesh_roots)
+    settings = given.settings
+    path = resolve_mesh(given.message.mesh_uri, settings.mesh_roots)
     # Equal keys mean: same unchanged file, scale, mass and friction.
-    key = f"mesh {uri} {path.stat().st_mtime_ns} {settings.mesh_scale} {settings.mass} {settings.friction}"
+    about = path.stat()
+    file = f"{path} {about.st_mtime_ns} {about.st_size}"
+    key = f"mesh {file} {settings.mesh_scale} {settings.mass} {settings.friction}"
     found = _placed(given, mesh_loader(path, settings), key, known_mesh(path, settings))
     if found.surface is None:
         return found
@@ -452,7 +463,7 @@ def _from_views(given: SourceInput) -> Request:
     views, settings = given.builder.views, given.settings
     if not views.clouds:
         raise RequestError(ErrorCode.NO_CLOUD, "no view is stored; call ~/add_view while clouds arrive")
-    point = _target(given, views.frame)
+    point = _target(given, views.frame, given.message.header.stamp, given.builder.lookup)
     target = None if point is None else Target(point=point)
     more = {"views": lambda: (views.clouds, ())} if given.message.any_object else {}
     return given.request(views.frame, views.stamp, lambda: seen.scene_of_views(views.clouds, settings, target), **more)
@@ -477,17 +488,27 @@ def source_of(message: GraspRequest) -> Source:
 
 def _of_frame(given: SourceInput, frame: SensorFrame) -> Request:
     message, place = given.message, place_of(given.settings, given.message)
-    point, mask = _target(given, frame.frame), message.target_mask if message.target_mask.height else None
-    lookup = given.builder.lookup_in_time
+    mask, lookup = message.target_mask if message.target_mask.height else None, given.builder.lookup_in_time
+    _target(given, frame.frame, message.header.stamp, given.builder.lookup)  # refuses frames that /tf does not connect
+    # The camera may have moved since. Its transforms at the cloud's time may still be on the way.
+    point = partial(_target, given, frame.frame, frame.stamp, lookup)
     load = frame_loader(frame, given.settings, place, lookup, point, mask)
     region_points = lambda: _region_points(frame, message.region_mask)  # noqa: E731
     if message.any_object:
         views = frame_views(frame, given.settings, place, lookup)
         return given.request(frame.frame, frame.stamp, load, region_points=region_points, views=views)
-    physics = f"{given.settings.mass} {given.settings.friction}"
-    meant = "" if mask is not None else f"{point} {place} {given.settings.segment} {physics}"
-    key = f"{frame.kind} {frame.frame} {nanoseconds(frame.stamp)} {meant}" if nanoseconds(frame.stamp) and meant else ""
+    key = ""
+    if nanoseconds(frame.stamp) and mask is None:
+        aim = f"{message.header.frame_id} {message.target_point}" if message.use_target_point else ""
+        key = f"{frame.kind} {frame.frame} {nanoseconds(frame.stamp)} {frame.content()} {aim} {place} {_cut(given)}"
     return given.request(frame.frame, frame.stamp, load, object_key=key, region_points=region_points)
+
+
+def _cut(given: SourceInput) -> str:
+    """Return the settings that decide which object a cloud shows."""
+    used = given.settings
+    workspace = f"{used.roi_min} {used.roi_max} {used.voxel_size}"
+    return f"{used.segment} {used.mass} {used.friction} {workspace} {used.scene_config}"
 
 
 def _region_points(frame: SensorFrame, mask: Image) -> Float[np.ndarray, "points 3"]:
@@ -495,14 +516,15 @@ def _region_points(frame: SensorFrame, mask: Image) -> Float[np.ndarray, "points
     return points[marked & np.isfinite(points).all(1)]
 
 
-def _target(given: SourceInput, frame: str) -> Float[np.ndarray, "3"] | None:
+def _target(given: SourceInput, frame: str, stamp: Time, lookup: Lookup) -> Float[np.ndarray, "3"] | None:
+    """Return the target point in `frame` at a time [m]. None if the request has none."""
     message = given.message
     if not message.use_target_point:
         return None
     point, named = near(message.target_point, "target_point"), message.header.frame_id
     if named in ("", frame):
         return point
-    return moved_points(point[None], given.builder.lookup(frame, named, message.header.stamp))[0]
+    return moved_points(point[None], lookup(frame, named, stamp))[0]
 
 
 def resolve_mesh(uri: str, roots: Sequence[str]) -> Path:

@@ -34,6 +34,7 @@ from graspd_core.io.messages import (
 from graspd_core.perception.cloud.camera import camera_rays
 from graspd_core.perception.cloud.point_cloud import transform_cloud
 from graspd_core.perception.cloud.voxel_downsample import unit_hint
+from graspd_core.runtime.disk_cache import digest
 from graspd_core.verify.robustness import begin_other_shapes
 from graspd_ros.convert import Matrix, array_of, nanoseconds
 from graspd_ros.error_codes import ErrorCode, RequestError, bad_request
@@ -67,6 +68,7 @@ class SensorFrame:
         read: returns the points in `frame` [m] and the camera's position. Its arguments are the configured camera
             position and a frame lookup. It takes some milliseconds and may raise a CloudError or TransformError.
         pixels: returns one point per pixel in `frame` [m], NaN without a measurement. May raise a CloudError.
+        content: returns a digest of what was measured. Two clouds cut out of one image have one stamp, but two digests.
     """
 
     kind: str
@@ -75,6 +77,7 @@ class SensorFrame:
     arrived: int
     read: Callable[..., PointCloud]
     pixels: Callable[[], Pixels] | None = None
+    content: Callable[[], str] = str
 
     def check(self, now: int, limit: float) -> None:
         """Check frame id and age. Raises RequestError: no frame id, or a stamp over `limit` [s] away from `now` [ns].
@@ -110,7 +113,8 @@ def cloud_frame(message: PointCloud2, arrived: int) -> SensorFrame:
         raise RequestError(ErrorCode.BAD_CLOUD, fault)
     header = message.header
     read = lambda place=ORIGIN, lookup=no_lookup: place.cloud(message, lookup)  # noqa: E731
-    return SensorFrame(CLOUD, header.frame_id, header.stamp, arrived, read, lambda: pixels_from_message(message))
+    pixels, content = partial(pixels_from_message, message), partial(_content, message, message.fields)
+    return SensorFrame(CLOUD, header.frame_id, header.stamp, arrived, read, pixels, content)
 
 
 def depth_sensor_frame(image: DepthMessage, info: CameraInfo, arrived: int) -> SensorFrame:
@@ -124,7 +128,12 @@ def depth_sensor_frame(image: DepthMessage, info: CameraInfo, arrived: int) -> S
         depth, camera = depth_and_camera(image, info, rectified=True)
         return camera_rays(camera) * np.where(depth > 0, depth, np.nan)[..., None]
 
-    return SensorFrame("depth image", image.header.frame_id, image.header.stamp, arrived, read, pixels)
+    header, content = image.header, partial(_content, image, info)
+    return SensorFrame("depth image", header.frame_id, header.stamp, arrived, read, pixels, content)
+
+
+def _content(message: PointCloud2 | DepthMessage, layout: object) -> str:
+    return digest([np.frombuffer(message.data, np.uint8), layout])
 
 
 class ImagePairs:
@@ -166,6 +175,10 @@ class ImagePairs:
         self._images = self._calibrations = 0
         self._waiting = None
         return image, info
+
+    def forget(self) -> None:
+        """Delete the image that waits. Calibrations stay, because many cameras send them only once."""
+        self._waiting, self._images, self._calibrations = None, 0, 0
 
     def unpaired(self) -> str:
         """Return a line about images that wait longer than `UNPAIRED` [s] for a matching CameraInfo, or ""."""

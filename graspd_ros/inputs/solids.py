@@ -23,6 +23,7 @@ from graspd_ros.error_codes import RequestError, bad_request
 from graspd_ros.request import FrameLookup, Request
 
 MOST_OBJECTS = 1000
+FARTHEST = 1e6  # largest valid size or coordinate of a shape [m]. Products of much larger numbers overflow
 # Number of dimensions of each kind of solid.
 _SIZES = {SolidPrimitive.BOX: 3, SolidPrimitive.SPHERE: 1, SolidPrimitive.CYLINDER: 2, SolidPrimitive.CONE: 2}
 
@@ -50,9 +51,10 @@ def moved_mesh(mesh: TriangleMesh, T: Matrix) -> TriangleMesh:
 def _mesh(shape: Mesh, owner: str) -> TriangleMesh:
     vertices = np.array([[p.x, p.y, p.z] for p in shape.vertices]).reshape(-1, 3)
     faces = np.array([list(t.vertex_indices) for t in shape.triangles], dtype=np.int64).reshape(-1, 3)
-    if not len(faces) or not np.isfinite(vertices).all() or faces.max() >= len(vertices):
+    if not len(faces) or not (np.abs(vertices) <= FARTHEST).all() or faces.max() >= len(vertices):
         counts = f"meshes: {len(vertices)} vertices and {len(faces)} triangles"
-        raise bad_message(owner, f"{counts}; valid: finite vertices, and triangles of vertex indices")
+        valid = f"finite vertices within {FARTHEST:g} m, and triangles of vertex indices"
+        raise bad_message(owner, f"{counts}; valid: {valid}")
     return TriangleMesh(vertices, faces)
 
 
@@ -60,8 +62,8 @@ def _primitive(shape: SolidPrimitive, owner: str) -> TriangleMesh:
     sizes = np.array(shape.dimensions, dtype=float)
     if shape.type not in _SIZES:
         raise bad_message(owner, f"primitives: type {shape.type}; valid: BOX=1, SPHERE=2, CYLINDER=3, CONE=4")
-    if len(sizes) != _SIZES[shape.type] or not (np.isfinite(sizes) & (sizes > 0)).all():
-        valid = f"{_SIZES[shape.type]} positive numbers [m]"
+    if len(sizes) != _SIZES[shape.type] or not ((sizes > 0) & (sizes <= FARTHEST)).all():
+        valid = f"{_SIZES[shape.type]} numbers above 0, at most {FARTHEST:g} [m]"
         raise bad_message(owner, f"primitives: dimensions {sizes.tolist()}; valid: {valid}")
     solid = _solid(shape.type, sizes)
     return TriangleMesh(np.array(solid.vertices), np.array(solid.faces, dtype=np.int64))

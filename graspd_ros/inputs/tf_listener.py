@@ -36,7 +36,8 @@ _COMPLAIN_AGAIN = 10.0  # seconds between two log lines about invalid transforms
 class TransformListener:
     """Subscriber that fills a buffer from /tf and /tf_static. `available` is False if tf2_msgs is not installed.
 
-    When time jumps back, for example when a bag restarts under simulated time, the buffer is cleared.
+    When time jumps back, for example when a bag restarts under simulated time, the moving transforms are deleted.
+    Static transforms are kept, because their publishers do not send them again.
     """
 
     def __init__(self, node: Node, buffer: TransformBuffer) -> None:
@@ -84,7 +85,9 @@ class TransformListener:
                 self._node.get_logger().warning(str(error), throttle_duration_sec=_COMPLAIN_AGAIN)
 
     def _on_jump(self, jump: TimeJump) -> None:
-        self._node.get_logger().info(f"time jumped by {jump.delta.nanoseconds * 1e-9:.3f} s: transforms are deleted")
+        self._node.get_logger().info(
+            f"time jumped by {jump.delta.nanoseconds * 1e-9:.3f} s: moving transforms are deleted"
+        )
         self._buffer.clear()
 
 

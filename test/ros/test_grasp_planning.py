@@ -178,6 +178,22 @@ def loaded(target: Object):
     return request_from_goal(builder, "allegro_right", "r", Settings(cloud_max_age=0.0), goal).load()
 
 
+def test_a_cluster_without_a_frame_is_in_the_frame_of_its_object(make_cloud):
+    asked: list[tuple[str, str]] = []
+
+    def lookup(target: str, source: str, stamp: Time) -> np.ndarray:
+        asked.append((target, source))
+        return np.eye(4)
+
+    target = cluster(make_cloud)
+    target.header.frame_id, target.point_cluster.header.frame_id = "base", ""
+    builder = RequestBuilder("allegro_right", lambda: Time(sec=1), lookup)
+    settings = Settings(sensor_frame="camera_depth_optical_frame")
+    made = request_from_goal(builder, "allegro_right", "r", settings, GraspPlanning.Goal(object=target))
+    made.load()
+    assert (made.frame, asked) == ("base", [("base", "camera_depth_optical_frame")])
+
+
 def test_the_surface_is_what_the_object_stands_on_whichever_way_it_is_written():
     for coefficients in ([0.0, 0.0, 2.0, 0.2], [0.0, 0.0, -1.0, -0.1]):
         scene = loaded(box(0.04, 0.05, 0.06, z=-0.07, surface=Plane(coef=coefficients)))

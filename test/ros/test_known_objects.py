@@ -115,6 +115,13 @@ def test_grasps_that_were_lost_are_left_out(folder: Path, hand: HandModel, unrea
     assert np.abs(first.grasp.position - second.grasp.position).max() > 1e-3
 
 
+def test_a_known_object_s_grasps_are_given_for_a_hand_that_closes_late(folder: Path, hand: HandModel):
+    for count in (2, 4):  # from the library alone, and with planned ones
+        planned = Node(hand, num_grasps=count).answer(**known(closes_late=True))
+        assert len(planned.result.grasps) == count
+        assert all(grasp.arrival is not None for grasp in planned.result.grasps)
+
+
 def test_what_is_missing_is_planned_and_added(folder: Path, hand: HandModel):
     planned = Node(hand, num_grasps=5).answer(**known())
     assert planned.result.outcome is Outcome.SUCCEEDED

@@ -30,6 +30,7 @@ from graspd_ros.parameters import LiveSettings, Settings, check_parameters
         ("roi_max", [0.0, 1.0, math.nan], "three finite numbers"),
         ("view_point", "here", "three finite numbers"),
         ("arm", "ur99", "unknown arm 'ur99'; valid: "),
+        ("collision_objects", "bad topic", "'bad topic' is no topic; valid: a name such as /collision_object"),
         ("deadline", "soon", "'soon' is no number"),
         ("deadline", True, "True is no number"),
         ("deadline", 0, "0.0; valid: 0.1 to 3600"),
@@ -54,6 +55,7 @@ def test_what_is_no_choice_is_refused_by_name(name, value, culprit):
         ("use_sim_time", True),
         ("deadline", 5),
         ("roi_min", [-1, -1, 0]),
+        ("collision_objects", "~/collision_object"),
     ],
 )
 def test_choices_are_taken(name, value):

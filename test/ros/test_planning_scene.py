@@ -11,7 +11,7 @@ from geometry_msgs.msg import Point, Pose, Quaternion, TransformStamped, Vector3
 from graspd_msgs.msg import GraspArray, GraspRequest
 from moveit_msgs.msg import CollisionObject
 from scipy.spatial.transform import Rotation
-from shape_msgs.msg import Mesh, Plane, SolidPrimitive
+from shape_msgs.msg import Mesh, MeshTriangle, Plane, SolidPrimitive
 from std_msgs.msg import Header
 from tf2_msgs.msg import TFMessage
 
@@ -143,6 +143,12 @@ BAD = {
     "collision object '': id: empty": message(name="", **crate()),
     "operation: 7; valid: ADD=0, REMOVE=1, APPEND=2, MOVE=3": message(b"\x07", **crate()),
     "'wall': meshes: 0 vertices and 0 triangles": message(meshes=[Mesh()]),
+    "'wall': meshes: 1 vertices and 1 triangles; valid: finite vertices within 1e+06 m": message(
+        meshes=[Mesh(vertices=[Point(x=1e200)], triangles=[MeshTriangle()])]
+    ),
+    "'wall': primitives: dimensions [1e+200]; valid: 1 numbers above 0, at most 1e+06 [m]": message(
+        primitives=[SolidPrimitive(type=SolidPrimitive.SPHERE, dimensions=[1e200])]
+    ),
     "'wall': planes: infinite planes are not supported": message(planes=[Plane()], **crate()),
     "'wall': no primitives and no meshes": message(),
     "'wall': header.frame_id: empty": message(frame="", **crate()),

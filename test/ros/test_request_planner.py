@@ -159,5 +159,63 @@ def test_the_next_best_grasp_comes_at_once_from_the_candidates_of_the_same_run(h
     fifth = ask("fifth", "first/0", key="cloud 2")
     assert len(loaded) == before + 2
     assert unlike(fifth.tried, lost[:1]) == list(fifth.tried)
-    with pytest.raises(RequestError, match="exclude: no grasp 'nobody/0' in the last 16 runs; kept: first, second"):
-        ask("sixth", "nobody/0")
+    for unknown in ("nobody/0", "first/99", "first/" + "9" * 5000):
+        with pytest.raises(
+            RequestError, match=f"exclude: no grasp '{unknown[:100]}.* in the last 16 runs; kept: first, "
+        ):
+            ask("sixth", unknown)
+
+
+@pytest.mark.parametrize(
+    "change", [{"closes_late": True}, {"settings": replace(SETTINGS, verify="full")}], ids=["arrival", "trials"]
+)
+def test_a_run_with_other_terms_does_not_answer(hand, change):
+    plans, scene = planner(hand), load_scene("shape:sphere")
+    first = replace(request(lambda: scene, replace(SETTINGS, num_grasps=3)), id="first", object_key="sphere")
+    assert plans.plan(first, never, lambda _: None).result.outcome is Outcome.SUCCEEDED
+    asked = replace(first, id="second", exclude=("first/0",), settings=SETTINGS)
+    found = plans.plan(replace(asked, **change), never, lambda _: None).result
+    assert "of an earlier run" not in found.message
+    assert (found.tried[0].arrival is not None) == ("closes_late" in change)
+
+
+def test_lost_grasps_are_placed_where_the_camera_stood_when_it_saw(hand):
+    asked: list[tuple[str, str, int]] = []
+
+    def lookup(target: str, source: str, stamp: Time, stop) -> np.ndarray:
+        asked.append((target, source, stamp.sec))
+        return np.eye(4)
+
+    mesh = replace(request(lambda: load_scene("shape:sphere")), stamp=Time(sec=7), exclude_poses=(("map", np.eye(4)),))
+    cloud = replace(mesh, region_points=lambda: np.zeros((0, 3)))
+    for one in (mesh, cloud):
+        Planner(hand, lookup).plan(one, never, lambda _: None)
+    assert asked == [("object", "map", 0), ("object", "map", 7)]
+
+
+def test_a_result_file_that_cannot_be_written_costs_no_grasp(hand, tmp_path):
+    (tmp_path / "taken").touch()
+    settings = replace(SETTINGS, output_dir=str(tmp_path / "taken"))
+    planned = planner(hand).plan(request(lambda: load_scene("shape:sphere"), settings), never, lambda _: None)
+    assert planned.result.outcome is Outcome.SUCCEEDED
+    assert planned.file == ""
+    assert any(told.startswith("output_dir: ") and "taken/r.json" in told for told in planned.result.warnings)
+
+
+def test_the_greatest_seed_leaves_room_for_what_is_excluded(hand):
+    settings = replace(SETTINGS, seed=2**63 - 1, verify="none")
+    asked = replace(request(lambda: load_scene("shape:sphere"), settings), exclude_poses=(("object", np.eye(4)),))
+    assert planner(hand).plan(asked, never, lambda _: None).result.outcome is Outcome.SUCCEEDED
+
+
+def test_an_answer_of_an_earlier_run_keeps_the_warnings_about_the_object(hand):
+    scene = load_scene("shape:sphere")
+    scene = replace(scene, object=replace(scene.object, warnings=("half of it is guessed",)))
+    plans, settings = planner(hand), replace(SETTINGS, num_grasps=3)
+    first = replace(request(lambda: scene, settings), id="first", object_key="sphere")
+    told = plans.plan(first, never, lambda _: None).result.warnings
+    again = replace(first, id="second", exclude=("first/0",), settings=SETTINGS)
+    found = plans.plan(again, never, lambda _: None).result
+    assert "of an earlier run" in found.message
+    assert "half of it is guessed" in found.warnings
+    assert found.warnings == told

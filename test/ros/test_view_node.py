@@ -84,6 +84,20 @@ def test_what_a_node_publishes_is_shown(client):
     assert any(line.startswith("can-2: optimise 3 of 9") for line in viewer.lines)
 
 
+def test_the_hand_of_a_node_with_a_prefix_is_shown(client):
+    viewer = Watched()
+    Follower(client.node, viewer, "/left/graspd")
+    answer = an_answer(a_grasp())
+    (grasp,) = answer.grasps
+    grasp.base_link = f"left_{HAND.base_link}"
+    for joints in (grasp.pregrasp_joints, grasp.grasp_joints, grasp.squeeze_joints):
+        joints.name = [f"left_{name}" for name in joints.name]
+    client.kept(GraspArray, "/left/graspd/grasps").publish(answer)
+    client.spin_until(lambda: answer.message in viewer.lines, "an answer")
+    (session,) = viewer.sessions
+    assert session.hand.joint_names == tuple(f"left_{name}" for name in HAND.joint_names)
+
+
 def test_answers_that_cannot_be_shown_are_left_out(client):
     viewer = Watched()
     Follower(client.node, viewer, "/followed_too")

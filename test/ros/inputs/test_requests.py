@@ -2,6 +2,7 @@
 
 import array
 import math
+import os
 from dataclasses import replace
 from pathlib import Path
 
@@ -20,6 +21,7 @@ from graspd_core import Box, PointCloud, Sphere, load_scene, preset_names
 from graspd_core.errors import CloudError, GraspdError, MeshError, NoObjectError, ResourceError, TransformError
 from graspd_ros.convert import pose_matrix
 from graspd_ros.error_codes import ErrorCode, RequestError, code_of, sentence_of
+from graspd_ros.inputs import sensor_frames
 from graspd_ros.inputs.request_builder import (
     MOST_MESH_BYTES,
     SOURCES,
@@ -314,9 +316,32 @@ def test_what_was_lost_and_which_object_it_was_of_reach_the_worker(tmp_path):
     again = request(tmp_path, object_pose=Pose(position=Point(z=2.0)))
     assert again.object_key == asked.object_key != ""
     assert request(tmp_path, mesh_scale=2.0).object_key != asked.object_key
+    (tmp_path / "can.obj").write_text("# another object, whose file is as old")
+    os.utime(tmp_path / "can.obj", ns=(0, 0))
+    (tmp_path / "left").mkdir()
+    (tmp_path / "left" / "can.obj").touch()
+    os.utime(tmp_path / "left" / "can.obj", ns=(0, 0))
+    roots = [Settings(mesh_roots=[str(root)]) for root in (tmp_path, tmp_path / "left")]
+    message = GraspRequest(source=GraspRequest.MESH, mesh_uri="can.obj")
+    assert len({intake().from_message("r", settings, message).object_key for settings in roots}) == 2
     assert "exclude: 257 ids, 0 poses; valid: at most 256 together" in str(refusal(exclude=["a/0"] * 257))
     with pytest.raises(RequestError, match="exclude_poses: position"):
         request(tmp_path, exclude_poses=[PoseStamped(pose=FAR)])
+
+
+def test_clouds_of_one_image_are_one_object_only_where_they_show_the_same(make_cloud):
+    def key(points: np.ndarray, **settings: object) -> str:
+        cloud = make_cloud(points)
+        cloud.header.stamp = NOW
+        message = GraspRequest(cloud=cloud, alone=True)
+        return intake().from_message("r", replace(Settings(), **settings), message).object_key
+
+    ball = np.random.default_rng(0).normal(size=(100, 3))
+    assert key(ball) == key(ball) != ""
+    # A segmenter gives each object of an image as its own cloud, all with the image's stamp.
+    assert key(ball + np.array([0.2, 0.0, 0.0])) != key(ball)
+    assert key(ball, roi_min=[0.0, 0.0, 0.0]) != key(ball)
+    assert key(ball, voxel_size=0.01) != key(ball)
 
 
 @pytest.fixture
@@ -459,6 +484,25 @@ def test_wishes_in_another_frame_than_the_cloud_go_by_tf():
         assert np.allclose(np.asarray(steering().approach_direction), direction)
 
 
+def test_point_and_wishes_are_placed_where_the_camera_stood_when_it_saw(make_cloud, monkeypatch):
+    def lookup(target: str, source: str, stamp: Time) -> np.ndarray:
+        T = np.eye(4)
+        T[2, 3] = 5.0 if stamp == SEEN else -1.0  # the camera has moved since
+        return T
+
+    cloud, targets = make_cloud(np.ones((100, 3))), []
+    cloud.header.stamp = SEEN
+    monkeypatch.setattr(sensor_frames, "scene_of_views", lambda views, settings, target, told: targets.append(target))
+    fields = {"cloud": cloud, "use_target_point": True, "target_point": Point(x=0.5), "region": solid(BALL, 0.1)}
+    asked = intake(lookup).from_message("r", Settings(), GraspRequest(header=Header(frame_id="map"), **fields))
+    asked.load()
+    assert np.allclose(targets[0].point, [0.5, 0, 5])
+    assert asked.steering is not None
+    region = asked.steering().region
+    assert isinstance(region, Sphere)
+    assert np.allclose(np.asarray(region.center), [0, 0, 5])
+
+
 def test_a_box_may_be_the_region(tmp_path):
     steering = request(tmp_path, region=solid(BOX, 0.1, 0.1, 0.1)).steering
     assert steering is not None
@@ -481,6 +525,7 @@ def test_a_box_may_be_the_region(tmp_path):
         ({"region_mask": Image(height=1)}, "region_mask: given with source 1; valid with CLOUD=0"),
         ({"region_mask": Image(height=1), "region": solid(BALL, 0.1)}, "region_mask: region is given too"),
         ({"avoid": [solid(BOX, 1, 1, 1)]}, "avoid: 1 boxes, 0 poses; valid: one pose for each box, at most 64"),
+        ({"avoid_poses": [Pose()]}, "avoid: 0 boxes, 1 poses; valid: one pose for each box"),
         ({"avoid": [solid(BALL, 1)], "avoid_poses": [Pose()]}, "avoid: type 2 of 1 dimensions; valid: BOX=1"),
         ({"avoid": [solid(BOX, 1, 0, 1)], "avoid_poses": [Pose()]}, "box size: .*three lengths above 0"),
     ],

@@ -173,6 +173,15 @@ def test_an_image_takes_the_last_calibration_of_its_frame_and_size():
     assert pairs.add(first) == (first, newer)
 
 
+def test_after_a_reset_no_older_image_is_given_out_and_calibrations_stay():
+    pairs, (old, new), own = ImagePairs(), [image(np.ones((48, 64)), "16UC1", stamp=k) for k in (1, 2)], calibration()
+    assert pairs.add(old) is None
+    pairs.forget()
+    assert pairs.add(own) is None
+    pairs.forget()
+    assert pairs.add(new) == (new, own)
+
+
 def test_images_without_any_calibration_are_counted():
     now = [0.0]
     pairs = ImagePairs(lambda: now[0])
