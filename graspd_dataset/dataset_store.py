@@ -67,6 +67,8 @@ T = TypeVar("T")
 
 # Number of attempts of a server request, and the pause before the second attempt [s]. The pause doubles each time.
 _TRIES, _PAUSE = 6, 0.2
+# Endings of the listed files.
+_ENDINGS = (".parquet", ".json")
 # Number of digits of an object's hash in the name of its directory.
 _SHORT = 16
 
@@ -94,16 +96,20 @@ class DatasetStore:
         return None if "://" in self.where else Path(self.where)
 
     def list(self, folder: str) -> list[str]:
-        """Return the sorted paths of all files below a folder. Empty if there is no such folder."""
+        """Return the sorted paths of all Parquet and JSON files below a folder. Empty if there is no such folder.
+
+        A killed process leaves the file that it was writing, with letters after the ending. Such files do not count.
+        """
         if self.local is not None:
-            found = (self.local / folder).rglob("*")
-            return sorted(path.relative_to(self.local).as_posix() for path in found if path.is_file())
+            found = (path for path in (self.local / folder).rglob("*") if path.suffix in _ENDINGS and path.is_file())
+            return sorted(path.relative_to(self.local).as_posix() for path in found)
         from pyarrow.fs import FileSelector, FileType
 
         system, root = self._arrow()
         selector = FileSelector(f"{root}/{folder}", recursive=True, allow_not_found=True)
         found = self._tried(folder, lambda: system.get_file_info(selector))
-        return sorted(item.path.removeprefix(f"{root}/") for item in found if item.type is FileType.File)
+        files = (item.path.removeprefix(f"{root}/") for item in found if item.type is FileType.File)
+        return sorted(path for path in files if PurePosixPath(path).suffix in _ENDINGS)
 
     def read(self, path: str) -> bytes:
         if self.local is not None:
@@ -195,5 +201,5 @@ def read_record(store: DatasetStore, path: str) -> dict[str, Any]:
 
 
 def keys_below(store: DatasetStore, folder: str) -> set[str]:
-    """Return the keys of all Parquet and JSON files below a folder."""
-    return {key_of(path) for path in store.list(folder) if PurePosixPath(path).suffix in (".parquet", ".json")}
+    """Return the keys of all files below a folder."""
+    return {key_of(path) for path in store.list(folder)}

@@ -275,3 +275,16 @@ def test_the_example_trains_on_it(tmp_path: Path, monkeypatch: pytest.MonkeyPatc
     told = capsys.readouterr().out
     assert "of 1 objects held out" in told
     assert "of the best half by the network" in told
+
+
+def test_a_file_that_a_killed_process_was_writing_does_not_count(copied: DatasetStore, blocks: tuple[Block, ...], graspd):
+    _recorded(copied)
+    for path in (*copied.list("grasps"), *copied.list("objects"), *copied.list("runs")):
+        half = Path(copied.where) / f"{path}x1y2z3_4"
+        half.write_bytes(copied.read(path)[:40])
+    assert begin_run(copied, REQUEST, 2, any_code=True).blocks == 2
+    assert with_unrecorded(copied, begin_run(copied, REQUEST, 2, any_code=True)).files.keys() == {
+        *copied.list("grasps"), *copied.list("objects")
+    }  # fmt: skip
+    assert stats_of(copied).rows == sum(table.num_rows for _, _, table, _ in tables_of(copied))
+    assert graspd("dataset", "validate", copied.where) == 0
