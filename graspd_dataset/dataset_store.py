@@ -12,6 +12,7 @@ every file that the run wrote. So `graspd dataset validate` finds any changed by
 
 from __future__ import annotations
 
+import contextlib
 import hashlib
 import json
 import time
@@ -135,6 +136,19 @@ class DatasetStore:
                 file.write(content)
 
         return self._tried(path, write)
+
+    def remove(self, path: str) -> None:
+        """Remove a file. Do nothing if there is no such file."""
+        if self.local is not None:
+            local = self.local / path
+            return self._once(path, lambda: local.unlink(missing_ok=True))
+        system, root = self._arrow()
+
+        def remove() -> None:
+            with contextlib.suppress(FileNotFoundError):
+                system.delete_file(f"{root}/{path}")
+
+        return self._tried(path, remove)
 
     def _arrow(self) -> tuple[Any, str]:
         """Return pyarrow's file system, and the path of the data set in it."""

@@ -36,7 +36,7 @@ class DatasetStats:
         hands: counts of each hand, by its name.
         reasons: number of failed grasps for each text of `kind_of_reason`.
         codes: versions of the code that made the rows.
-        failed: records of failed blocks and objects. Without blocks that were made later.
+        failed: records of failed blocks and objects. Without those that succeeded later.
     """
 
     hands: dict[str, HandCount] = field(default_factory=dict)
@@ -70,7 +70,7 @@ def stats_of(store: DatasetStore) -> DatasetStats:
     """Count the rows of a data set. Raises FormatError: there is no block, or a block is damaged."""
     stats, there = DatasetStats(), set[str]()
     for path, content, table, header in tables_of(store, ("object_sha256", "verdict", "code", "trials")):
-        there.add(header["block"])
+        there.update((header["block"], content_key(header["asked"]["object"])))
         stats.codes.update(table["code"].unique().to_pylist())
         # The path gives the hand, because a block may have no rows.
         hand = stats.hands.setdefault(path.split("/")[1].removeprefix("hand="), HandCount())

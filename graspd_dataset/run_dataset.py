@@ -10,7 +10,7 @@ import os
 import platform
 import shlex
 from collections import deque
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Collection, Iterator, Sequence
 from dataclasses import asdict, dataclass, field, fields, replace
 from datetime import date
 from typing import Any
@@ -172,6 +172,12 @@ def missing_blocks(blocks: Sequence[Block], store: DatasetStore, *, retry_failed
     there = keys_below(store, "grasps")
     failed = set() if retry_failed else keys_below(store, "failed")
     return [b for b in blocks if b.key not in there and not failed & {b.key, b.object.key}]
+
+
+def remove_failure(store: DatasetStore, report: Report, failed: Collection[str]) -> None:
+    """Remove the record of an earlier failure if the object or block has succeeded. `failed` are the recorded keys."""
+    if report.key in failed and not report.failed:
+        store.remove(f"failed/{report.key}.json")
 
 
 def run_blocks(

@@ -15,9 +15,11 @@ from small_dataset import REQUEST, make_here
 from graspd_core.errors import FormatError
 from graspd_dataset.blocks import Block, DatasetRequest, blocks_of
 from graspd_dataset.dataset_store import DatasetStore, file_hash, key_of, parquet_bytes, read_parquet
+from graspd_dataset.guarded_calls import Report, failed_report
 from graspd_dataset.inspect_dataset import count_by_content, faults_of_dataset, recorded_hashes, stats_of, tables_of
 from graspd_dataset.merge_datasets import merge, sample
-from graspd_dataset.run_dataset import begin_run, missing_blocks, with_unrecorded, write_run
+from graspd_dataset.ray_engine import object_job
+from graspd_dataset.run_dataset import begin_run, missing_blocks, remove_failure, with_unrecorded, write_run
 
 Run = Callable[..., int]
 
@@ -277,7 +279,9 @@ def test_the_example_trains_on_it(tmp_path: Path, monkeypatch: pytest.MonkeyPatc
     assert "of the best half by the network" in told
 
 
-def test_a_file_that_a_killed_process_was_writing_does_not_count(copied: DatasetStore, blocks: tuple[Block, ...], graspd):
+def test_a_file_that_a_killed_process_was_writing_does_not_count(
+    copied: DatasetStore, blocks: tuple[Block, ...], graspd
+):
     _recorded(copied)
     for path in (*copied.list("grasps"), *copied.list("objects"), *copied.list("runs")):
         half = Path(copied.where) / f"{path}x1y2z3_4"
@@ -288,3 +292,15 @@ def test_a_file_that_a_killed_process_was_writing_does_not_count(copied: Dataset
     }  # fmt: skip
     assert stats_of(copied).rows == sum(table.num_rows for _, _, table, _ in tables_of(copied))
     assert graspd("dataset", "validate", copied.where) == 0
+
+
+def test_an_object_that_failed_and_then_succeeded_is_no_failure(copied: DatasetStore, blocks: tuple[Block, ...]):
+    first = blocks[0]
+    failed_report(copied, object_job(first.object, first.config), MemoryError("too much"))
+    assert stats_of(copied).failed == []
+    more = blocks_of(replace(REQUEST, per_object=6))
+    assert missing_blocks(more, copied) == []
+    remove_failure(copied, Report(first.object.key, failed="memory"), {first.object.key})
+    assert missing_blocks(more, copied) == []
+    remove_failure(copied, Report(first.object.key), {first.object.key})
+    assert [block.seed for block in missing_blocks(more, copied)] == [2]
