@@ -203,13 +203,22 @@ def file_hash(content: bytes) -> str:
     return hashlib.sha256(content).hexdigest()
 
 
+# Entries that every record in a folder has, with their types.
+_ENTRIES: dict[str, dict[str, Any]] = {
+    "runs": {"command": str, "code": str, "commit": str, "made": str, "machine": str, "blocks": int},
+    "failed": {"key": str, "failed": str, "error": str, "asked": dict},
+}
+
+
 def read_record(store: DatasetStore, path: str) -> dict[str, Any]:
     """Read the record of a run or of a failure. Raises FormatError: the file is not a valid record in JSON."""
     try:
         record = json.loads(store.read(path))
-    except ValueError:
+    except (ValueError, RecursionError):
         record = None
-    if not isinstance(record, dict) or not isinstance(record.get("files", {}), dict):
+    needed = _ENTRIES[path.partition("/")[0]]
+    whole = isinstance(record, dict) and all(isinstance(record.get(name), kind) for name, kind in needed.items())
+    if not whole or not isinstance(record.get("files", {}), dict):
         raise FormatError(f"{store.label}/{path}: not a record of a run or a failure; expected a JSON object")
     return record
 

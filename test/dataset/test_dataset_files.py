@@ -279,9 +279,7 @@ def test_the_example_trains_on_it(tmp_path: Path, monkeypatch: pytest.MonkeyPatc
     assert "of the best half by the network" in told
 
 
-def test_a_file_that_a_killed_process_was_writing_does_not_count(
-    copied: DatasetStore, blocks: tuple[Block, ...], graspd
-):
+def test_a_file_that_a_killed_process_was_writing_does_not_count(copied: DatasetStore, graspd: Run):
     _recorded(copied)
     for path in (*copied.list("grasps"), *copied.list("objects"), *copied.list("runs")):
         half = Path(copied.where) / f"{path}x1y2z3_4"
@@ -304,3 +302,18 @@ def test_an_object_that_failed_and_then_succeeded_is_no_failure(copied: DatasetS
     assert missing_blocks(more, copied) == []
     remove_failure(copied, Report(first.object.key), {first.object.key})
     assert [block.seed for block in missing_blocks(more, copied)] == [2]
+
+
+def test_a_record_or_a_file_that_lacks_an_entry_is_one_line(copied: DatasetStore, graspd: Run, capsys, tmp_path: Path):
+    for path in ("failed/a.json", "runs/a.json"):
+        copied.write(path, b'{"files": {}}')
+        with pytest.raises(FormatError, match=f"{path}: not a record of a run or a failure"):
+            stats_of(copied) if path.startswith("failed") else begin_run(copied, REQUEST, 2)
+        copied.remove(path)
+    # An object's file is a Parquet file of graspd too, but no block.
+    copied.write("grasps/hand=x/object=y/z.parquet", copied.read(copied.list("objects")[0]))
+    for action in ("stats", "validate", "merge", "sample", "export"):
+        status = graspd("dataset", action, copied.where, "--out", tmp_path / f"{action}.parquet")
+        told = capsys.readouterr()
+        assert status == (1 if action == "validate" else 2)
+        assert ("its columns are not those" if status == 1 else "z.parquet: not a block") in told.out + told.err

@@ -79,3 +79,11 @@ def test_a_full_disk_leaves_no_part_of_a_file(tmp_path: Path):
     assert [path.name for path in (tmp_path / "grasps").iterdir()] == ["a.parquet"]
     store.write("grasps/b.parquet", b"x" * 100_000)
     assert len(store.list("grasps")) == 2
+
+
+def test_a_file_is_removed_from_a_disk_and_from_s3(server: Server, tmp_path: Path):
+    for store in (DatasetStore(str(tmp_path)), DatasetStore(server.url("removed"))):
+        store.write("failed/a.json", b"{}")
+        store.remove("failed/a.json")
+        store.remove("failed/a.json")
+        assert store.list("failed") == []
