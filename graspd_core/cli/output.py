@@ -77,6 +77,17 @@ def _plain(value: Any) -> Any:
     return value.tolist() if hasattr(value, "tolist") else sorted(value) if isinstance(value, set) else str(value)
 
 
+def flush_output() -> OSError | None:
+    """Flush stdout. If this fails, discard the rest, because Python would fail again at its end. Return the error."""
+    try:
+        if sys.stdout is not None:
+            sys.stdout.flush()
+    except OSError as error:
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        return error
+    return None
+
+
 def print_note(text: object) -> None:
     """Print a note on stderr, unless `--quiet` was given."""
     if not _settings.quiet:
