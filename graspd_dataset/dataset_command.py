@@ -158,6 +158,8 @@ def _request(options: argparse.Namespace) -> DatasetRequest:
     from graspd_dataset.blocks import DatasetRequest
 
     number, low, high = options.random_scales
+    if not float(number).is_integer():
+        raise ConfigError(f"random-scales: {number:g} {low:g} {high:g}; valid: N >= 0 and 0 < LOW <= HIGH")
     names = ("per_object", "block", "preset", "seed", "mass", "friction", "verify", "measure")
     return DatasetRequest(
         objects=tuple(options.words),

@@ -317,3 +317,20 @@ def test_a_record_or_a_file_that_lacks_an_entry_is_one_line(copied: DatasetStore
         told = capsys.readouterr()
         assert status == (1 if action == "validate" else 2)
         assert ("its columns are not those" if status == 1 else "z.parquet: not a block") in told.out + told.err
+
+
+@pytest.mark.parametrize(
+    ("words", "told"),
+    [
+        (["--random-scales", "nan", "1", "2"], "random-scales: nan 1 2; valid: N >= 0"),
+        (["--random-scales", "2.5", "1", "2"], "random-scales: 2.5 1 2; valid: N >= 0"),
+        (["--patience", "-1"], "patience: -1; valid: a positive number"),
+        (["--patience", "nan"], "patience: nan; valid: a positive number"),
+        (["--memory", "0"], "memory: 0; valid: a positive number"),
+        (["--memory", "1", "--dry-run"], "more than 1 MB; change --memory or --patience"),
+    ],
+)
+def test_a_number_that_makes_no_sense_is_one_line(words: list[str], told: str, graspd: Run, capsys, tmp_path: Path):
+    assert graspd("dataset", "shape:sphere", "--out", tmp_path / "out", "--per-object", "1", *words) == 2
+    assert told in capsys.readouterr().err
+    assert not list(tmp_path.iterdir())
