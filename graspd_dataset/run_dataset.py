@@ -66,8 +66,14 @@ def command_of(request: DatasetRequest, out: str) -> str:
         if item.name == "objects" or value == getattr(usual, item.name):
             continue
         several = value if isinstance(value, tuple) else (value,)
-        words += [f"--{item.name.replace('_', '-')}", *(f"{v:g}" if isinstance(v, float) else str(v) for v in several)]
+        words += [f"--{item.name.replace('_', '-')}", *map(_word, several)]
     return shlex.join([*words, "--out", out])
+
+
+def _word(value: Any) -> str:
+    """Return a value as a word of a command line. Numbers are short, but give the same value again."""
+    short = f"{value:g}" if isinstance(value, float) else str(value)
+    return short if not isinstance(value, float) or float(short) == value else repr(value)
 
 
 def begin_run(store: DatasetStore, request: DatasetRequest, blocks: int, *, any_code: bool = False) -> RunRecord:

@@ -2,6 +2,7 @@
 
 import importlib
 import json
+import shlex
 import shutil
 import subprocess
 import sys
@@ -19,7 +20,7 @@ from graspd_dataset.guarded_calls import Report, failed_report
 from graspd_dataset.inspect_dataset import count_by_content, faults_of_dataset, recorded_hashes, stats_of, tables_of
 from graspd_dataset.merge_datasets import merge, sample
 from graspd_dataset.ray_engine import object_job
-from graspd_dataset.run_dataset import begin_run, missing_blocks, remove_failure, with_unrecorded, write_run
+from graspd_dataset.run_dataset import begin_run, command_of, missing_blocks, remove_failure, with_unrecorded, write_run
 
 Run = Callable[..., int]
 
@@ -334,3 +335,25 @@ def test_a_number_that_makes_no_sense_is_one_line(words: list[str], told: str, g
     assert graspd("dataset", "shape:sphere", "--out", tmp_path / "out", "--per-object", "1", *words) == 2
     assert told in capsys.readouterr().err
     assert not list(tmp_path.iterdir())
+
+
+def test_the_recorded_command_has_every_digit():
+    request = replace(REQUEST, mass=0.123456789, scales=(1.0, 0.3333333333333333), per_object=1)
+    words = shlex.split(command_of(request, "out"))
+    assert float(words[words.index("--mass") + 1]) == request.mass
+    assert tuple(map(float, words[words.index("--scales") + 1 :][:2])) == request.scales
+    assert words[words.index("--scales") + 1] == "1"
+
+
+def test_the_hashes_of_a_merged_record_are_those_of_the_kept_files(made: DatasetStore, copied: DatasetStore, tmp_path):
+    """Another version of pyarrow writes the same rows as other bytes."""
+    other = DatasetStore(str(tmp_path / "other"))
+    shutil.copytree(made.where, other.where)
+    path = other.list("grasps")[0]
+    table, header = read_parquet(other.read(path), path)
+    other.write(path, parquet_bytes(table, {**header, "writer": "another"}))
+    for store in (copied, other):
+        record = replace(begin_run(store, REQUEST, 2), command="graspd dataset shape:sphere --out here")
+        write_run(store, with_unrecorded(store, record))
+    merge([other], copied)
+    assert list(faults_of_dataset(copied)) == []
