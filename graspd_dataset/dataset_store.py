@@ -216,9 +216,9 @@ def read_record(store: DatasetStore, path: str) -> dict[str, Any]:
         record = json.loads(store.read(path))
     except (ValueError, RecursionError):
         record = None
-    needed = _ENTRIES[path.partition("/")[0]]
-    whole = isinstance(record, dict) and all(isinstance(record.get(name), kind) for name, kind in needed.items())
-    if not whole or not isinstance(record.get("files", {}), dict):
+    given = {"files": {}, **record} if isinstance(record, dict) else {}
+    entries = {**_ENTRIES[path.partition("/")[0]], "files": dict}
+    if not isinstance(record, dict) or not all(isinstance(given.get(key), kind) for key, kind in entries.items()):
         raise FormatError(f"{store.label}/{path}: not a record of a run or a failure; expected a JSON object")
     return record
 

@@ -79,11 +79,13 @@ def _plain(value: Any) -> Any:
 
 def flush_output() -> OSError | None:
     """Flush stdout. If this fails, discard the rest, because Python would fail again at its end. Return the error."""
+    # Without a standard output, sys.stdout is None.
+    if (stream := sys.stdout) is None:
+        return None
     try:
-        if sys.stdout is not None:
-            sys.stdout.flush()
+        stream.flush()
     except OSError as error:
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        os.dup2(os.open(os.devnull, os.O_WRONLY), stream.fileno())
         return error
     return None
 

@@ -269,7 +269,7 @@ class SlowRobot:
 
 @pytest.mark.parametrize(("speed", "seconds"), [(1.0, 0.25), (50.0, 0.0)])
 def test_a_simulation_that_cannot_keep_up_goes_on(speed: float, seconds: float):
-    cell = SimulatorNode.__new__(SimulatorNode)
+    cell: Any = SimulatorNode.__new__(SimulatorNode)
     cell.robot, cell._speed, cell._lock, cell._stop = SlowRobot(), speed, threading.Lock(), threading.Event()
     rounds: list[float] = []
 
