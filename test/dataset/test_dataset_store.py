@@ -43,9 +43,9 @@ def test_a_server_that_refuses_one_request_in_ten_loses_and_doubles_nothing(serv
         before = server.refused
         remote = DatasetStore(server.url("flaky"))
         for number in range(12):
-            remote.write(f"runs/{number}.json", b"{}".ljust(200))
+            remote.write(f"failed/{number}.json", b"{}".ljust(200))
         merge([made], remote)
-        assert len(remote.list("runs")) == 12
+        assert len(remote.list("failed")) == 12
         assert count_by_content(remote) == count_by_content(made)
         assert list(faults_of_dataset(remote)) == []
         assert server.refused > before
