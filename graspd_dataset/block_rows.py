@@ -12,6 +12,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+from graspd_core.errors import ConfigError
 from graspd_core.hands.model import HandModel, all_joint_names, all_joint_positions
 from graspd_core.io.grasps_json import grasp_figures
 from graspd_core.optimize.plan_config import PlanConfig
@@ -171,15 +172,21 @@ def _object_file(target: ObjectModel) -> bytes:
 
 
 def dry_run(blocks: Sequence[Block], limits: Limits, workers: int | None) -> str:
-    """Make one block of each hand. From these, estimate grasps, CPU hours and megabytes of all blocks, as text."""
+    """Make one block of each hand. From these, estimate grasps, CPU hours and megabytes of all blocks, as text.
+
+    Raises GraspdError: a block exceeds the limits, or its process died, or its object cannot be used.
+    """
     if not blocks:
         return "nothing is missing"
     workers = workers or os.cpu_count() or 1
     measured: dict[str, tuple[Block, MadeBlock]] = {}
     for block in blocks:
         if block.hand_content not in measured:
-            ready = call_guarded(limits, make_ready, block.object, None, block.config)
-            made = call_guarded(limits, make_block, block, pickled_hand(block), ready.shared)
+            try:
+                ready = call_guarded(limits, make_ready, block.object, None, block.config)
+                made = call_guarded(limits, make_block, block, pickled_hand(block), ready.shared)
+            except (MemoryError, TimeoutError, ChildProcessError) as error:
+                raise ConfigError(f"{block.object.source}: {error}; change --memory or --patience") from None
             measured[block.hand_content] = block, made
     close_child()
     lines, wanted = [], Counter[str]()

@@ -123,14 +123,17 @@ def _run_missing(
     interrupt: Interrupt,
 ) -> tuple[Lines, RunRecord]:
     """Run the missing blocks. Write the run record every 30 s. Return the progress display and the updated record."""
+    from graspd_dataset.dataset_store import keys_below
     from graspd_dataset.ray_engine import RayEngine, ray_running
-    from graspd_dataset.run_dataset import run_blocks, write_run
+    from graspd_dataset.run_dataset import remove_failure, run_blocks, write_run
 
+    failed = keys_below(store, "failed")
     lines, began, written = Lines(len(missing)), time.monotonic(), 0.0
     with ray_running(options.address, options.workers, options.ray_dir) as ray, lines:
         engine = RayEngine(ray, store, limits, ship=options.address is not None)
         for what, report in run_blocks(missing, engine, interrupt.is_interrupted):
             lines(what, report)
+            remove_failure(store, report, failed)
             if time.monotonic() > written + _RECORDS:
                 write_run(store, lines.added_to(record, time.monotonic() - began))
                 written = time.monotonic()
@@ -155,6 +158,8 @@ def _request(options: argparse.Namespace) -> DatasetRequest:
     from graspd_dataset.blocks import DatasetRequest
 
     number, low, high = options.random_scales
+    if not float(number).is_integer():
+        raise ConfigError(f"random-scales: {number:g} {low:g} {high:g}; valid: N >= 0 and 0 < LOW <= HIGH")
     names = ("per_object", "block", "preset", "seed", "mass", "friction", "verify", "measure")
     return DatasetRequest(
         objects=tuple(options.words),

@@ -12,6 +12,7 @@ every file that the run wrote. So `graspd dataset validate` finds any changed by
 
 from __future__ import annotations
 
+import contextlib
 import hashlib
 import json
 import time
@@ -67,6 +68,8 @@ T = TypeVar("T")
 
 # Number of attempts of a server request, and the pause before the second attempt [s]. The pause doubles each time.
 _TRIES, _PAUSE = 6, 0.2
+# Endings of the listed files.
+_ENDINGS = (".parquet", ".json")
 # Number of digits of an object's hash in the name of its directory.
 _SHORT = 16
 
@@ -94,16 +97,20 @@ class DatasetStore:
         return None if "://" in self.where else Path(self.where)
 
     def list(self, folder: str) -> list[str]:
-        """Return the sorted paths of all files below a folder. Empty if there is no such folder."""
+        """Return the sorted paths of all Parquet and JSON files below a folder. Empty if there is no such folder.
+
+        A killed process leaves the file that it was writing, with letters after the ending. Such files do not count.
+        """
         if self.local is not None:
-            found = (self.local / folder).rglob("*")
-            return sorted(path.relative_to(self.local).as_posix() for path in found if path.is_file())
+            found = (path for path in (self.local / folder).rglob("*") if path.suffix in _ENDINGS and path.is_file())
+            return sorted(path.relative_to(self.local).as_posix() for path in found)
         from pyarrow.fs import FileSelector, FileType
 
         system, root = self._arrow()
         selector = FileSelector(f"{root}/{folder}", recursive=True, allow_not_found=True)
         found = self._tried(folder, lambda: system.get_file_info(selector))
-        return sorted(item.path.removeprefix(f"{root}/") for item in found if item.type is FileType.File)
+        files = (item.path.removeprefix(f"{root}/") for item in found if item.type is FileType.File)
+        return sorted(path for path in files if PurePosixPath(path).suffix in _ENDINGS)
 
     def read(self, path: str) -> bytes:
         if self.local is not None:
@@ -129,6 +136,19 @@ class DatasetStore:
                 file.write(content)
 
         return self._tried(path, write)
+
+    def remove(self, path: str) -> None:
+        """Remove a file. Do nothing if there is no such file."""
+        if self.local is not None:
+            local = self.local / path
+            return self._once(path, lambda: local.unlink(missing_ok=True))
+        system, root = self._arrow()
+
+        def remove() -> None:
+            with contextlib.suppress(FileNotFoundError):
+                system.delete_file(f"{root}/{path}")
+
+        return self._tried(path, remove)
 
     def _arrow(self) -> tuple[Any, str]:
         """Return pyarrow's file system, and the path of the data set in it."""
@@ -183,17 +203,26 @@ def file_hash(content: bytes) -> str:
     return hashlib.sha256(content).hexdigest()
 
 
+# Entries that every record in a folder has, with their types.
+_ENTRIES: dict[str, dict[str, Any]] = {
+    "runs": {"command": str, "code": str, "commit": str, "made": str, "machine": str, "blocks": int},
+    "failed": {"key": str, "failed": str, "error": str, "asked": dict},
+}
+
+
 def read_record(store: DatasetStore, path: str) -> dict[str, Any]:
     """Read the record of a run or of a failure. Raises FormatError: the file is not a valid record in JSON."""
     try:
         record = json.loads(store.read(path))
-    except ValueError:
+    except (ValueError, RecursionError):
         record = None
-    if not isinstance(record, dict) or not isinstance(record.get("files", {}), dict):
+    given = {"files": {}, **record} if isinstance(record, dict) else {}
+    entries = {**_ENTRIES[path.partition("/")[0]], "files": dict}
+    if not isinstance(record, dict) or not all(isinstance(given.get(key), kind) for key, kind in entries.items()):
         raise FormatError(f"{store.label}/{path}: not a record of a run or a failure; expected a JSON object")
     return record
 
 
 def keys_below(store: DatasetStore, folder: str) -> set[str]:
-    """Return the keys of all Parquet and JSON files below a folder."""
-    return {key_of(path) for path in store.list(folder) if PurePosixPath(path).suffix in (".parquet", ".json")}
+    """Return the keys of all files below a folder."""
+    return {key_of(path) for path in store.list(folder)}

@@ -34,7 +34,7 @@ def export(store: DatasetStore, kind: str, out: Path) -> tuple[int, int]:
     """Write the grasps of each pair of hand and object, and the meshes. Return the counts of pairs and of grasps.
 
     Raises:
-        ConfigError: the format `kind` is unknown, or does not support a hand.
+        ConfigError: the format `kind` is unknown or does not support a hand, or different hands have the same name.
         FormatError: there is no data set, or a file is damaged.
     """
     if kind not in (*KINDS, DEXGRASPBENCH):
@@ -45,8 +45,12 @@ def export(store: DatasetStore, kind: str, out: Path) -> tuple[int, int]:
         for row in table.to_pylist():
             if row["verdict"] in keep:
                 rows.setdefault((row["hand_name"], row["object_sha256"]), []).append(row)
-    for hand in {hand for hand, _ in rows} if written is None else ():
-        refuse_hand(hand)
+    for hand in {hand for hand, _ in rows}:
+        files = {row["hand_sha256"] for (name, _), own in rows.items() if name == hand for row in own}
+        if len(files) > 1:
+            raise ConfigError(f"{store.label}: grasps of {len(files)} different hands named {hand!r}; valid: one")
+        if written is None:
+            refuse_hand(hand)
     for (hand, target), own in rows.items():
         if written is None:
             write_dexgraspbench(own, _mesh(store, target), out)
@@ -94,7 +98,7 @@ KINDS: dict[str, tuple[str, tuple[str, ...], Callable[[Sequence[Row], str], str]
 }
 DEXGRASPBENCH = "dexgraspbench"
 _PARTS = ("position", "quaternion_wxyz", "joint_positions")
-_COLUMNS = ("hand_name", "object_sha256", "mass", "verdict", "code", "joint_names")
+_COLUMNS = ("hand_name", "hand_sha256", "object_sha256", "mass", "verdict", "code", "joint_names")
 _COLUMNS += tuple(f"{stage}_{part}" for stage in ("pregrasp", "grasp", "squeeze") for part in _PARTS)
 
 

@@ -12,6 +12,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import Any, TypeVar
 
+from graspd_core.errors import ConfigError
 from graspd_core.runtime.worker_process import WorkerProcess
 from graspd_dataset.dataset_store import DatasetStore, block_path, file_hash
 
@@ -24,10 +25,19 @@ _KINDS = {TimeoutError: "hung", MemoryError: "memory", ChildProcessError: "died"
 
 @dataclass(frozen=True)
 class Limits:
-    """Limits of the child while it makes one block or prepares one object: wall time [s] and resident memory [MB]."""
+    """Limits of the child while it makes one block or prepares one object: wall time [s] and resident memory [MB].
+
+    Raises:
+        ConfigError: a limit is not positive.
+    """
 
     seconds: float = 1800.0
     most_mb: float = 4096.0
+
+    def __post_init__(self) -> None:
+        for name, value in (("patience", self.seconds), ("memory", self.most_mb)):
+            if not value > 0:
+                raise ConfigError(f"{name}: {value:g}; valid: a positive number")
 
 
 @dataclass(frozen=True)

@@ -36,7 +36,7 @@ class DatasetStats:
         hands: counts of each hand, by its name.
         reasons: number of failed grasps for each text of `kind_of_reason`.
         codes: versions of the code that made the rows.
-        failed: records of failed objects, and of failed blocks that were not made later.
+        failed: records of failed blocks and objects. Without those that succeeded later.
     """
 
     hands: dict[str, HandCount] = field(default_factory=dict)
@@ -56,21 +56,28 @@ class DatasetStats:
 def tables_of(store: DatasetStore, columns: Sequence[str] | None = None) -> Iterator[tuple[str, bytes, Any, Any]]:
     """Yield path, content, pyarrow table and metadata of each block, sorted by path.
 
-    Raises FormatError: there is no block, or a block is damaged.
+    Raises FormatError: there is no block, or a block is damaged, or lacks a column.
     """
     paths = store.list("grasps")
     if not paths:
         raise FormatError(f"{store.label}: no data set; expected .parquet files below grasps/")
+    wanted = columns or arrow_schema().names
     for path in paths:
-        content = store.read(path)
-        yield path, content, *read_parquet(content, f"{store.label}/{path}", columns)
+        content, where = store.read(path), f"{store.label}/{path}"
+        table, header = read_parquet(content, where, columns)
+        lacking = [name for name in wanted if name not in table.schema.names]
+        if lacking or not isinstance(header.get("block"), str) or not isinstance(header.get("asked"), dict):
+            raise FormatError(
+                f"{where}: not a block of grasps: it lacks {', '.join(lacking) or 'the name of its block'}"
+            )
+        yield path, content, table, header
 
 
 def stats_of(store: DatasetStore) -> DatasetStats:
     """Count the rows of a data set. Raises FormatError: there is no block, or a block is damaged."""
     stats, there = DatasetStats(), set[str]()
     for path, content, table, header in tables_of(store, ("object_sha256", "verdict", "code", "trials")):
-        there.add(header["block"])
+        there.update((header["block"], content_key(header["asked"].get("object"))))
         stats.codes.update(table["code"].unique().to_pylist())
         # The path gives the hand, because a block may have no rows.
         hand = stats.hands.setdefault(path.split("/")[1].removeprefix("hand="), HandCount())
@@ -108,7 +115,9 @@ def stats_table(stats: DatasetStats) -> str:
 def reason_lines(stats: DatasetStats) -> list[str]:
     """Return lines: the 8 most frequent reasons why grasps failed, with counts, then each failed block or object."""
     lines = [f"{number} {reason}" for reason, number in stats.reasons.most_common(_REASONS)]
-    return lines + [f"{record['failed']}: {record['asked']['object']}: {record['error']}" for record in stats.failed]
+    return lines + [
+        f"{record['failed']}: {record['asked'].get('object')}: {record['error']}" for record in stats.failed
+    ]
 
 
 _POSTURES = tuple(f"{s}_{part}" for s in ("pregrasp", "grasp", "squeeze") for part in ("position", "quaternion_wxyz"))
@@ -137,7 +146,7 @@ def faults_of_dataset(store: DatasetStore) -> Iterator[str]:
             continue
         yield from _changed(path, content, known)
         yield from (f"{path}: {fault}" for fault in _file_faults(path, table, header, meshes))
-        for digest in row_digests(table):
+        for digest in row_digests(table) if table.schema.remove_metadata() == arrow_schema() else ():
             if digest in seen:
                 yield f"{path}: a grasp is also in {seen[digest]}"
                 break

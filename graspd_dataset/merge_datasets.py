@@ -43,7 +43,8 @@ def merge(sources: Sequence[DatasetStore], out: DatasetStore) -> tuple[int, int]
                     out.write(path, source.read(path))
                 elif folder == "runs":
                     record = read_record(source, path)
-                    files = read_record(out, path).get("files", {}) | record.get("files", {})
+                    # The hashes of `out` win, because its files are not replaced.
+                    files = record.get("files", {}) | read_record(out, path).get("files", {})
                     out.write(path, (json.dumps({**record, "files": files}, indent=1) + "\n").encode())
     return copied, common
 

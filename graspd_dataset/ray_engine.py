@@ -6,8 +6,10 @@ import os
 import pickle
 import secrets
 import shutil
+import signal
 import socket
 import tempfile
+import threading
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from functools import lru_cache
@@ -57,7 +59,8 @@ def ray_running(address: str | None, workers: int | None, folder: Path | None = 
             options |= {"address": "local", "num_cpus": workers, "object_store_memory": _OBJECT_STORE}
             options |= {"include_dashboard": False, "_temp_dir": str(own), "_node_ip_address": _LOOPBACK}
         try:
-            ray.init(**{"address": address, **options})
+            with _own_handler():
+                ray.init(**{"address": address, **options})
         except (ConnectionError, ValueError, RuntimeError) as error:
             said = " ".join(str(error).split())[-200:]
             raise ConfigError(f"address: no connection to Ray at {address}; does the cluster run? ({said})") from None
@@ -70,6 +73,18 @@ def ray_running(address: str | None, workers: int | None, folder: Path | None = 
             os.environ.pop(name) if value is None else os.environ.update({name: value})
         if own is not None:
             shutil.rmtree(own, ignore_errors=True)
+
+
+@contextmanager
+def _own_handler() -> Iterator[None]:
+    """Keep this process's handler of SIGTERM. Ray's own handler ends the process before it writes the run record."""
+    handler = signal.getsignal(signal.SIGTERM)
+    try:
+        yield
+    finally:
+        # Ray and this context can change handlers only in the main thread.
+        if handler is not None and threading.current_thread() is threading.main_thread():
+            signal.signal(signal.SIGTERM, handler)
 
 
 def _refuse_silent(address: str | None) -> None:

@@ -10,7 +10,7 @@ import os
 import platform
 import shlex
 from collections import deque
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Collection, Iterator, Sequence
 from dataclasses import asdict, dataclass, field, fields, replace
 from datetime import date
 from typing import Any
@@ -66,8 +66,14 @@ def command_of(request: DatasetRequest, out: str) -> str:
         if item.name == "objects" or value == getattr(usual, item.name):
             continue
         several = value if isinstance(value, tuple) else (value,)
-        words += [f"--{item.name.replace('_', '-')}", *(f"{v:g}" if isinstance(v, float) else str(v) for v in several)]
+        words += [f"--{item.name.replace('_', '-')}", *map(_word, several)]
     return shlex.join([*words, "--out", out])
+
+
+def _word(value: Any) -> str:
+    """Return a value as a word of a command line. Numbers are short, but give the same value again."""
+    short = f"{value:g}" if isinstance(value, float) else str(value)
+    return short if not isinstance(value, float) or float(short) == value else repr(value)
 
 
 def begin_run(store: DatasetStore, request: DatasetRequest, blocks: int, *, any_code: bool = False) -> RunRecord:
@@ -172,6 +178,12 @@ def missing_blocks(blocks: Sequence[Block], store: DatasetStore, *, retry_failed
     there = keys_below(store, "grasps")
     failed = set() if retry_failed else keys_below(store, "failed")
     return [b for b in blocks if b.key not in there and not failed & {b.key, b.object.key}]
+
+
+def remove_failure(store: DatasetStore, report: Report, failed: Collection[str]) -> None:
+    """Remove the record of an earlier failure if the object or block has succeeded. `failed` are the recorded keys."""
+    if report.key in failed and not report.failed:
+        store.remove(f"failed/{report.key}.json")
 
 
 def run_blocks(

@@ -162,6 +162,9 @@ class PlanTab:
         self._saved: bytes | None = None
         self._stop = threading.Event()
         self._busy = threading.Lock()
+        # Work that waits for the end of the run in progress, and the lock of this attribute.
+        self._next: Callable[[StopHook], None] | None = None
+        self._waiting = threading.Lock()
         self._thread: threading.Thread | None = None
         self._build(server.gui)
 
@@ -200,15 +203,40 @@ class PlanTab:
 
     def begin(self, work: Callable[[StopHook], None]) -> None:
         """Start a thread that calls `work`. Its argument tells whether to stop. Do nothing if a run is in progress."""
-        if not self._busy.acquire(blocking=False):
-            return
+        if self._busy.acquire(blocking=False):
+            self._start(work)
+
+    def replace(self, work: Callable[[StopHook], None]) -> None:
+        """Stop the run in progress. When it has ended, start a thread that calls `work`. The newest `work` counts."""
+        with self._waiting:
+            self._next = work
+        self._stop.set()
+        self._start_next()
+
+    def _start_next(self) -> None:
+        """Start the work that waits, if any. If a run is in progress, it calls this method at its end."""
+        while self._next is not None and self._busy.acquire(blocking=False):
+            with self._waiting:
+                work, self._next = self._next, None
+            if work is not None:
+                # The work shows its own grasps, so the grasps of the last run cannot be saved any more.
+                self._saved = None
+                self._start(work)
+                return
+            self._busy.release()
+
+    def _start(self, work: Callable[[StopHook], None]) -> None:
         self._stop.clear()
+        if self._next is not None:
+            self._stop.set()
         self._plan.disabled, self._halt.disabled, self._save.disabled = True, False, True
         self._thread = threading.Thread(target=self._run, args=(work,), name="graspd-viewer-plan", daemon=True)
         self._thread.start()
 
     def close(self) -> None:
-        """Stop the run in progress, if any. Wait at most 10 s for its end."""
+        """Stop the run in progress, if any. Wait at most 10 s for its end. Drop the work that waits for its end."""
+        with self._waiting:
+            self._next = None
         self._stop.set()
         if self._thread is not None:
             self._thread.join(10.0)
@@ -256,6 +284,7 @@ class PlanTab:
             self._live.end()
             self._plan.disabled, self._halt.disabled, self._save.disabled = False, True, self._saved is None
             self._busy.release()
+            self._start_next()
 
     def _plan_and_show(self, request: PlanRequest) -> None:
         self._say("loading")
@@ -264,6 +293,7 @@ class PlanTab:
         hand = load_hand(request.hand, candidates=config.problem.fine_candidates)
         title = request.upload.name if request.upload else request.shape
         session = make_session(title, hand, (), scene, config, seen, scene.object.warnings)
+        self._saved = None
         self._show(session)
         self._live.begin(session)
         result = plan_grasps(

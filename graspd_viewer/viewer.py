@@ -118,10 +118,9 @@ class Viewer:
         self._jobs.submit(kind, work)
 
     def run(self, work: Callable[[StopHook], None]) -> None:
-        """Stop the run in progress. Start a thread that calls `work`. Do nothing if the page has no tab Plan."""
+        """Stop the run in progress. Then call `work` in a thread. Do nothing if the page has no tab Plan."""
         if self._planner is not None:
-            self._planner.close()
-            self._planner.begin(work)
+            self._planner.replace(work)
 
     def say(self, line: str, share: float = 0.0) -> None:
         """Show a line of text and the progress of a run, 0 to 1. Thread-safe."""

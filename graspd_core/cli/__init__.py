@@ -16,8 +16,8 @@ from collections.abc import Iterator, Sequence
 from importlib.metadata import entry_points, version
 from typing import Any, NoReturn
 
-from graspd_core.cli.output import add_output_options, output_of, print_error
-from graspd_core.cli.running import EXIT_BAD_INPUT, EXIT_INTERRUPTED, SIBLINGS, process_began
+from graspd_core.cli.output import add_output_options, flush_output, output_of, print_error
+from graspd_core.cli.running import EXIT_BAD_INPUT, EXIT_INTERRUPTED, EXIT_PIPE, SIBLINGS, process_began
 from graspd_core.errors import ConfigError, GraspdError, choices
 
 # A garbage collection starts after this number of new objects. Python's default is 700. Collections during imports free
@@ -26,7 +26,10 @@ _YOUNG = 20_000
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Run the command line. Return 0 for enough grasps, 3 for fewer, 2 for bad input, 130 if interrupted."""
+    """Run the command line. Return 0 for enough grasps, 3 for fewer, 2 for bad input, 130 if interrupted.
+
+    Return 141 if the reader of the output has ended.
+    """
     # With `arguments`, the caller is a process that may have started long ago.
     own_process = arguments is None
     began = process_began() if own_process else time.perf_counter()
@@ -37,7 +40,12 @@ def main(arguments: Sequence[str] | None = None) -> int:
         options = (_overview() if words[0].startswith("-") else build_parser(words[0])).parse_args(words)
         options.began = began
         with output_of(options):
-            return int(options.run(options))
+            status = int(options.run(options))
+        if own_process and (error := flush_output()):
+            raise error
+        return status
+    except BrokenPipeError:
+        return EXIT_PIPE
     except (GraspdError, OSError) as error:
         print_error(error)
         return EXIT_BAD_INPUT
@@ -46,6 +54,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         return EXIT_INTERRUPTED
     finally:
         if own_process:
+            flush_output()
             # Without `freeze`, the interpreter would collect garbage once more at exit.
             gc.freeze()
 

@@ -68,15 +68,18 @@ def run_inspect(options: argparse.Namespace) -> int:
     if options.yaml is not None and Path(options.hand).suffix == ".pkl":
         raise ConfigError(f"--yaml: {options.hand} is a MANO file; valid: a hand read from a URDF or MJCF file")
     hand = load_hand(options.hand, candidates=options.candidates)
-    print(as_text(hand))
-    answer(_document(hand))
+    # Write the files first, because printing fails if the reader of the output has ended.
     if options.picture is not None:
         render = sibling("graspd_bench.rendering.render")
         render.save_png(options.picture, render.hand_picture(hand))
-        print(f"{options.picture}: open (left) and closed (right), from the side and onto the palm")
     if options.yaml is not None:
         urdf = os.path.relpath(hand.urdf, options.yaml.parent)
         save_text(options.yaml, as_yaml(hand, urdf))
+    print(as_text(hand))
+    answer(_document(hand))
+    if options.picture is not None:
+        print(f"{options.picture}: open (left) and closed (right), from the side and onto the palm")
+    if options.yaml is not None:
         print(f"{options.yaml}: a hand description to edit; graspd synthesize --hand {options.yaml}")
     return EXIT_OK
 

@@ -77,6 +77,19 @@ def _plain(value: Any) -> Any:
     return value.tolist() if hasattr(value, "tolist") else sorted(value) if isinstance(value, set) else str(value)
 
 
+def flush_output() -> OSError | None:
+    """Flush stdout. If this fails, discard the rest, because Python would fail again at its end. Return the error."""
+    # Without a standard output, sys.stdout is None.
+    if (stream := sys.stdout) is None:
+        return None
+    try:
+        stream.flush()
+    except OSError as error:
+        os.dup2(os.open(os.devnull, os.O_WRONLY), stream.fileno())
+        return error
+    return None
+
+
 def print_note(text: object) -> None:
     """Print a note on stderr, unless `--quiet` was given."""
     if not _settings.quiet:

@@ -19,6 +19,8 @@ from graspd_core.errors import ConfigError
 from graspd_core.types import GraspResult, ProgressHook, WatchHook
 
 EXIT_OK, EXIT_BAD_INPUT, EXIT_TOO_FEW, EXIT_INTERRUPTED = 0, 2, 3, 130
+# Exit status if the reader of the output has ended, such as `head`. Shells report the same for the signal SIGPIPE.
+EXIT_PIPE = 141
 
 
 # Signals that end a run. Terminals send SIGINT, services and batch systems send SIGTERM.

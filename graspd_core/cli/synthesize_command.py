@@ -148,7 +148,7 @@ def _report(
     from graspd_core.io.grasps_json import result_document, save_result
     from graspd_core.verify.metrics import distinct
 
-    answer({**result_document(result, scene.object, hand, config), **(about or {})})
+    # Write the files first, because printing fails if the reader of the output has ended.
     if options.out:
         save_result(options.out, result, scene.object, hand, config)
     if options.html or options.picture:
@@ -159,6 +159,7 @@ def _report(
             page.save_view(options.html, *content, name=Path(options.object).name, up=up)
         if options.picture:
             page.save_picture(options.picture, *content, up=up)
+    answer({**result_document(result, scene.object, hand, config), **(about or {})})
     different = len(distinct(result.grasps[: good_grasps(result)], hand))
     print(summary(result, options.count, different))
     if options.out:

@@ -7,6 +7,7 @@ cloud is new and adds files. Files are written atomically.
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
 import hashlib
 import itertools
@@ -94,10 +95,13 @@ def digest(values: Iterable[Any]) -> str:
 
 
 def cache_path(key: str) -> Path | None:
-    """Return the file path of `key`, or None if `GRASPD_CACHE` disables files."""
+    """Return the file path of `key`. None if `GRASPD_CACHE` disables files, or the user has no home directory."""
     if os.environ.get("GRASPD_CACHE", "").lower() in ("off", "0", "no"):
         return None
-    home = os.environ.get("XDG_CACHE_HOME") or str(Path.home() / ".cache")
+    try:
+        home = os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache"
+    except RuntimeError:
+        return None
     return Path(home) / "graspd" / f"{key}-v{VERSION}.npz"
 
 
@@ -106,10 +110,13 @@ def _read(path: Path) -> Arrays | None:
         # `open` also closes the file after an error. The members of an npz file have a CRC, so damage is detected.
         with path.open("rb") as file, np.load(file, allow_pickle=False) as stored:
             arrays = {name: stored[name] for name in stored.files}
-        os.utime(path)
-        return arrays
-    except (OSError, ValueError, EOFError, KeyError, zipfile.BadZipFile):
+    # zipfile raises RuntimeError or NotImplementedError if a damaged file seems encrypted or compressed.
+    except (OSError, ValueError, EOFError, KeyError, RuntimeError, zipfile.BadZipFile):
         return None
+    # The file may belong to another user, or the disk may be read-only.
+    with contextlib.suppress(OSError):
+        os.utime(path)
+    return arrays
 
 
 def _write(path: Path, arrays: Arrays) -> None:
@@ -124,15 +131,27 @@ def _write(path: Path, arrays: Arrays) -> None:
         if next(_written) % LOOK_EVERY == 0:
             _prune(path.parent)
     except OSError:
+        pass
+    finally:
+        # Ctrl-C or a deadline may also end the work above. After the renaming, there is no such file.
         if temporary:
-            temporary.unlink(missing_ok=True)
+            with contextlib.suppress(OSError):
+                temporary.unlink(missing_ok=True)
 
 
 def _prune(directory: Path) -> None:
-    """Remove the least recently used files until the remaining files have at most `MOST_BYTES`."""
-    files = sorted((path.stat().st_mtime, path.stat().st_size, path) for path in directory.glob("*.npz"))
+    """Remove the least recently used files until the remaining files have at most `MOST_BYTES`.
+
+    Files of killed processes, which end with .part, count too.
+    """
+    files = []
+    for path in (path for pattern in ("*.npz", "*.part") for path in directory.glob(pattern)):
+        # Another process may have removed or renamed the file.
+        with contextlib.suppress(FileNotFoundError):
+            about = path.stat()
+            files.append((about.st_mtime, about.st_size, path))
     total = sum(size for _, size, _ in files)
-    for _, size, path in files:
+    for _, size, path in sorted(files):
         if total <= MOST_BYTES:
             break
         path.unlink(missing_ok=True)

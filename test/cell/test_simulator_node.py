@@ -6,9 +6,11 @@ import json
 import os
 import subprocess
 import sys
+import threading
 import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -28,6 +30,7 @@ from trajectory_msgs.msg import JointTrajectory, JointTrajectoryPoint
 
 from graspd_cell.layout import layout_of
 from graspd_cell.robot_description import CAMERA_FRAME, robot_description
+from graspd_cell.simulator_node import SimulatorNode
 from graspd_core.arms.arm import load_arm, tip_hand
 from graspd_core.hands.library import load_hand
 from graspd_core.hands.readers.urdf import read_urdf
@@ -250,3 +253,32 @@ def test_a_wrong_option_is_one_line():
     assert done.returncode == 2
     assert done.stderr.startswith("graspd_cell_simulator: unknown thing 'nothing'; valid: ")
     assert done.stderr.count("\n") == 1
+
+
+class SlowRobot:
+    """A robot whose state takes a while to publish, as on a busy machine."""
+
+    world = SimpleNamespace(model=SimpleNamespace(opt=SimpleNamespace(timestep=0.002)))
+
+    def __init__(self) -> None:
+        self.time = 0.0
+
+    def step(self, steps: int) -> None:
+        self.time += 0.002 * steps
+
+
+@pytest.mark.parametrize(("speed", "seconds"), [(1.0, 0.25), (50.0, 0.0)])
+def test_a_simulation_that_cannot_keep_up_goes_on(speed: float, seconds: float):
+    cell: Any = SimulatorNode.__new__(SimulatorNode)
+    cell.robot, cell._speed, cell._lock, cell._stop = SlowRobot(), speed, threading.Lock(), threading.Event()
+    rounds: list[float] = []
+
+    def publish(due: dict[str, float]) -> None:
+        rounds.append(cell.robot.time)
+        time.sleep(seconds)
+        if len(rounds) == 4:
+            cell._stop.set()
+
+    cell._publish = publish
+    cell.simulate()
+    assert rounds[1:] == pytest.approx([rounds[0] + 0.2 * k for k in (1, 2, 3)], abs=0.05)

@@ -20,7 +20,7 @@ import pytest
 
 from graspd_core.cli import build_parser, main, output, runnable
 from graspd_core.cli.output import answer, busy, print_note, waiting
-from graspd_core.cli.running import EXIT_BAD_INPUT, EXIT_OK
+from graspd_core.cli.running import EXIT_BAD_INPUT, EXIT_OK, EXIT_PIPE
 from graspd_core.io.grasps_json import load_document
 from graspd_core.mesh.mesh_files import surface_samples
 from graspd_core.mesh.shapes import make_shape
@@ -188,3 +188,33 @@ def test_completion_says_what_it_lacks(capsys: pytest.CaptureFixture[str], monke
     assert capsys.readouterr().err == "graspd: completion: shtab is not installed; run: pip install shtab\n"
     assert main(["completion", "fish"]) == EXIT_BAD_INPUT
     assert "choose from" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("unbuffered", ["", "1"])
+@pytest.mark.parametrize(
+    ("words", "files"),
+    [
+        (["metrics"], []),
+        (["--help"], []),
+        (["hands", "inspect", "parallel_gripper", "--yaml", "hand.yaml"], ["hand.yaml"]),
+        (["synthesize", "shape:box", "-n", "1", "--preset", "fast", "--json", "--out", "grasps.json"], ["grasps.json"]),
+    ],
+)
+def test_a_reader_that_has_ended_costs_no_file_and_prints_nothing(tmp_path: Path, words, files, unbuffered: str):
+    read, write = os.pipe()
+    os.close(read)
+    environment = {**os.environ, "PYTHONUNBUFFERED": unbuffered}
+    command = [sys.executable, "-m", "graspd_core.cli", *words, *(["--quiet"] if files else [])]
+    done = subprocess.run(command, cwd=tmp_path, env=environment, stdout=write, stderr=subprocess.PIPE, text=True)
+    os.close(write)
+    assert [path.name for path in tmp_path.iterdir()] == files
+    assert done.stderr == ""
+    assert done.returncode == (EXIT_OK if words == ["--help"] else EXIT_PIPE)
+
+
+def test_a_full_disk_behind_stdout_is_one_line():
+    command = [sys.executable, "-m", "graspd_core.cli", "metrics"]
+    with open("/dev/full", "w") as full:
+        done = subprocess.run(command, stdout=full, stderr=subprocess.PIPE, text=True)
+    assert done.returncode == EXIT_BAD_INPUT
+    assert done.stderr == "graspd: [Errno 28] No space left on device\n"

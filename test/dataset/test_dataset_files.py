@@ -2,6 +2,7 @@
 
 import importlib
 import json
+import shlex
 import shutil
 import subprocess
 import sys
@@ -15,9 +16,11 @@ from small_dataset import REQUEST, make_here
 from graspd_core.errors import FormatError
 from graspd_dataset.blocks import Block, DatasetRequest, blocks_of
 from graspd_dataset.dataset_store import DatasetStore, file_hash, key_of, parquet_bytes, read_parquet
+from graspd_dataset.guarded_calls import Report, failed_report
 from graspd_dataset.inspect_dataset import count_by_content, faults_of_dataset, recorded_hashes, stats_of, tables_of
 from graspd_dataset.merge_datasets import merge, sample
-from graspd_dataset.run_dataset import begin_run, missing_blocks, with_unrecorded, write_run
+from graspd_dataset.ray_engine import object_job
+from graspd_dataset.run_dataset import begin_run, command_of, missing_blocks, remove_failure, with_unrecorded, write_run
 
 Run = Callable[..., int]
 
@@ -275,3 +278,82 @@ def test_the_example_trains_on_it(tmp_path: Path, monkeypatch: pytest.MonkeyPatc
     told = capsys.readouterr().out
     assert "of 1 objects held out" in told
     assert "of the best half by the network" in told
+
+
+def test_a_file_that_a_killed_process_was_writing_does_not_count(copied: DatasetStore, graspd: Run):
+    _recorded(copied)
+    for path in (*copied.list("grasps"), *copied.list("objects"), *copied.list("runs")):
+        half = Path(copied.where) / f"{path}x1y2z3_4"
+        half.write_bytes(copied.read(path)[:40])
+    assert begin_run(copied, REQUEST, 2, any_code=True).blocks == 2
+    assert with_unrecorded(copied, begin_run(copied, REQUEST, 2, any_code=True)).files.keys() == {
+        *copied.list("grasps"), *copied.list("objects")
+    }  # fmt: skip
+    assert stats_of(copied).rows == sum(table.num_rows for _, _, table, _ in tables_of(copied))
+    assert graspd("dataset", "validate", copied.where) == 0
+
+
+def test_an_object_that_failed_and_then_succeeded_is_no_failure(copied: DatasetStore, blocks: tuple[Block, ...]):
+    first = blocks[0]
+    failed_report(copied, object_job(first.object, first.config), MemoryError("too much"))
+    assert stats_of(copied).failed == []
+    more = blocks_of(replace(REQUEST, per_object=6))
+    assert missing_blocks(more, copied) == []
+    remove_failure(copied, Report(first.object.key, failed="memory"), {first.object.key})
+    assert missing_blocks(more, copied) == []
+    remove_failure(copied, Report(first.object.key), {first.object.key})
+    assert [block.seed for block in missing_blocks(more, copied)] == [2]
+
+
+def test_a_record_or_a_file_that_lacks_an_entry_is_one_line(copied: DatasetStore, graspd: Run, capsys, tmp_path: Path):
+    for path in ("failed/a.json", "runs/a.json"):
+        copied.write(path, b'{"files": {}}')
+        with pytest.raises(FormatError, match=f"{path}: not a record of a run or a failure"):
+            stats_of(copied) if path.startswith("failed") else begin_run(copied, REQUEST, 2)
+        copied.remove(path)
+    # An object's file is a Parquet file of graspd too, but no block.
+    copied.write("grasps/hand=x/object=y/z.parquet", copied.read(copied.list("objects")[0]))
+    for action in ("stats", "validate", "merge", "sample", "export"):
+        status = graspd("dataset", action, copied.where, "--out", tmp_path / f"{action}.parquet")
+        told = capsys.readouterr()
+        assert status == (1 if action == "validate" else 2)
+        assert ("its columns are not those" if status == 1 else "z.parquet: not a block") in told.out + told.err
+
+
+@pytest.mark.parametrize(
+    ("words", "told"),
+    [
+        (["--random-scales", "nan", "1", "2"], "random-scales: nan 1 2; valid: N >= 0"),
+        (["--random-scales", "2.5", "1", "2"], "random-scales: 2.5 1 2; valid: N >= 0"),
+        (["--patience", "-1"], "patience: -1; valid: a positive number"),
+        (["--patience", "nan"], "patience: nan; valid: a positive number"),
+        (["--memory", "0"], "memory: 0; valid: a positive number"),
+        (["--memory", "1", "--dry-run"], "more than 1 MB; change --memory or --patience"),
+    ],
+)
+def test_a_number_that_makes_no_sense_is_one_line(words: list[str], told: str, graspd: Run, capsys, tmp_path: Path):
+    assert graspd("dataset", "shape:sphere", "--out", tmp_path / "out", "--per-object", "1", *words) == 2
+    assert told in capsys.readouterr().err
+    assert not list(tmp_path.iterdir())
+
+
+def test_the_recorded_command_has_every_digit():
+    request = replace(REQUEST, mass=0.123456789, scales=(1.0, 0.3333333333333333), per_object=1)
+    words = shlex.split(command_of(request, "out"))
+    assert float(words[words.index("--mass") + 1]) == request.mass
+    assert tuple(map(float, words[words.index("--scales") + 1 :][:2])) == request.scales
+    assert words[words.index("--scales") + 1] == "1"
+
+
+def test_the_hashes_of_a_merged_record_are_those_of_the_kept_files(made: DatasetStore, copied: DatasetStore, tmp_path):
+    """Another version of pyarrow writes the same rows as other bytes."""
+    other = DatasetStore(str(tmp_path / "other"))
+    shutil.copytree(made.where, other.where)
+    path = other.list("grasps")[0]
+    table, header = read_parquet(other.read(path), path)
+    other.write(path, parquet_bytes(table, {**header, "writer": "another"}))
+    for store in (copied, other):
+        record = replace(begin_run(store, REQUEST, 2), command="graspd dataset shape:sphere --out here")
+        write_run(store, with_unrecorded(store, record))
+    merge([other], copied)
+    assert list(faults_of_dataset(copied)) == []

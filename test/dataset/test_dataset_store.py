@@ -43,9 +43,9 @@ def test_a_server_that_refuses_one_request_in_ten_loses_and_doubles_nothing(serv
         before = server.refused
         remote = DatasetStore(server.url("flaky"))
         for number in range(12):
-            remote.write(f"runs/{number}.json", b"{}".ljust(200))
+            remote.write(f"failed/{number}.json", b"{}".ljust(200))
         merge([made], remote)
-        assert len(remote.list("runs")) == 12
+        assert len(remote.list("failed")) == 12
         assert count_by_content(remote) == count_by_content(made)
         assert list(faults_of_dataset(remote)) == []
         assert server.refused > before
@@ -76,6 +76,14 @@ def test_a_full_disk_leaves_no_part_of_a_file(tmp_path: Path):
             store.write("grasps/b.parquet", b"x" * 100_000)
     finally:
         resource.setrlimit(resource.RLIMIT_FSIZE, limits)
-    assert store.list("grasps") == ["grasps/a.parquet"]
+    assert [path.name for path in (tmp_path / "grasps").iterdir()] == ["a.parquet"]
     store.write("grasps/b.parquet", b"x" * 100_000)
     assert len(store.list("grasps")) == 2
+
+
+def test_a_file_is_removed_from_a_disk_and_from_s3(server: Server, tmp_path: Path):
+    for store in (DatasetStore(str(tmp_path)), DatasetStore(server.url("removed"))):
+        store.write("failed/a.json", b"{}")
+        store.remove("failed/a.json")
+        store.remove("failed/a.json")
+        assert store.list("failed") == []

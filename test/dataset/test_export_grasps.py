@@ -5,12 +5,13 @@ from pathlib import Path
 
 import mujoco
 import numpy as np
+import pyarrow as pa
 import yaml
 from menagerie_like import menagerie_like
 
 from graspd_core import load_hand, load_mesh
 from graspd_core.hands.kinematics import link_poses
-from graspd_dataset.dataset_store import DatasetStore
+from graspd_dataset.dataset_store import DatasetStore, parquet_bytes
 from graspd_dataset.foreign_grasps import read_foreign
 from graspd_dataset.inspect_dataset import tables_of
 
@@ -116,3 +117,14 @@ def test_dexgraspbench_has_every_finger_where_it_was(allegro: DatasetStore, tmp_
     assert np.allclose(
         np.ptp(np.concatenate([part.vertices for part in parts]), axis=0), np.ptp(whole.vertices, axis=0), atol=0.003
     )
+
+
+def test_grasps_of_two_hands_of_one_name_are_not_mixed(copied: DatasetStore, tmp_path: Path, graspd, capsys):
+    path, _, table, told = next(iter(tables_of(copied)))
+    at = table.schema.get_field_index("hand_sha256")
+    other = table.set_column(at, table.schema.field(at), pa.array(["0" * 64] * table.num_rows))
+    copied.write(path, parquet_bytes(other, {"block": told["block"], "asked": told["asked"]}))
+    for kind in ("isaac", "graspgen"):
+        assert graspd("dataset", "export", copied.where, "--to", kind, "--out", tmp_path / "out") == 2
+        assert "grasps of 2 different hands named 'parallel_gripper'; valid: one" in capsys.readouterr().err
+    assert not (tmp_path / "out").exists()

@@ -124,15 +124,16 @@ def test_a_driver_that_is_killed_goes_on_where_it_was(start: Start, many: dict[s
     assert rows == different
 
 
-def test_ctrl_c_keeps_what_is_done(start: Start, many: dict[str, bytes], tmp_path: Path):
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_ctrl_c_and_sigterm_keep_what_is_done(start: Start, many: dict[str, bytes], tmp_path: Path, number: int):
     store = DatasetStore(str(tmp_path / "out"))
     process = dataset(start, store.where, "--per-object", "40")
     wait_for_blocks(store, process, 3)
     start.family(process)  # type: ignore[attr-defined]
-    process.send_signal(signal.SIGINT)
+    process.send_signal(number)
     _, errors = process.communicate()
     assert process.returncode == 130, errors
-    assert "the same command goes on" in errors
+    assert "repeat the command to continue" in errors
     assert "Traceback" not in errors
     assert files(store).items() <= many.items()
 

@@ -3,6 +3,7 @@
 import io
 import os
 import re
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -178,3 +179,65 @@ def test_a_plane_that_is_none_is_refused(numbers, told: str):
     normal, *others = numbers
     with pytest.raises(ConfigError, match=re.escape(told)):
         Plane(np.array(normal), *others)
+
+
+def test_every_damaged_bit_of_a_file_is_noticed(own_cache):
+    numbers = np.arange(3.0)
+
+    def cached() -> np.ndarray:
+        cache.forget()
+        return cache.remember("bits", lambda: {"numbers": numbers}, lambda arrays: set(arrays) == {"numbers"})[
+            "numbers"
+        ]
+
+    cached()
+    (file,) = own_cache.iterdir()
+    content = file.read_bytes()
+    for at in range(8 * len(content)):
+        changed = bytearray(content)
+        changed[at // 8] ^= 1 << at % 8
+        file.write_bytes(changed)
+        assert np.array_equal(cached(), numbers), at
+
+
+def test_a_file_of_another_user_is_read_and_an_interrupted_one_is_removed(own_cache, monkeypatch):
+    def build() -> dict[str, np.ndarray]:
+        return {"numbers": np.zeros(built.append(1) or 3)}
+
+    def refuse(*_: object, **__: object) -> None:
+        raise PermissionError(1, "Operation not permitted")
+
+    def interrupt(*_: object, **__: object) -> None:
+        raise KeyboardInterrupt
+
+    built: list[int] = []
+    cache.remember("theirs", build, lambda _: True)
+    cache.forget()
+    monkeypatch.setattr(os, "utime", refuse)
+    cache.remember("theirs", build, lambda _: True)
+    assert len(built) == 1
+    monkeypatch.setattr(np, "savez", interrupt)
+    with pytest.raises(KeyboardInterrupt):
+        cache.remember("interrupted", build, lambda _: True)
+    assert len(list(own_cache.iterdir())) == 1
+
+
+def test_files_of_killed_processes_are_removed_too(own_cache, monkeypatch):
+    monkeypatch.setattr(cache, "MOST_BYTES", 3000)
+    monkeypatch.setattr(cache, "LOOK_EVERY", 1)
+    own_cache.mkdir(parents=True)
+    left = own_cache / "tmpabc.part"
+    left.write_bytes(bytes(5000))
+    os.utime(left, (1, 1))
+    cache.remember("new", lambda: {"numbers": np.zeros(100)}, lambda _: True)
+    assert not left.exists()
+    assert len(list(own_cache.iterdir())) == 1
+
+
+def test_a_user_without_a_home_directory_has_no_files(own_cache, monkeypatch):
+    def homeless() -> Path:
+        raise RuntimeError("Could not determine home directory.")
+
+    monkeypatch.delenv("XDG_CACHE_HOME")
+    monkeypatch.setattr(Path, "home", homeless)
+    assert cache.remember("homeless", lambda: {"numbers": np.zeros(3)}, lambda _: True)["numbers"].shape == (3,)

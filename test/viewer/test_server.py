@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import threading
+import time
+from collections.abc import Callable
 from types import SimpleNamespace
 
 import numpy as np
@@ -12,6 +15,7 @@ from graspd_core.errors import ConfigError, GraspdError
 from graspd_core.hands.library import load_hand
 from graspd_core.planning.plan_grasps import plan_grasps
 from graspd_core.planning.steering import angle_of_approach
+from graspd_viewer import plan_tab
 from graspd_viewer import server as viewer_server
 from graspd_viewer.plan_tab import PlanRequest, Upload, check, load_object
 from graspd_viewer.server import may_connect
@@ -163,3 +167,41 @@ def test_bad_arguments_are_one_line(capsys, arguments, culprit):
     error = capsys.readouterr().err
     assert culprit in error
     assert error.count("\n") == 1
+
+
+def test_a_run_that_is_slow_to_stop_is_followed_by_the_newest(viewer):
+    slow, ran, release = threading.Event(), list[str](), threading.Event()
+
+    def first(stop: Callable[[], bool]) -> None:
+        slow.set()
+        release.wait(30.0)
+        ran.append(f"first, stopped: {stop()}")
+
+    viewer.run(first)
+    assert slow.wait(10.0)
+    for name in ("second", "third"):
+        viewer.run(lambda stop, name=name: ran.append(f"{name}, stopped: {stop()}"))
+    release.set()
+    end = time.monotonic() + 10.0
+    while len(ran) < 2 and time.monotonic() < end:
+        time.sleep(0.01)
+    assert ran == ["first, stopped: True", "third, stopped: False"]
+
+
+def test_only_the_grasps_that_are_shown_can_be_saved(viewer, monkeypatch):
+    planner = viewer._planner
+    request = PlanRequest("box", None, "m", True, "parallel_gripper", "fast", 0.6, 1)
+    planner._plan_and_show(request)
+    assert planner._saved is not None
+    monkeypatch.setattr(plan_tab, "plan_grasps", raise_refused)
+    with pytest.raises(ConfigError):
+        planner._plan_and_show(request)
+    assert planner._saved is None
+    planner._saved, done = b"{}", threading.Event()
+    viewer.run(lambda _: done.set())
+    assert done.wait(10.0)
+    assert planner._saved is None
+
+
+def raise_refused(*_: object, **__: object) -> None:
+    raise ConfigError("refused")
