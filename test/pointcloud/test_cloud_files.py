@@ -137,6 +137,7 @@ FLIPPED = POSES[:2] * np.array([1, 1, -1, 1])
     [
         ({**GOOD, "K": np.eye(2)}, "'K' has shape (2, 2); 3 × 3 is needed"),
         ({**GOOD, "K": np.zeros((3, 3))}, "is no calibration"),
+        ({**GOOD, "K": MATRIX.T}, "K is 150, 0, 0, 0, 150, 0, 79.5, 59.5, 1; valid: fx, 0, cx, 0, fy, cy, 0, 0, 1"),
         ({**GOOD, "poses": POSES}, "'poses' has shape (3, 4, 4); 2 × 4 × 4 is needed"),
         ({**GOOD, "poses": FLIPPED}, "'poses' is no rigid transform"),
         ({**GOOD, "distortion": np.ones(9)}, "9 distortion coefficients; rational_polynomial has at most 8"),
