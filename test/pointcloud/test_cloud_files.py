@@ -143,6 +143,7 @@ FLIPPED = POSES[:2] * np.array([1, 1, -1, 1])
         ({**GOOD, "distortion": np.ones(9)}, "9 distortion coefficients; rational_polynomial has at most 8"),
         ({**GOOD, "depths": np.ones((6, 8))}, "'depths' has shape (6, 8); views × height × width is needed"),
         ({**GOOD, "depths": np.ones((2, 6, 8), dtype=complex)}, "'depths' holds complex128; integers (mm) or floats"),
+        ({**GOOD, "depths": np.full((2, 6, 8), 100, "u1")}, "'depths' holds uint8: cut to 8 bits; 16 bits (mm) or"),
         ({"depths": np.ones((2, 6, 8)), "K": MATRIX}, "holds 'depths' but no 'poses'; it has: depths, K"),
         ({"depth": np.ones((6, 8)), "K": MATRIX, "T_world_camera": np.eye(3)}, "shape (3, 3); 4 × 4 is needed"),
         ({"points": np.ones((5, 3)), "forward": np.zeros(3)}, "'forward' is no direction"),

@@ -285,6 +285,8 @@ def _depth_views(arrays: Mapping[str, np.ndarray]) -> tuple[PointCloud, ...]:
 
 
 def _metres(image: np.ndarray, name: str) -> Float[np.ndarray, "height width"]:
+    if image.dtype.kind in "iu" and image.dtype.itemsize < 2:
+        raise CloudError(f"{name!r} holds {image.dtype}: cut to 8 bits; 16 bits (mm) or floats (m) are needed")
     if image.dtype.kind in "iu":
         return depth_in_metres(image.astype(float).clip(0, 2**16 - 1).astype(np.uint16), "16UC1")
     if image.dtype.kind == "f":
