@@ -61,7 +61,7 @@ def check_target(target: Target, views: Sequence[PointCloud]) -> None:
             raise CloudError(f"target: mask of length {len(target.mask)}; valid: {many}, the points of the first view")
         # Pictures have masks of 0 and 255. NumPy would take these numbers for indices.
         kind = np.asarray(target.mask).dtype
-        if kind != bool:
+        if kind != np.dtype(bool):
             raise CloudError(f"target: mask of {kind}; valid: bool, True where a point shows the object")
         if not np.any(target.mask):
             raise CloudError("target: mask selects no point; valid: at least one True")
