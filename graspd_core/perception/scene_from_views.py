@@ -12,7 +12,12 @@ import torch
 from graspd_core.config import SceneConfig, SegmentationConfig
 from graspd_core.errors import CloudError
 from graspd_core.perception.cloud.point_cloud import PointCloud, Points
-from graspd_core.perception.cloud.viewpoint_check import check_scene, check_viewpoint, fits_nowhere
+from graspd_core.perception.cloud.viewpoint_check import (
+    check_scene,
+    check_viewpoint,
+    fits_nowhere,
+    refuse_no_place,
+)
 from graspd_core.perception.obstacles import make_obstacles
 from graspd_core.perception.reconstruct.merge_views import Evidence, is_all_round, is_unposed
 from graspd_core.perception.reconstruct.reconstruct import Reconstruction, reconstruct
@@ -96,6 +101,8 @@ def reconstruct_object(
 
     Raises CloudError like `segment` and `reconstruct`, and if a camera cannot have been at its stated position.
     """
+    for view in views:
+        refuse_no_place(view.viewpoint)
     # Round to float32, so that a cloud gives the same scene in float32 and float64.
     views = [replace(view, points=_single(view.points)) for view in views]
     alone = alone or _is_whole_object(views)

@@ -3,13 +3,14 @@
 import re
 from contextlib import nullcontext
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
 
 from graspd_bench.rendering.depth_noise import DEFAULT
 from graspd_bench.rendering.tabletop import depth_views, ring_poses, tabletop
-from graspd_core import PointCloud, Target, make_shape, scene_from_views
+from graspd_core import PointCloud, Target, load_scene, make_shape, scene_from_views
 from graspd_core.config import SegmentationConfig
 from graspd_core.errors import CloudError
 from graspd_core.mesh.mesh_files import mass_properties, surface_samples
@@ -193,3 +194,13 @@ def test_what_stands_out_over_the_end_of_the_table_does_not():
     assert not reaches_image_border(both, EYE, np.arange(len(both)) >= len(points), WIDTH)
     assert not reaches_image_border(np.zeros((0, 3)), EYE, np.zeros(0, dtype=bool), WIDTH)
     assert not reaches_image_border(np.zeros((5, 3)), EYE, np.ones(5, dtype=bool), WIDTH)
+
+
+@pytest.mark.parametrize("place", [[np.nan, 0.0, 0.0], [0.0, np.inf, 0.0]])
+def test_a_place_that_is_not_finite_is_named(place, tmp_path: Path):
+    points = surface_samples(make_shape("box"), 500, seed=0)[0] + np.array([0.0, 0.0, 0.6])
+    np.savetxt(tmp_path / "a.xyz", points)
+    with pytest.raises(CloudError, match=r"camera is at \[.*\]; valid: 3 finite numbers"):
+        load_scene(tmp_path / "a.xyz", view_point=place)
+    with pytest.raises(CloudError, match=r"camera is at \[.*\]; valid: 3 finite numbers"):
+        scene_from_views([PointCloud(points, np.array(place))])

@@ -72,14 +72,23 @@ def seen_from(pixels: Pixels, viewpoint: Vector, forward: Vector | None = None) 
     NaN points are kept. An image of one row or column is not checked.
 
     Raises:
-        CloudError: the pixels show that the camera stood at another position, which the error names.
+        CloudError: the pixels show that the camera stood at another position, which the error names, or the viewpoint
+            is no position.
     """
+    viewpoint = np.asarray(viewpoint, dtype=float)
+    refuse_no_place(viewpoint)
     fits = None if min(pixels.shape[:2]) < 2 else _pinhole_fits(pixels, viewpoint)
     place = _pinhole_place(pixels) if fits is False else None
     if place is not None:
         x, y, z = place
         raise _refusal(viewpoint, f"its pixels show the camera at ({x:.3f}, {y:.3f}, {z:.3f})")
-    return PointCloud(pixels.reshape(-1, 3), np.asarray(viewpoint, dtype=float), forward, posed=bool(fits))
+    return PointCloud(pixels.reshape(-1, 3), viewpoint, forward, posed=bool(fits))
+
+
+def refuse_no_place(viewpoint: np.ndarray) -> None:
+    """Raise CloudError if a viewpoint is not three finite numbers."""
+    if viewpoint.shape != (3,) or not np.isfinite(viewpoint).all():
+        raise CloudError(f"cloud: its camera is at {viewpoint.tolist()}; valid: 3 finite numbers [m]")
 
 
 def check_scene(views: Sequence[PointCloud]) -> None:
