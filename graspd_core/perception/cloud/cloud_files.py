@@ -17,7 +17,7 @@ from jaxtyping import Float
 
 from graspd_core.errors import CloudError, Extra, first_line
 from graspd_core.perception.cloud.camera import camera_from_calibration, cloud_from_depth, depth_in_metres
-from graspd_core.perception.cloud.point_cloud import PointCloud, Points, Vector
+from graspd_core.perception.cloud.point_cloud import PointCloud, Points, Vector, is_rigid
 from graspd_core.perception.cloud.viewpoint_check import seen_from
 
 # LZF, the compression of pcd files, expands one byte to at most this many bytes: three bytes make 264.
@@ -298,9 +298,7 @@ def _metres(image: np.ndarray, name: str) -> Float[np.ndarray, "height width"]:
 
 def rigid(pose: np.ndarray, name: str) -> Float[np.ndarray, "4 4"]:
     pose = _numbers({name: pose}, name)
-    turn = np.nan_to_num(pose[:3, :3]).clip(-2, 2)
-    square = np.abs(turn @ turn.T - np.eye(3)).max() < _ROTATION_TOLERANCE and np.linalg.det(turn) > 0
-    if not (np.isfinite(pose).all() and square and np.allclose(pose[3], (0, 0, 0, 1))):
+    if not is_rigid(pose, _ROTATION_TOLERANCE):
         raise CloudError(
             f"{name!r} is no rigid transform: its upper left 3 × 3 must be a rotation, its last row 0 0 0 1"
         )
