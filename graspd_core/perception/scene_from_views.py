@@ -15,6 +15,7 @@ from graspd_core.perception.cloud.point_cloud import PointCloud, Points
 from graspd_core.perception.cloud.viewpoint_check import (
     check_scene,
     check_viewpoint,
+    check_views,
     fits_nowhere,
     refuse_no_place,
 )
@@ -152,6 +153,8 @@ def _camera_doubts(seen: Segmentation, views: Sequence[PointCloud]) -> tuple[str
         if _needs_no_camera(seen.views):
             return ()
         raise
+    if len(views) > 1 and (apart := check_views(seen.views, views)):
+        return (apart,)
     # Views from several sides confirm each other.
     return tuple(told) if len(told) == 1 and told[0] and not _needs_no_camera(seen.views) else ()
 

@@ -204,3 +204,22 @@ def test_a_place_that_is_not_finite_is_named(place, tmp_path: Path):
         load_scene(tmp_path / "a.xyz", view_point=place)
     with pytest.raises(CloudError, match=r"camera is at \[.*\]; valid: 3 finite numbers"):
         scene_from_views([PointCloud(points, np.array(place))])
+
+
+@pytest.mark.parametrize(
+    ("shift", "doubt"),
+    [
+        ((0.0, 0.0, 0.0), ""),
+        ((0.0, 0.0, 0.02), "of the points near the object"),
+        ((0.15, 0.0, 0.0), r"view 3 saw empty space where other views show \d+ % of the object: is the pose of each"),
+    ],
+)
+def test_views_of_which_one_has_a_wrong_pose_are_doubted(shift, doubt):
+    poses = ring_poses(3, elevation=0.6, azimuth=-1.2)
+    depths = [depth for depth, _ in depth_views(tabletop("bottle"), CAMERA, poses, DEFAULT)]
+    poses[2][:3, 3] += shift
+    views = [cloud_from_depth(depth, CAMERA, pose) for depth, pose in zip(depths, poses, strict=True)]
+    evidence = scene_from_views(views).evidence
+    assert evidence is not None
+    told = " ".join(evidence.doubts)
+    assert re.search(doubt, told) if doubt else not told
