@@ -33,6 +33,8 @@ from graspd_core.types import Plane
 _FAR, _ENDLESS = 100.0, 1e100
 # Least range of depth cameras [m], and fraction of points out of range above which the unit of a scene is doubtful.
 _NEAREST, _CUT_OFF = 0.1, 0.3
+# Views whose cameras are nearer to each other than this [m] show the object from one side.
+_SAME_PLACE = 0.01
 
 
 def scene_from_views(
@@ -155,8 +157,10 @@ def _camera_doubts(seen: Segmentation, views: Sequence[PointCloud]) -> tuple[str
         raise
     if len(views) > 1 and (apart := check_views(seen.views, views)):
         return (apart,)
-    # Views from several sides confirm each other.
-    return tuple(told) if len(told) == 1 and told[0] and not _needs_no_camera(seen.views) else ()
+    # Views from several sides confirm each other. Several clouds of one camera that stood still do not.
+    if np.ptp([thing.viewpoint for thing in seen.views], axis=0).max() > _SAME_PLACE or _needs_no_camera(seen.views):
+        return ()
+    return tuple(filter(None, told))[:1]
 
 
 def _is_whole_object(views: Sequence[PointCloud]) -> bool:

@@ -142,6 +142,10 @@ def test_a_thing_without_its_table_is_doubted_from_right_behind():
     assert check_viewpoint(PointCloud(thing, place), PointCloud(thing, place)) == ""
     mirrored = PointCloud(thing, 2 * thing.mean(0) - place)
     assert "the object is hollow, or seen from the back of its surface" in check_viewpoint(mirrored, mirrored)
+    # A second cloud of the same camera confirms nothing.
+    evidence = scene_from_views([mirrored, mirrored], alone=True).evidence
+    assert evidence is not None
+    assert "the object is hollow" in " ".join(evidence.doubts)
 
 
 def test_numbers_of_32_and_of_64_bits_are_the_same_scene():
