@@ -190,6 +190,15 @@ def test_a_comment_may_name_the_end_of_the_header(tmp_path):
     assert read(tmp_path / "cloud.ply", head, POINTS.tobytes()) == POINTS.tolist()
 
 
+def test_a_mesh_is_none_however_long_its_comments_are(tmp_path):
+    comments = "comment up to end_header is text\n" * 200
+    head = "ply\nformat ascii 1.0\n" + comments + "element vertex 3\nelement face 1\nend_header\n"
+    (tmp_path / "a.ply").write_text(head)
+    assert not is_cloud_file(tmp_path / "a.ply")
+    (tmp_path / "a.ply").write_text(head.replace("face 1", "face 0"))
+    assert is_cloud_file(tmp_path / "a.ply")
+
+
 def test_two_properties_may_have_one_name(tmp_path):
     head = _PLY.format("") + "property uchar quality\nproperty uchar quality\nend_header\n"
     body = b"".join(row.tobytes() + b"\0\1" for row in POINTS)

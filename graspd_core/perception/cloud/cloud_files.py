@@ -31,6 +31,7 @@ _TYPES = {
 RECORDINGS = ("mcap", "db3", "bag")
 CLOUD_ENDINGS = ("npy", "npz", "pcd", "ply", "xyz")
 
+_LONGEST_HEADER = 2**20  # of a ply file [bytes]
 _ROTATION_TOLERANCE = 1e-4
 # Maximum size of an unpacked archive [bytes]. 100 depth images of two million 16-bit pixels take a fifth of this limit.
 _MAX_UNPACKED_BYTES = 2**31
@@ -336,8 +337,9 @@ def read_numpy(path: Path) -> dict[str, np.ndarray]:
 
 def _ply_has_faces(path: Path) -> bool:
     with path.open("rb") as file:
-        header = file.read(4096).split(b"end_header")[0]
-    faces = [line.split() for line in header.splitlines() if line.startswith(b"element face")]
+        # Some writers put a whole scene description into the comments of a header.
+        header = re.split(rb"[\r\n]end_header", file.read(_LONGEST_HEADER), maxsplit=1)[0]
+    faces = [words for line in header.splitlines() if (words := line.split())[:2] == [b"element", b"face"]]
     return any(len(words) > 2 and words[2] != b"0" for words in faces)
 
 
