@@ -204,9 +204,9 @@ def test_what_stands_out_over_the_end_of_the_table_does_not():
 def test_a_place_that_is_not_finite_is_named(place, tmp_path: Path):
     points = surface_samples(make_shape("box"), 500, seed=0)[0] + np.array([0.0, 0.0, 0.6])
     np.savetxt(tmp_path / "a.xyz", points)
-    with pytest.raises(CloudError, match=r"camera is at \[.*\]; valid: 3 finite numbers"):
+    with pytest.raises(CloudError, match=r"viewpoint is \[.*\]; valid: 3 finite numbers"):
         load_scene(tmp_path / "a.xyz", view_point=place)
-    with pytest.raises(CloudError, match=r"camera is at \[.*\]; valid: 3 finite numbers"):
+    with pytest.raises(CloudError, match=r"viewpoint is \[.*\]; valid: 3 finite numbers"):
         scene_from_views([PointCloud(points, np.array(place))])
 
 

@@ -93,7 +93,7 @@ def seen_from(pixels: Pixels, viewpoint: Vector, forward: Vector | None = None) 
 def refuse_no_place(viewpoint: np.ndarray) -> None:
     """Raise CloudError if a viewpoint is not three finite numbers."""
     if viewpoint.shape != (3,) or not np.isfinite(viewpoint).all():
-        raise CloudError(f"cloud: its camera is at {viewpoint.tolist()}; valid: 3 finite numbers [m]")
+        raise CloudError(f"cloud: its viewpoint is {viewpoint.tolist()}; valid: 3 finite numbers [m]")
 
 
 def check_scene(views: Sequence[PointCloud]) -> None:
