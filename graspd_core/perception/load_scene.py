@@ -74,6 +74,8 @@ def load_scene(
     else:
         mesh, warnings = _read_mesh(source, scale)
         view = view_in_mesh(mesh, given)
+        if view_point is not None:
+            raise MeshError(f"view_point: {given} is a mesh; only a cloud has a camera")
         if view is not None:
             views, warnings = (view,), (f"{given}: shows one camera's view, so its points are used as a cloud",)
     if views or mesh is None:
@@ -83,8 +85,6 @@ def load_scene(
         about = {"target": target, "alone": alone, "settings": settings, "source": given, "device": device}
         scene = scene_from_views(views, **about, **numbers)
         return replace(scene, object=replace(scene.object, scale=scale, warnings=warnings + scene.object.warnings))
-    if view_point is not None:
-        raise MeshError(f"view_point: {given} is a mesh; only a cloud has a camera")
     if target is not None:
         raise MeshError(f"target: given with {given}, a mesh; valid with clouds of several objects")
     return build_scene(mesh, source=given, scale=scale, device=device, started=started, warnings=warnings, **numbers)

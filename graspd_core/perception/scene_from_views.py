@@ -12,7 +12,13 @@ import torch
 from graspd_core.config import SceneConfig, SegmentationConfig
 from graspd_core.errors import CloudError
 from graspd_core.perception.cloud.point_cloud import PointCloud, Points
-from graspd_core.perception.cloud.viewpoint_check import check_scene, check_viewpoint, fits_nowhere
+from graspd_core.perception.cloud.viewpoint_check import (
+    check_scene,
+    check_viewpoint,
+    check_views,
+    fits_nowhere,
+    refuse_no_place,
+)
 from graspd_core.perception.obstacles import make_obstacles
 from graspd_core.perception.reconstruct.merge_views import Evidence, is_all_round, is_unposed
 from graspd_core.perception.reconstruct.reconstruct import Reconstruction, reconstruct
@@ -27,6 +33,8 @@ from graspd_core.types import Plane
 _FAR, _ENDLESS = 100.0, 1e100
 # Least range of depth cameras [m], and fraction of points out of range above which the unit of a scene is doubtful.
 _NEAREST, _CUT_OFF = 0.1, 0.3
+# Views whose cameras are nearer to each other than this [m] show the object from one side.
+_SAME_PLACE = 0.01
 
 
 def scene_from_views(
@@ -96,6 +104,8 @@ def reconstruct_object(
 
     Raises CloudError like `segment` and `reconstruct`, and if a camera cannot have been at its stated position.
     """
+    for view in views:
+        refuse_no_place(view.viewpoint)
     # Round to float32, so that a cloud gives the same scene in float32 and float64.
     views = [replace(view, points=_single(view.points)) for view in views]
     alone = alone or _is_whole_object(views)
@@ -145,8 +155,12 @@ def _camera_doubts(seen: Segmentation, views: Sequence[PointCloud]) -> tuple[str
         if _needs_no_camera(seen.views):
             return ()
         raise
-    # Views from several sides confirm each other.
-    return tuple(told) if len(told) == 1 and told[0] and not _needs_no_camera(seen.views) else ()
+    if len(views) > 1 and (apart := check_views(seen.views, views)):
+        return (apart,)
+    # Views from several sides confirm each other. Several clouds of one camera that stood still do not.
+    if np.ptp([thing.viewpoint for thing in seen.views], axis=0).max() > _SAME_PLACE or _needs_no_camera(seen.views):
+        return ()
+    return tuple(filter(None, told))[:1]
 
 
 def _is_whole_object(views: Sequence[PointCloud]) -> bool:

@@ -137,11 +137,13 @@ FLIPPED = POSES[:2] * np.array([1, 1, -1, 1])
     [
         ({**GOOD, "K": np.eye(2)}, "'K' has shape (2, 2); 3 × 3 is needed"),
         ({**GOOD, "K": np.zeros((3, 3))}, "is no calibration"),
+        ({**GOOD, "K": MATRIX.T}, "K is 150, 0, 0, 0, 150, 0, 79.5, 59.5, 1; valid: fx, 0, cx, 0, fy, cy, 0, 0, 1"),
         ({**GOOD, "poses": POSES}, "'poses' has shape (3, 4, 4); 2 × 4 × 4 is needed"),
         ({**GOOD, "poses": FLIPPED}, "'poses' is no rigid transform"),
         ({**GOOD, "distortion": np.ones(9)}, "9 distortion coefficients; rational_polynomial has at most 8"),
         ({**GOOD, "depths": np.ones((6, 8))}, "'depths' has shape (6, 8); views × height × width is needed"),
         ({**GOOD, "depths": np.ones((2, 6, 8), dtype=complex)}, "'depths' holds complex128; integers (mm) or floats"),
+        ({**GOOD, "depths": np.full((2, 6, 8), 100, "u1")}, "'depths' holds uint8: cut to 8 bits; 16 bits (mm) or"),
         ({"depths": np.ones((2, 6, 8)), "K": MATRIX}, "holds 'depths' but no 'poses'; it has: depths, K"),
         ({"depth": np.ones((6, 8)), "K": MATRIX, "T_world_camera": np.eye(3)}, "shape (3, 3); 4 × 4 is needed"),
         ({"points": np.ones((5, 3)), "forward": np.zeros(3)}, "'forward' is no direction"),
@@ -186,6 +188,15 @@ def read(path: Path, head: str, body: bytes) -> list[list[float]]:
 def test_a_comment_may_name_the_end_of_the_header(tmp_path):
     head = _PLY.format("comment up to end_header is text\n") + "end_header\n"
     assert read(tmp_path / "cloud.ply", head, POINTS.tobytes()) == POINTS.tolist()
+
+
+def test_a_mesh_is_none_however_long_its_comments_are(tmp_path):
+    comments = "comment up to end_header is text\n" * 200
+    head = "ply\nformat ascii 1.0\n" + comments + "element vertex 3\nelement face 1\nend_header\n"
+    (tmp_path / "a.ply").write_text(head)
+    assert not is_cloud_file(tmp_path / "a.ply")
+    (tmp_path / "a.ply").write_text(head.replace("face 1", "face 0"))
+    assert is_cloud_file(tmp_path / "a.ply")
 
 
 def test_two_properties_may_have_one_name(tmp_path):

@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 from situations import sheet, sheet_in_world
 
+from graspd_core import load_scene
 from graspd_core.errors import MeshError
 from graspd_core.mesh.shapes import SHAPES, make_shape
 from graspd_core.perception.cloud.mesh_views import view_in_mesh
@@ -18,6 +19,11 @@ def test_a_sheet_of_pixels_is_a_view_however_it_is_wound(turn):
         assert view is not None
         assert not view.viewpoint.any()
         np.testing.assert_array_equal(view.points, wound.vertices)
+
+
+def test_the_camera_of_a_sheet_has_no_other_place():
+    with pytest.raises(MeshError, match="view_point: mesh is a mesh; only a cloud has a camera"):
+        load_scene(sheet(), view_point=(0.0, 0.0, 1.0))
 
 
 def test_a_sheet_in_another_frame_is_refused_by_that_name():

@@ -13,6 +13,7 @@ from graspd_core.errors import CloudError
 from graspd_core.io.messages import pixels_from_message, points_from_message
 from graspd_core.mesh.mesh_files import surface_samples
 from graspd_core.mesh.shapes import make_shape
+from graspd_core.perception.cloud.camera import PinholeCamera, cloud_from_depth
 from graspd_core.perception.cloud.point_cloud import (
     PointCloud,
     clean_cloud,
@@ -81,6 +82,15 @@ def test_a_cloud_moves_with_its_camera():
     assert moved.forward == pytest.approx(-moved.viewpoint / np.linalg.norm(moved.viewpoint))
     assert transform_cloud(PointCloud(points, ORIGIN), pose).forward is None
     assert points[1].tolist() == [0.1, 0, 0]
+
+
+@pytest.mark.parametrize("scales", [(-1.0, 1.0, 1.0), (1e-3, 1e-3, 1e-3), (1.0, np.nan, 1.0)])
+def test_a_cloud_is_neither_mirrored_nor_scaled(scales):
+    pose = look_at((0.3, 0.2, 0.1), (0, 0, 0)) * np.array([*scales, 1.0])
+    with pytest.raises(CloudError, match="is no rigid transform; valid: a rotation, a finite position"):
+        transform_cloud(PointCloud(np.ones((2, 3)), ORIGIN), pose)
+    with pytest.raises(CloudError, match="is no rigid transform; valid: a rotation, a finite position"):
+        cloud_from_depth(np.ones((6, 8)), PinholeCamera(8, 6, 10.0, 10.0, 3.5, 2.5), pose)
 
 
 @pytest.mark.parametrize("scales", [(1, 1, 1), (1, 1, 1e-3), (1, 1, 0), (1, 1e-4, 1e-4), (1, 0, 0), (0, 0, 0)])

@@ -3,13 +3,14 @@
 import re
 from contextlib import nullcontext
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
 
 from graspd_bench.rendering.depth_noise import DEFAULT
 from graspd_bench.rendering.tabletop import depth_views, ring_poses, tabletop
-from graspd_core import PointCloud, Target, make_shape, scene_from_views
+from graspd_core import PointCloud, Target, load_scene, make_shape, scene_from_views
 from graspd_core.config import SegmentationConfig
 from graspd_core.errors import CloudError
 from graspd_core.mesh.mesh_files import mass_properties, surface_samples
@@ -141,6 +142,10 @@ def test_a_thing_without_its_table_is_doubted_from_right_behind():
     assert check_viewpoint(PointCloud(thing, place), PointCloud(thing, place)) == ""
     mirrored = PointCloud(thing, 2 * thing.mean(0) - place)
     assert "the object is hollow, or seen from the back of its surface" in check_viewpoint(mirrored, mirrored)
+    # A second cloud of the same camera confirms nothing.
+    evidence = scene_from_views([mirrored, mirrored], alone=True).evidence
+    assert evidence is not None
+    assert "the object is hollow" in " ".join(evidence.doubts)
 
 
 def test_numbers_of_32_and_of_64_bits_are_the_same_scene():
@@ -193,3 +198,32 @@ def test_what_stands_out_over_the_end_of_the_table_does_not():
     assert not reaches_image_border(both, EYE, np.arange(len(both)) >= len(points), WIDTH)
     assert not reaches_image_border(np.zeros((0, 3)), EYE, np.zeros(0, dtype=bool), WIDTH)
     assert not reaches_image_border(np.zeros((5, 3)), EYE, np.ones(5, dtype=bool), WIDTH)
+
+
+@pytest.mark.parametrize("place", [[np.nan, 0.0, 0.0], [0.0, np.inf, 0.0]])
+def test_a_place_that_is_not_finite_is_named(place, tmp_path: Path):
+    points = surface_samples(make_shape("box"), 500, seed=0)[0] + np.array([0.0, 0.0, 0.6])
+    np.savetxt(tmp_path / "a.xyz", points)
+    with pytest.raises(CloudError, match=r"viewpoint is \[.*\]; valid: 3 finite numbers"):
+        load_scene(tmp_path / "a.xyz", view_point=place)
+    with pytest.raises(CloudError, match=r"viewpoint is \[.*\]; valid: 3 finite numbers"):
+        scene_from_views([PointCloud(points, np.array(place))])
+
+
+@pytest.mark.parametrize(
+    ("shift", "doubt"),
+    [
+        ((0.0, 0.0, 0.0), ""),
+        ((0.0, 0.0, 0.02), "of the points near the object"),
+        ((0.15, 0.0, 0.0), r"view 3 saw empty space where other views show \d+ % of the object: is the pose of each"),
+    ],
+)
+def test_views_of_which_one_has_a_wrong_pose_are_doubted(shift, doubt):
+    poses = ring_poses(3, elevation=0.6, azimuth=-1.2)
+    depths = [depth for depth, _ in depth_views(tabletop("bottle"), CAMERA, poses, DEFAULT)]
+    poses[2][:3, 3] += shift
+    views = [cloud_from_depth(depth, CAMERA, pose) for depth, pose in zip(depths, poses, strict=True)]
+    evidence = scene_from_views(views).evidence
+    assert evidence is not None
+    told = " ".join(evidence.doubts)
+    assert re.search(doubt, told) if doubt else not told

@@ -287,6 +287,14 @@ def test_targets_that_cannot_be_meant_are_refused(target, complaint):
         segment([seen(THREE.meshes)[0]], target=target)
 
 
+def test_a_mask_of_numbers_is_refused():
+    target, (view, label) = Target(), seen(THREE.meshes)
+    # Outside the tests, nothing checks the type of an attribute.
+    object.__setattr__(target, "mask", np.where(label == 0, 255, 0).astype(np.uint8))
+    with pytest.raises(CloudError, match="target: mask of uint8; valid: bool, True where a point shows the object"):
+        segment([view], target=target)
+
+
 def test_points_without_any_surface_are_no_object():
     points = np.random.default_rng(0).random((2000, 3))
     with pytest.raises(NoObjectError, match="no graspable object among 2000 points"):

@@ -95,7 +95,8 @@ def camera_from_calibration(
 ) -> PinholeCamera:
     """Return a camera from image size [pixels], camera matrix (row by row), distortion coefficients and their model.
 
-    Raises CloudError if `model` is unknown, `distortion` has too many numbers, or size or `matrix` is not valid.
+    Raises CloudError if `model` is unknown, `distortion` has too many numbers, size or `matrix` is not valid, or
+    `matrix` is given column by column.
     """
     if len(matrix) != 9:
         raise CloudError(f"camera: its matrix K has {len(matrix)} numbers; 9 are needed")
@@ -109,7 +110,11 @@ def camera_from_calibration(
             f"camera: {len(coefficients)} distortion coefficients; {model} has at most {DISTORTION_MODELS[model]}"
         )
     fx, fy, cx, cy = (float(matrix[index]) for index in (0, 4, 2, 5))
-    return PinholeCamera(int(width), int(height), fx, fy, cx, cy, coefficients)
+    camera = PinholeCamera(int(width), int(height), fx, fy, cx, cy, coefficients)
+    if any(matrix[index] for index in (3, 6, 7)):
+        told = ", ".join(f"{float(number):g}" for number in matrix)
+        raise CloudError(f"camera: its matrix K is {told}; valid: fx, 0, cx, 0, fy, cy, 0, 0, 1, row by row")
+    return camera
 
 
 @lru_cache(maxsize=8)
@@ -240,7 +245,8 @@ def cloud_from_depth(
         T_frame_camera: pose of the camera (z forward, x right, y down). If None, points are in the camera frame.
 
     Raises:
-        CloudError: image and camera differ in size, depth was cut to 8 bits, or the matrix is for another image size.
+        CloudError: image and camera differ in size, depth was cut to 8 bits, the matrix is for another image size, or
+            the pose is not rigid.
     """
     if depth.shape != (camera.height, camera.width):
         raise CloudError(

@@ -17,7 +17,7 @@ from jaxtyping import Float
 
 from graspd_core.errors import CloudError, Extra, first_line
 from graspd_core.perception.cloud.camera import camera_from_calibration, cloud_from_depth, depth_in_metres
-from graspd_core.perception.cloud.point_cloud import PointCloud, Points, Vector
+from graspd_core.perception.cloud.point_cloud import PointCloud, Points, Vector, is_rigid
 from graspd_core.perception.cloud.viewpoint_check import seen_from
 
 # LZF, the compression of pcd files, expands one byte to at most this many bytes: three bytes make 264.
@@ -31,6 +31,7 @@ _TYPES = {
 RECORDINGS = ("mcap", "db3", "bag")
 CLOUD_ENDINGS = ("npy", "npz", "pcd", "ply", "xyz")
 
+_LONGEST_HEADER = 2**20  # of a ply file [bytes]
 _ROTATION_TOLERANCE = 1e-4
 # Maximum size of an unpacked archive [bytes]. 100 depth images of two million 16-bit pixels take a fifth of this limit.
 _MAX_UNPACKED_BYTES = 2**31
@@ -285,6 +286,8 @@ def _depth_views(arrays: Mapping[str, np.ndarray]) -> tuple[PointCloud, ...]:
 
 
 def _metres(image: np.ndarray, name: str) -> Float[np.ndarray, "height width"]:
+    if image.dtype.kind in "iu" and image.dtype.itemsize < 2:
+        raise CloudError(f"{name!r} holds {image.dtype}: cut to 8 bits; 16 bits (mm) or floats (m) are needed")
     if image.dtype.kind in "iu":
         return depth_in_metres(image.astype(float).clip(0, 2**16 - 1).astype(np.uint16), "16UC1")
     if image.dtype.kind == "f":
@@ -296,9 +299,7 @@ def _metres(image: np.ndarray, name: str) -> Float[np.ndarray, "height width"]:
 
 def rigid(pose: np.ndarray, name: str) -> Float[np.ndarray, "4 4"]:
     pose = _numbers({name: pose}, name)
-    turn = np.nan_to_num(pose[:3, :3]).clip(-2, 2)
-    square = np.abs(turn @ turn.T - np.eye(3)).max() < _ROTATION_TOLERANCE and np.linalg.det(turn) > 0
-    if not (np.isfinite(pose).all() and square and np.allclose(pose[3], (0, 0, 0, 1))):
+    if not is_rigid(pose, _ROTATION_TOLERANCE):
         raise CloudError(
             f"{name!r} is no rigid transform: its upper left 3 × 3 must be a rotation, its last row 0 0 0 1"
         )
@@ -336,8 +337,9 @@ def read_numpy(path: Path) -> dict[str, np.ndarray]:
 
 def _ply_has_faces(path: Path) -> bool:
     with path.open("rb") as file:
-        header = file.read(4096).split(b"end_header")[0]
-    faces = [line.split() for line in header.splitlines() if line.startswith(b"element face")]
+        # Some writers put a whole scene description into the comments of a header.
+        header = re.split(rb"[\r\n]end_header", file.read(_LONGEST_HEADER), maxsplit=1)[0]
+    faces = [words for line in header.splitlines() if (words := line.split())[:2] == [b"element", b"face"]]
     return any(len(words) > 2 and words[2] != b"0" for words in faces)
 
 

@@ -21,6 +21,8 @@ MIN_POINTS = 50
 MAX_DISTANCE_IN_SIZES = 1e3
 # Points nearer to the camera than this [m] are not measurements. Some drivers send such points for missing depth.
 CAMERA_PLACE_TOLERANCE_M = 1e-5
+# Greatest error of a rotation matrix times its transpose, as in a `TransformBuffer`.
+RIGID = 1e-3
 
 
 @dataclass(frozen=True, eq=False)
@@ -44,8 +46,23 @@ class PointCloud:
         return replace(self, points=self.points[np.unique(voxel_keys(self.points, size), return_index=True)[1]])
 
 
+def is_rigid(pose: np.ndarray, tolerance: float = RIGID) -> bool:
+    """Return True if a matrix is a rotation, to within `tolerance`, with a finite position above a row 0 0 0 1."""
+    if pose.shape != (4, 4):
+        return False
+    turn = np.nan_to_num(pose[:3, :3]).clip(-2, 2)
+    square = np.abs(turn @ turn.T - np.eye(3)).max() < tolerance and np.linalg.det(turn) > 0
+    return bool(np.isfinite(pose).all() and square and np.allclose(pose[3], (0, 0, 0, 1)))
+
+
 def transform_cloud(cloud: PointCloud, T_a_b: Float[np.ndarray, "4 4"]) -> PointCloud:
-    """Transform a cloud from frame b to frame a, together with the position and axis of its camera."""
+    """Transform a cloud from frame b to frame a, together with the position and axis of its camera.
+
+    Raises CloudError if the transform is not rigid. A mirrored or scaled cloud would be another scene.
+    """
+    if not is_rigid(T_a_b):
+        told = np.asarray(T_a_b).tolist()
+        raise CloudError(f"cloud: {told} is no rigid transform; valid: a rotation, a finite position, and 0 0 0 1")
     rotation, position = T_a_b[:3, :3], T_a_b[:3, 3]
     points = cloud.points @ rotation.T
     points += position

@@ -22,6 +22,7 @@ from graspd_core.mesh.surface_queries import make_surface, surface_distance
 from graspd_core.mesh.topology import is_closed
 from graspd_core.perception.cloud.free_space import FreeSpace, make_view_depths
 from graspd_core.perception.cloud.point_cloud import PointCloud, Points, Vector, clean_cloud, measured
+from graspd_core.perception.cloud.viewpoint_check import refuse_no_place
 from graspd_core.perception.reconstruct.extrusion import MAX_FOOT_HEIGHT_M, with_foot
 from graspd_core.perception.reconstruct.merge_views import (
     Evidence,
@@ -186,8 +187,7 @@ def _clean(views: Sequence[PointCloud], settings: ReconstructionConfig) -> list[
     if len(views) == 0:
         raise CloudError("cloud: no view at all; at least one is needed")
     for view in views:
-        if not np.isfinite(view.viewpoint).all():
-            raise CloudError("cloud: the position of a view's camera (viewpoint) is not finite")
+        refuse_no_place(view.viewpoint)
     most = settings.max_points // len(views)
     kept = [_some(view, most) for view in views]
     clean = clean_cloud(np.concatenate(kept))

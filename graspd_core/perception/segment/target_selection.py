@@ -40,8 +40,8 @@ def check_target(target: Target, views: Sequence[PointCloud]) -> None:
     """Check a target.
 
     Raises:
-        CloudError: several kinds are given, a value is not finite, the box is empty, or the mask has no point or
-            another length than the first view.
+        CloudError: several kinds are given, a value is not finite, the box is empty, or the mask has no point,
+            another length than the first view, or another type than bool.
     """
     given = [name for name in ("point", "box", "mask") if getattr(target, name) is not None]
     if len(given) > 1:
@@ -53,13 +53,17 @@ def check_target(target: Target, views: Sequence[PointCloud]) -> None:
         raise CloudError(f"target: point {_place(target.point)}; valid: finite numbers")
     if target.box is not None:
         low, high = target.box
-        if not (np.isfinite(low).all() and np.isfinite(high).all() and (low != high).all()):
+        if not (np.isfinite(low).all() and np.isfinite(high).all() and np.not_equal(low, high).all()):
             raise CloudError(f"target: box from {_place(low)} to {_place(high)}; valid: finite, with a volume above 0")
     if target.mask is not None:
         if len(target.mask) != len(views[0].points):
             many = len(views[0].points)
             raise CloudError(f"target: mask of length {len(target.mask)}; valid: {many}, the points of the first view")
-        if not target.mask.any():
+        # Pictures have masks of 0 and 255. NumPy would take these numbers for indices.
+        kind = np.asarray(target.mask).dtype
+        if kind != np.dtype(bool):
+            raise CloudError(f"target: mask of {kind}; valid: bool, True where a point shows the object")
+        if not np.any(target.mask):
             raise CloudError("target: mask selects no point; valid: at least one True")
 
 
