@@ -77,11 +77,11 @@ PCD = "# .PCD\nFIELDS x y z\nSIZE 4 4 4\nTYPE F F F\nCOUNT 1 1 1\nWIDTH {n}\nHEI
         (PCD.format(n=10**9, data="binary").encode() + bytes(24), "cut short: 2 of 1000000000 points"),
         (
             PCD.format(n=10**9, data="binary_compressed").encode() + bytes(24),
-            "promises points of 12000000000 bytes, its data 0",
+            "promises 12000000000 bytes of points, its data promises 0",
         ),
         (
             PCD.replace("1 1 1", "1 1 100000000").format(n=1, data="binary_compressed").encode(),
-            "promises points of 400000008 bytes, its data 0",
+            "promises 400000008 bytes of points, its data promises 0",
         ),
         (PCD.replace("4 4 4", "4 4 5").format(n=1, data="binary").encode() + bytes(24), "not a readable pcd cloud"),
         (
@@ -90,7 +90,7 @@ PCD = "# .PCD\nFIELDS x y z\nSIZE 4 4 4\nTYPE F F F\nCOUNT 1 1 1\nWIDTH {n}\nHEI
         ),
         (
             PCD.format(n=1, data="binary_compressed").encode() + struct.pack("<II", 8, 24) + bytes(8),
-            "12 bytes, its data 8",
+            "12 bytes of points, its data promises 8",
         ),
         (PCD.format(n=1, data="packed").encode() + bytes(12), "its DATA 'packed' is unknown; valid: ascii, binary"),
         (b"# 7\nFIELDS x y z\n", "its header has no SIZE"),

@@ -224,7 +224,7 @@ MESHES = (
         BOTTLE,
         "realsenseai/librealsense/issues/2036",
         {},
-        "not a solid: its points are taken as a cloud",
+        "so its points are used as a cloud",
     ),
     Situation(
         "a camera viewer's mesh, y and z turned",
@@ -232,7 +232,7 @@ MESHES = (
         BOTTLE,
         "realsenseai/librealsense/issues/10536",
         {},
-        "taken as a cloud",
+        "used as a cloud",
     ),
     Situation(
         "a camera viewer's mesh with faces to what it did not see",
@@ -240,7 +240,7 @@ MESHES = (
         BOTTLE,
         "giacomodabisias/libfreenect2pclgrabber/issues/11",
         {},
-        "taken as a cloud",
+        "used as a cloud",
     ),
     Situation(
         "a camera viewer's mesh in another frame",

@@ -150,6 +150,8 @@ def test_a_flood_of_sliders_ends_where_the_last_one_is(page, viewer):
 
 def angles_from_y(viewer, folder: Path) -> list[float]:
     """Of the grasps that can be saved, to a hand that comes from +y [degrees]; -1 where there is none."""
+    if viewer._planner._saved is None:
+        return [-1.0]
     (folder / "grasps.json").write_bytes(viewer._planner._saved)
     hand, grasps = load_hand("parallel_gripper"), open_grasps(folder / "grasps.json").grasps
     return [np.degrees(angle_of_approach(hand, grasp, np.array([0.0, -1.0, 0.0]))) for grasp in grasps] or [-1.0]
