@@ -31,6 +31,8 @@ from graspd_core.verify.world import Protocol, World, advance, trial_data
 DIRECTIONS = np.concatenate([np.eye(3), -np.eye(3)])
 # Reason of a trial result if the stop hook ended the trial.
 STOPPED = "stopped before the trial ended"
+# Greatest distance of a posture beyond a joint limit [rad] or [m]. Files round their numbers.
+_BEYOND = 1e-3
 
 
 def hold_trial(
@@ -168,15 +170,30 @@ def close_hand(
 
 
 def posture_fault(world: World, data: Any, grasp: Grasp, protocol: Protocol) -> str:
-    """Return why pregrasp or grasp is invalid: the hand penetrates object or itself. Return "" if both are valid."""
+    """Return why pregrasp or grasp is invalid: joint limits or penetration. Return "" if both are valid."""
     deepest = {"pregrasp": protocol.max_start_penetration, "grasp": protocol.max_grasp_penetration}
     for name, limit in deepest.items():
+        if fault := limit_fault(world, getattr(grasp, name)):
+            return f"the {name} {fault}"
         place_hand(world, data, getattr(grasp, name))
         if (depth := start_penetration(world, data)) > limit:
             return f"the {name} penetrates the object by {depth * 1e3:.1f} mm"
         if fault := self_fault(world, data, protocol):
             return f"the {name} {fault}"
     return ""
+
+
+def limit_fault(world: World, posture: Posture) -> str:
+    """Return a text about the joint that is farthest beyond its limits. Return "" if all joints are within them."""
+    # MuJoCo lists joints by ascending address.
+    joints = np.searchsorted(world.model.jnt_qposadr, world.joint_addresses)
+    low, high = world.model.jnt_range[joints].T
+    beyond = np.maximum(low - posture.joint_positions, posture.joint_positions - high)
+    worst = int(beyond.argmax())
+    if beyond[worst] <= _BEYOND:
+        return ""
+    name = world.model.joint(int(joints[worst])).name.removeprefix("joint:")
+    return f"puts joint {name!r} {beyond[worst]:.3g} rad or m beyond its limit"
 
 
 def start_penetration(world: World, data: Any) -> float:

@@ -65,6 +65,18 @@ def test_all_ways_in_refuse_crossed_fingers(allegro, cube, posture):
     assert lift.reason == tried.reason
 
 
+@pytest.mark.parametrize("where", ["pregrasp", "grasp"])
+def test_a_joint_beyond_its_limit_is_refused_by_name(allegro, cube, posture, where):
+    clear = Grasp(posture(0.0), posture(0.0), posture(0.0), (), 0.0)
+    for angle, refused in ((allegro.upper[0] + 5e-4, False), (allegro.upper[0] + 0.05, True)):
+        joints = np.array(clear.grasp.joint_positions)
+        joints[0] = angle
+        bent = replace(clear, **{where: replace(clear.grasp, joint_positions=joints)})
+        (tried,) = verify_grasps(load_scene("shape:box", resolution=16), allegro, [bent], measure=False)
+        told = f"the {where} puts joint {allegro.joint_names[0]!r} 0.05 rad or m beyond its limit"
+        assert (tried.reason == told) == refused
+
+
 def test_a_squeeze_that_ends_in_the_hand_is_refused(far, posture):
     clear = posture(0.0)
     grasp = Grasp(clear, clear, posture(-0.47), (), 0.0)
