@@ -72,7 +72,7 @@ MAX_PACKAGE_LINES = {
     "graspd_dataset": 3_053,
     "graspd_viewer": 2_422,
     "graspd_cell": 3_799,
-    "test": 33_597,
+    "test": 33_598,
 }
 # Lines that a program reaches through its imports, those inside functions too.
 # The layout aims at 22,000 of the node.

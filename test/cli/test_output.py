@@ -209,7 +209,8 @@ def test_a_reader_that_has_ended_costs_no_file_and_prints_nothing(tmp_path: Path
     os.close(write)
     assert [path.name for path in tmp_path.iterdir()] == files
     assert done.stderr == ""
-    assert done.returncode == (EXIT_OK if words == ["--help"] else EXIT_PIPE)
+    # Argparse of Python 3.11.7 ignores the ended reader of its help, that of 3.11.2 does not.
+    assert done.returncode in ((EXIT_OK, EXIT_PIPE) if words == ["--help"] else (EXIT_PIPE,))
 
 
 def test_a_full_disk_behind_stdout_is_one_line():
