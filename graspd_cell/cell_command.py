@@ -173,8 +173,8 @@ def _refuse(options: argparse.Namespace) -> None:
         raise ConfigError(f"--picks: {options.picks}; valid: 1 or more")
     if options.picks is not None and (options.view or options.film):
         raise ConfigError("--picks cannot be combined with --view or --film; remove one of them")
-    if not options.speed > 0:
-        raise ConfigError(f"--speed: {options.speed}; valid: more than zero")
+    if not 0 < options.speed < float("inf"):
+        raise ConfigError(f"--speed: {options.speed}; valid: a positive number")
     if options.film is not None:
         check_writable(options.film)
 

@@ -52,8 +52,8 @@ def complete_grasps(
     """Close each hand whose file has no joint values. Compute each missing pregrasp and squeeze.
 
     Postures from a file are kept exactly. A squeeze has joint targets, so it may exceed the joint limits. A grasp is
-    refused if its file marks it as failed, or if a joint is beyond its limits. A grasp whose
-    file has no squeeze is also refused if fewer than two links touch the object.
+    refused if its file marks it as failed, or if a joint is beyond its limits. A grasp whose file has no squeeze is
+    also refused if fewer than two links touch the object.
     """
     faults = [grasp.refused or beyond_limits(grasp, hand) for grasp in imported]
     kept = [grasp for grasp, fault in zip(imported, faults, strict=True) if not fault]

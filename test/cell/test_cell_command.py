@@ -54,7 +54,8 @@ def test_an_empty_bin_is_filled_again_until_there_were_enough_picks(capsys: pyte
     [
         (("--count", "0"), "--count: 0; valid: 1 to 24"),
         (("--seed", "-1"), "--seed: -1; valid: 0 to"),
-        (("--speed", "0"), "--speed: 0.0; valid: more than zero"),
+        (("--speed", "0"), "--speed: 0.0; valid: a positive number"),
+        (("--speed", "inf"), "--speed: inf; valid: a positive number"),
         (("--attempts", "0"), "--attempts: 0; valid: 1 or more"),
         (("--picks", "0"), "--picks: 0; valid: 1 or more"),
         (("--picks", "9", "--view"), "--picks cannot be combined with --view or --film; remove one of them"),
