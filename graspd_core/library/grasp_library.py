@@ -129,11 +129,12 @@ _APPLICATION = 0x67727370
 _PATIENCE = 30.0
 _COLUMNS = tuple(item.name for item in fields(LibraryEntry))
 _SCHEMA = f"""
-CREATE TABLE records (key TEXT PRIMARY KEY, {", ".join(_COLUMNS)}, grasps INTEGER, document BLOB) WITHOUT ROWID;
-CREATE INDEX by_name ON records (name);
-CREATE INDEX by_file ON records (file_sha256, scale);
-CREATE INDEX by_mesh ON records (mesh_sha256);
-CREATE INDEX by_source ON records (source);
+CREATE TABLE IF NOT EXISTS records
+(key TEXT PRIMARY KEY, {", ".join(_COLUMNS)}, grasps INTEGER, document BLOB) WITHOUT ROWID;
+CREATE INDEX IF NOT EXISTS by_name ON records (name);
+CREATE INDEX IF NOT EXISTS by_file ON records (file_sha256, scale);
+CREATE INDEX IF NOT EXISTS by_mesh ON records (mesh_sha256);
+CREATE INDEX IF NOT EXISTS by_source ON records (source);
 """
 
 

@@ -27,6 +27,7 @@ from graspd_core import (
 )
 from graspd_core.errors import ConfigError, FormatError, MeshError
 from graspd_core.hands.kinematics import hand_mesh
+from graspd_core.library import grasp_library
 from graspd_core.library import known_grasps as module
 from graspd_core.library.grasp_library import GraspLibrary, LibraryEntry, entry_of, hand_hash
 from graspd_core.library.known_grasps import (
@@ -112,6 +113,19 @@ def test_grasps_come_back_as_they_were_put_in(library: GraspLibrary, planned: Gr
     good = [grasp for grasp in planned.tried if grasp.verdict is Verdict.VERIFIED]
     assert len(grasps) == len(good) == 4
     assert all(map(same, grasps, good))
+
+
+def test_another_process_may_create_the_library_at_the_same_time(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    library, opened = GraspLibrary(tmp_path / "known.grasps"), grasp_library._opened
+
+    def opened_second(path: Path, mode: str):
+        monkeypatch.setattr(grasp_library, "_opened", opened)
+        library.create()
+        return opened(path, mode)
+
+    monkeypatch.setattr(grasp_library, "_opened", opened_second)
+    library.create()
+    assert library.checked().names() == []
 
 
 def test_what_is_added_stands_behind_what_was_there(library: GraspLibrary, planned: GraspResult, scene, hand):
