@@ -29,6 +29,7 @@ from graspd_core.hands.kinematics import (
 from graspd_core.hands.model import HandModel, Primitive
 from graspd_core.hands.self_collision import collision_spheres
 from graspd_core.hands.surface_points import outermost
+from graspd_core.mesh.mesh_files import surface_samples
 from graspd_core.mesh.sdf import GridSDF, sample_sdf
 from graspd_core.optimize.loop import Poses, Values
 from graspd_core.perception.scene import Scene
@@ -39,8 +40,8 @@ RETREAT_SHARES = (0.15, 0.3, 0.5, 0.75, 1.0)
 _PATH_SHARES = (0.0, 0.25, 0.5, 0.75, 1.0)
 # Gaps of at least this make no difference to the optimiser [m].
 WIDE = 0.005
-# Number of points that represent each rim of a cylinder, and greatest number of points that represent a hull.
-_RIM, _HULL = 12, 32
+# Number of points for each rim of a cylinder, greatest number for a hull, and number for the object's surface.
+_RIM, _HULL, _SURFACE = 12, 32, 1000
 
 
 @dataclass(frozen=True)
@@ -79,8 +80,10 @@ def make_obstacle_tensors(
     scene: Scene, hand: HandModel, device: torch.device | str, dtype: torch.dtype
 ) -> ObstacleTensors | None:
     """Return the support and the obstacles that this hand can reach, None if there are none. Results are cached."""
-    vertices = torch.as_tensor(scene.object.mesh.vertices)
-    gaps = [float(sample_sdf(solid.sdf, vertices.to(solid.sdf.field))[0].min()) for solid in scene.obstacles]
+    # The vertices alone are not enough, because an obstacle may be near the middle of a large face.
+    samples = surface_samples(scene.object.mesh, _SURFACE, 0)[0]
+    surface = torch.as_tensor(np.concatenate([scene.object.mesh.vertices, samples]))
+    gaps = [float(sample_sdf(solid.sdf, surface.to(solid.sdf.field))[0].min()) for solid in scene.obstacles]
     reached = [solid for solid, gap in zip(scene.obstacles, gaps, strict=True) if gap < hand_reach(hand) + RETREAT]
     if scene.support is None and not reached:
         return None

@@ -66,7 +66,7 @@ def make_obstacles(
         if len(seen) < settings.min_points or near.query(seen)[0].min() > reach:
             continue
         whole = _obstacle(seen, support, settings.padding)
-        at = torch.as_tensor(target.vertices).to(whole.sdf.field)
+        at = torch.as_tensor(near.data).to(whole.sdf.field)
         if not (sample_sdf(whole.sdf, at)[0] < -2 * settings.padding).any():
             found.append(whole)
             continue

@@ -8,9 +8,10 @@ import pytest
 import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from made_meshes import box_between
 from small_problem import small_problem
 
-from graspd_core import PlanConfig, Scene, draw_starts, hand_names, load_hand
+from graspd_core import PlanConfig, Scene, draw_starts, hand_names, load_hand, load_scene
 from graspd_core.config import ProblemConfig
 from graspd_core.hands.kinematics import RETREAT, forward, hand_mesh, in_base, link_poses, place_points
 from graspd_core.mesh.sdf import sample_sdf
@@ -51,6 +52,14 @@ def lowest(hand, posture: Posture, plane: Plane) -> float:
     rotation = rotation_from_quaternion(torch.as_tensor(posture.quaternion_wxyz)).numpy()
     vertices = hand_mesh(hand, posture.joint_positions).vertices @ rotation.T + posture.position
     return float((vertices @ plane.normal).min() - plane.offset)
+
+
+def test_an_obstacle_near_the_middle_of_a_large_face_is_in_reach(hand):
+    # A bar of 1.2 m has vertices only at its ends, farther from the wall than the hand reaches.
+    scene = beside(load_scene(box_between((-0.02, -0.6, -0.02), (0.02, 0.6, 0.02)), mass=0.3), 0.05)
+    obstacles = make_obstacle_tensors(scene, hand, "cpu", DOUBLE)
+    assert obstacles is not None
+    assert len(obstacles.sdfs) == 1
 
 
 @settings(max_examples=12)

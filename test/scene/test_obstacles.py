@@ -148,6 +148,14 @@ def test_what_touches_or_holds_the_object_is_not_the_object(scene):
     assert depth(found, *(0.5 * (low + high))) < -0.02, "the object's own place is free"
 
 
+def test_a_ring_about_the_middle_of_a_bar_leaves_the_bar_room():
+    bar = box_between((-0.02, -0.02, -0.6), (0.02, 0.02, 0.6))
+    turn, height = np.meshgrid(np.linspace(0, 2 * np.pi, 60, endpoint=False), np.linspace(-0.05, 0.05, 12))
+    ring = np.column_stack([0.12 * np.cos(turn.ravel()), 0.12 * np.sin(turn.ravel()), height.ravel()])
+    inside = [sample_sdf(n.sdf, torch.zeros(1, 3))[0].item() for n in make_obstacles([ring], None, bar, 0.3)]
+    assert min(inside) > 0.05
+
+
 def test_a_tray_in_one_piece_leaves_the_object_s_place_free(scene):
     low, high = scene.object.mesh.vertices.min(0), scene.object.mesh.vertices.max(0)
     centre, size = 0.5 * (low + high), high - low
