@@ -7,7 +7,6 @@ closes the file.
 
 from __future__ import annotations
 
-import hashlib
 import json
 import os
 import sqlite3
@@ -19,11 +18,10 @@ from functools import lru_cache
 from pathlib import Path
 from urllib.parse import quote
 
-from graspd_core.errors import ConfigError, FormatError, GraspdError, MeshError
+from graspd_core.errors import ConfigError, FormatError, GraspdError
 from graspd_core.hands.model import HandModel
 from graspd_core.io.grasps_json import grasps_of, result_document
-from graspd_core.mesh.mesh_files import content_hash
-from graspd_core.mesh.shapes import make_shape
+from graspd_core.mesh.shapes import source_hash
 from graspd_core.optimize.plan_config import PlanConfig
 from graspd_core.perception.load_scene import SHAPE_PREFIX
 from graspd_core.perception.scene import ObjectModel
@@ -95,23 +93,6 @@ def entry_of(target: ObjectModel, hand: HandModel, verify: str, name: str = "") 
 def absolute(source: str) -> str:
     """Return the absolute path of a mesh file. Return shape:NAME unchanged."""
     return source if source.startswith(SHAPE_PREFIX) else str(Path(source).resolve())
-
-
-def source_hash(source: str) -> str:
-    """Return the hash of a mesh file's content, or of a shape's mesh. Raises MeshError: the file cannot be read."""
-    if source.startswith(SHAPE_PREFIX):
-        return content_hash(make_shape(source.removeprefix(SHAPE_PREFIX)))
-    try:
-        found = os.stat(source)
-        return _file_hash(source, found.st_mtime_ns, found.st_size)
-    except OSError as error:
-        raise MeshError(f"{source}: {error.strerror or error}") from None
-
-
-@lru_cache(maxsize=4096)
-def _file_hash(path: str, changed: int, size: int) -> str:
-    with open(path, "rb") as file:
-        return hashlib.file_digest(file, "sha256").hexdigest()
 
 
 @lru_cache(maxsize=8)

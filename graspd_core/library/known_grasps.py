@@ -29,11 +29,11 @@ from graspd_core.library.grasp_library import (
     absolute,
     entry_of,
     hand_hash,
-    source_hash,
     strict_enough,
 )
 from graspd_core.mesh.mesh_files import surface_samples
 from graspd_core.mesh.sdf import sample_sdf
+from graspd_core.mesh.shapes import source_hash
 from graspd_core.optimize.loop import Poses
 from graspd_core.optimize.obstacle_distance import extreme_points, gap_on_path, make_obstacle_tensors
 from graspd_core.optimize.plan_config import PlanConfig, load_preset

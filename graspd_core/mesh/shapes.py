@@ -7,6 +7,7 @@ and the hammer (shaft and head) are overlapping closed bodies. The winding numbe
 from __future__ import annotations
 
 import hashlib
+import os
 from collections.abc import Callable, Sequence
 from functools import lru_cache
 from math import pi
@@ -185,14 +186,38 @@ def object_sources(sources: Sequence[str]) -> tuple[str, ...]:
     return tuple(found)
 
 
-@lru_cache
 def object_hash(source: str) -> str:
     """Return the SHA-256 of the content of a shape or a mesh file. Raises MeshError if shape or file does not exist."""
+    path = Path(source)
+    if not source.startswith("shape:") and not path.is_file():
+        raise MeshError(f"{path}: no such mesh file; valid: a file, or shape:NAME with {', '.join(sorted(SHAPES))}")
+    if not source.startswith("shape:") and path.suffix.lower().lstrip(".") not in MESH_ENDINGS:
+        raise MeshError(f"{path}: unknown mesh ending {path.suffix!r}; valid endings: {', '.join(MESH_ENDINGS)}")
+    return source_hash(source)
+
+
+def source_hash(source: str) -> str:
+    """Return the SHA-256 of a file's content, or of a shape's mesh. Raises MeshError: the file cannot be read."""
+    try:
+        return _content_hash(source, file_state(source))
+    except OSError as error:
+        raise MeshError(f"{source}: {error.strerror or error}") from None
+
+
+def file_state(path: str) -> tuple[int, ...]:
+    """Return numbers that differ if a file was changed or replaced. Return no numbers if there is no such file."""
+    try:
+        found = os.stat(path)
+    except OSError:
+        return ()
+    # A program can set back the time of writing, but not the time of the last change.
+    return found.st_ctime_ns, found.st_ino, found.st_size
+
+
+@lru_cache(maxsize=4096)
+def _content_hash(source: str, state: tuple[int, ...]) -> str:
+    del state
     if source.startswith("shape:"):
         return content_hash(make_shape(source.removeprefix("shape:")))
-    path = Path(source)
-    if not path.is_file():
-        raise MeshError(f"{path}: no such mesh file; valid: a file, or shape:NAME with {', '.join(sorted(SHAPES))}")
-    if path.suffix.lower().lstrip(".") not in MESH_ENDINGS:
-        raise MeshError(f"{path}: unknown mesh ending {path.suffix!r}; valid endings: {', '.join(MESH_ENDINGS)}")
-    return hashlib.sha256(path.read_bytes()).hexdigest()
+    with open(source, "rb") as file:
+        return hashlib.file_digest(file, "sha256").hexdigest()

@@ -1,6 +1,7 @@
 """Meshes: authored, read, refused, cut off, cleaned and measured."""
 
 import dataclasses
+import os
 import re
 import zlib
 from pathlib import Path
@@ -26,7 +27,7 @@ from graspd_core.mesh.mesh_files import (
     surface_samples,
     unit_advice,
 )
-from graspd_core.mesh.shapes import BOX_HALF, SHAPES, make_shape
+from graspd_core.mesh.shapes import BOX_HALF, SHAPES, make_shape, object_hash
 from graspd_core.mesh.topology import is_closed, is_oriented
 
 
@@ -267,6 +268,17 @@ def test_a_shape_has_the_volume_of_its_formula_and_needs_no_cleaning(name):
     # Its size suits a hand.
     assert 0.05 < np.ptp(mesh.vertices, axis=0).max() < 0.2
     assert np.abs((mesh.vertices.min(0) + mesh.vertices.max(0)) / 2).max() < 0.03
+
+
+def test_another_file_of_the_same_size_and_time_in_its_place_has_another_hash(tmp_path: Path):
+    path, other = tmp_path / "a.obj", tmp_path / "b.obj"
+    path.write_text("v 0 0 0")
+    other.write_text("v 1 0 0")
+    for file in (path, other):
+        os.utime(file, (0, 0))
+    before = object_hash(str(path))
+    other.replace(path)
+    assert object_hash(str(path)) != before
 
 
 def test_unknown_shape_lists_the_valid_ones():
