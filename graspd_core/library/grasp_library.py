@@ -21,7 +21,7 @@ from urllib.parse import quote
 from graspd_core.errors import ConfigError, FormatError, GraspdError
 from graspd_core.hands.model import HandModel
 from graspd_core.io.grasps_json import grasps_of, result_document
-from graspd_core.mesh.shapes import source_hash
+from graspd_core.mesh.shapes import file_state, source_hash
 from graspd_core.optimize.plan_config import PlanConfig
 from graspd_core.perception.load_scene import SHAPE_PREFIX
 from graspd_core.perception.scene import ObjectModel
@@ -42,7 +42,7 @@ class LibraryEntry:
 
     Attributes:
         name: name of the object. The default is the file's name, followed by the scale if the scale is not 1.
-        source: absolute path of the mesh file, or shape:NAME. Empty for a mesh without a file.
+        source: absolute path of the mesh file, or shape:NAME. Empty for a mesh without a file, or of a changed file.
         file_sha256: hash of the file's content. Empty for a mesh without a file.
         mesh_sha256: hash of the cleaned mesh in metres.
         scale: metres per unit of the file.
@@ -74,7 +74,9 @@ class LibraryEntry:
 def entry_of(target: ObjectModel, hand: HandModel, verify: str, name: str = "") -> LibraryEntry:
     """Return the library entry of a loaded object. An empty `name` becomes the name of the object's file."""
     shape = target.source.startswith(SHAPE_PREFIX)
-    source = absolute(target.source) if shape or Path(target.source).is_file() else ""
+    # If the file has changed since it was loaded, only the mesh identifies the object.
+    same = shape or (target.file_state and target.file_state == file_state(target.source))
+    source = absolute(target.source) if same else ""
     called = target.source.removeprefix(SHAPE_PREFIX) if shape else Path(target.source).stem
     return LibraryEntry(
         name=name or (called if target.scale == 1.0 else f"{called}@{target.scale:g}"),

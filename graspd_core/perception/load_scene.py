@@ -13,7 +13,7 @@ import torch
 from graspd_core.config import SceneConfig
 from graspd_core.errors import CloudError, MeshError
 from graspd_core.mesh.mesh_files import MESH_ENDINGS, read_mesh
-from graspd_core.mesh.shapes import make_shape
+from graspd_core.mesh.shapes import file_state, make_shape
 from graspd_core.perception.cloud.cloud_files import (
     CLOUD_ENDINGS,
     RECORDINGS,
@@ -65,7 +65,7 @@ def load_scene(
         CloudError: the cloud cannot be read or shows no object.
     """
     started = time.perf_counter()
-    given = "mesh" if isinstance(source, TriangleMesh) else str(source)
+    given, state = ("mesh", ()) if isinstance(source, TriangleMesh) else (str(source), file_state(str(source)))
     numbers = {"mass": mass, "friction": friction, "resolution": resolution}
     refuse_numbers(given, scale=scale, **numbers)
     mesh, views, warnings = None, (), ()
@@ -84,10 +84,13 @@ def load_scene(
 
         about = {"target": target, "alone": alone, "settings": settings, "source": given, "device": device}
         scene = scene_from_views(views, **about, **numbers)
-        return replace(scene, object=replace(scene.object, scale=scale, warnings=warnings + scene.object.warnings))
-    if target is not None:
+        scene = replace(scene, object=replace(scene.object, warnings=warnings + scene.object.warnings))
+    elif target is not None:
         raise MeshError(f"target: given with {given}, a mesh; valid with clouds of several objects")
-    return build_scene(mesh, source=given, scale=scale, device=device, started=started, warnings=warnings, **numbers)
+    else:
+        about = {"source": given, "scale": scale, "device": device, "started": started, "warnings": warnings}
+        scene = build_scene(mesh, **about, **numbers)
+    return replace(scene, object=replace(scene.object, scale=scale, file_state=state))
 
 
 def scaled_views(

@@ -117,6 +117,7 @@ class ObjectModel:
         radius: distance from the centre of mass to the farthest vertex [m].
         warnings: problems found in the input, one sentence each.
         reconstructed: whether the mesh was reconstructed from camera data.
+        file_state: `file_state` of the source when loading began. Empty if the source is no file.
     """
 
     source: str
@@ -132,6 +133,7 @@ class ObjectModel:
     warnings: tuple[str, ...]
     reconstructed: bool = False
     mass_assumed: bool = False
+    file_state: tuple[int, ...] = ()
 
     def at_mass(self, mass: float) -> ObjectModel:
         """Return the object with another mass [kg] and proportional inertia."""

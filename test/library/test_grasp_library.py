@@ -128,6 +128,21 @@ def test_another_process_may_create_the_library_at_the_same_time(tmp_path: Path,
     assert library.checked().names() == []
 
 
+def test_grasps_of_a_file_that_changed_after_loading_are_not_stored_under_its_new_content(
+    tmp_path: Path, library: GraspLibrary, planned: GraspResult, hand: HandModel
+):
+    path = tmp_path / "thing.obj"
+    save_mesh(path, make_shape("sphere"))
+    scene = load_scene(path, mass=0.2)
+    other = tmp_path / "other.obj"
+    save_mesh(other, make_shape("box"))
+    other.replace(path)
+    assert add_planned(library, scene, hand, load_preset("fast"), planned, "standard") == 4
+    with pytest.raises(ConfigError, match="is not in the library"):
+        entry_by_file(library, hand, path, 1.0, Physics(0.2, scene.object.friction))
+    assert len(known_grasps(library, scene, hand, count=4).grasps) == 4
+
+
 def test_what_is_added_stands_behind_what_was_there(library: GraspLibrary, planned: GraspResult, scene, hand):
     entry, before = stored(library, hand)
     bad = replace(planned.tried[0], trials=())
