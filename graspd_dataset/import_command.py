@@ -64,6 +64,8 @@ def run(options: argparse.Namespace) -> int:
         with busy("complete"):
             result = _result(scene, hand, imported, config, options.verify)
         path = options.out if single else options.out / f"{scene.object.sha256[:16]}.json"
+        if any(done["file"] == path for done in files):  # another mesh file has the same content
+            path = path.with_stem(f"{path.stem}-{len(files)}")
         save_result(path, result, scene.object, hand, config)
         status = status if result.tried else EXIT_TOO_FEW
         held = sum(grasp.verdict is Verdict.VERIFIED for grasp in result.tried)

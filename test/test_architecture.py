@@ -69,10 +69,10 @@ MAX_PACKAGE_LINES = {
     "graspd_core": 27_681,
     "graspd_ros": 5_325,
     "graspd_bench": 8_337,
-    "graspd_dataset": 3_053,
+    "graspd_dataset": 3_057,
     "graspd_viewer": 2_422,
     "graspd_cell": 3_799,
-    "test": 33_657,
+    "test": 33_673,
 }
 # Lines that a program reaches through its imports, those inside functions too.
 # The layout aims at 22,000 of the node.

@@ -18,6 +18,8 @@ from graspd_core import Posture, Verdict, load_grasps, load_hand, load_scene, pl
 from graspd_core.errors import FormatError
 from graspd_core.hands.kinematics import link_poses
 from graspd_core.hands.model import all_joint_names
+from graspd_core.mesh.mesh_files import save_mesh
+from graspd_core.mesh.shapes import make_shape
 from graspd_dataset.dataset_store import DatasetStore
 from graspd_dataset.export_grasps import qpos
 from graspd_dataset.foreign_grasps import STAGES, npy_dictionary, read_foreign
@@ -92,6 +94,18 @@ def test_a_pose_alone_is_closed_and_pressed(exported, tmp_path: Path, graspd, ca
         assert grasp.metrics is not None
     assert sum(grasp.verdict is Verdict.VERIFIED for grasp in back) >= len(back) // 2
     assert "verified" in capsys.readouterr().out
+
+
+def test_objects_of_equal_content_have_a_file_each(tmp_path: Path, graspd):
+    for number, name in enumerate("ab", 1):
+        (tmp_path / name).mkdir()
+        save_mesh(tmp_path / name / "box.obj", make_shape("box"))
+        poses = {"transforms": number * [np.eye(4).tolist()], "object_in_gripper": number * [False]}
+        document = {"object": {"file": "box.obj", "scale": 1.0}, "grasps": poses}
+        (tmp_path / name / "grasps.json").write_text(json.dumps(document))
+    graspd("import", tmp_path, "--hand", "allegro_right", "--preset", "fast", "--out", tmp_path / "out")
+    refused = [json.loads(path.read_text())["refused"] for path in (tmp_path / "out").iterdir()]
+    assert sorted(sum(counts.values()) for counts in refused) == [1, 2]
 
 
 def test_an_order_by_name_and_a_moved_object(exported, tmp_path: Path):
