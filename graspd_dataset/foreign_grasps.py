@@ -17,6 +17,7 @@ import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from io import BytesIO
+from os.path import isfile
 from pathlib import Path
 from typing import Any
 
@@ -129,9 +130,10 @@ def checked_order(order: Sequence[str], hand: HandModel) -> tuple[str, ...]:
 
 def find_beside(named: Any, file: Path, where: str) -> str:
     """Search `named` in the folders above `file`, nearest first, and return its path. Raises FormatError: not found."""
-    if isinstance(named, str) and named and "\0" not in named:
+    if isinstance(named, str) and named:
         for folder in file.resolve().parents:
-            if (folder / named).is_file():
+            # Path.is_file raises an error for a name that is too long.
+            if isfile(folder / named):
                 return str(folder / named)
     raise FormatError(f"{where}: object {short_repr(named)} is in no folder above the file; give --object MESH")
 
@@ -216,9 +218,9 @@ def plain_entry(values: dict[Any, Any], key: str, path: Path) -> Any:
 
 
 def _pose(values: Any, joints: int, where: str) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    size = np.shape(values)
-    if joints and len(size) == 1 and size[0] != 7 + joints:
-        raise FormatError(f"{where}: {size[0] - 7} joints; the joint order has {joints}")
+    size = len(values) if isinstance(values, np.ndarray) and values.ndim == 1 else 0
+    if joints and size > 7 and size != 7 + joints:
+        raise FormatError(f"{where}: {size - 7} joints; the joint order has {joints}")
     row = numbers_of(values, (7 + joints,), where)
     return row[:3], quaternion_of(row[3:7], where), row[7:]
 

@@ -243,7 +243,9 @@ CHANGES: dict[str, tuple[Callable[[dict[str, Any]], Any], str]] = {
     "length": (lambda v: v["grasp_qpos"].__setitem__(slice(3, 7), 0.1), "the quaternion has length 0.2"),
     "text": (lambda v: v.update(obj_scale="big"), "obj_scale: 'big'; expected a number of at most"),
     "objects": (lambda v: v.update(obj_pose=np.array([None] * 7)), "obj_pose: its array has type 'O8'"),
+    "ragged": (lambda v: v.update(grasp_qpos=[[1.0], [1.0, 2.0]]), "grasp_qpos.*expected 23 numbers"),
     "mesh": (lambda v: v.update(obj_path="/nowhere"), "--object MESH"),
+    "mesh of a long name": (lambda v: v.update(obj_path=300 * "x"), "--object MESH"),
 }
 
 
@@ -252,7 +254,7 @@ def test_a_wrong_entry_is_named(exported, tmp_path: Path, change: str):
     _, values = one_npy(exported)
     spoil, message = CHANGES[change]
     spoil(values)
-    mesh = None if change == "mesh" else "shape:mug"
+    mesh = None if change.startswith("mesh") else "shape:mug"
     with pytest.raises(FormatError, match=message) as caught:
         read_foreign(written(tmp_path, values), HAND, mesh=mesh)
     assert str(caught.value).startswith(f"{tmp_path / 'grasp.npy'}: ")
