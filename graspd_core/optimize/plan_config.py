@@ -187,7 +187,9 @@ def override(config: PlanConfig, changes: Mapping[str, Any]) -> PlanConfig:
         *sections, last = name.split(".")
         section = values
         for key in sections:
-            section = section.setdefault(key, {})
+            # A name below a number replaces the number, and `plan_config` refuses the mapping.
+            inner = section.get(key)
+            section[key] = section = inner if isinstance(inner, dict) else {}
         section[last] = value
     return plan_config(values, "settings")
 

@@ -12,7 +12,16 @@ import yaml
 
 from graspd_bench.rendering.depth_noise import NONE
 from graspd_bench.rendering.tabletop import ring_poses, tabletop, views_of
-from graspd_core import PinholeCamera, PlanConfig, PointCloud, Target, load_preset, preset_names, scene_from_views
+from graspd_core import (
+    PinholeCamera,
+    PlanConfig,
+    PointCloud,
+    Target,
+    load_preset,
+    override,
+    preset_names,
+    scene_from_views,
+)
 from graspd_core.config import SceneConfig, SegmentationConfig, from_mapping, load_scene_config
 from graspd_core.errors import ConfigError
 from graspd_core.perception.obstacles import make_obstacles
@@ -82,6 +91,12 @@ def test_a_bad_preset_file_is_named(tmp_path: Path, text: str, culprits: list[st
     message = str(caught.value)
     assert "\n" not in message
     assert all(part in message for part in ["bad.yaml", *culprits]), message
+
+
+@pytest.mark.parametrize("name", ["resolution", "method", "closed_form.weights.posture"])
+def test_a_name_below_a_value_is_refused(name: str):
+    with pytest.raises(ConfigError, match=rf"settings.{name}: .*'deeper': 3"):
+        override(load_preset("fast"), {f"{name}.deeper": 3})
 
 
 def test_a_file_that_is_no_text_is_named(tmp_path: Path):
