@@ -99,7 +99,7 @@ class Planned:
 class _Run:
     object_key: str
     frame: str
-    T_frame_object: Matrix | None
+    T_frame_object: Matrix
     terms: tuple[str, str, bool]
     planned: Planned
 
@@ -114,9 +114,12 @@ class RecentRuns:
     def __init__(self) -> None:
         self._runs: OrderedDict[str, _Run] = OrderedDict()
 
-    def keep(self, request: Request, planned: Planned) -> None:
-        """Store a result under the id of its request, so that later requests can exclude its grasps."""
-        about = request.object_key, request.frame, request.T_frame_object, _terms(request)
+    def keep(self, request: Request, planned: Planned, T_out_object: Matrix) -> None:
+        """Store a result under the id of its request, so that later requests can exclude its grasps.
+
+        Grasps are placed in the answer's frame by `T_out_object` [m], because the frame of a camera may move.
+        """
+        about = request.object_key, request.frame_out, T_out_object, _terms(request)
         self._runs[request.id] = _Run(*about, planned)
         while len(self._runs) > MOST_RUNS:
             self._runs.popitem(last=False)
@@ -131,8 +134,7 @@ class RecentRuns:
             run, grasp = self._grasp(name)
             pose = matrix_of_posture(grasp.grasp)
             if run.object_key != request.object_key or not request.object_key:
-                placed = pose if run.T_frame_object is None else run.T_frame_object @ pose
-                pose = request.to_object(run.frame, placed, lookup)
+                pose = request.to_object(run.frame, run.T_frame_object @ pose, lookup)
             poses.append(pose)
         return poses + [request.to_object(frame, pose, lookup) for frame, pose in request.exclude_poses]
 
@@ -145,7 +147,8 @@ class RecentRuns:
         for row, name in enumerate(request.exclude):
             run = self._grasp(name)[0]
             for place, _ in run.planned.objects[:1]:
-                places[row] = request.to_object(run.frame, matrix_of(place, (1.0, 0.0, 0.0, 0.0)), lookup)[:3, 3]
+                placed = run.T_frame_object @ matrix_of(place, (1.0, 0.0, 0.0, 0.0))
+                places[row] = request.to_object(run.frame, placed, lookup)[:3, 3]
         grasps = _postures(excluded)
         return [Failure(place, grasp) for place, grasp in zip(places, grasps, strict=True)]
 
@@ -277,7 +280,7 @@ class Planner:
             place = lambda grasp: grasp if T_out_object is None else moved_grasp(grasp, T_out_object)  # noqa: E731
             moved = lambda progress: report(_with_found(progress, place))  # noqa: E731
             planned = self._search(request, excluded, reach, stop, moved)
-        self._runs.keep(request, planned)
+        self._runs.keep(request, planned, np.eye(4) if T_out_object is None else T_out_object)
         best, surface = next(iter(planned.result.tried), None), planned.surface
         held = None if surface is None or best is None or not best.usable else held_hull(surface, best.grasp)
         planned = replace(planned, held=held)

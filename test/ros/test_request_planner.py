@@ -34,6 +34,12 @@ def never() -> bool:
     return False
 
 
+def translation(x: float) -> np.ndarray:
+    pose = np.eye(4)
+    pose[0, 3] = x
+    return pose
+
+
 def test_a_request_is_steered_and_earlier_runs_do_not_answer_it(hand):
     plans, scene = planner(hand), load_scene("shape:bottle")
     asked = replace(request(lambda: scene), id="free", object_key="bottle")
@@ -191,6 +197,21 @@ def test_lost_grasps_are_placed_where_the_camera_stood_when_it_saw(hand):
     for one in (mesh, cloud):
         Planner(hand, lookup).plan(one, never, lambda _: None)
     assert asked == [("object", "map", 0), ("object", "map", 7)]
+
+
+def test_an_excluded_id_stays_where_it_was_answered_though_the_camera_moved_since(hand):
+    T_world_camera = {1: translation(0.0), 2: translation(1.0)}
+
+    def lookup(target: str, source: str, stamp: Time, stop) -> np.ndarray:
+        pose = T_world_camera[stamp.sec]
+        return pose if target == "world" else np.linalg.inv(pose)
+
+    settings, plans = replace(SETTINGS, output_frame="world", verify="none"), Planner(hand, lookup)
+    cloud = replace(request(lambda: load_scene("shape:sphere"), settings), region_points=lambda: np.zeros((0, 3)))
+    first = plans.plan(replace(cloud, stamp=Time(sec=1)), never, lambda _: None).result.tried[0]
+    again = replace(cloud, id="again", stamp=Time(sec=2), exclude=("r/0",))
+    (excluded,) = plans._runs.excluded(again, lambda target, source: lookup(target, source, again.stamp, never))
+    np.testing.assert_allclose(T_world_camera[2] @ excluded, matrix_of_posture(first.grasp), atol=1e-9)
 
 
 def test_a_result_file_that_cannot_be_written_costs_no_grasp(hand, tmp_path):
