@@ -294,6 +294,14 @@ def _of_their_types(parameters: list[Parameter]) -> list[Parameter]:
     return kept
 
 
+# Valid QoS overrides by policy. For other values, rclpy ends the node with a traceback.
+_QOS = {
+    "reliability": ("reliable", "best_effort", "best_available", "system_default"),
+    "history": ("keep_last", "keep_all", "system_default"),
+    "depth": range(2**31),
+}
+
+
 def check_parameters(parameters: list[Parameter]) -> SetParametersResult:
     """Return whether all values are valid, and the reason if not. ROS checks types and ranges not checked here."""
     try:
@@ -306,8 +314,12 @@ def check_parameters(parameters: list[Parameter]) -> SetParametersResult:
 
 def _check_value(name: str, value: Any) -> None:
     setting = Settings.__dataclass_fields__.get(name)
-    if setting is None:
-        return  # a parameter that ROS adds to every node
+    if setting is None:  # a parameter that ROS adds to every node
+        valid = _QOS.get(name.rpartition(".")[2], ()) if name.startswith("qos_overrides.") else ()
+        if valid and (value.lower() if isinstance(value, str) else value) not in valid:
+            text = f"{valid[0]} to {valid[-1]}" if isinstance(valid, range) else ", ".join(valid)
+            raise ConfigError(f"parameter {name}: {value!r}; valid: {text}")
+        return
     choices, check, value = setting.metadata["choices"], setting.metadata["check"], _word(setting, value)
     if _is_number(setting) and not _is_number_like(value):
         raise ConfigError(f"parameter {name}: {value!r} is no number; valid: a number such as 1.0")

@@ -7,6 +7,7 @@ from collections.abc import Callable, Iterator
 from typing import Any
 
 import pytest
+from rclpy.exceptions import InvalidParameterValueException
 from rclpy.executors import Executor, SingleThreadedExecutor
 from rclpy.node import Node
 from rclpy.qos import DurabilityPolicy, ReliabilityPolicy
@@ -14,6 +15,7 @@ from sensor_msgs.msg import CameraInfo, CompressedImage, Image, PointCloud2
 
 from graspd_ros.inputs import sensor_topics
 from graspd_ros.inputs.sensor_topics import SensorTopic
+from graspd_ros.parameters import LiveSettings
 
 pytestmark = pytest.mark.timeout(300)
 LARGE = 1_200_000  # bytes of a cloud that Fast DDS' shared memory of 512 KB does not hold
@@ -161,6 +163,15 @@ def test_what_somebody_asks_for_by_a_parameter_stays(make_node, domain: int, pub
     publish("PointCloud2", "/points", "RELIABLE", asked="BEST_EFFORT", count=5)
     watch(node, [topic], lambda told: heard)
     assert topic._qos.reliability is ReliabilityPolicy.BEST_EFFORT
+
+
+@pytest.mark.parametrize(("policy", "value"), [("reliability", "certain"), ("history", "unknown"), ("depth", "-3")])
+def test_an_invalid_qos_override_is_named_with_the_valid_values(make_node, domain: int, policy: str, value: str):
+    name = f"qos_overrides./points.subscription.{policy}"
+    node = make_node("-p", f"{name}:={value}", domain=domain)
+    LiveSettings(node)
+    with pytest.raises(InvalidParameterValueException, match=f"{name}: '?{value}'?; valid: "):
+        SensorTopic(node, PointCloud2, "points", print)
 
 
 def test_packed_images_are_heard_where_nobody_sends_plain_ones(node: Node, publish: Start):
