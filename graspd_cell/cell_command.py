@@ -127,7 +127,7 @@ def _many_picks(options: argparse.Namespace, arm: Arm, hand: HandModel) -> int:
     The first bin has the seed `--seed`. Each later bin has the next seed. Return the exit status.
     """
     from graspd_cell.grasp_source import InProcessGrasps
-    from graspd_cell.picker import Attempt, Ending, Picker, summary
+    from graspd_cell.picker import Attempt, Cancelled, Ending, Picker, summary
 
     attempts, memory, ended = list[Attempt](), list[float](), Counter[str]()
     with Interrupt() as interrupt:
@@ -143,7 +143,7 @@ def _many_picks(options: argparse.Namespace, arm: Arm, hand: HandModel) -> int:
                     if attempt.ending is not Ending.PICKED:
                         print(f"bin {number}, attempt {attempt.number}: {attempt.ending}: {attempt.reason}", flush=True)
             except GraspdError as error:
-                ended["the arm stayed where it was"] += 1
+                ended["the arm stayed where it was"] += not isinstance(error, Cancelled)
                 print(f"bin {number}: {error}", flush=True)
             memory.append(resident_mb())
     ended += Counter(str(attempt.ending) for attempt in attempts)

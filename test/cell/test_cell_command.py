@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from graspd_cell import cell_command
+from graspd_cell import cell_command, picker
 from graspd_cell.cell_view import FRAMES, Film, LiveCell
 from graspd_cell.simulated_robot import SimulatedRobot
 from graspd_core.errors import ConfigError
@@ -47,6 +47,18 @@ def test_an_empty_bin_is_filled_again_until_there_were_enough_picks(capsys: pyte
     assert all(line.startswith(("bin 1, attempt 1: ", "bin 2, attempt 1: ")) for line in failures)
     assert sum(int(part.rpartition(": ")[2]) for part in endings.split("; ")) == 2
     assert re.search(r"things in 2 attempts; .*; 2 bins; \d+ MB after the first bin, \d+ MB after the last", last)
+
+
+def test_ctrl_c_is_no_failure_of_the_arm(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]):
+    def cancelled(*_: object):
+        raise picker.Cancelled("cancelled")
+
+    monkeypatch.setattr(picker.Picker, "empty_the_bin", cancelled)
+    words = ("--hand", "parallel_gripper", "--things", "shape:box", "--count", "1", "--picks", "1")
+    cell_command.run(_options(*words))
+    said = capsys.readouterr().out
+    assert "bin 1: cancelled" in said
+    assert "the arm stayed where it was" not in said
 
 
 @pytest.mark.parametrize(
