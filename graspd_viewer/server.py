@@ -96,12 +96,23 @@ def start_server(host: str, port: int) -> Any:
             probe.bind((host, 0))
     except OSError as error:
         raise ConfigError(f"host: {host!r}: {error.strerror or error}; use 127.0.0.1 for this machine only") from None
+    # Without a free port, viser's thread would end with an error, and its constructor would wait for ever.
+    if not any(_is_free(family, host, free) for free in range(port, 65536)):
+        raise ConfigError(f"port: {port}; no port from {port} to 65535 is free; valid: a lower port, or 0")
     with quiet():
         server = viser.ViserServer(host=host, port=port, label="graspd", verbose=False)
     _refuse_strangers(server, host)
     _refuse_tunnels(server)
     _limit_uploads(server)
     return server
+
+
+def _is_free(family: int, host: str, port: int) -> bool:
+    with contextlib.suppress(OSError), socket.socket(family) as probe:
+        probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+        probe.bind((host, port))
+        return True
+    return False
 
 
 def name_tab(server: Any, title: str) -> None:

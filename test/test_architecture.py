@@ -70,9 +70,9 @@ MAX_PACKAGE_LINES = {
     "graspd_ros": 5_340,
     "graspd_bench": 8_337,
     "graspd_dataset": 3_057,
-    "graspd_viewer": 2_422,
+    "graspd_viewer": 2_433,
     "graspd_cell": 3_799,
-    "test": 33_732,
+    "test": 33_741,
 }
 # Lines that a program reaches through its imports, those inside functions too.
 # The layout aims at 22,000 of the node.

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import socket
 import threading
 import time
 from collections.abc import Callable
@@ -23,6 +24,14 @@ from graspd_viewer.server import may_connect
 viser = pytest.importorskip("viser", reason="viser is not installed: pip install 'graspd[view]'")
 
 GOOD = PlanRequest("box", None, "m", False, "parallel_gripper", "fast", 0.6, 2)
+
+
+def test_a_last_port_that_is_in_use_is_named():
+    with socket.socket() as busy:
+        busy.bind(("127.0.0.1", 65535))
+        busy.listen()
+        with pytest.raises(ConfigError, match="port: 65535; no port from 65535 to 65535 is free"):
+            viewer_server.start_server("127.0.0.1", 65535)
 
 
 @pytest.mark.parametrize(
