@@ -69,7 +69,7 @@ def answer_known(
         grasps = unlike(library.grasps(entry, hand), excluded)[:count]
         if len(grasps) >= count:
             found = library_result(library, grasps, count, time.perf_counter() - began)
-            return replace(found, mass=entry.mass), None
+            return replace(found, mass=entry.mass, tried_mass=entry.mass), None
     scene = request.load()
     plan |= {"deadline": max(request.time_left(), 1e-3), "count": count}
     plan |= {"verify": settings.verify, "restrictions": restrictions}

@@ -202,20 +202,34 @@ def known_grasps(
     check_request(count=count, seed=0, verify=verify, deadline=None, device="cpu")
     bound = BoundRestrictions(tuple(one.bind(scene, hand) for one in restrictions))
     entries = library.of_mesh(entry_of(scene.object, hand, verify), any_mass=scene.object.mass_assumed)
-    stored = [grasp for entry in entries for grasp in library.grasps(entry, hand)]
-    admitted, refused = bound.admit(tuple(wanted(stored)))
-    good: list[Grasp] = []
-    for grasp, reason in _held(scene, hand, admitted, verify, stop or (lambda: False)):
-        if reason:
-            refused[reason] += 1
-            continue
-        good.append(grasp)
+    good, masses, refused = list[Grasp](), list[float](), Counter[str]()
+    # Entries with strict trials and heavy objects come first, so that the others are used only if needed.
+    for entry in entries:
+        admitted, more = bound.admit(tuple(wanted(library.grasps(entry, hand))))
+        refused.update(more)
+        for grasp, reason in _held(scene, hand, admitted, verify, stop or (lambda: False)):
+            if reason:
+                refused[reason] += 1
+                continue
+            good.append(grasp)
+            masses.append(entry.mass)
+            if len(good) == count:
+                break
         if len(good) == count:
             break
-    refusals = restrictions_in_words(bound, refused, len(good), len(admitted)) if refused else ""
+    refusals = restrictions_in_words(bound, refused, len(good), 0) if refused else ""
     result = library_result(library, good, count, time.perf_counter() - began)
-    message = "; ".join(filter(None, (result.message, refusals)))
-    return replace(result, message=message, refused=refused, warnings=(*scene.object.warnings, *hand.named_warnings))
+    tried = _least_mass(scene, masses)
+    lighter = f"tried at {tried['mass']:.2g} kg" if tried["mass"] else ""
+    message = "; ".join(filter(None, (result.message, lighter, refusals)))
+    warnings = (*scene.object.warnings, *hand.named_warnings)
+    return replace(result, message=message, refused=refused, warnings=warnings, **tried)
+
+
+def _least_mass(scene: Scene, masses: Sequence[float]) -> dict[str, float | None]:
+    """Return the fields `mass` and `tried_mass` of a result whose grasps were tried at these masses [kg]."""
+    least = min(masses, default=None)
+    return {"tried_mass": least, "mass": least if least is not None and least < scene.object.mass else None}
 
 
 def library_result(library: GraspLibrary, grasps: Sequence[Grasp], count: int, seconds: float) -> GraspResult:
@@ -279,6 +293,7 @@ def known_or_planned(
         message="; ".join(filter(None, (counts, why))),
         warnings=warnings,
         refused=Counter(known.refused) + Counter(planned.refused),
+        **_least_mass(scene, [mass for mass in (known.tried_mass, planned.tried_mass) if mass is not None]),
     )
 
 

@@ -400,6 +400,18 @@ def test_of_an_unknown_mass_the_heaviest_are_given_first(library, scene, hand, p
     assert found == sorted([*masses, 0.1], reverse=True)
 
 
+def test_of_an_unknown_mass_the_least_mass_in_the_trials_is_told(library, scene, hand, planned):
+    heavy, unknown = load_scene("shape:sphere", mass=0.8).object, load_scene("shape:sphere")
+    library.add(entry_of(heavy, hand, "standard"), heavy, hand, load_preset("fast"), planned.tried[:2])
+    found = known_grasps(library, unknown, hand, count=2)
+    assert (found.mass, found.tried_mass) == (None, 0.8)
+    # The other grasps of the library were tried at 0.1 kg.
+    for found in (known_grasps(library, unknown, hand, count=3), known_or_planned(library, unknown, hand, count=3)):
+        assert (found.mass, found.tried_mass, len(found.grasps)) == (0.1, 0.1, 3)
+        assert "tried at 0.1 kg" in found.message
+    assert known_grasps(library, scene, hand).tried_mass == scene.object.mass
+
+
 @pytest.mark.parametrize(
     ("asked", "told"),
     [({"deadline": -1.0}, "deadline: -1.0 s"), ({"seed": -1}, "seed: -1"), ({"device": "tpu"}, "device: 'tpu'")],
