@@ -128,6 +128,7 @@ def write_dexgraspbench(
 ) -> None:
     """Write the grasps of one hand on one object. Also write the object: mesh, convex parts, mass and centre of mass.
 
+    The mass is the least in the trials of these grasps, because blocks may have tried one object at different masses.
     Grasp files name the object folder by the path `objects`. DexGraspBench looks for this path in its code folder.
     """
     name = rows[0]["object_sha256"]
@@ -138,7 +139,7 @@ def write_dexgraspbench(
         np.save(buffer, np.array(grasp, dtype=object), allow_pickle=True)
         save_bytes(out / row["hand_name"] / name / f"{number}.npy", buffer.getvalue())
     folder = out / "objects" / name
-    model = load_scene(mesh, mass=rows[0]["mass"]).object
+    model = load_scene(mesh, mass=min(row["mass"] for row in rows)).object
     values = {"mass": model.mass, "density": model.mass / model.volume, "scale": 1.0}
     values["gravity_center"] = model.center_of_mass.tolist()
     save_text(folder / "info" / "simplified.json", json.dumps(values, indent=1) + "\n")

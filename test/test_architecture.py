@@ -69,10 +69,10 @@ MAX_PACKAGE_LINES = {
     "graspd_core": 27_698,
     "graspd_ros": 5_340,
     "graspd_bench": 8_337,
-    "graspd_dataset": 3_057,
+    "graspd_dataset": 3_058,
     "graspd_viewer": 2_433,
     "graspd_cell": 3_799,
-    "test": 33_753,
+    "test": 33_762,
 }
 # Lines that a program reaches through its imports, those inside functions too.
 # The layout aims at 22,000 of the node.

@@ -9,9 +9,10 @@ import pyarrow as pa
 import yaml
 from menagerie_like import menagerie_like
 
-from graspd_core import load_hand, load_mesh
+from graspd_core import load_hand, load_mesh, make_shape
 from graspd_core.hands.kinematics import link_poses
 from graspd_dataset.dataset_store import DatasetStore, parquet_bytes
+from graspd_dataset.export_grasps import write_dexgraspbench
 from graspd_dataset.foreign_grasps import read_foreign
 from graspd_dataset.inspect_dataset import tables_of
 
@@ -117,6 +118,14 @@ def test_dexgraspbench_has_every_finger_where_it_was(allegro: DatasetStore, tmp_
     assert np.allclose(
         np.ptp(np.concatenate([part.vertices for part in parts]), axis=0), np.ptp(whole.vertices, axis=0), atol=0.003
     )
+
+
+def test_dexgraspbench_gets_the_least_mass_in_the_trials(allegro: DatasetStore, tmp_path: Path):
+    light, heavy = ({**rows_of(allegro)[0], "mass": mass} for mass in (0.2, 0.5))
+    for name, rows in (("light first", [light, heavy]), ("heavy first", [heavy, light])):
+        write_dexgraspbench(rows, make_shape("mug"), tmp_path / name)
+        (about,) = (tmp_path / name).rglob("simplified.json")
+        assert json.loads(about.read_text())["mass"] == 0.2
 
 
 def test_grasps_of_two_hands_of_one_name_are_not_mixed(copied: DatasetStore, tmp_path: Path, graspd, capsys):
