@@ -56,6 +56,12 @@ def test_rows_follow_the_arms_path_and_the_three_postures_in_the_order_of_the_ga
     assert made.rows_to("lifted") == slice(gates["squeezed"], len(made.times))
 
 
+@pytest.mark.parametrize("speeds", [[0.5, 0.0, 2.0], [0.5, np.nan, 2.0], [0.5, 1.0], [0.5, -1.0, 2.0]])
+def test_speeds_that_no_motion_can_have_are_refused(speeds: list[float]):
+    with pytest.raises(ConfigError, match=r"arm_speeds: .*; valid: one positive number for each of a, b, c"):
+        execution_of(reached_grasp(), HAND, arm_speeds=np.array(speeds))
+
+
 def test_joints_press_within_their_limits_and_only_once_the_hand_is_closed():
     made = execution_of(reached_grasp(), HAND, arm_speeds=SPEEDS)
     assert not made.efforts[: made.gates[1] + 1].any()
