@@ -103,9 +103,7 @@ def scaled_views(
         return [load_depth_view(source, camera, None if scale == 1.0 else scale)]
     if is_depth_image(source):
         raise CloudError(f"{source}: a depth image needs the camera that took it: --camera camera.json")
-    place = None if view_point is None else np.asarray(view_point, dtype=float) / scale
-    views = load_views(source, place)
-    return [replace(view, points=view.points * scale, viewpoint=view.viewpoint * scale) for view in views]
+    return list(load_views(source, None if view_point is None else np.asarray(view_point, dtype=float), scale))
 
 
 def _read_mesh(source: str | Path | TriangleMesh, scale: float) -> tuple[TriangleMesh, tuple[str, ...]]:

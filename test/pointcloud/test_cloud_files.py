@@ -11,6 +11,7 @@ from graspd_core.mesh.mesh_files import save_mesh, surface_samples
 from graspd_core.mesh.shapes import SPHERE_RADIUS, make_shape
 from graspd_core.perception.cloud.camera import PinholeCamera
 from graspd_core.perception.cloud.cloud_files import is_cloud_file, load_views
+from graspd_core.perception.load_scene import scaled_views
 
 MATRIX = np.array([[150.0, 0, 79.5], [0, 150.0, 59.5], [0, 0, 1]])
 LENS = (0.1, -0.2, 0.001, -0.001, 0.05)
@@ -82,6 +83,17 @@ def test_depth_images_with_poses_are_views_of_one_scene(tmp_path, unit):
         assert len(distance) > 300
         assert view.viewpoint == pytest.approx(eye)
         assert view.forward == pytest.approx(-np.array(eye) / np.linalg.norm(eye))
+
+
+@pytest.mark.parametrize(("pixels", "scale"), [(1000.0, 1e-3), (4000.0, 0.25e-3)])
+@pytest.mark.parametrize("dtype", [float, np.uint16])
+def test_a_scale_is_the_unit_of_depth_and_not_of_the_cameras_poses(tmp_path, pixels: float, scale: float, dtype: type):
+    np.savez(tmp_path / "m.npz", depths=spheres(), K=MATRIX, poses=POSES)
+    np.savez(tmp_path / "unit.npz", depths=np.rint(pixels * spheres()).astype(dtype), K=MATRIX, poses=POSES)
+    others = scaled_views(tmp_path / "unit.npz", None, scale)
+    for metres, other in zip(load_views(tmp_path / "m.npz"), others, strict=True):
+        np.testing.assert_allclose(other.viewpoint, metres.viewpoint)
+        np.testing.assert_allclose(other.points, metres.points, atol=1e-3)
 
 
 def test_one_depth_image_needs_no_pose(tmp_path):

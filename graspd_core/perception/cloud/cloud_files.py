@@ -8,8 +8,9 @@ Cloud Library).
 from __future__ import annotations
 
 import re
-from collections.abc import Mapping
-from dataclasses import dataclass, field
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field, replace
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -189,10 +190,11 @@ def is_cloud_file(path: str | Path) -> bool:
     return ending in CLOUD_ENDINGS
 
 
-def load_views(path: str | Path, viewpoint: Vector | None = None) -> tuple[PointCloud, ...]:
+def load_views(path: str | Path, viewpoint: Vector | None = None, scale: float = 1.0) -> tuple[PointCloud, ...]:
     """Read the views of one or several cameras from a file, in one frame.
 
     For a file of points, `viewpoint` [m] replaces the camera's position in the file. It is not valid with depth.
+    `scale` is in metres per unit of points and viewpoint, or per unit of depth. 1 means the units below. Poses stay.
 
     * ply, xyz, npy (n×3 or h×w×3): points [m], seen from the origin.
     * pcd: points [m], seen from its `VIEWPOINT`. The format does not give the camera's direction.
@@ -215,16 +217,21 @@ def load_views(path: str | Path, viewpoint: Vector | None = None) -> tuple[Point
     if ending not in CLOUD_ENDINGS:
         raise CloudError(f"{path}: unknown cloud ending {path.suffix!r}; valid endings: {', '.join(CLOUD_ENDINGS)}")
     if ending not in ("npy", "npz"):
-        return (_read_points(path, ending, viewpoint),)
+        return (_scaled(partial(_read_points, path, ending), viewpoint, scale),)
     arrays = read_numpy(path)
     try:
         if "depth" in arrays or "depths" in arrays:
             if viewpoint is not None:
                 raise CloudError("view_point: given with depth, which has its own camera pose; valid with points")
-            return _depth_views(arrays)
-        return (_points_view(arrays, viewpoint),)
+            return _depth_views(arrays, scale)
+        return (_scaled(partial(_points_view, arrays), viewpoint, scale),)
     except CloudError as error:
         raise CloudError(f"{path}: {error}") from None
+
+
+def _scaled(read: Callable[[Vector | None], PointCloud], viewpoint: Vector | None, scale: float) -> PointCloud:
+    view = read(None if viewpoint is None else np.asarray(viewpoint, dtype=float) / scale)
+    return replace(view, points=view.points * scale, viewpoint=view.viewpoint * scale)
 
 
 def recording_told(path: Path) -> str:
@@ -258,7 +265,7 @@ def _points_view(arrays: Mapping[str, np.ndarray], said: Vector | None) -> Point
     return seen_from(pixels, viewpoint, forward)
 
 
-def _depth_views(arrays: Mapping[str, np.ndarray]) -> tuple[PointCloud, ...]:
+def _depth_views(arrays: Mapping[str, np.ndarray], scale: float) -> tuple[PointCloud, ...]:
     several = "depths" in arrays
     name, place = ("depths", "poses") if several else ("depth", "T_world_camera")
     for needed in ("K", place) if several else ("K",):
@@ -281,13 +288,15 @@ def _depth_views(arrays: Mapping[str, np.ndarray]) -> tuple[PointCloud, ...]:
     views = []
     for index, image in enumerate(images):
         pose = None if poses is None else rigid(poses[index], place)
-        views.append(cloud_from_depth(_metres(image, name), camera, pose))
+        views.append(cloud_from_depth(_metres(image, name, scale), camera, pose))
     return tuple(views)
 
 
-def _metres(image: np.ndarray, name: str) -> Float[np.ndarray, "height width"]:
+def _metres(image: np.ndarray, name: str, scale: float) -> Float[np.ndarray, "height width"]:
     if image.dtype.kind in "iu" and image.dtype.itemsize < 2:
         raise CloudError(f"{name!r} holds {image.dtype}: cut to 8 bits; 16 bits (mm) or floats (m) are needed")
+    if scale != 1.0 and image.dtype.kind in "iuf":
+        image = image.astype(float) * scale
     if image.dtype.kind in "iu":
         return depth_in_metres(image.astype(float).clip(0, 2**16 - 1).astype(np.uint16), "16UC1")
     if image.dtype.kind == "f":
