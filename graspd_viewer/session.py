@@ -60,7 +60,7 @@ def open_grasps(path: Path, *, object_source: str | None = None, hand: str | Non
         GraspdError: `object_source` cannot be read.
     """
     document = load_document(path)
-    grasps = grasps_of(document)
+    grasps = grasps_of(document, str(path))
     model = _hand_of(document, path, hand)
     config = plan_config(document.get("config") or {}, f"{path}: config")
     scene, seen, notes = _object_of(document, path, object_source, config)

@@ -135,7 +135,7 @@ def run_bench(case: BenchCase) -> Record:
     if case.grasps:
         document = load_document(case.grasps)
         scene = load_scene(case.object, mass=MASS, scale=float(document["object"].get("scale", 1.0)))
-        grasps = grasps_of(document)
+        grasps = grasps_of(document, case.grasps)
     else:
         scene = load_scene(case.object, mass=MASS, resolution=config.resolution)
         grasps = plan_grasps(scene, hand, count=case.count, seed=case.seed, preset=config, measure=False).tried

@@ -184,7 +184,7 @@ def load_grasps(path: str | Path) -> tuple[Grasp, ...]:
     Raises:
         FormatError: the file is missing, has another format or version, or holds a malformed grasp.
     """
-    return grasps_of(load_document(path))
+    return grasps_of(load_document(path), str(path))
 
 
 def load_document(path: str | Path) -> dict[str, Any]:
@@ -204,8 +204,8 @@ def load_document(path: str | Path) -> dict[str, Any]:
     return document
 
 
-def grasps_of(document: dict[str, Any]) -> tuple[Grasp, ...]:
-    """Return the grasps of a document that `load_document` read, in rank order.
+def grasps_of(document: dict[str, Any], where: str = "grasps") -> tuple[Grasp, ...]:
+    """Return the grasps of a document that `load_document` read, in rank order. `where` begins the error messages.
 
     The squeeze posture gets the base pose of the grasp posture. Postures hold actuated joints only. Unknown metrics are
     ignored. Raises FormatError: a grasp lacks a key, or a value has the wrong type or is not finite.
@@ -218,10 +218,10 @@ def grasps_of(document: dict[str, Any]) -> tuple[Grasp, ...]:
         upgrade = _from_version_1 if document.get("version") == 1 else dict
         return tuple(_grasp_of(upgrade(values), actuated) for values in document["grasps"])
     except KeyError as error:
-        raise FormatError(f"grasps: a grasp lacks the key {short_repr(error.args[0])}") from None
+        raise FormatError(f"{where}: a grasp lacks the key {short_repr(error.args[0])}") from None
     # A JSON number may be too large for a float.
     except (AttributeError, TypeError, ValueError, OverflowError) as error:
-        raise FormatError(f"grasps: {' '.join(str(error).split())[:300]}") from None
+        raise FormatError(f"{where}: {' '.join(str(error).split())[:300]}") from None
 
 
 def _grasp_of(values: dict[str, Any], actuated: Bool[np.ndarray, "movable"]) -> Grasp:

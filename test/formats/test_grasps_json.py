@@ -15,7 +15,7 @@ import trimesh
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from graspd_core import METRICS, PlanConfig, load_hand, load_scene, make_shape
+from graspd_core import METRICS, PlanConfig, load_grasps, load_hand, load_scene, make_shape
 from graspd_core.errors import ConfigError, FormatError
 from graspd_core.hands.model import Mount
 from graspd_core.io.grasps_json import check_writable, grasps_of, load_document, result_document, save_result
@@ -33,6 +33,7 @@ from graspd_core.types import (
     Verdict,
 )
 from graspd_viewer.grasp_page import placed_hand, save_view
+from graspd_viewer.session import open_grasps
 
 VERSION_1 = Path(__file__).parent / "data" / "grasps_v1.json"
 
@@ -254,10 +255,13 @@ def test_a_file_from_before_joints_could_be_coupled_is_read(document, result):
     assert np.array_equal(grasps_of(document)[0].grasp.joint_positions, result.tried[0].grasp.joint_positions)
 
 
-def test_too_few_joint_values_are_refused(document):
+def test_too_few_joint_values_are_refused_with_the_files_name(document, tmp_path: Path):
     document["grasps"][0]["squeeze_joint_positions"].pop()
-    with pytest.raises(FormatError, match="squeeze_joint_positions: 15 values; expected 16"):
-        grasps_of(document)
+    path = tmp_path / "odd.json"
+    path.write_text(json.dumps(document))
+    for read in (load_grasps, open_grasps):
+        with pytest.raises(FormatError, match=r"odd\.json: squeeze_joint_positions: 15 values; expected 16"):
+            read(path)
 
 
 # Half a turn about z: x and y change sign.
