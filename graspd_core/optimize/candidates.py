@@ -22,7 +22,7 @@ from graspd_core.optimize.grasp_postures import (
     settle,
     squeeze,
 )
-from graspd_core.optimize.loop import Hooks, Poses
+from graspd_core.optimize.loop import Hooks, Poses, pack
 from graspd_core.optimize.obstacle_distance import gap_on_path
 from graspd_core.optimize.plan_config import PlanConfig, method_row
 from graspd_core.optimize.problem import Problem, build_problem
@@ -120,9 +120,11 @@ def expected_to_hold(grasps: Sequence[Grasp]) -> float:
 
 def _searched(task: PlannerInput) -> Candidates:
     found = method_row(task.config.method).plan(task)
-    if found.interrupted == "cancelled" or len(found.poses.translation) == 0:
+    # One pose that is not finite would end the whole run.
+    poses = found.poses[pack(found.poses).isfinite().all(-1) & (found.poses.quaternion.norm(dim=-1) > 0)]
+    if found.interrupted == "cancelled" or len(poses.translation) == 0:
         return Candidates((), found.interrupted)
-    return Candidates(assemble(task.problem, task.hand, found.poses, task.config, task.hooks.stop), found.interrupted)
+    return Candidates(assemble(task.problem, task.hand, poses, task.config, task.hooks.stop), found.interrupted)
 
 
 def _best_first(grasps: Iterable[Grasp]) -> tuple[Grasp, ...]:
