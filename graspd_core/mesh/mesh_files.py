@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import hashlib
 import os
+import re
 import warnings
 from math import ceil, log, log10
 from pathlib import Path
@@ -86,7 +87,7 @@ _HEADER, _TRIANGLE, _MOST_TRIANGLES = 84, 50, 10**8
 
 
 def refuse_broken(path: Path) -> None:
-    """Raise MeshError if a file is empty, is another kind of file, or is an STL or OBJ file that is cut off."""
+    """Raise MeshError if a file is empty, is another kind of file, or is an STL, OBJ, PLY or OFF that is cut off."""
     with path.open("rb") as file:
         head = file.read(_LOOK)
         size = file.seek(0, os.SEEK_END)
@@ -99,6 +100,7 @@ def refuse_broken(path: Path) -> None:
             raise MeshError(f"{path}: {what}")
     ending = path.suffix.lower()
     cut = _cut_stl(head, tail, size) if ending == ".stl" else _cut_obj(tail) if ending == ".obj" else ""
+    cut = _cut_rows(path.read_bytes(), ending == ".ply") if ending in (".ply", ".off") else cut
     if cut:
         raise MeshError(f"{path}: cut off: {cut}")
 
@@ -121,6 +123,20 @@ def _cut_obj(tail: bytes) -> str:
         return ""
     whole = len(words) >= 4 and (words[0] == "f" or all(map(_is_number, words[1:])))
     return "" if whole else f"it ends in the middle of a line, {line.strip()[:60]!r}"
+
+
+def _cut_rows(text: bytes, ply: bool) -> str:
+    """Return how many rows an OFF or a text PLY lacks, empty if none."""
+    head, _, body = text.partition(b"end_header" if ply else b"OFF")
+    body = re.sub(rb"#.*", b"", body)
+    counts = re.findall(rb"(?m)^element +\S+ +(\d+)", head) if b"format ascii" in head else []
+    if not ply and (found := re.match(rb"\s*(\d+)\s+(\d+).*", body)):
+        counts, body = list(found.groups()), body[found.end() :]
+    rows, asked = [row for row in body.splitlines() if row.strip()], sum(map(int, counts))
+    # A last row without a line end may lack some of the corners that its first number states.
+    words = rows[-1].split() if rows and not body.endswith((b"\n", b"\r")) else [b"0"]
+    there = len(rows) - (words[0].isdigit() and len(words) <= int(words[0]))
+    return f"{there} of {asked} rows are there" if there < asked else ""
 
 
 def _is_number(word: str) -> bool:
@@ -306,7 +322,10 @@ def _read(path: Path):
         if isinstance(error, IndexError) and "out of bounds" in reason:
             reason = f"a face names a vertex that the file does not hold: {reason}"
         if "expected length" in reason:
-            reason = f"cut off: {reason}"
+            uneven = ", or faces with different numbers of corners" if "unexpected" in reason else ""
+            reason = f"cut off{uneven}: {reason}"
+        if "string multiply" in reason:
+            reason = "faces with more than four corners; triangulate them"
         raise MeshError(f"{path}: not a readable {path.suffix.lstrip('.')} mesh ({reason})") from error
     return np.array(mesh.vertices, dtype=float).reshape(-1, 3), np.array(mesh.faces, dtype=np.int64).reshape(-1, 3)
 

@@ -343,6 +343,25 @@ def test_other_binary_files_that_were_cut_off(tmp_path: Path, ending: str):
     assert "cut off" in refusal(path, saved(path)[:-100])
 
 
+_ROWS = "0 0 0\n.05 0 0\n0 .05 0\n0 0 .05\n3 0 2 1\n3 0 1 3\n3 0 3 2\n3 1 2 3"
+_TEXT_PLY = "ply\nformat ascii 1.0\nelement vertex 4\nproperty float x\nproperty float y\nproperty float z\n"
+_TEXT_PLY += "element face 4\nproperty list uchar int vertex_indices\nend_header\n"
+
+
+@pytest.mark.parametrize(("ending", "head"), [("ply", _TEXT_PLY), ("off", "OFF # a comment\n4 4 6\n\n")])
+@pytest.mark.parametrize(("cut", "left"), [(2, 7), (7, 7), (9, 6), (17, 5)])
+def test_text_files_that_state_more_rows_than_they_have(tmp_path: Path, ending: str, head: str, cut: int, left: int):
+    path = tmp_path / f"a.{ending}"
+    path.write_text(head + _ROWS)
+    assert len(load_mesh(path).faces) == 4
+    assert f"cut off: {left} of 8 rows are there" in refusal(path, (head + _ROWS)[:-cut].encode())
+
+
+def test_faces_with_many_corners_are_named(tmp_path: Path):
+    off = f"OFF\n4 5 0\n{_ROWS}\n5 0 1 2 3 0\n"
+    assert "faces with more than four corners; triangulate them" in refusal(tmp_path / "a.off", off.encode())
+
+
 @pytest.mark.parametrize(
     ("last", "told"),
     [
