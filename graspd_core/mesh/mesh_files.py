@@ -279,9 +279,12 @@ def mass_properties(mesh: TriangleMesh) -> tuple[float, Float[np.ndarray, "3"], 
         # Moments about the origin would lose all digits.
         volume, centre, inertia = mass_properties(topology.moved_mesh(mesh, -far))
         return volume, centre + far, inertia
-    if topology.is_closed(mesh) and topology.is_oriented(mesh.faces) and not face_components(mesh).any():
-        return _solid_moments(mesh)
     low, high = mesh.vertices.min(0), mesh.vertices.max(0)
+    if topology.is_closed(mesh) and topology.is_oriented(mesh.faces) and not face_components(mesh).any():
+        solid = _solid_moments(mesh)
+        # A closed sheet encloses nothing but rounding errors.
+        if solid[0] > 1e-9 * (high - low).max() ** 3:
+            return solid
     # A flat sheet still needs a box of some thickness for its inertia to be positive.
     size = np.maximum(high - low, 1e-3)
     spread = SobolEngine(3, scramble=True, seed=0).draw(SPREAD_POINTS, dtype=torch.float64).numpy()
@@ -385,7 +388,7 @@ def _solid_moments(mesh: TriangleMesh) -> tuple[float, Float[np.ndarray, "3"], F
     corners = mesh.vertices[mesh.faces]
     sixfold = np.einsum("fi,fi->f", corners[:, 0], np.cross(corners[:, 1], corners[:, 2]))
     total, middle = sixfold.sum(), corners.sum(1)
-    centre = sixfold @ middle / (4 * total)
+    centre = sixfold @ middle / (4 * (total or 1.0))
     # A tetrahedron with corners c and a corner at zero has the second moment det/120 · (Σ c cᵀ + (Σ c)(Σ c)ᵀ).
     second = np.einsum("f,fki,fkj->ij", sixfold, corners, corners) + np.einsum("f,fi,fj->ij", sixfold, middle, middle)
     spread = np.sign(total) * (second / 120 - total / 6 * np.outer(centre, centre))

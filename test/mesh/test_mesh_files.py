@@ -215,6 +215,16 @@ def test_mass_properties_of_broken_boxes(change):
     assert inertia == pytest.approx(exact[2], abs=0.05 * exact[2].max())
 
 
+def test_a_box_without_thickness_counts_as_its_bounding_box():
+    # Top and bottom have other diagonals, so the merged surface is closed, but encloses nothing.
+    square = np.array([[0, 0, 0], [0.05, 0, 0], [0.05, 0.05, 0], [0, 0.05, 0]])
+    sheet = TriangleMesh(square, np.array([[0, 1, 2], [0, 2, 3], [0, 3, 1], [1, 3, 2]]))
+    volume, center, inertia = mass_properties(sheet)
+    assert volume == pytest.approx(0.05 * 0.05 * 1e-3)
+    assert center == pytest.approx([0.025, 0.025, 0], abs=1e-6)
+    assert (np.linalg.eigvalsh(inertia) > 0).all()
+
+
 def test_a_flat_sheet_has_the_mass_properties_of_a_thin_box():
     corners = np.array([[0.0, 0, 0], [0.1, 0, 0], [0.1, 0.1, 0], [0, 0.1, 0]])
     sheet = TriangleMesh(corners, np.array([[0, 1, 2], [0, 2, 3]]))
