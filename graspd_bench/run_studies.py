@@ -235,7 +235,8 @@ def make_plan(
     jobs, done = [], {}
     for name, study in studies.items():
         code = bench_version(study.sources)
-        for case in study.cases(request):
+        # A seed or an object that is given twice counts once.
+        for case in dict.fromkeys(study.cases(request)):
             jobs.append(Job(name, case, study.run, code, study.alone, study.patience(case)))
             record = read_record(folder, name, case, None if any_code else code, failed=failed)
             if record is not None:

@@ -84,7 +84,7 @@ def main_suite(request: Request) -> tuple[Cell, ...]:
             cells += _cells(request, "pace", name, presets[name], "shape:cylinder", BATCH)[:1]
         if "balanced" in presets:
             cells += _cells(request, "start", "balanced", presets["balanced"], "shape:mug", 1)[:1]
-    return tuple(dict.fromkeys(cells))
+    return tuple(cells)
 
 
 def sweep_suite(request: Request) -> tuple[Cell, ...]:

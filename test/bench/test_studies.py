@@ -64,6 +64,12 @@ def test_cases_differ_and_a_small_run_has_fewer(name: str):
         assert all(study.seconds(case) > 0 for case in cases)
 
 
+@pytest.mark.parametrize("name", ["main", "hands", "robust", "early", "steered"])
+def test_a_seed_that_is_given_twice_counts_once(tmp_path: Path, name: str):
+    plans = [make_plan(studies_of([name]), Request(seeds=seeds, quick=True), tmp_path) for seeds in ((0,), (0, 0))]
+    assert plans[0].jobs == plans[1].jobs
+
+
 def test_all_of_them_fit_into_eighty_minutes_on_two_cores():
     seconds = sum(study.seconds(case) for study in STUDIES.values() if study.usual for case in study.cases(Request()))
     assert seconds / 2 < 80 * 60
