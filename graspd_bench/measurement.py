@@ -18,8 +18,9 @@ import numpy as np
 
 from graspd_bench.bullet.bullet_hold import bullet_hold_trial
 from graspd_bench.bullet.bullet_world import build_bullet_world, bullet_available, bullet_displacement
-from graspd_bench.study import PROTOCOL_MASS, Case, Record, raw_grasps
+from graspd_bench.study import PROTOCOL_MASS, Case, Record, Request, raw_grasps
 from graspd_bench.trials import gravity_trial
+from graspd_core.errors import ConfigError, choices
 from graspd_core.hands.library import hand_hash, load_hand
 from graspd_core.hands.model import HandModel
 from graspd_core.mesh.shapes import object_hash
@@ -105,6 +106,14 @@ TRIALS: Mapping[str, Callable[[Tried], Trial]] = {
 }
 # Default trials of a raw cell. The noisy trial takes eight times as long as another trial, so it is not among them.
 USUAL = ("standard", "hard", "sd", "gravity")
+
+
+def requested_trials(request: Request, usual: tuple[str, ...]) -> tuple[str, ...]:
+    """Return the names of the requested trials, each once, in the order of `TRIALS`. Default: `usual`."""
+    for name in request.trials:
+        if name not in TRIALS:
+            raise ConfigError(f"unknown trial {name!r}; {choices(name, TRIALS)}")
+    return tuple(name for name in TRIALS if name in request.trials) or usual
 
 
 Kind = Literal["raw", "verified", "pace", "start"]

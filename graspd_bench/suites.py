@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from pathlib import Path
 
 from graspd_bench.figures import hand_row
-from graspd_bench.measurement import TRIALS, USUAL, Cell, Kind
+from graspd_bench.measurement import USUAL, Cell, Kind, requested_trials
 from graspd_bench.study import Request, all_shapes, find_objects
-from graspd_core.errors import ConfigError, choices
+from graspd_core.errors import ConfigError
 from graspd_core.hands.library import hand_names
 from graspd_core.optimize.plan_config import PlanConfig, load_preset, method_row, override, preset_names
+from graspd_dataset.run_records import object_name
 
 # Number of grasps of a cell of kind "verified", and batch size of a cell of kind "pace".
 VERIFIED, BATCH = 8, 32
@@ -68,10 +68,12 @@ def main_suite(request: Request) -> tuple[Cell, ...]:
     names = (name for name in preset_names() if name != _RANKED)
     defaults = [name for name in names if not request.quick or name in _QUICK_PRESETS]
     presets = {name: load_preset(name) for name in request.presets or defaults}
+    if len({object_name(name) for name in presets}) < len(presets):
+        raise ConfigError(f"presets: {', '.join(presets)}; valid: presets of different names")
     planned = {name: config for name, config in presets.items() if name in PLANNED or name not in preset_names()}
     if "balanced" in planned and not request.presets:
         planned[STEADY] = override(planned["balanced"], {"rounds.first_budget": 1.0, "rounds.growth": 1.0})
-    trials = _trials(request, USUAL)
+    trials = requested_trials(request, USUAL)
     cells: list[Cell] = []
     for thing in find_objects(request.objects or (_QUICK_OBJECTS if request.quick else all_shapes())):
         for name, config in presets.items():
@@ -90,7 +92,7 @@ def main_suite(request: Request) -> tuple[Cell, ...]:
 def sweep_suite(request: Request) -> tuple[Cell, ...]:
     """Return `raw` cells that sweep four settings, one at a time. Other settings are those of `balanced`."""
     base = load_preset(_SWEEP_PRESET)
-    count, trials = _count(request, base), _trials(request, _SWEEP_TRIALS)
+    count, trials = _count(request, base), requested_trials(request, _SWEEP_TRIALS)
     return tuple(
         cell
         for thing in find_objects(request.objects or (_SWEEP_OBJECTS[:2] if request.quick else _SWEEP_OBJECTS))
@@ -102,7 +104,7 @@ def sweep_suite(request: Request) -> tuple[Cell, ...]:
 
 def decades_suite(request: Request) -> tuple[Cell, ...]:
     """Return `raw` cells that sweep contact settings over three decades. They show how exact a setting must be."""
-    count, trials = request.count or HAND_COUNT, _trials(request, _SWEEP_TRIALS)
+    count, trials = request.count or HAND_COUNT, requested_trials(request, _SWEEP_TRIALS)
     return tuple(
         cell
         for thing in find_objects(request.objects or _SWEEP_OBJECTS[:2])
@@ -123,7 +125,7 @@ def decades_suite(request: Request) -> tuple[Cell, ...]:
 def hands_suite(request: Request) -> tuple[Cell, ...]:
     """Return `raw` cells of each built-in hand with preset `balanced`."""
     base, count = load_preset(_SWEEP_PRESET), request.count or (_QUICK_COUNT if request.quick else HAND_COUNT)
-    trials = _trials(request, _SWEEP_TRIALS)
+    trials = requested_trials(request, _SWEEP_TRIALS)
     return tuple(
         cell
         for thing in find_objects(request.objects or (_QUICK_OBJECTS if request.quick else all_shapes()))
@@ -151,13 +153,6 @@ def _steps(config: PlanConfig) -> int:
     return getattr(config.settings, "steps", 0)
 
 
-def _trials(request: Request, usual: tuple[str, ...]) -> tuple[str, ...]:
-    for name in request.trials:
-        if name not in TRIALS:
-            raise ConfigError(f"unknown trial {name!r}; {choices(name, TRIALS)}")
-    return request.trials or usual
-
-
 def _count(request: Request, config: PlanConfig) -> int:
     usual = _LONG_COUNT if _steps(config) > _LONG else method_row(config.method).benchmark_count
     return request.count or (_QUICK_COUNT if request.quick else usual)
@@ -174,6 +169,5 @@ def _cells(
     *,
     hand: str = "",
 ) -> list[Cell]:
-    label = Path(name).stem if Path(name).suffix in (".yaml", ".yml") else name
     hand = hand or request.hand or "allegro_right"
-    return [Cell(kind, label, config, thing, hand, seed, count, trials) for seed in request.seeds or (0,)]
+    return [Cell(kind, object_name(name), config, thing, hand, seed, count, trials) for seed in request.seeds or (0,)]

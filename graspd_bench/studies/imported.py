@@ -16,7 +16,7 @@ from typing import Any
 
 import numpy as np
 
-from graspd_bench.measurement import TRIALS, Tried
+from graspd_bench.measurement import TRIALS, Tried, requested_trials
 from graspd_bench.study import PROTOCOL_MASS, ObjectCase, Record, Request, Sections, raw_grasps
 from graspd_core.errors import ConfigError
 from graspd_core.hands.library import load_hand
@@ -80,8 +80,7 @@ def imported_cases(request: Request) -> tuple[ImportedCase, ...]:
         raise ConfigError("imported: give both --import FOLDER and --hand NAME")
     if len(request.objects) > 1:
         raise ConfigError(f"objects: {', '.join(request.objects)}; valid: one mesh, which replaces the files' mesh")
-    if unknown := [name for name in request.trials if name not in TRIALS]:
-        raise ConfigError(f"trials: {unknown[0]!r}; valid: {', '.join(TRIALS)}")
+    trials = requested_trials(request, tuple(TRIALS))
     hand, mesh = load_hand(request.hand, candidates=1), "".join(request.objects)
     files: dict[tuple[str, float], dict[Path, int]] = {}
     for path in foreign_files(Path(request.imported)):
@@ -95,7 +94,7 @@ def imported_cases(request: Request) -> tuple[ImportedCase, ...]:
             files=tuple(map(str, own)),
             mesh=mesh,
             order=request.joint_order,
-            trials=request.trials or tuple(TRIALS),
+            trials=trials,
             content=hashlib.sha256(b"".join(path.read_bytes() for path in own)).hexdigest(),
         )
         for seed in request.seeds or (0,)

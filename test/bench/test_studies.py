@@ -135,6 +135,17 @@ def test_a_preset_of_ones_own_is_planned_with_and_nothing_else_that_was_not_aske
     assert [cell.name for cell in cells if cell.kind == "verified"] == ["balanced", "own"]
 
 
+def test_two_presets_of_one_name_are_refused_because_their_counts_would_be_summed(tmp_path: Path):
+    (tmp_path / "balanced.yaml").write_text("rounds: {growth: 1.5}\n")
+    with pytest.raises(ConfigError, match=r"presets: balanced, .*balanced.yaml; valid: presets of different names"):
+        main_suite(Request(presets=("balanced", str(tmp_path / "balanced.yaml")), objects=("shape:box",)))
+
+
+def test_the_standard_trial_runs_first_and_once_because_it_times_the_first_grasp():
+    cells = main_suite(Request(presets=("fast",), objects=("shape:box",), trials=("hard", "standard", "standard")))
+    assert cells[0].trials == ("standard", "hard")
+
+
 # Two cells of a few seconds, whose method does next to nothing.
 SMALL = ["--presets", "random_closure", "--objects", "shape:sphere", "--count", "2", "--trials", "standard"]
 BAD: list[tuple[list[str], str]] = [

@@ -377,7 +377,7 @@ def test_a_bench_tries_them_beside_ours(exported, tmp_path: Path, graspd, capsys
         (("imported",), "imported: give both --import FOLDER and --hand"),
         (("--import", "x"), "imported: give both --import FOLDER and --hand"),
         (("--import", "nowhere", "--hand", "allegro_right"), "nowhere: no such file or folder"),
-        (("--import", "x", "--hand", "allegro_right", "--trials", "luck"), "trials: 'luck'; valid: standard"),
+        (("--import", "x", "--hand", "allegro_right", "--trials", "luck"), "unknown trial 'luck'; valid: standard"),
         (("steered", "--import", "x"), "imported: not used by steered"),
     ],
 )
