@@ -56,24 +56,24 @@ def run_throughput(case: Throughput) -> Record:
 
 def throughput_sections(records: Sequence[Record], chart: Path | None) -> Sections:
     """Return a table of verified grasps per second, and CPU time for each, by object and number of threads."""
-    rows = [record for record in records if record["verified"]]
-    if not rows:
+    if not any(record["verified"] for record in records):
         return {}
     headings = ["object", "tried for one verified"]
     for threads in THREADS:
         headings += [f"verified a second, {threads} thread{'s' if threads > 1 else ''}", "CPU ms each"]
-    things = list(dict.fromkeys(object_name(row["object"]) for row in rows))
-    figures = {thing: _figures([row for row in rows if object_name(row["object"]) == thing]) for thing in things}
-    figures["**mean**"] = np.nanmean(list(figures.values()), axis=0).tolist()
+    things = list(dict.fromkeys(object_name(row["object"]) for row in records))
+    figures = {thing: _figures([row for row in records if object_name(row["object"]) == thing]) for thing in things}
+    figures["**mean**"] = np.ma.masked_invalid(list(figures.values())).mean(axis=0).filled(np.nan).tolist()
     body = [[name, f"{tried:.2f}", *(f"{value:.1f}" for value in others)] for name, (tried, *others) in figures.items()]
+    body = [[cell.replace("nan", "–") if place else cell for place, cell in enumerate(row)] for row in body]
     return {"throughput": [markdown_table(headings, body)]}
 
 
 def _figures(rows: Sequence[Record]) -> list[float]:
     """Return the ratio of tried to verified grasps. Then per thread count: verified grasps per s, CPU ms per grasp."""
-    found = [sum(row["tried"] for row in rows) / sum(row["verified"] for row in rows)]
+    found = [sum(row["tried"] for row in rows) / (sum(row["verified"] for row in rows) or np.nan)]
     for threads in THREADS:
         here = [row for row in rows if row["threads"] == threads]
         verified, wall, cpu = (sum(row[key] for row in here) for key in ("verified", "wall_s", "cpu_s"))
-        found += [verified / wall, 1e3 * cpu / verified] if here else [np.nan, np.nan]
+        found += [verified / wall, 1e3 * cpu / (verified or np.nan)] if here else [np.nan, np.nan]
     return found

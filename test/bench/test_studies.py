@@ -17,7 +17,7 @@ from graspd_bench import run_studies
 from graspd_bench.result_store import bench_version, case_file, case_key, read_results
 from graspd_bench.run_studies import Job, make_plan, run_job, studies_of
 from graspd_bench.studies.human_hand import SOFTNESS
-from graspd_bench.study import Request
+from graspd_bench.study import Record, Request
 from graspd_bench.study_registry import STUDIES
 from graspd_bench.suites import main_suite
 from graspd_bench.tables import sourced, written
@@ -108,6 +108,15 @@ def test_a_human_hand_is_measured_rigid_and_with_flesh_that_gives(tmp_path: Path
     (table,) = study.sections(records, None)["mano"]
     names = [line.split(" | ")[0].strip("| ") for line in str(table).splitlines()[2:6]]
     assert names == ["sphere, rigid", "**mean**, rigid", "sphere, 1 mm", "**mean**, 1 mm"]
+
+
+def test_a_plan_without_verified_grasps_costs_time_in_the_throughput():
+    def plan(thing: str, verified: int, wall: float) -> Record:
+        return {"object": thing, "threads": 1, "verified": verified, "tried": 20, "wall_s": wall, "cpu_s": wall}
+
+    records = [plan("shape:mug", 10, 1.0), plan("shape:mug", 0, 4.0), plan("shape:box", 0, 1.0)]
+    lines = str(STUDIES["throughput"].sections(records, None)["throughput"][0]).splitlines()[2:]
+    assert lines == ["| mug | 4.00 | 2.0 | 500.0 | – | – |", "| box | – | 0.0 | – | – | – |", lines[2]]
 
 
 def test_an_option_that_no_study_looks_at_is_named(tmp_path: Path):
