@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+import re
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -21,6 +22,8 @@ from graspd_core.types import TriangleMesh
 SHAPE_DENSITY = 700.0
 # Accepted column names of a csv of masses. The first one present is used.
 _NAME_COLUMNS, _MASS_COLUMNS = ("name", "mesh", "file"), ("mass_kg", "mass")
+# A family's number, or none.
+_SEED = re.compile("[0-9]{0,18}")
 # Faces of an object's simplified surface for the camera.
 _SEEN_FACES = 2000
 
@@ -70,7 +73,7 @@ def find_sources(names: Sequence[str]) -> tuple[ThingSource, ...]:
         kind, _, rest = name.partition(":")
         if f"{kind}:" == SHAPE_PREFIX and rest in SHAPES:
             found.append(ThingSource(name))
-        elif f"{kind}:" == PREFIX and rest.split(":")[0] in FAMILIES and (":" not in rest or rest[-1].isdigit()):
+        elif f"{kind}:" == PREFIX and rest.partition(":")[0] in FAMILIES and _SEED.fullmatch(rest.partition(":")[2]):
             found.append(ThingSource(name if ":" in rest else f"{name}:0"))
         elif Path(name).is_dir():
             found += folder_sources(Path(name))
@@ -100,8 +103,12 @@ def folder_sources(folder: Path) -> tuple[ThingSource, ...]:
 
 
 def _masses(path: Path) -> dict[str, float]:
-    with path.open(newline="") as file:
-        rows = list(csv.DictReader(file))
+    try:
+        # Spreadsheets write a byte order mark.
+        with path.open(newline="", encoding="utf-8-sig") as file:
+            rows = list(csv.DictReader(file))
+    except (OSError, ValueError, csv.Error) as error:
+        raise ConfigError(f"{path}: cannot be read: {error}; valid: text with columns name, mass_kg") from None
     columns = list(rows[0]) if rows else []
     name = next((column for column in _NAME_COLUMNS if column in columns), None)
     mass = next((column for column in _MASS_COLUMNS if column in columns), None)

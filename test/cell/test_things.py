@@ -42,9 +42,18 @@ def test_a_folder_of_meshes_needs_a_csv_of_masses(tmp_path: Path):
     (tmp_path / "masses.csv").write_text("name,mass_kg\none,-1\n")
     with pytest.raises(ConfigError, match="the mass of 'one' is -1; valid: more than zero"):
         find_sources([str(tmp_path)])
+    # Spreadsheets write a byte order mark.
+    (tmp_path / "masses.csv").write_text("name,mass_kg\none,0.3\ntwo,0.5\n", encoding="utf-8-sig")
+    assert [source.mass for source in find_sources([str(tmp_path)])] == [0.3, 0.5]
+    for broken in (b"name,mass_kg\ncaf\xe9,0.3\n", b"name,mass_kg\n" + b"a" * 200_000):
+        (tmp_path / "masses.csv").write_bytes(broken)
+        with pytest.raises(ConfigError, match=r"masses\.csv: cannot be read: .*; valid: text with columns name"):
+            find_sources([str(tmp_path)])
 
 
-@pytest.mark.parametrize("name", ["shape:what", "family:unicorn", "family:pear:x", "nowhere"])
+@pytest.mark.parametrize(
+    "name", ["shape:what", "family:unicorn", "family:pear:x", "family:pear:x1", "family:pear:-1", "nowhere"]
+)
 def test_an_unknown_thing_is_named(name: str):
     with pytest.raises(ConfigError, match=f"unknown thing '{name}'; valid: a folder of meshes, shape:NAME, or family"):
         find_sources([name])
