@@ -216,8 +216,11 @@ def pile_cell(
     arm: Arm, hand: HandModel, sources: Sequence[ThingSource], seed: int, *, friction: float | None = None
 ) -> CellWorld:
     """Compile a cell with objects dropped into the pick bin. The same seed gives the same poses."""
-    layout, things = layout_of(arm), [load_thing(source) for source in sources]
-    poses = []
+    layout, things, poses = layout_of(arm), list[Thing](), []
+    for source in sources:
+        # Reports name objects, so each object gets a name of its own.
+        thing, same = load_thing(source), sum(source.name == other.name for other in sources[: len(things)])
+        things.append(replace(thing, name=f"{thing.name} #{same + 1}") if same else thing)
     # The fence stays until the objects rest, so that no object rolls into the bin's walls.
     for body in dropped([thing.model for thing in things], seed, layout.pick.half - _GAP, stays=True):
         pose = body.pose.copy()

@@ -12,7 +12,7 @@ from graspd_bench.rendering.depth_noise import DEFAULT
 from graspd_cell.referee import HARD
 from graspd_cell.robot import JointMotion, MotionAborted
 from graspd_cell.simulated_robot import ARM_TOLERANCES, SETTLING, SimulatedRobot
-from graspd_cell.things import family_sources
+from graspd_cell.things import family_sources, find_sources
 from graspd_cell.world import PICK_BIN, pile_cell
 from graspd_core.arms.arm import load_arm
 from graspd_core.errors import ConfigError
@@ -204,3 +204,10 @@ def test_no_thing_is_in_a_wall_and_a_pile_lies_still():
     robot.wait(0.5)
     for first, then in zip(before, robot.thing_poses(), strict=True):
         assert np.linalg.norm(first[:3, 3] - then[:3, 3]) < 0.01
+
+
+def test_equal_things_have_names_of_their_own():
+    sources = find_sources(["shape:sphere", "shape:box", "shape:sphere", "shape:sphere"])
+    world = pile_cell(load_arm("ur5e_like"), load_hand("parallel_gripper"), sources, 1)
+    places = SimulatedRobot(world).referee().places
+    assert list(places) == ["sphere", "box", "sphere #2", "sphere #3"]
