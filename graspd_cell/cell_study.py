@@ -250,7 +250,7 @@ def _row(pair: str, size: str, own: Sequence[Record]) -> list[str]:
         str(len(fit)),
         _share(fit_out),
         _share(out),
-        str(sum(len(attempt["astray"]) for attempt in attempts)),
+        str(sum(record["ended"][name] in ("table", "lost") for record, name in there)),
         str(len(attempts)),
         _share([bool(attempt["out"]) for attempt in first]),
         _share([bool(attempt["hard"]) for attempt in attempts]),

@@ -109,6 +109,10 @@ def test_the_tables_count_what_they_say():
     assert "| no way for the arm | no | 1 |" in endings
     assert "from there to the closed hand 3.0 s" in times
     assert STUDY.summary(_record(PAIRS[0])) == "1 of 2 out in 3 attempts"
+    # A thing that moved from the table to the floor is one thing.
+    strayed = _record(PAIRS[0], ended={"a": "place bin", "b": "lost", "c": "table"})
+    strayed["attempts"] = [{**attempt, "astray": ["b"]} for attempt in strayed["attempts"]]
+    assert str(cell_sections([strayed], None)["cell"][0]).splitlines()[2].split("|")[7].strip() == "1"
 
 
 @pytest.mark.slow
