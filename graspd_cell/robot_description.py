@@ -16,6 +16,7 @@ from scipy.spatial.transform import Rotation
 from graspd_cell.world import CellWorld, Pose
 from graspd_core.arms.arm import Arm, tip_hand
 from graspd_core.hands.model import HandModel
+from graspd_core.hands.readers.urdf import below_link
 from graspd_core.hands.readers.xml_io import read_xml
 
 CAMERA_FRAME, HAND_PREFIX = "camera_depth_optical_frame", "hand_"
@@ -31,6 +32,8 @@ def robot_description(arm: Arm, hand: HandModel) -> str:
     path = Path(hand.urdf)
     if path.suffix == ".pkl" or (own := read_xml(path)).tag != "robot":
         return ET.tostring(root, encoding="unicode")
+    # Links above the hand's base have no place below the arm's tip.
+    below_link(path, own, hand.base_link)
     for link in own.iter("link"):
         if link.get("name"):
             link.set("name", HAND_PREFIX + str(link.get("name")))

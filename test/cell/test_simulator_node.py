@@ -179,6 +179,22 @@ def test_the_robots_description_is_a_robot_with_the_hand_where_it_is_mounted(tmp
         np.testing.assert_allclose(whole.link_offset_translation[base], mount.translation.numpy(), atol=1e-6)
 
 
+def test_links_above_the_hands_base_are_not_in_the_robots_description(tmp_path: Path):
+    box = '<collision><geometry><box size=".08 .02 .02"/></geometry></collision>'
+    finger = '<joint name="j{0}" type="prismatic"><parent link="base"/><child link="f{0}"/>'
+    finger += '<axis xyz="{0} 0 0"/><limit lower="0" upper=".03" effort="9" velocity="1"/></joint><link name="f{0}"/>'
+    text = f'<robot name="h"><link name="world"/><link name="base">{box}</link>{finger.format(1)}{finger.format(-1)}'
+    text += '<joint name="w" type="fixed"><parent link="world"/><child link="base"/></joint></robot>'
+    (tmp_path / "h.urdf").write_text(text)
+    palm = "palm: {center: [0, 0, 0.01], normal: [0, 0, 1]}"
+    postures = "open: {j1: 0.03, j-1: 0.03}\nclosed: {j1: 0, j-1: 0}"
+    (tmp_path / "h.yaml").write_text(f"urdf: h.urdf\nmount: {{parent: tool}}\n{palm}\n{postures}\n")
+    arm, hand = load_arm(ARM), load_hand(tmp_path / "h.yaml")
+    path = tmp_path / "robot.urdf"
+    whole = read_urdf(path, parse_xml(path, robot_description(arm, hand)))
+    assert whole.joint_names == arm.joint_names + hand.joint_names
+
+
 def test_motions_reach_their_goals_with_feedback(cell: CellClient):
     arm, hand = load_arm(ARM), load_hand(HAND)
     start, feedback = cell.positions(), list[Any]()
