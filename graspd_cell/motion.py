@@ -39,8 +39,8 @@ class NoMotionError(GraspdError):
     """No collision-free path was found for the arm, or its goal is in collision."""
 
 
-# Cell size of the distance grid, and its margin around the points seen [m].
-_CELL, _AROUND = 0.01, 0.12
+# Cell size of the distance grid, its margin around the points seen, and the greatest coordinate of these points [m].
+_CELL, _AROUND, _FARTHEST = 0.01, 0.12, 2.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -79,10 +79,10 @@ class SeenWorld:
 def seen_world(points: Points, floor: float, boxes: Sequence[Box] = (), slack: float = 0.012) -> SeenWorld:
     """Build the obstacles from a camera's points [m], base frame, and known solids.
 
-    Points within `slack` [m] of the floor or of a box are dropped as part of it.
+    Points within `slack` [m] of the floor or of a box are dropped as part of it. So are points out of the arm's reach.
     """
     known = SeenWorld(floor, tuple(boxes))
-    points = points[np.isfinite(points).all(1)]
+    points = points[(np.abs(points) < _FARTHEST).all(1)]
     points = points[points[:, 2] > floor + slack]
     points = points[known.clearance(points) > slack] if boxes else points
     if not len(points):

@@ -62,6 +62,14 @@ def test_a_way_around_a_pillar_of_points_keeps_clear_of_every_one_of_them(name: 
         assert (away.min(0) > np.concatenate([mover.shape.radius, mover.carried.radius])).all()
 
 
+def test_points_far_away_need_no_memory():
+    near = np.array([[0.4, 0.0, 0.1], [0.3, 0.2, 0.2]])
+    far = np.array([[9.0, 8.0, 5.0], [np.nan, 0.0, 1.0], [0.0, 0.0, np.inf]])
+    one, other = seen_world(near, 0.0), seen_world(np.vstack([near, far]), 0.0)
+    np.testing.assert_array_equal(other.points, near)
+    np.testing.assert_array_equal(one.distances, other.distances)
+
+
 def test_times_keep_to_speed_and_acceleration():
     arm = load_arm("panda_like")
     goal = arm.seed + np.array([0.8, 0.3, -0.5, 0.4, 0.2, -0.6, 0.9])
