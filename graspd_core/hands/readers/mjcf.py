@@ -66,7 +66,8 @@ def _read_assets(path: Path, spec: Any) -> dict[str, _MeshAsset]:
             raise fault(path, mesh, "<mesh refpos=...> and <mesh refquat=...> are not read; move the vertices instead")
         if not np.all(mesh.scale):
             raise fault(path, mesh, f"<mesh scale={short_repr(list(mesh.scale))}>: a factor cannot be zero")
-        file = str(Path(spec.meshdir) / mesh.file) if mesh.file else ""
+        # As MuJoCo does, `strippath` takes only the name of a file.
+        file = str(Path(spec.meshdir) / (Path(mesh.file).name if spec.strippath else mesh.file)) if mesh.file else ""
         vertices = np.array(mesh.uservert, dtype=float).reshape(-1, 3)
         assets[mesh.name or Path(mesh.file).stem] = _MeshAsset(_place(mesh), file, np.array(mesh.scale), vertices)
     return assets
@@ -253,7 +254,7 @@ def _refuse(path: Path, root: ET.Element) -> None:
             raise wrong(path, element, f"<{element.tag}> is not read; save the compiled model as one plain MJCF file")
         for key, text in element.attrib.items():
             # MuJoCo accepts nan and inf, but writes a note to the terminal and to a log file.
-            if key not in _NAMES and re.search(r"(?i)(^|\s)[+-]?(nan|inf)", text):
+            if key not in _NAMES and re.search(r"(?i)(^|\s)[+-]?(nan|inf(inity)?)(?!\w)", text):
                 raise wrong(path, element, f"<{element.tag} {key}={short_repr(text)}>: expected finite numbers")
     classes = len(root.findall(".//default"))
     if classes > _MOST_CLASSES:
@@ -419,5 +420,7 @@ def _efforts(parts: _Parts) -> dict[str, float]:
             force = float(np.abs(gain * model.actuator_ctrlrange[i]).max())
         force *= abs(float(model.actuator_gear[i, 0]))
         if model.actuator_trntype[i] == mujoco.mjtTrn.mjTRN_JOINT and 0 < force < np.inf:
-            efforts[parts.labels.get(int(model.actuator_trnid[i, 0]), "")] = force
+            label = parts.labels.get(int(model.actuator_trnid[i, 0]), "")
+            # Forces of several actuators of a joint add up.
+            efforts[label] = efforts.get(label, 0.0) + force
     return efforts

@@ -176,6 +176,19 @@ def test_ranges_that_do_not_hold_limit_nothing(folder: Path) -> None:
     assert any("joint 'j2' has no limits" in text for text in hand.warnings)
 
 
+def test_efforts_of_a_joint_with_two_actuators_add_up_and_names_may_begin_like_numbers(folder: Path) -> None:
+    text = MJCF.replace('"j1"', '"infra_j1"').replace('"s1"', '"nano"')
+    velocity = '<velocity joint="infra_j1" forcerange="-0.5 0.5"/>'
+    hand = _read(folder, text.replace("<actuator>", f"<actuator>{velocity}"))
+    assert hand.joint_names[0] == "infra_j1"
+    assert hand.effort.tolist() == [2.5, np.inf, np.inf, 15.0]
+
+
+def test_strippath_takes_the_name_of_a_mesh_file_alone(folder: Path) -> None:
+    stripped = MJCF.replace("<compiler ", '<compiler strippath="true" ').replace("wedge.obj", "/home/maker/wedge.obj")
+    assert len(_read(folder, stripped).primitives) == len(_read(folder, MJCF).primitives)
+
+
 def test_included_files_are_read_as_if_they_stood_there(folder: Path) -> None:
     """A hand of three files, one of which includes another in a body of the first."""
     head, finger, rest = re.split(r'(?=  <body name="b")|(?=</body></worldbody>)', MJCF)
