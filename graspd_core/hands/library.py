@@ -172,8 +172,9 @@ def _palms(hand: HandModel, translations: Float[np.ndarray, "links 3"]) -> tuple
 
 @lru_cache
 def hand_hash(name: str) -> str:
-    """Return the hash of a hand's URDF and description. Raises HandError: the hand does not exist or is unusable."""
+    """Return the hash of a hand's file, description and meshes. Raises HandError: no such hand, or it is unusable."""
     hand = load_hand(name, candidates=1)
     boxed = config_dir() / "hands" / f"{name}.yaml"
     files = [Path(hand.urdf), boxed if boxed.is_file() else Path(name)]
-    return hashlib.sha256(b"".join(file.read_bytes() for file in files)).hexdigest()
+    hulls = (shape.vertices.tobytes() for shape in hand.primitives)
+    return hashlib.sha256(b"".join([*(file.read_bytes() for file in files), *hulls])).hexdigest()

@@ -17,6 +17,7 @@ from graspd_core.errors import MeshError
 from graspd_core.hands.readers.xml_io import wrong
 from graspd_core.mesh.convex_parts import limited_hull
 from graspd_core.mesh.mesh_files import load_mesh
+from graspd_core.mesh.shapes import file_state
 from graspd_core.types import TriangleMesh
 
 # Greatest number of corners of a hull. For a ball of 12 mm, the hull then lies up to 0.3 mm below the surface.
@@ -82,7 +83,7 @@ def mesh_hull(
     """
     path = resolve_mesh(urdf, shape, filename)
     try:
-        hull = _hull(path, path.stat().st_mtime_ns, tuple(scale.tolist()), corners)
+        hull = _hull(path, file_state(str(path)), tuple(scale.tolist()), corners)
     except (MeshError, OSError) as error:
         raise wrong(urdf, shape, f"mesh {filename!r} cannot be read as a collision mesh: {error}") from error
     extent = float(np.ptp(hull.vertices, axis=0).max())
@@ -104,8 +105,8 @@ def whole_mesh(urdf: Path, shape: ET.Element, filename: str, scale: Float[np.nda
 
 
 @lru_cache(maxsize=2048)
-def _hull(path: Path, modified: int, scale: tuple[float, float, float], corners: int) -> TriangleMesh:
-    del modified
+def _hull(path: Path, state: tuple[int, ...], scale: tuple[float, float, float], corners: int) -> TriangleMesh:
+    del state
     mesh = load_mesh(path)
     # Scale the points before computing the hull, because mirroring a hull would turn the hull inside out.
     points = mesh.vertices[np.unique(mesh.faces)] * np.array(scale)

@@ -1,5 +1,6 @@
 """Meshes that hands name: found where ROS keeps them, read as hulls, refused by name, and drawn whole but bounded."""
 
+import os
 from pathlib import Path
 
 import numpy as np
@@ -9,7 +10,7 @@ from made_meshes import taken
 
 from graspd_core import HandModel, TriangleMesh, make_shape, save_mesh
 from graspd_core.errors import HandError
-from graspd_core.hands.library import hand_names, load_hand, read_hand_file
+from graspd_core.hands.library import hand_hash, hand_names, load_hand, read_hand_file
 from graspd_core.hands.readers.urdf import visual_solids
 
 WEDGE = "v 0 0 0\nv 0.02 0 0\nv 0 0.02 0\nv 0 0 0.03\nf 1 3 2\nf 1 2 4\nf 1 4 3\nf 2 3 4\n"
@@ -103,6 +104,18 @@ def test_a_mesh_that_cannot_be_used_is_named(workspace: Path, name: str, scale: 
     (workspace / "src" / "hand_description" / "urdf" / "broken.obj").write_text("v 1 2\nf 1 2 9\n")
     with pytest.raises(HandError, match=message):
         _read(workspace, name, scale)
+
+
+def test_a_replaced_mesh_is_read_anew_and_changes_the_hash_of_its_hand(workspace: Path) -> None:
+    mesh, urdf = (workspace / "src" / "hand_description" / name for name in ("meshes/wedge one.obj", "urdf/hand.urdf"))
+    before, hashed = _read(workspace, "meshes/wedge one.obj").primitives[0], hand_hash(str(urdf))
+    stamp = mesh.stat().st_mtime_ns
+    mesh.write_text(WEDGE.replace("0.03", "0.05"))
+    os.utime(mesh, ns=(stamp, stamp))
+    hand_hash.cache_clear()
+    after = _read(workspace, "meshes/wedge one.obj").primitives[0]
+    assert np.ptp(after.vertices, axis=0).max() > np.ptp(before.vertices, axis=0).max()
+    assert hand_hash(str(urdf)) != hashed
 
 
 def test_a_flat_mesh_becomes_a_thin_plate(workspace: Path) -> None:
