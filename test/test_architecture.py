@@ -68,11 +68,11 @@ MAY_IMPORT = {
 MAX_PACKAGE_LINES = {
     "graspd_core": 27_737,
     "graspd_ros": 5_340,
-    "graspd_bench": 8_340,
+    "graspd_bench": 8_360,
     "graspd_dataset": 3_058,
     "graspd_viewer": 2_433,
     "graspd_cell": 3_812,
-    "test": 33_921,
+    "test": 33_945,
 }
 # Lines that a program reaches through its imports, those inside functions too.
 # The layout aims at 22,000 of the node.

@@ -22,10 +22,10 @@ from graspd_bench.rendering.tabletop import TabletopScene, crowded, moved, on_ta
 from graspd_bench.studies.seen_objects import calibration, reconstruction_error
 from graspd_bench.study import PROTOCOL_MASS, Case, Record, Request, Sections, find_objects
 from graspd_core.config import ReconstructionConfig, SceneConfig
-from graspd_core.errors import GraspdError
+from graspd_core.errors import ConfigError, GraspdError
 from graspd_core.hands.library import load_hand
 from graspd_core.mesh.mesh_files import load_mesh, mass_properties
-from graspd_core.mesh.shapes import make_shape
+from graspd_core.mesh.shapes import make_shape, object_hash
 from graspd_core.perception.cloud.camera import PinholeCamera
 from graspd_core.perception.cloud.point_cloud import PointCloud
 from graspd_core.perception.scene import build_scene, object_parts
@@ -82,12 +82,23 @@ class CameraView(Case):
         """Return the kind of object: "irregular" (a family), "regular" (a shape) or "scan"."""
         return "irregular" if self.thing in FAMILIES | OTHERS else "scan" if Path(self.thing).suffix else "regular"
 
+    def inputs(self) -> Record:
+        """Return all inputs except the code. A scan counts by its content and mass, not by its path."""
+        scan = self.kind == "scan"
+        own = [object_name(self.thing), object_hash(self.thing), scan_mass(self.thing)] if scan else self.thing
+        return {**super().inputs(), "thing": own}
+
     def recorded(self) -> Record:
         return {**super().recorded(), "thing": object_name(self.thing), "kind": self.kind}
 
 
 def camera_cases(request: Request) -> tuple[CameraView, ...]:
-    """Return cases for every object, seed and way. Cameras take turns, and half of the views have a crowd."""
+    """Return cases for every object, seed and way. Cameras take turns, and half of the views have a crowd.
+
+    Raises GraspdError: an object of the request is no mesh file.
+    """
+    if shapes := [name for name in request.objects if name.startswith("shape:")]:
+        raise ConfigError(f"objects: {shapes[0]}; valid: mesh files beside a stats.csv of masses")
     things = (*(name for name in FAMILIES if name not in CHOSEN_ON), *SHAPES)
     things += tuple(find_objects(request.objects)) if request.objects else ()
     seeds = request.seeds or range(FIRST_SEED, FIRST_SEED + SEEDS)
@@ -103,6 +114,17 @@ def camera_cases(request: Request) -> tuple[CameraView, ...]:
     )
 
 
+def scan_mass(path: str) -> float:
+    """Return a scan's mass from stats.csv in its folder [kg]. Raises ConfigError: there is no such file or mass."""
+    table = Path(path).parent / "stats.csv"
+    try:
+        with table.open(encoding="utf-8-sig") as file:
+            return {row["name"]: float(row["mass_kg"]) for row in csv.DictReader(file)}[Path(path).stem]
+    except (OSError, KeyError, TypeError, ValueError) as error:
+        told = error.strerror if isinstance(error, OSError) else f"no {error}" if isinstance(error, KeyError) else error
+        raise ConfigError(f"{table}: {told}; valid: columns name and mass_kg, with a row for {path}") from None
+
+
 def object_of(case: CameraView) -> tuple[TriangleMesh, float]:
     """Return the true mesh of the object in its own frame [m], and its mass [kg]."""
     if case.kind == "irregular":
@@ -110,9 +132,7 @@ def object_of(case: CameraView) -> tuple[TriangleMesh, float]:
         return drawn.mesh, drawn.mass
     rng = np.random.default_rng([case.seed, len(case.thing)])
     if case.kind == "scan":
-        with (Path(case.thing).parent / "stats.csv").open() as file:
-            masses = {row["name"]: float(row["mass_kg"]) for row in csv.DictReader(file)}
-        return load_mesh(case.thing), masses[Path(case.thing).stem]
+        return load_mesh(case.thing), scan_mass(case.thing)
     mesh = make_shape(case.thing)
     mesh = TriangleMesh(mesh.vertices * rng.uniform(0.8, 1.3), mesh.faces)
     return mesh, float(rng.uniform(*(_WARE if case.thing in _HOLLOW else _OTHER)) * mass_properties(mesh)[0])

@@ -24,6 +24,8 @@ from graspd_bench.tables import sourced, written
 from graspd_core.cli import main
 from graspd_core.cli.running import EXIT_BAD_INPUT, EXIT_INTERRUPTED, EXIT_OK
 from graspd_core.errors import ConfigError
+from graspd_core.mesh.mesh_files import save_mesh
+from graspd_core.mesh.shapes import make_shape
 
 ROOT = Path(__file__).parents[2]
 
@@ -124,6 +126,28 @@ def test_an_option_that_no_study_looks_at_is_named(tmp_path: Path):
         make_plan(studies_of(["maps"]), Request(trials=("hard",)), tmp_path)
     both = make_plan(studies_of(["maps", "main", "maps"]), Request(trials=("hard",), quick=True), tmp_path)
     assert {job.study for job in both.jobs} == {"maps", "main"}
+
+
+def test_scans_count_by_content_and_need_a_mass(tmp_path: Path):
+    cameras, scan = STUDIES["cameras"], tmp_path / "thing.obj"
+
+    def key() -> str:
+        return case_key("cameras", cameras.cases(Request(objects=(str(scan),), seeds=(100,)))[-1])
+
+    save_mesh(scan, make_shape("box"))
+    with pytest.raises(ConfigError, match=r"stats\.csv: No such file .*; valid: columns name and mass_kg, with a row"):
+        key()
+    (tmp_path / "stats.csv").write_text("name,mass_kg\nother,0.3\n")
+    with pytest.raises(ConfigError, match=r"stats\.csv: no 'thing'; valid: columns name and mass_kg"):
+        key()
+    (tmp_path / "stats.csv").write_text("name,mass_kg\nthing,0.3\n")
+    keys = [key()]
+    (tmp_path / "stats.csv").write_text("name,mass_kg\nthing,0.4\n")
+    keys.append(key())
+    save_mesh(scan, make_shape("mug"))
+    assert len({*keys, key()}) == 3
+    with pytest.raises(ConfigError, match=r"objects: shape:mug; valid: mesh files beside a stats\.csv of masses"):
+        cameras.cases(Request(objects=("shape:mug",)))
 
 
 def test_what_needs_the_user_s_files_says_so():
