@@ -25,8 +25,9 @@ from graspd_cell.things import Thing, ThingSource, family_sources, find_sources
 from graspd_cell.world import pile_cell
 from graspd_core.arms.arm import load_arm
 from graspd_core.errors import ConfigError, GraspdError
-from graspd_core.hands.library import load_hand
+from graspd_core.hands.library import hand_hash, load_hand
 from graspd_core.hands.model import HandModel
+from graspd_core.mesh.shapes import source_hash
 from graspd_core.perception.scene import build_scene
 from graspd_core.planning.plan_grasps import plan_grasps
 from graspd_core.types import Verdict
@@ -56,6 +57,14 @@ class CellCase(Case):
     @property
     def label(self) -> str:
         return f"{self.pair} {self.size} {self.seed} {self.preset} {'folder' if self.things else 'families'}"
+
+    def inputs(self) -> Record:
+        """Return all inputs except the code. Files of objects, arm and hand count by content."""
+        arm, hand = self.pair.split("+")
+        files = [source_hash(source) for source, mass in self.things if mass is not None]
+        files += [hand_hash(hand)] if Path(hand).is_file() else []
+        files += map(source_hash, (arm, load_arm(arm).chain.urdf)) if Path(arm).is_file() else ()
+        return {**super().inputs(), **({"files": files} if files else {})}
 
     def sources(self) -> tuple[ThingSource, ...]:
         """Return the objects in the order in which they are dropped."""

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -15,6 +16,8 @@ from graspd_cell.cell_study import DEVELOPED_ON, PAIRS, SIZES, STUDY, AttemptWat
 from graspd_cell.picker import Attempt, Ending
 from graspd_cell.simulated_robot import SimulatedRobot
 from graspd_core.errors import ConfigError
+from graspd_core.mesh.mesh_files import save_mesh
+from graspd_core.mesh.shapes import make_shape
 
 
 def test_cases_differ_and_no_thing_of_theirs_was_developed_on():
@@ -42,6 +45,16 @@ def test_a_case_that_there_is_not_is_named():
             cell_cases(Request(cases=(wrong,)))
     with pytest.raises(ConfigError, match="unknown thing"):
         cell_cases(Request(objects=("nowhere",)))
+
+
+def test_a_changed_mesh_is_another_case(tmp_path: Path):
+    (tmp_path / "masses.csv").write_text("name,mass_kg\nthing,0.2\n")
+    keys = set()
+    for shape in ("box", "mug"):
+        save_mesh(tmp_path / "thing.obj", make_shape(shape))
+        (case,) = cell_cases(Request(objects=(str(tmp_path),), cases=("1", PAIRS[2]), seeds=(7,)))
+        keys.add(case_key("cell", case))
+    assert len(keys) == 2
 
 
 def _attempt(place: np.ndarray, ending: Ending) -> Attempt:
