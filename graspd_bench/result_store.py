@@ -88,7 +88,10 @@ def read_results(path: Path) -> list[Record]:
         raise FormatError(f"{path}: not a {FORMAT} file; `graspd bench` writes one as results.json")
     if whole.get("version") != VERSION:
         raise FormatError(f"{path}: version {whole.get('version')!r}; this reader knows {VERSION}")
-    return whole["records"]
+    records = whole.get("records")
+    if not isinstance(records, list) or not all(isinstance(record, dict) and "error" in record for record in records):
+        raise FormatError(f"{path}: its records are incomplete; `graspd bench` writes them anew")
+    return records
 
 
 def bench_version(sources: tuple[str, ...]) -> str:

@@ -68,11 +68,11 @@ MAY_IMPORT = {
 MAX_PACKAGE_LINES = {
     "graspd_core": 27_737,
     "graspd_ros": 5_340,
-    "graspd_bench": 8_360,
+    "graspd_bench": 8_363,
     "graspd_dataset": 3_058,
     "graspd_viewer": 2_433,
     "graspd_cell": 3_821,
-    "test": 33_958,
+    "test": 33_960,
 }
 # Lines that a program reaches through its imports, those inside functions too.
 # The layout aims at 22,000 of the node.

@@ -202,6 +202,8 @@ def test_results_are_read_back_and_other_files_refused(tmp_path: Path):
         ("{}", "not a graspd/bench file"),
         ("x", "not JSON"),
         (json.dumps({"format": store.FORMAT}), "version None"),
+        (json.dumps({"format": store.FORMAT, "version": store.VERSION}), "its records are incomplete"),
+        (json.dumps({"format": store.FORMAT, "version": store.VERSION, "records": [1]}), "its records are incomplete"),
     ):
         path.write_text(text)
         with pytest.raises(GraspdError, match=culprit):
