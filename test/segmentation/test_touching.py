@@ -12,6 +12,7 @@ from graspd_core import PinholeCamera, PointCloud, Target, scene_from_views
 from graspd_core.config import SegmentationConfig
 from graspd_core.mesh.shapes import SHAPES, make_shape
 from graspd_core.perception.segment.segment import find_things, segment
+from graspd_core.types import TriangleMesh
 
 # As a D415 with half its pixels each way.
 CAMERA = PinholeCamera(320, 240, 308.0, 308.0, 159.5, 119.5)
@@ -129,6 +130,22 @@ def test_things_that_touch_are_found_apart_even_where_together_they_are_too_larg
         assert len(found) == 2
         nearest = [min(range(2), key=lambda k: np.linalg.norm(points.mean(0) - middles[k])) for points in found]
         assert sorted(nearest) == [0, 1]
+
+
+def test_a_small_thing_of_a_heap_is_found_beside_large_ones():
+    # The small ball has too few points for a part of all three, but not for a part of two.
+    balls, end = list[TriangleMesh](), 0.0
+    for radius in (0.05, 0.05, 0.02):
+        ball = make_shape("sphere")
+        scale = radius / ball.vertices[:, 0].max()
+        balls.append(TriangleMesh(ball.vertices * scale + np.array([end + radius, 0.0, radius]), ball.faces))
+        end += 2 * radius
+    view = view_of(on_table(balls[0], balls[1:]), -1.5)
+    found = find_things([view], SegmentationConfig(piled=True))
+    for ball in balls:
+        middle, radius = ball.vertices.mean(0), float(np.ptp(ball.vertices[:, 0])) / 2
+        away = [np.linalg.norm(points - middle, axis=1) for points in found]
+        assert sum(np.mean(distance < radius + 0.006) > 0.9 for distance in away) == 1
 
 
 def test_one_that_lies_on_another_is_a_thing_where_things_are_piled():

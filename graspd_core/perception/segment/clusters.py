@@ -167,6 +167,21 @@ def touching_things(points: Points, eyes: Eyes, height: Float[np.ndarray, "n"], 
     return one
 
 
+def heaped_things(points: Points, eyes: Eyes, spacing: float) -> Int[np.ndarray, "n"]:
+    """Split a heap at seams and waists, then each part again, until none has any. Return each point's part number.
+
+    The arguments are those of `touching_things`. Parts need not stand, because objects of a heap lie on each other.
+    """
+    part = touching_things(points, eyes, np.zeros(len(points)), spacing)
+    if not part.any():
+        return part
+    number = np.full(len(points), -1)
+    for k in range(int(part.max()) + 1):
+        rows = np.flatnonzero(part == k)
+        number[rows] = number.max() + 1 + heaped_things(points[rows], eyes, spacing)
+    return number
+
+
 def _normals(points: Points, near: Int[np.ndarray, "n near"], eyes: Eyes) -> Points:
     """Return unit normals of planes fitted to neighbours, oriented to the camera that sees the plane most frontally."""
     spread = points[near] - points[near].mean(1, keepdims=True)

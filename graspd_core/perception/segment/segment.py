@@ -17,6 +17,7 @@ from graspd_core.perception.cloud.point_cloud import MIN_POINTS, Eyes, PointClou
 from graspd_core.perception.cloud.voxel_downsample import Labels, Mask, VoxelScene, voxel_downsample
 from graspd_core.perception.segment.clusters import (
     extent,
+    heaped_things,
     link_length,
     link_points,
     merge_occluded,
@@ -249,9 +250,11 @@ def _parts(parted: _Parted, chosen: Mask) -> Labels:
     scene, support = parted.scene, parted.ground.support
     part = np.where(chosen, 0, -1)
     if support is not None:
-        points = scene.mean[chosen]
-        height = np.zeros(len(points)) if parted.settings.piled else support.height(points)
-        part[chosen] = touching_things(points, parted.eyes, height, scene.size)
+        points, eyes = scene.mean[chosen], parted.eyes
+        if parted.settings.piled:
+            part[chosen] = heaped_things(points, eyes, scene.size)
+        else:
+            part[chosen] = touching_things(points, eyes, support.height(points), scene.size)
     return part
 
 
