@@ -33,7 +33,7 @@ from graspd_core.planning.plan_grasps import plan_grasps
 from graspd_core.runtime import disk_cache
 from graspd_core.types import Verdict
 from graspd_core.verify.hold_trial import hold_trial, out_of_place
-from graspd_core.verify.robustness import begin_other_worlds, robustness_checks_of, shapes_needed
+from graspd_core.verify.robustness import OTHER_SHAPES, begin_other_worlds, robustness_checks_of
 from graspd_core.verify.run_clock import Run
 from graspd_core.verify.trial_registry import build_worlds
 from graspd_core.verify.world import PROTOCOLS, build_world
@@ -73,7 +73,7 @@ def grasps_of_view(case: CameraView) -> list[dict[str, Any]]:
         holds = [(item.hold(grasp, lambda: False) for item in stage.items) for stage in asked.stages]
         *places, slippery = (hold is not None and hold.passed for hold in holds[0])
         possible = (hold for hold in holds[1] if hold is not None) if len(holds) > 1 else iter(())
-        shapes = [hold.passed for hold in islice(possible, shapes_needed(scene.object))]
+        shapes = [hold.passed for hold in islice(possible, OTHER_SHAPES)]
         rows.append({
             "view": case.label, "way": case.way, "lowered": result.mass is not None, "places": sum(places),
             "slippery": slippery, "shapes": sum(shapes), "of_shapes": len(shapes),

@@ -107,9 +107,9 @@ class HeldShares:
     Attributes:
         likeliest: fraction among the grasps that hold on the likeliest shape, the best guess from the view.
         places: fraction among the grasps that also hold with the hand misplaced.
-        shapes: fraction among the grasps that hold with the hand misplaced and on two other shapes.
+        shapes: fraction among the grasps that hold with the hand misplaced and on other shapes.
         fails_places: fraction among the grasps that hold on the likeliest shape but not with the hand misplaced.
-        fails_shapes: fraction among the grasps that hold with the hand misplaced but not on two other shapes.
+        fails_shapes: fraction among the grasps that hold with the hand misplaced but not on other shapes.
     """
 
     likeliest: float

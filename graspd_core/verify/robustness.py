@@ -1,7 +1,7 @@
 """Check the robustness of grasps of objects that cameras saw: other poses, less friction, other shapes.
 
 A grasp that holds on the likeliest scene, the best guess from the clouds, must also pass these checks. The hidden side
-may be guessed wrong, so the grasp must also hold on other shapes. On these shapes, the limit of rotation is two
+may be guessed wrong, so the grasp must also hold on three other shapes. On these shapes, the limit of rotation is two
 thirds of the usual limit. docs/clouds.md reports how often grasps that pass all checks hold on the true object. Trials
 run on several threads. Their number changes neither results nor their order (`results_in_order`).
 """
@@ -105,9 +105,8 @@ _LESS_FRICTION = 2 / 3
 _LESS_TURN = 2 / 3
 # Number and seed of the displaced poses, equal for all grasps. No benchmark uses this seed.
 _PLACES, _PLACES_SEED = 3, 0x706C616365
-# If the mass is assumed, a grasp must hold at `_LEAST_PLACES` displaced poses and on `_SHAPES_ASSUMED` other shapes.
-# If the mass is known, grasps have less reserve. They must hold at all poses and on `_SHAPES_KNOWN` other shapes.
-_LEAST_PLACES, _SHAPES_ASSUMED, _SHAPES_KNOWN = 2, 2, 3
+# If the mass is assumed, a grasp must hold at `_LEAST_PLACES` displaced poses. It must hold on `OTHER_SHAPES` shapes.
+_LEAST_PLACES, OTHER_SHAPES = 2, 3
 # Number of nodes of another shape's distance grid along an axis. The shape is guessed, so a finer grid would not help.
 _RESOLUTION = 24
 # Interval at which the stop hook is polled while waiting for a world [s].
@@ -200,7 +199,7 @@ def begin_other_worlds(
 
     rules = _rules_needed(scene.evidence, probability, held_shares(scene.object))
     worlds = tuple(LaterWorld(partial(make, rule)) for rule in rules)
-    for world in worlds[: shapes_needed(scene.object)]:
+    for world in worlds[:OTHER_SHAPES]:
         world.begin()
     return worlds
 
@@ -229,7 +228,7 @@ def robustness_checks_of(
             RobustnessCheck(f"other shape {number}", partial(_hold_in, world, trials.protocol, waited_for))
             for number, world in enumerate(others, 1)
         )
-        stages.append(CheckStage(shapes, shapes_needed(scene.object), 0, shares.fails_shapes))
+        stages.append(CheckStage(shapes, OTHER_SHAPES, 0, shares.fails_shapes))
     return RobustnessChecks(tuple(stages), surest, waited_for)
 
 
@@ -312,11 +311,6 @@ def held_shares(target: ObjectModel) -> HeldShares:
     return MASS_ASSUMED if target.mass_assumed else MASS_KNOWN
 
 
-def shapes_needed(target: ObjectModel) -> int:
-    """Return on how many other shapes a grasp must hold. With fewer possible shapes, it must hold on all of them."""
-    return _SHAPES_ASSUMED if target.mass_assumed else _SHAPES_KNOWN
-
-
 def _rules_needed(evidence: Evidence | None, probability: float, shares: HeldShares) -> tuple[str, ...]:
     if evidence is None or evidence.doubts or probability <= shares.places:
         return ()
@@ -354,8 +348,7 @@ def begin_other_shapes(probability: float, likeliest: ObjectModel, evidence: Evi
 
     `scene_from_views` calls this function early: the likeliest shape's distance grid is built at the same time.
     """
-    rules = _rules_needed(evidence, probability, held_shares(likeliest))
-    for rule in rules[: shapes_needed(likeliest)]:
+    for rule in _rules_needed(evidence, probability, held_shares(likeliest))[:OTHER_SHAPES]:
         work = partial(run_isolated, other_scene, evidence, rule, likeliest)
         _begun(evidence)[rule] = begin_in_thread(_SHAPES, work)
 
