@@ -300,6 +300,10 @@ def depth_images_are_grasped(client) -> None:
     for kind in (Image, CompressedImage):
         client.call(Trigger, "reset")
         answer = latest(kind, kind.__name__)
+        if "0 CameraInfos received" in answer.message:
+            # The node may match the publisher after it is matched. Then the one message was lost.
+            infos.publish(calibration)
+            answer = latest(kind, f"{kind.__name__}-again")
         assert answer.status == GraspArray.SUCCEEDED, answer.message
         assert answer.header.frame_id == "camera_depth_optical_frame"
     client.node.destroy_publisher(infos)
