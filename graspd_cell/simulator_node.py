@@ -21,7 +21,7 @@ from graspd_cell.robot_description import CAMERA_FRAME, frames_of, robot_descrip
 from graspd_cell.simulated_robot import CAMERA_PERIOD, SimulatedRobot
 from graspd_core.errors import ConfigError, GraspdError
 from graspd_core.types import TriangleMesh
-from graspd_ros.node import Parser, run_command
+from graspd_ros.node import EXIT_STOPPED, STOP_TIMEOUT, Parser, exit_at_once, run_command, start_spinning, stop_spinning
 
 # Periods of joint states, transforms, referee reports and action feedback [s].
 _JOINTS, _FRAMES, _REFEREE, _FEEDBACK = 0.01, 0.02, 0.2, 0.05
@@ -68,22 +68,15 @@ def _serve(options: argparse.Namespace, stop: threading.Event) -> None:
     executor = MultiThreadedExecutor(num_threads=4)
     executor.add_node(node)
 
-    def spin() -> None:
-        try:
-            executor.spin()
-        except Exception:
-            # Ignore an error after the stop, because the shutdown may interrupt a callback.
-            if not stop.is_set():
-                stop.set()
-                raise
-
-    threads = [threading.Thread(target=work, daemon=True) for work in (cell.simulate, cell.film, spin)]
+    spinner = start_spinning(executor, stop, stop.set)
+    threads = [threading.Thread(target=work, daemon=True) for work in (cell.simulate, cell.film)]
     for thread in threads:
         thread.start()
     stop.wait()
-    for thread in threads[:2]:
-        thread.join(2.0)
-    executor.shutdown(timeout_sec=1.0)
+    for thread in threads:
+        thread.join(STOP_TIMEOUT)
+    if not stop_spinning(executor, spinner) or any(thread.is_alive() for thread in threads):
+        exit_at_once(EXIT_STOPPED)
     node.destroy_node()
 
 

@@ -135,7 +135,6 @@ def main(args: list[str] | None = None) -> int:
     # Start the child first, so that its imports (2 s) run in parallel with this process's imports.
     start_planning_worker()
     from rclpy.executors import SingleThreadedExecutor
-    from rclpy.utilities import try_shutdown
 
     limit_malloc_arenas()
     sys.setswitchinterval(SWITCH_INTERVAL)
@@ -151,20 +150,14 @@ def main(args: list[str] | None = None) -> int:
     _on_signal(wake.set)
     executor = SingleThreadedExecutor()
     executor.add_node(node)
-    spinner = _spinning(executor, wake, fail)
+    spinner = start_spinning(executor, wake, fail)
     wake.wait()
     ended = node.close(STOP_TIMEOUT)
-    # Keep this order. Shutting down the executor destroys objects on which its thread waits.
-    try_shutdown()
-    spinner.join(0.5)
-    executor.shutdown(timeout_sec=0.5)
+    ended = stop_spinning(executor, spinner) and ended
     node.destroy_node()
     status = EXIT_FAILED if failed.is_set() else EXIT_STOPPED
     if not ended:
-        # A worker inside a library call would crash the interpreter's shutdown. All answers are already published.
-        sys.stdout.flush()
-        sys.stderr.flush()
-        os._exit(status)
+        exit_at_once(status)
     return status
 
 
@@ -174,7 +167,7 @@ def _refuse_arguments(args: list[str]) -> None:
     parser.parse_args(args[: args.index("--ros-args")] if "--ros-args" in args else args)
 
 
-def _spinning(executor: Executor, wake: threading.Event, fail: Callable[[], None]) -> threading.Thread:
+def start_spinning(executor: Executor, wake: threading.Event, fail: Callable[[], None]) -> threading.Thread:
     """Start and return a thread that spins the executor. The thread calls `fail` if it ends before `wake` is set."""
 
     def spin() -> None:
@@ -191,6 +184,24 @@ def _spinning(executor: Executor, wake: threading.Event, fail: Callable[[], None
     spinner = threading.Thread(target=spin, name="graspd_executor", daemon=True)
     spinner.start()
     return spinner
+
+
+def stop_spinning(executor: Executor, spinner: threading.Thread) -> bool:
+    """Shut down rclpy, then the executor. Return False if the executor's thread is still alive."""
+    from rclpy.utilities import try_shutdown
+
+    # Keep this order. Shutting down the executor destroys objects on which its thread waits.
+    try_shutdown()
+    spinner.join(STOP_TIMEOUT)
+    executor.shutdown(timeout_sec=0.5)
+    return not spinner.is_alive()
+
+
+def exit_at_once(status: int) -> NoReturn:
+    """End the process without the interpreter's shutdown, which a thread inside a library call would crash."""
+    sys.stdout.flush()
+    sys.stderr.flush()
+    os._exit(status)
 
 
 def _make_node(args: list[str] | None, on_failure: Callable[[], None]) -> GraspNode | None:
