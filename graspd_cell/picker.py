@@ -185,7 +185,9 @@ class Picker:
             taking = _Taking(offer, execution, world, began)
             ending, reason = self._steps(taking)
         except NoMotionError as error:
-            ending, reason = Ending.NO_WAY, str(error)
+            # Once the hand has closed, the grasp counts as executed, even if the arm then finds no path.
+            closed = taking is not None and taking.closed > 0
+            ending, reason = Ending.ABORTED if closed else Ending.NO_WAY, str(error)
         except MotionAborted as error:
             self._stop_if_cancelled()
             ending, reason = Ending.ABORTED, str(error)

@@ -27,10 +27,10 @@ def robot_description(arm: Arm, hand: HandModel) -> str:
 
     Names of the hand's links begin with `hand_`. Joints keep their names.
     """
-    root = read_xml(Path(arm.chain.urdf))
+    root = _with_addresses(Path(arm.chain.urdf))
     root.set("name", f"{arm.name}_{hand.name}")
     path = Path(hand.urdf)
-    if path.suffix == ".pkl" or (own := read_xml(path)).tag != "robot":
+    if path.suffix == ".pkl" or (own := _with_addresses(path)).tag != "robot":
         return ET.tostring(root, encoding="unicode")
     # Links above the hand's base have no place below the arm's tip.
     below_link(path, own, hand.base_link)
@@ -40,10 +40,6 @@ def robot_description(arm: Arm, hand: HandModel) -> str:
     for joint in own.findall("joint"):
         for end in joint.findall("parent") + joint.findall("child"):
             end.set("link", HAND_PREFIX + str(end.get("link")))
-    for mesh in own.iter("mesh"):
-        name = str(mesh.get("filename"))
-        if "://" not in name:
-            mesh.set("filename", (path.parent / name).resolve().as_uri())
     for element in own:
         if element.tag in ("link", "joint", "material"):
             root.append(element)
@@ -57,6 +53,16 @@ def robot_description(arm: Arm, hand: HandModel) -> str:
     ET.SubElement(mount, "child", link=HAND_PREFIX + hand.base_link)
     ET.SubElement(mount, "origin", xyz=f"{x:.9g} {y:.9g} {z:.9g}", rpy=f"{roll:.9g} {pitch:.9g} {yaw:.9g}")
     return ET.tostring(root, encoding="unicode")
+
+
+def _with_addresses(path: Path) -> ET.Element:
+    """Return a file's XML, in which relative names of mesh files are replaced by addresses."""
+    root = read_xml(path)
+    for mesh in root.iter("mesh"):
+        name = mesh.get("filename")
+        if name and "://" not in name:
+            mesh.set("filename", (path.parent / name).resolve().as_uri())
+    return root
 
 
 def frames_of(world: CellWorld, poses: Mapping[str, Pose]) -> list[tuple[str, str, Pose]]:

@@ -359,7 +359,8 @@ def verify_grasps(
     """Try and measure the given grasps. Return all of them in order.
 
     Args:
-        scene: scene with the object. With a support or obstacles, the lift trial runs too.
+        scene: scene with the object. With a support or obstacles, the lift trial runs too. If cameras saw the object,
+            the robustness checks run too.
         hand: hand of the postures. Their joint values are in the order of `hand.joint_names`.
         grasps: grasps with `pregrasp`, `grasp` and `squeeze`. Earlier metrics and trials are replaced.
         verify: "standard" or "hard" trials, "full" or "hard_full" for these trials without early stop, or "none".
@@ -373,21 +374,28 @@ def verify_grasps(
     for index, grasp in enumerate(grasps):
         _refuse_posture(grasp, hand, f"grasp {index}")
     scene, far = near_scene(scene)
-    verified = tuple(replace(moved_grasp(grasp, -far), metrics=None, trials=()) for grasp in grasps)
+    tried = tuple(replace(moved_grasp(grasp, -far), metrics=None, trials=(), probability=None) for grasp in grasps)
+    trials = None
     if verify != "none":
-        worlds = trial_context(scene, hand, verify)
-        verified = tuple(replace(grasp, trials=grasp_trials(worlds, grasp)) for grasp in verified)
-    if measure:
-        trials = None if verify == "none" else trial_context(scene, hand, verify)
-        context = replace(_metrics_context(scene, hand), world=trials and trials.alone)
-        verified = tuple(
-            replace(grasp, metrics=_measured(trials, context, False, grasp))
-            if trials and grasp.verdict is Verdict.VERIFIED
-            else replace(grasp, metrics=metrics.measure(context, grasp.grasp))
-            for grasp in verified
+        run, certainty = Run(time.perf_counter(), None, None, None), CertaintyConfig()
+        context = make_trial_context(
+            run, scene, hand, prefetch(run, scene, hand, verify, certainty), certainty, measure=False
         )
-    tried = zip(grasps, verified, strict=True)
-    return tuple(replace(given, metrics=found.metrics, trials=found.trials) for given, found in tried)
+        assert context is not None  # the run has no end
+        trials = context.trials
+        tried = tuple(_all_trials(context, one_by_one, grasp, run.over) for grasp in tried)
+    if measure:
+        own = replace(_metrics_context(scene, hand), world=trials and trials.alone)
+        tried = tuple(
+            replace(grasp, metrics=_measured(trials, own, False, grasp))
+            if trials and grasp.verdict is Verdict.VERIFIED
+            else replace(grasp, metrics=metrics.measure(own, grasp.grasp))
+            for grasp in tried
+        )
+    return tuple(
+        replace(given, metrics=found.metrics, trials=found.trials, probability=found.probability)
+        for given, found in zip(grasps, tried, strict=True)
+    )
 
 
 def _refuse_posture(grasp: Grasp, hand: HandModel, name: str) -> None:

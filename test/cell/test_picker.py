@@ -121,6 +121,17 @@ def test_a_thing_that_is_taken_away_is_noticed_while_lifting(robot: SimulatedRob
     assert (np.abs(now - hand.open_posture) / hand.joint_scale).max() < 0.1
 
 
+def test_a_thing_that_the_arm_cannot_put_down_counts_as_taken(robot_of: RobotOf, monkeypatch: pytest.MonkeyPatch):
+    robot = robot_of("ur5e_like", "parallel_gripper", THING, height=0.05)
+    robot.wait(1.0)
+    monkeypatch.setattr("graspd_cell.picker.release_posture", lambda *_: None)
+    picker = picker_of(robot)
+    (attempt,) = picker.empty_the_bin(most=1)
+    assert attempt.ending is Ending.ABORTED
+    assert "holds the object above place bin" in attempt.reason
+    assert [failure.executed for failure in picker._failures] == [True]
+
+
 @pytest.mark.parametrize("strength", [1.0, 3.0])
 def test_fingers_that_close_on_nothing_or_on_each_other_are_told_from_fingers_that_press(
     pair: tuple[str, str], robot_of: RobotOf, strength: float

@@ -9,6 +9,7 @@ import sys
 import threading
 import time
 from collections.abc import Callable, Iterator
+from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -177,6 +178,19 @@ def test_the_robots_description_is_a_robot_with_the_hand_where_it_is_mounted(tmp
         mount = tip_hand(arm, hand)
         np.testing.assert_allclose(whole.link_offset_rotation[base], mount.rotation.numpy(), atol=1e-6)
         np.testing.assert_allclose(whole.link_offset_translation[base], mount.translation.numpy(), atol=1e-6)
+
+
+def test_the_robots_description_names_meshes_by_their_address(tmp_path: Path):
+    arm, hand = load_arm(ARM), load_hand(HAND)
+    text = Path(arm.chain.urdf).read_text()
+    visual = '<visual><geometry><mesh filename="meshes/{0}.stl"/></geometry></visual></link>'
+    for place, name in enumerate(("arm", "hand")):
+        own = text if name == "arm" else Path(hand.urdf).read_text()
+        (tmp_path / f"{name}.urdf").write_text(own.replace("</link>", visual.format(place), 1))
+    arm = replace(arm, chain=replace(arm.chain, urdf=str(tmp_path / "arm.urdf")))
+    whole = robot_description(arm, replace(hand, urdf=str(tmp_path / "hand.urdf")))
+    for place in range(2):
+        assert f'filename="{(tmp_path / "meshes" / f"{place}.stl").as_uri()}"' in whole
 
 
 def test_links_above_the_hands_base_are_not_in_the_robots_description(tmp_path: Path):

@@ -411,6 +411,19 @@ def test_what_speaks_against_a_scene_leaves_no_grasp_verified(monkeypatch):
         assert grasp.probability == pytest.approx(DOUBTED_SHARE * MASS_KNOWN.fails_places / MASS_KNOWN.places)
 
 
+def test_given_grasps_of_a_view_pass_the_same_checks_as_planned_ones():
+    seen, hand = seen_from(), load_hand("allegro_right")
+    given = planned().tried
+    assert given[0].verdict is Verdict.VERIFIED
+    again = verification.verify_grasps(seen, hand, given, measure=False)
+    told = [[(grasp.verdict, grasp.reason, grasp.probability) for grasp in grasps] for grasps in (again, given)]
+    assert told[0] == told[1]
+    assert seen.evidence is not None
+    doubted = replace(seen, evidence=replace(seen.evidence, doubts=("are its numbers metres?",)))
+    (grasp,) = verification.verify_grasps(doubted, hand, given[:1])
+    assert (grasp.verdict, grasp.reason) == (Verdict.UNVERIFIED, "are its numbers metres?")
+
+
 def test_seen_all_round_only_place_and_friction_are_in_doubt(monkeypatch):
     monkeypatch.delattr("graspd_core.verify.robustness._other_world")
     verified = [grasp for grasp in plan(seen_all_round(), SURE).grasps if grasp.verdict is Verdict.VERIFIED]
