@@ -215,7 +215,7 @@ def test_no_candidate_reaches_through_the_table_or_a_wall(hand, scenes):
     assert scene.support is not None
     short = ClosedFormConfig(explore_steps=15, refine_steps=10, polish_steps=15)
     config = PlanConfig(settings=short, problem=ProblemConfig(candidates=60, fine_candidates=120))
-    found = find_candidates(PlannerInput(scene, hand, count=6, seed=0, config=config, hooks=Hooks(), dtype=DOUBLE))
+    found = find_candidates(PlannerInput(scene, hand, count=6, seed=0, config=config, hooks=Hooks()))
     assert found.grasps
     obstacles = make_obstacle_tensors(scene, hand, "cpu", DOUBLE)
     assert obstacles is not None
