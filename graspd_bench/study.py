@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import csv
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, fields
 from pathlib import Path
@@ -172,6 +173,46 @@ def find_objects(sources: Sequence[str]) -> tuple[str, ...]:
     if twice := sorted({name for name in names if names.count(name) > 1}):
         same = ", ".join(source for source in found if object_name(source) == twice[0])
         raise MeshError(f"objects {same} share the name {twice[0]!r}; rename one of them")
+    return found
+
+
+# Accepted column names of a csv of masses. The first one present is used.
+_NAME_COLUMNS, _MASS_COLUMNS = ("name", "mesh", "file"), ("mass_kg", "mass")
+
+
+def masses_of(meshes: Sequence[Path]) -> list[float]:
+    """Return the masses of the meshes of one folder from its csv files [kg].
+
+    Raises ConfigError: a csv file is unreadable, or its masses are not positive numbers, or a mesh has no mass.
+    """
+    folder = meshes[0].parent
+    masses = _masses_in(folder)
+    if missing := [path.name for path in meshes if path.stem not in masses]:
+        told = f"its csv files name {', '.join(masses) or 'none'}"
+        raise ConfigError(f"{folder}: no mass of {missing[0]}; {told}; columns: name, mass_kg")
+    return [masses[path.stem] for path in meshes]
+
+
+def _masses_in(folder: Path) -> dict[str, float]:
+    found: dict[str, float] = {}
+    for path in sorted(folder.glob("*.csv")):
+        try:
+            # Spreadsheets write a byte order mark.
+            with path.open(newline="", encoding="utf-8-sig") as file:
+                rows = list(csv.DictReader(file))
+        except (OSError, ValueError, csv.Error) as error:
+            raise ConfigError(f"{path}: cannot be read: {error}; valid: text with columns name, mass_kg") from None
+        columns = list(rows[0]) if rows else []
+        name = next((column for column in _NAME_COLUMNS if column in columns), None)
+        mass = next((column for column in _MASS_COLUMNS if column in columns), None)
+        for row in rows if name and mass else ():
+            try:
+                value = float(row[mass])
+            except (TypeError, ValueError):
+                raise ConfigError(f"{path}: the mass of {row[name]!r} is {row[mass]!r}; valid: a number [kg]") from None
+            if not 0 < value < float("inf"):
+                raise ConfigError(f"{path}: the mass of {row[name]!r} is {row[mass]}; valid: more than zero kilograms")
+            found[Path(str(row[name])).stem] = value
     return found
 
 

@@ -2,15 +2,13 @@
 
 from __future__ import annotations
 
-import csv
 import re
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-import numpy as np
-
 from graspd_bench.rendering.families import FAMILIES, PREFIX, draw_object
+from graspd_bench.study import masses_of
 from graspd_core.errors import ConfigError, MeshError
 from graspd_core.mesh.mesh_files import MESH_ENDINGS, simplify
 from graspd_core.mesh.shapes import SHAPES
@@ -20,8 +18,6 @@ from graspd_core.types import TriangleMesh
 
 # Density of built-in shapes, between wood and water [kg/m³].
 SHAPE_DENSITY = 700.0
-# Accepted column names of a csv of masses. The first one present is used.
-_NAME_COLUMNS, _MASS_COLUMNS = ("name", "mesh", "file"), ("mass_kg", "mass")
 # A family's number, or none.
 _SEED = re.compile("[0-9]{0,18}")
 # Faces of an object's simplified surface for the camera.
@@ -86,43 +82,11 @@ def find_sources(names: Sequence[str]) -> tuple[ThingSource, ...]:
 
 
 def folder_sources(folder: Path) -> tuple[ThingSource, ...]:
-    """Return the meshes of a folder with their masses from its csv files.
-
-    Raises ConfigError: the folder has no meshes, or the csv files lack a mesh's mass.
-    """
+    """Return the meshes of a folder with their masses (`masses_of`). Raises ConfigError: no meshes, or no mass."""
     meshes = sorted(path for path in folder.iterdir() if path.suffix.lower().lstrip(".") in MESH_ENDINGS)
-    masses: dict[str, float] = {}
-    for path in sorted(folder.glob("*.csv")):
-        masses |= _masses(path)
     if not meshes:
         raise ConfigError(f"{folder}: no meshes; endings: {', '.join(sorted(MESH_ENDINGS))}")
-    if missing := [path.name for path in meshes if path.stem not in masses]:
-        told = f"its csv files name {', '.join(masses) or 'none'}"
-        raise ConfigError(f"{folder}: no mass of {missing[0]}; {told}; columns: name, mass_kg")
-    return tuple(ThingSource(str(path), masses[path.stem]) for path in meshes)
-
-
-def _masses(path: Path) -> dict[str, float]:
-    try:
-        # Spreadsheets write a byte order mark.
-        with path.open(newline="", encoding="utf-8-sig") as file:
-            rows = list(csv.DictReader(file))
-    except (OSError, ValueError, csv.Error) as error:
-        raise ConfigError(f"{path}: cannot be read: {error}; valid: text with columns name, mass_kg") from None
-    columns = list(rows[0]) if rows else []
-    name = next((column for column in _NAME_COLUMNS if column in columns), None)
-    mass = next((column for column in _MASS_COLUMNS if column in columns), None)
-    if name is None or mass is None:
-        return {}
-    found = {}
-    for row in rows:
-        try:
-            found[Path(str(row[name])).stem] = float(row[mass])
-        except (TypeError, ValueError):
-            raise ConfigError(f"{path}: the mass of {row[name]!r} is {row[mass]!r}; valid: a number [kg]") from None
-        if not 0 < found[Path(str(row[name])).stem] < np.inf:
-            raise ConfigError(f"{path}: the mass of {row[name]!r} is {row[mass]}; valid: more than zero kilograms")
-    return found
+    return tuple(ThingSource(str(path), mass) for path, mass in zip(meshes, masses_of(meshes), strict=True))
 
 
 def load_thing(source: ThingSource) -> Thing:

@@ -68,11 +68,11 @@ MAY_IMPORT = {
 MAX_PACKAGE_LINES = {
     "graspd_core": 27_763,
     "graspd_ros": 5_351,
-    "graspd_bench": 8_363,
+    "graspd_bench": 8_397,
     "graspd_dataset": 3_058,
     "graspd_viewer": 2_433,
-    "graspd_cell": 3_822,
-    "test": 34_021,
+    "graspd_cell": 3_786,
+    "test": 34_024,
 }
 # Lines that a program reaches through its imports, those inside functions too.
 # The layout aims at 22,000 of the node.

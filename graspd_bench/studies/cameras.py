@@ -7,7 +7,6 @@ these views. `HeldShares` (`config/planning_config.py`) come from other objects:
 
 from __future__ import annotations
 
-import csv
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -20,7 +19,7 @@ from graspd_bench.rendering.families import FAMILIES, OTHERS, draw_object
 from graspd_bench.rendering.render import render_scene
 from graspd_bench.rendering.tabletop import TabletopScene, crowded, moved, on_table, resting_pose, ring_poses, views_of
 from graspd_bench.studies.seen_objects import calibration, reconstruction_error
-from graspd_bench.study import PROTOCOL_MASS, Case, Record, Request, Sections, find_objects
+from graspd_bench.study import PROTOCOL_MASS, Case, Record, Request, Sections, find_objects, masses_of
 from graspd_core.config import ReconstructionConfig, SceneConfig
 from graspd_core.errors import ConfigError, GraspdError
 from graspd_core.hands.library import load_hand
@@ -63,7 +62,7 @@ class CameraView(Case):
     """A request for `count` grasps on one view of an object.
 
     Attributes:
-        thing: name of a family or a shape, or path of a scan. The mass of a scan is in stats.csv in the same folder.
+        thing: name of a family or a shape, or path of a scan. The mass of a scan is in a csv file in the same folder.
         crowd: whether neighbours stand around the object.
         way: how to plan: `ASSUMED` (mass not given), `GIVEN` (mass given), or `OPEN3D` (not given, Open3D's Poisson).
     """
@@ -98,7 +97,7 @@ def camera_cases(request: Request) -> tuple[CameraView, ...]:
     Raises GraspdError: an object of the request is no mesh file.
     """
     if shapes := [name for name in request.objects if name.startswith("shape:")]:
-        raise ConfigError(f"objects: {shapes[0]}; valid: mesh files beside a stats.csv of masses")
+        raise ConfigError(f"objects: {shapes[0]}; valid: mesh files beside a csv of masses")
     things = (*(name for name in FAMILIES if name not in CHOSEN_ON), *SHAPES)
     things += tuple(find_objects(request.objects)) if request.objects else ()
     seeds = request.seeds or range(FIRST_SEED, FIRST_SEED + SEEDS)
@@ -115,14 +114,8 @@ def camera_cases(request: Request) -> tuple[CameraView, ...]:
 
 
 def scan_mass(path: str) -> float:
-    """Return a scan's mass from stats.csv in its folder [kg]. Raises ConfigError: there is no such file or mass."""
-    table = Path(path).parent / "stats.csv"
-    try:
-        with table.open(encoding="utf-8-sig") as file:
-            return {row["name"]: float(row["mass_kg"]) for row in csv.DictReader(file)}[Path(path).stem]
-    except (OSError, KeyError, TypeError, ValueError) as error:
-        told = error.strerror if isinstance(error, OSError) else f"no {error}" if isinstance(error, KeyError) else error
-        raise ConfigError(f"{table}: {told}; valid: columns name and mass_kg, with a row for {path}") from None
+    """Return the mass of a scan from a csv file in its folder [kg]. Raises ConfigError: see `masses_of`."""
+    return masses_of([Path(path)])[0]
 
 
 def object_of(case: CameraView) -> tuple[TriangleMesh, float]:

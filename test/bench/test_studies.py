@@ -135,10 +135,13 @@ def test_scans_count_by_content_and_need_a_mass(tmp_path: Path):
         return case_key("cameras", cameras.cases(Request(objects=(str(scan),), seeds=(100,)))[-1])
 
     save_mesh(scan, make_shape("box"))
-    with pytest.raises(ConfigError, match=r"stats\.csv: No such file .*; valid: columns name and mass_kg, with a row"):
+    with pytest.raises(ConfigError, match=r"no mass of thing\.obj; its csv files name none; columns: name, mass_kg"):
         key()
     (tmp_path / "stats.csv").write_text("name,mass_kg\nother,0.3\n")
-    with pytest.raises(ConfigError, match=r"stats\.csv: no 'thing'; valid: columns name and mass_kg"):
+    with pytest.raises(ConfigError, match=r"no mass of thing\.obj; its csv files name other; columns"):
+        key()
+    (tmp_path / "stats.csv").write_text("name,mass_kg\nthing,nan\n")
+    with pytest.raises(ConfigError, match="the mass of 'thing' is nan; valid: more than zero"):
         key()
     (tmp_path / "stats.csv").write_text("name,mass_kg\nthing,0.3\n")
     keys = [key()]
@@ -146,7 +149,7 @@ def test_scans_count_by_content_and_need_a_mass(tmp_path: Path):
     keys.append(key())
     save_mesh(scan, make_shape("mug"))
     assert len({*keys, key()}) == 3
-    with pytest.raises(ConfigError, match=r"objects: shape:mug; valid: mesh files beside a stats\.csv of masses"):
+    with pytest.raises(ConfigError, match=r"objects: shape:mug; valid: mesh files beside a csv of masses"):
         cameras.cases(Request(objects=("shape:mug",)))
 
 
