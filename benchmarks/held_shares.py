@@ -118,7 +118,7 @@ def main() -> None:
             file.write(json.dumps(lines[-1]) + "\n")
             file.flush()
     rows = [row for line in lines for row in line["grasps"]]
-    two = lambda row: row["shapes"] == row["of_shapes"]  # noqa: E731
+    shaped = lambda row: row["shapes"] == row["of_shapes"]  # noqa: E731
     most = lambda row: row["places"] >= 2  # noqa: E731
     every = lambda row: row["places"] == 3 and row["slippery"]  # noqa: E731
     for name, placed, way, lowered in (
@@ -129,9 +129,9 @@ def main() -> None:
         of = [row for row in rows if row["way"] == way and row["lowered"] is lowered]
         print(f"{name}: likeliest {share(of)}")
         print(f"  out of place {share([r for r in of if placed(r)])}")
-        print(f"  and two shapes {share([r for r in of if placed(r) and two(r)])}")
+        print(f"  and other shapes {share([r for r in of if placed(r) and shaped(r)])}")
         print(f"  fails out of place {share([r for r in of if not placed(r)])}")
-        print(f"  fails on shapes {share([r for r in of if placed(r) and not two(r)])}")
+        print(f"  fails on shapes {share([r for r in of if placed(r) and not shaped(r)])}")
 
 
 if __name__ == "__main__":

@@ -119,10 +119,10 @@ class HeldShares:
     fails_shapes: float
 
 
-# Measured on 385 grasps planned without a mass and 544 with the true mass, on 76 single views (docs/clouds.md).
+# Measured on 366 grasps planned without a mass and 547 with the true mass, on 76 single views (docs/clouds.md).
 # An assumed mass is the heavy end, the most that the volume allows. So trials lift more than most objects weigh.
-MASS_ASSUMED = HeldShares(0.85, 0.88, 0.95, 0.77, 0.85)
-MASS_KNOWN = HeldShares(0.80, 0.89, 0.95, 0.61, 0.83)
+MASS_ASSUMED = HeldShares(0.81, 0.82, 0.95, 0.78, 0.76)
+MASS_KNOWN = HeldShares(0.79, 0.89, 0.95, 0.65, 0.85)
 # Masses as fractions of the heavy end, and for each mass the fraction of objects that weigh at most this mass. Counted
 # on 325 drawn household objects and ten scans.
 _MASSES, _LIGHTER = (0.0, 0.25, 0.5, 0.7, 1.0), (0.0, 0.26, 0.64, 0.85, 1.0)
