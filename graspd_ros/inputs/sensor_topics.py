@@ -120,6 +120,7 @@ class SensorTopic:
                 self._destroy(self._before)
                 self._before = None
             if qos is self._qos and stamp and stamp in self._twice:
+                self._twice.remove(stamp)  # A later message with this stamp is another one, as in a bag that loops.
                 return
             self._received += 1
             self._callback(message)

@@ -1,7 +1,6 @@
 """The table of situations by way of the node, over DDS: the answer that the library gives, or a refusal by name."""
 
 import re
-import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
@@ -17,7 +16,6 @@ from situations import FILE_ONLY, MESHES, SITUATIONS
 from graspd_core.io.bags import read_raw
 
 pytestmark = pytest.mark.timeout(300)
-MATCHED_WITHIN = 15.0  # seconds
 KINDS = {"points": PointCloud2, "image_rect": Image, "camera_info": CameraInfo}
 
 
@@ -53,20 +51,8 @@ def source_of(row: Situation, path: Path, show: Callable[[dict[str, Any]], None]
 @pytest.mark.parametrize("row", [row for row in SITUATIONS if row.name not in FILE_ONLY], ids=lambda row: row.name)
 def test_the_node_answers_the_same(row: Situation, client, node, tmp_path: Path):
     def show(found: dict[str, Any]) -> None:
-        kinds = {"image_rect": Image, "camera_info": CameraInfo}
-        publishers, made = {}, 0.0
-
-        def send() -> None:
-            nonlocal publishers, made
-            # DDS once left node and publisher unmatched for minutes: new ones are found.
-            if time.monotonic() - made > MATCHED_WITHIN:
-                for publisher in publishers.values():
-                    client.node.destroy_publisher(publisher)
-                publishers = {name: client.node.create_publisher(kinds[name], f"/depth/{name}", 10) for name in kinds}
-                made = time.monotonic()
-            for name, publisher in publishers.items():
-                publisher.publish(found[name])
-
+        publishers = {name: client.node.create_publisher(KINDS[name], f"/depth/{name}", 10) for name in found}
+        send = lambda: [publishers[name].publish(message) for name, message in found.items()]  # noqa: E731
         client.show(send, found["image_rect"].header)
         for publisher in publishers.values():
             client.node.destroy_publisher(publisher)
