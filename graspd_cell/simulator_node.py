@@ -21,7 +21,16 @@ from graspd_cell.robot_description import CAMERA_FRAME, frames_of, robot_descrip
 from graspd_cell.simulated_robot import CAMERA_PERIOD, SimulatedRobot
 from graspd_core.errors import ConfigError, GraspdError
 from graspd_core.types import TriangleMesh
-from graspd_ros.node import EXIT_STOPPED, STOP_TIMEOUT, Parser, exit_at_once, run_command, start_spinning, stop_spinning
+from graspd_ros.node import (
+    EXIT_FAILED,
+    EXIT_STOPPED,
+    STOP_TIMEOUT,
+    Parser,
+    exit_at_once,
+    run_command,
+    start_thread,
+    stop_spinning,
+)
 
 # Periods of joint states, transforms, referee reports and action feedback [s].
 _JOINTS, _FRAMES, _REFEREE, _FEEDBACK = 0.01, 0.02, 0.2, 0.05
@@ -30,7 +39,7 @@ _LATE = 0.2
 
 
 def main(args: list[str] | None = None) -> int:
-    """Run the cell until a signal. Return 0 when stopped, 2 for bad input."""
+    """Run the cell until a signal. Return 0 when stopped, 1 after a failure, 2 for bad input."""
     return run_command("graspd_cell_simulator", args, _parse, _serve)
 
 
@@ -68,15 +77,20 @@ def _serve(options: argparse.Namespace, stop: threading.Event) -> None:
     executor = MultiThreadedExecutor(num_threads=4)
     executor.add_node(node)
 
-    spinner = start_spinning(executor, stop, stop.set)
-    threads = [threading.Thread(target=work, daemon=True) for work in (cell.simulate, cell.film)]
-    for thread in threads:
-        thread.start()
+    failed = threading.Event()
+
+    def fail() -> None:
+        failed.set()
+        stop.set()
+
+    spinner = start_thread(executor.spin, stop, fail)
+    threads = [start_thread(work, stop, fail) for work in (cell.simulate, cell.film)]
     stop.wait()
     for thread in threads:
         thread.join(STOP_TIMEOUT)
-    if not stop_spinning(executor, spinner) or any(thread.is_alive() for thread in threads):
-        exit_at_once(EXIT_STOPPED)
+    ended = stop_spinning(executor, spinner) and not any(thread.is_alive() for thread in threads)
+    if failed.is_set() or not ended:
+        exit_at_once(EXIT_FAILED if failed.is_set() else EXIT_STOPPED)
     node.destroy_node()
 
 

@@ -150,7 +150,7 @@ def main(args: list[str] | None = None) -> int:
     _on_signal(wake.set)
     executor = SingleThreadedExecutor()
     executor.add_node(node)
-    spinner = start_spinning(executor, wake, fail)
+    spinner = start_thread(executor.spin, wake, fail)
     wake.wait()
     ended = node.close(STOP_TIMEOUT)
     ended = stop_spinning(executor, spinner) and ended
@@ -167,12 +167,12 @@ def _refuse_arguments(args: list[str]) -> None:
     parser.parse_args(args[: args.index("--ros-args")] if "--ros-args" in args else args)
 
 
-def start_spinning(executor: Executor, wake: threading.Event, fail: Callable[[], None]) -> threading.Thread:
-    """Start and return a thread that spins the executor. The thread calls `fail` if it ends before `wake` is set."""
+def start_thread(work: Callable[[], None], wake: threading.Event, fail: Callable[[], None]) -> threading.Thread:
+    """Start and return a thread that runs `work`. The thread calls `fail` if it ends before `wake` is set."""
 
-    def spin() -> None:
+    def run() -> None:
         try:
-            executor.spin()
+            work()
         except Exception:
             if not wake.is_set():
                 raise
@@ -181,9 +181,9 @@ def start_spinning(executor: Executor, wake: threading.Event, fail: Callable[[],
             if not wake.is_set():
                 fail()
 
-    spinner = threading.Thread(target=spin, name="graspd_executor", daemon=True)
-    spinner.start()
-    return spinner
+    thread = threading.Thread(target=run, daemon=True)
+    thread.start()
+    return thread
 
 
 def stop_spinning(executor: Executor, spinner: threading.Thread) -> bool:

@@ -285,6 +285,21 @@ def test_a_wrong_option_is_one_line():
     assert done.stderr.count("\n") == 1
 
 
+@pytest.mark.parametrize("method", ["step", "view_of"])
+def test_a_failure_while_it_runs_ends_the_simulator_with_1(domain: int, tmp_path: Path, method: str):
+    program = f"""
+from graspd_cell import simulated_robot, simulator_node
+def fail(*arguments): raise RuntimeError("broken on purpose")
+def settled(self, *arguments): simulated_robot.SimulatedRobot.{method} = fail
+simulator_node.SimulatorNode._publish = settled
+raise SystemExit(simulator_node.main(["--arm", "{ARM}", "--hand", "{HAND}", "--things", "family:pear:0"]))
+"""
+    environment = {**os.environ, "ROS_DOMAIN_ID": str(domain), "ROS_LOG_DIR": str(tmp_path)}
+    done = subprocess.run([sys.executable, "-c", program], env=environment, capture_output=True, text=True)
+    assert done.returncode == 1, done.stderr
+    assert "RuntimeError: broken on purpose" in done.stderr
+
+
 class SlowRobot:
     """A robot whose state takes a while to publish, as on a busy machine."""
 
