@@ -101,16 +101,19 @@ def draw_starts(
         return drawn if restrictions.aim is None else _aimed(drawn, restrictions.aim, surface, hand, generator)
 
     drawn = _allowed(draw, pool, seed, restrictions) if restrictions.each else draw(seed)
-    blocked = torch.zeros(len(drawn.joints), dtype=torch.float64)
     if obstacles is not None:
         links = forward(make_kinematics(hand, dtype=torch.float64), drawn.joints)
-        raised, blocked = raise_clear(obstacles, SE3(drawn.rotation, drawn.translation), links)
-        drawn = replace(drawn, middle=drawn.middle + raised - drawn.translation, translation=raised)
+        lift = _lift(obstacles, SE3(drawn.rotation, drawn.translation), links)
+        drawn = replace(drawn, middle=drawn.middle + lift, translation=drawn.translation + lift)
 
     half_width = half_widths(surface, drawn.middle, drawn.rotation, hand)
     # With Gumbel noise, the best poses are a random draw without replacement, with weights exp(−half width / scale).
     gumbel = -torch.log(-torch.log(_uniform(1e-12, 1.0, len(drawn.joints), generator)))
-    preference = gumbel - (half_width + drawn.depth) / _SPAN_SCALE - blocked / _DEPTH_SCALE
+    preference = gumbel - (half_width + drawn.depth) / _SPAN_SCALE
+    if obstacles is not None:
+        base = SE3(drawn.rotation, drawn.translation)
+        penalty = lambda rows: _depth(obstacles, base[rows], links[rows]) / _DEPTH_SCALE  # noqa: E731
+        preference = _lowered(preference, count, penalty)
     chosen = preference.topk(min(count, len(preference))).indices
     return Poses(
         drawn.translation[chosen].to(device, dtype),
@@ -205,18 +208,32 @@ def _allowed(draw: Callable[[int], StartPool], wanted: int, seed: int, restricti
     return StartPool(*(torch.cat(values)[:wanted] for values in columns))
 
 
-def raise_clear(obstacles: ObstacleTensors, base: SE3, links: SE3) -> tuple[Positions, Values]:
-    """Lift hands out of the support by at most `_HIGHEST_LIFT`. `links` are the link poses in the base frame.
+def _lift(obstacles: ObstacleTensors, base: SE3, links: SE3) -> Positions | float:
+    """Return the translation that lifts each hand out of the support, at most by `_HIGHEST_LIFT` [m]."""
+    if obstacles.normal is None:
+        return 0.0
+    depth = -obstacle_gaps(replace(obstacles, sdfs=()), base, links).amin(-1)
+    return depth.clamp(0.0, _HIGHEST_LIFT)[:, None] * obstacles.normal
 
-    Returns the lifted base origins [m], and each hand's greatest depth in obstacles there or at its retreat [m].
+
+def _depth(obstacles: ObstacleTensors, base: SE3, links: SE3) -> Values:
+    """Return each hand's depth in obstacles at its pose and its retreat, the greater [m]. `links` are in its frame."""
+    behind = drawn_back(base.translation, base.rotation, obstacles.approach)
+    gaps = [least_gap(obstacles, SE3(base.rotation, at), links) for at in (base.translation, behind)]
+    return (-torch.stack(gaps).amin(0)).clamp_min(0.0)
+
+
+def _lowered(preference: Values, count: int, penalty: Callable[[Tensor], Values]) -> Values:
+    """Subtract the `penalty` of each row. A row that cannot be among the `count` greatest may get −inf instead.
+
+    A penalty is not negative and slow to compute, so rows get theirs in descending order until `count` are known.
     """
-    translation = base.translation
-    if obstacles.normal is not None:
-        depth = -obstacle_gaps(replace(obstacles, sdfs=()), base, links).amin(-1)
-        translation = translation + depth.clamp(0.0, _HIGHEST_LIFT)[:, None] * obstacles.normal
-    behind = drawn_back(translation, base.rotation, obstacles.approach)
-    gaps = [least_gap(obstacles, SE3(base.rotation, at), links) for at in (translation, behind)]
-    return translation, (-torch.stack(gaps).amin(0)).clamp_min(0.0)
+    lowered = torch.full_like(preference, -torch.inf)
+    for rows in preference.argsort(descending=True).split(count):
+        if bool((lowered.topk(min(count, len(lowered))).values >= preference[rows[:1]]).all()):
+            break
+        lowered[rows] = preference[rows] - penalty(rows)
+    return lowered
 
 
 def depth_of_starts(scene: Scene, hand: HandModel, count: int, restrictions: BoundRestrictions) -> float:
@@ -226,7 +243,8 @@ def depth_of_starts(scene: Scene, hand: HandModel, count: int, restrictions: Bou
         return 0.0
     starts = draw_starts(scene, hand, count, 0, "cpu", torch.float64, restrictions=restrictions)
     links = forward(make_kinematics(hand, dtype=torch.float64), starts.joints)
-    return float(raise_clear(obstacles, starts.base, links)[1].amin()) if len(starts.joints) else 0.0
+    base = replace(starts.base, translation=starts.translation + _lift(obstacles, starts.base, links))
+    return float(_depth(obstacles, base, links).amin()) if len(starts.joints) else 0.0
 
 
 def half_widths(
