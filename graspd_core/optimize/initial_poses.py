@@ -217,7 +217,7 @@ def _lift(obstacles: ObstacleTensors, base: SE3, links: SE3) -> Positions | floa
 
 
 def _depth(obstacles: ObstacleTensors, base: SE3, links: SE3) -> Values:
-    """Return each hand's depth in obstacles at its pose and its retreat, the greater [m]. `links` are in its frame."""
+    """Return the depth of each hand in obstacles, at its pose or at its retreat, whichever is greater [m]."""
     behind = drawn_back(base.translation, base.rotation, obstacles.approach)
     gaps = [least_gap(obstacles, SE3(base.rotation, at), links) for at in (base.translation, behind)]
     return (-torch.stack(gaps).amin(0)).clamp_min(0.0)
