@@ -1,5 +1,6 @@
 """Switched on for every test: array shapes checked at run time, one torch thread, reproducible Hypothesis draws."""
 
+import ast
 import fcntl
 import os
 import sys
@@ -15,17 +16,21 @@ from jaxtyping import _import_hook, install_import_hook
 
 # Before anything imports graspd_core, or its functions would stay unchecked.
 install_import_hook("graspd_core", "beartype.beartype")
-_to_code, _one_at_a_time = _import_hook._JaxtypingLoader.source_to_code, threading.RLock()
+_reading = threading.RLock()
 
 
-def _locked_to_code(*arguments: Any, **named: Any) -> Any:
-    # Python 3.11 counts the depth of syntax trees for all threads together (python/cpython#106905): a module that the
-    # hook reads while another thread's is read would end in a SystemError.
-    with _one_at_a_time:
-        return _to_code(*arguments, **named)
+def _one_at_a_time(read: Callable[..., Any]) -> Callable[..., Any]:
+    def locked(*arguments: Any, **named: Any) -> Any:
+        with _reading:
+            return read(*arguments, **named)
+
+    return locked
 
 
-_import_hook._JaxtypingLoader.source_to_code = _locked_to_code
+# Python 3.11 counts the depth of syntax trees for all threads together (python/cpython#106905): a module that the hook
+# reads, or a header that np.load reads, while another thread reads one would end in a SystemError.
+_import_hook._JaxtypingLoader.source_to_code = _one_at_a_time(_import_hook._JaxtypingLoader.source_to_code)
+ast.parse = _one_at_a_time(ast.parse)
 
 import torch  # noqa: E402
 
