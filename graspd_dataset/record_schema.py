@@ -1,4 +1,4 @@
-"""The columns of a data set. `columns` defines them for the Parquet schema and the table in docs/dataset.md."""
+"""The columns of a data set. `columns` defines them for the Parquet schema and the table in docs/tables/dataset.md."""
 
 from __future__ import annotations
 
@@ -116,7 +116,7 @@ def object_schema() -> Any:
 
 
 def schema_table() -> str:
-    """Return the table of all columns in Markdown, for docs/dataset.md."""
+    """Return the table of all columns in Markdown, for docs/tables/dataset.md."""
     return markdown_table(
         ("column", "type", "what it holds"), [(f"`{c.name}`", c.kind, c.description) for c in columns()]
     )

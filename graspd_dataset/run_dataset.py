@@ -128,7 +128,7 @@ def data_card(store: DatasetStore, stats: DatasetStats) -> str:
         "",
         f"{stats.rows} grasps that were tried in MuJoCo, {stats.size / 2**20:.1f} MB. A row is a candidate, verified",
         "or failed: three postures, contacts, metrics, results of every trial, the verdict and its reason.",
-        f"The columns are described in graspd's docs/dataset.md (schema version {SCHEMA_VERSION}).",
+        f"The columns are described in graspd's docs/tables/dataset.md (schema version {SCHEMA_VERSION}).",
         "",
         stats_table(stats),
         "",

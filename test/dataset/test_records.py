@@ -62,8 +62,8 @@ def test_every_metric_has_a_column_and_the_page_lists_all():
     assert names == arrow_schema().names
     assert len(names) == len(set(names))
     assert {f"metric_{row.key}" for row in METRICS.values()} <= set(names)
-    page = (ROOT / "docs" / "dataset.md").read_text()
-    assert schema_table() in page, f"docs/dataset.md is not up to date; the table is\n{schema_table()}"
+    page = (ROOT / "docs" / "tables" / "dataset.md").read_text()
+    assert schema_table() in page, f"docs/tables/dataset.md is not up to date; the table is\n{schema_table()}"
 
 
 def test_a_table_comes_back_as_it_was_and_a_changed_byte_is_found(made: DatasetStore):
