@@ -217,14 +217,20 @@ def _reasons(records: Sequence[Record]) -> str:
     kinds: dict[str, int] = {}
     for record in records:
         for reason, count in record["filtered"]["refused"].items():
-            kind = next((kind for kind in _KINDS if kind in reason), reason)
+            kind = next((kind for word, kind in _KINDS.items() if word in reason), reason)
             kinds[kind] = kinds.get(kind, 0) + count
     counts = ", ".join(f"{count} {kind}" for kind, count in sorted(kinds.items(), key=lambda item: -item[1]))
     return f"Refused before any trial: {counts or 'none'}."
 
 
-# Words by which reasons are grouped, whatever link or joint a reason names. The first word that occurs counts.
-_KINDS = ("limit on the path", "limit", "in the table", "in the object", "against the hand", "against", "jump")
+# Kinds of reasons by a word of the reason, whatever link or joint it names. The first word that occurs counts.
+_KINDS = {
+    "limit on the path": "beyond a joint's limit on the path",
+    "limit": "beyond a joint's limit",
+    "jump": "with a jump of a joint",
+    **{kind: kind for kind in ("in the table", "in the object", "against the hand")},
+    "against": "arm against itself",
+}
 
 
 def measure_arm(arm: Arm, poses: int) -> Record:
