@@ -10,7 +10,7 @@ import json
 import tempfile
 import time
 from collections.abc import Callable, Sequence
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any, Literal
 
@@ -145,13 +145,12 @@ def run_case(case: Case, preset: str = "balanced") -> StressEnding:
             len(verified),
             _hold_again(case, result, scene, hand, Path(folder), preset) if verified else 0,
             _finite(result),
-            None if case.truth is None else _hold_truly(verified, scene, hand, case.truth()),
+            None if case.truth is None else _hold_truly(result, scene, hand, case.truth()),
         )
 
 
 def _printed(result: GraspResult, folder: str) -> str:
-    lines = (result.outcome.value, result.message, *result.warnings)
-    return "; ".join(filter(None, lines)).replace(f"{folder}/", "")
+    return "; ".join((result.message, *result.warnings)).replace(f"{folder}/", "")
 
 
 def _hold_again(case: Case, result: GraspResult, scene: Scene, hand: Any, folder: Path, preset: str) -> int:
@@ -164,19 +163,18 @@ def _hold_again(case: Case, result: GraspResult, scene: Scene, hand: Any, folder
     save_result(path, result, scene.object, hand, load_preset(preset))
     kept = grasps_of(load_document(path))
     cache.forget()
-    verified = [grasp for grasp in kept if grasp.verdict is Verdict.VERIFIED]
-    return _held(verified, case.scene(folder).object, hand)
+    return _held(kept, replace(case.scene(folder).object, mass=result.tried_mass), hand)
 
 
-def _hold_truly(verified: Sequence[Grasp], scene: Scene, hand: Any, truth: TriangleMesh) -> int:
+def _hold_truly(result: GraspResult, scene: Scene, hand: Any, truth: TriangleMesh) -> int:
     from graspd_core.perception.scene import build_scene
 
-    true = build_scene(truth, source="truth", mass=scene.object.mass, friction=scene.object.friction)
-    return _held(verified, true.object, hand)
+    true = build_scene(truth, source="truth", mass=result.tried_mass, friction=scene.object.friction)
+    return _held(result.tried, true.object, hand)
 
 
 def _held(grasps: Sequence[Grasp], target: ObjectModel, hand: Any) -> int:
-    """Return how many grasps pass the hold trial on an object, in a new world."""
+    """Return how many verified grasps pass the hold trial on an object, in a new world."""
     from graspd_core.verify.hold_trial import hold_trial, out_of_place
     from graspd_core.verify.world import PROTOCOLS, at_friction, build_world
 
@@ -184,7 +182,8 @@ def _held(grasps: Sequence[Grasp], target: ObjectModel, hand: Any) -> int:
     target = moved_object(target, -far)
     world = build_world(hand, target, object_parts(target), protocol)
     protocol = out_of_place(protocol)
-    return sum(hold_trial(world, moved_grasp(grasp, -far), protocol).passed for grasp in grasps)
+    verified = [moved_grasp(grasp, -far) for grasp in grasps if grasp.verdict is Verdict.VERIFIED]
+    return sum(hold_trial(world, grasp, protocol).passed for grasp in verified)
 
 
 def _finite(result: GraspResult) -> bool:

@@ -116,7 +116,7 @@ def reconstruct_object(
     doubts = ()
     if seen.views:
         about_units = _unit_doubts(seen, views, settings.segmentation.max_range)
-        doubts = (*about_units, *_camera_doubts(seen, views), *filter(None, (seen.beside,)))
+        doubts = (*about_units, *_camera_doubts(seen, views), *filter(None, (seen.cut, seen.beside)))
     whole = reconstruct(seen.views, seen.support, settings.reconstruction, () if alone else views)
     whole = replace(whole, evidence=replace(whole.evidence, doubts=doubts))
     told = tuple(f"cloud: {doubt}; no grasp counts as verified" for doubt in doubts)

@@ -7,7 +7,7 @@ from graspd_bench.rendering.depth_noise import LEVELS, NONE, DepthNoise
 from graspd_bench.rendering.tabletop import CAMERA as D415
 from graspd_bench.rendering.tabletop import TabletopScene, ring_poses, tabletop, views_of
 from graspd_bench.stress.broken_clouds import beside_a_step, half_out_of_view, zero_filled
-from graspd_core import PinholeCamera, Target, TriangleMesh, make_shape
+from graspd_core import PinholeCamera, Target, TriangleMesh, make_shape, scene_from_views
 from graspd_core.config import SegmentationConfig
 from graspd_core.errors import CloudError, NoObjectError
 from graspd_core.mesh.surface_queries import make_surface, surface_distance
@@ -70,9 +70,16 @@ def test_the_lower_level_of_a_stepped_table_is_what_the_object_stands_on():
     assert found.views[0].points[:, 2].min() < 0.01
 
 
-def test_an_object_at_the_border_of_the_picture_is_told():
-    assert any("reaches the border of view 1" in w for w in segment(half_out_of_view("box")).warnings)
-    assert segment([view_of_box()]).warnings == ()
+def test_an_object_at_the_border_of_the_picture_is_doubted():
+    scene = scene_from_views(half_out_of_view("box"))
+    told = "the object reaches the border of the image, and may extend beyond it"
+    assert scene.evidence is not None
+    assert scene.evidence.doubts == (told,)
+    assert f"cloud: {told}; no grasp counts as verified" in scene.object.warnings
+    # The second view shows the whole outline.
+    assert segment([*half_out_of_view("box"), view_of_box()]).cut == ""
+    found = segment([view_of_box()])
+    assert (found.cut, found.warnings) == ("", ())
 
 
 def test_a_view_that_shows_nothing_is_told():

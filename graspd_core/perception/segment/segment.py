@@ -53,7 +53,7 @@ class Segmentation:
         support: support plane of the object. None if none was seen.
         obstacles: downsampled points of each other object or surface nearby [m].
         warnings: warnings for the user.
-        cut: whether the object reaches the border of an image or of the workspace.
+        cut: why the object may extend beyond what the views show. Empty if one view shows its whole outline.
         beside: why `views` may show only a part of the object, or several objects. Empty if there is no doubt.
     """
 
@@ -61,7 +61,7 @@ class Segmentation:
     support: Plane | None
     obstacles: tuple[Float[np.ndarray, "_ 3"], ...]
     warnings: tuple[str, ...]
-    cut: bool = False
+    cut: str = ""
     beside: str = ""
 
 
@@ -99,15 +99,14 @@ def segment(
     if total < MIN_POINTS:
         raise CloudError(f"cloud: only {total} points show the object; at least {MIN_POINTS} are needed")
     obstacles = _obstacles(parted, chosen)
-    doubts = _doubts(parted, chosen, bool(obstacles))
+    warnings = _warnings(parted, bool(obstacles))
     support = ground.support and ground.support.as_support(scene.mean_distance[chosen])
-    cut = any("reaches the border" in doubt for doubt in doubts)
     touching = () if marked else _touching(scene, chosen, parts)
     beside = "" if target.point is None or len(views) > 1 else _beside(parted, chosen, target.point)
     if parted.settings.piled and target.point is not None and touching:
         # In a pile, a part need not stand on the support, so the seam may also lie within one object.
         touching, beside = (), "a seam divides the target from its neighbour, and both may be one object"
-    return Segmentation(found, support, obstacles, (*doubts, *touching), cut, beside)
+    return Segmentation(found, support, obstacles, (*warnings, *touching), _cut(parted, chosen), beside)
 
 
 def find_things(
@@ -221,28 +220,36 @@ def _obstacles(parted: _Parted, chosen: Mask) -> tuple[Float[np.ndarray, "_ 3"],
     return tuple(mean[mask] for mask in masks if mask.any())
 
 
-def _doubts(parted: _Parted, chosen: Mask, crowded: bool) -> tuple[str, ...]:
+def _warnings(parted: _Parted, crowded: bool) -> tuple[str, ...]:
     """Return warnings about the segmentation. `crowded` is True if there are obstacles."""
     scene, ground, settings = parted.scene, parted.ground, parted.settings
-    doubts = []
+    warnings = []
     if scene.size > 0.5 * settings.gap:
-        doubts.append(
+        warnings.append(
             f"cloud: {len(scene.points)} points were thinned to one per {1e3 * scene.size:.1f} mm; finer gaps are lost"
         )
     blind = [str(k) for k, rows in enumerate(scene.rows, 1) if len(rows) == 0]
     if blind:
-        doubts.append(f"cloud: of {len(scene.rows)} views these show nothing within range: {', '.join(blind)}")
+        warnings.append(f"cloud: of {len(scene.rows)} views these show nothing within range: {', '.join(blind)}")
     if ground.support is None and crowded:
-        doubts.append("cloud: no support is seen; the object may include what is behind it in the image")
-    # Without surroundings, the object's own outline is the outline of the view.
-    surrounded = ground.support is not None or len(ground.background) > 0
-    for k in range(len(scene.rows) if surrounded else 0):
-        part = scene.of_view(k)
-        if reaches_image_border(scene.points[part], parted.eyes[k], chosen[scene.voxel[part]], settings.border_width):
-            doubts.append(f"cloud: the object reaches the border of view {k + 1}, and may extend beyond it")
+        warnings.append("cloud: no support is seen; the object may include what is behind it in the image")
+    return tuple(warnings)
+
+
+def _cut(parted: _Parted, chosen: Mask) -> str:
+    """Return why the object may extend beyond what the views show, or ""."""
+    scene, ground, settings = parted.scene, parted.ground, parted.settings
     if _cut_off(scene, chosen, settings):
-        doubts.append("cloud: the object reaches the border of the workspace; the rest of it is not seen")
-    return tuple(doubts)
+        return "the object reaches the border of the workspace; the rest of it is not seen"
+    # Without surroundings, the object's own outline is the outline of the view.
+    if ground.support is None and not ground.background:
+        return ""
+    for k in range(len(scene.rows)):
+        part = scene.of_view(k)
+        mine = chosen[scene.voxel[part]]
+        if mine.any() and not reaches_image_border(scene.points[part], parted.eyes[k], mine, settings.border_width):
+            return ""
+    return "the object reaches the border of the image, and may extend beyond it"
 
 
 def _parts(parted: _Parted, chosen: Mask) -> Labels:
