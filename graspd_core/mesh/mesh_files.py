@@ -126,7 +126,7 @@ def _cut_obj(tail: bytes) -> str:
 
 
 def _cut_rows(text: bytes, ply: bool) -> str:
-    """Return how many rows an OFF or a text PLY lacks, empty if none."""
+    """Return text that tells how many rows an OFF or a text PLY lacks, empty if none."""
     head, _, body = text.partition(b"end_header" if ply else b"OFF")
     body = re.sub(rb"#.*", b"", body)
     counts = re.findall(rb"(?m)^element +\S+ +(\d+)", head) if b"format ascii" in head else []
@@ -384,7 +384,7 @@ def _distinct(mesh: TriangleMesh, source: str) -> tuple[TriangleMesh, int, int]:
 
 
 def _solid_moments(mesh: TriangleMesh) -> tuple[float, Float[np.ndarray, "3"], Float[np.ndarray, "3 3"]]:
-    """Return volume, centre and inertia of a closed body of either winding, summed over tetrahedra from the origin."""
+    """Return volume, centre and inertia of a closed body of either winding, by tetrahedra with a corner at zero."""
     corners = mesh.vertices[mesh.faces]
     sixfold = np.einsum("fi,fi->f", corners[:, 0], np.cross(corners[:, 1], corners[:, 2]))
     total, middle = sixfold.sum(), corners.sum(1)

@@ -164,7 +164,7 @@ def _closest_to_nodes(surface: Surface, nodes: _Vectors, spacing: float) -> tupl
 
 
 def _sweep(nodes: _Vectors, closest: _Vectors, squared: _Lengths) -> None:
-    """Give nodes a neighbour's surface point if it is nearer. Change `closest` and the `squared` distances in place."""
+    """Give each node a neighbour's surface point if that point is nearer. Change `closest` and `squared` in place."""
     for axis in range(3):
         # All three are NumPy views with this axis first, so writing to them changes the arrays.
         at, to, best = np.moveaxis(nodes, axis + 1, 1), np.moveaxis(closest, axis + 1, 1), np.moveaxis(squared, axis, 0)

@@ -163,7 +163,7 @@ _AROUND = _AROUND[np.abs(_AROUND).any(1)] / np.linalg.norm(_AROUND[np.abs(_AROUN
 def pressed_points(
     surface: Surface, points: Float[np.ndarray, "n 3"], normals: Float[np.ndarray, "n 3"]
 ) -> tuple[Float[np.ndarray, "n 3"], Float[np.ndarray, "n 3"]]:
-    """Return the closest surface points [m], and the outward unit normals there that are nearest to `normals`.
+    """Return the closest surface points [m], and at each point the outward unit normal nearest to that in `normals`.
 
     On a face, the face's normal is returned. On an edge or a corner, any direction between the face normals is valid.
     """
