@@ -23,8 +23,8 @@ TINY, STAYS = 0.05, 0.98
 def drop_small_components(mesh: TriangleMesh) -> tuple[TriangleMesh, int]:
     """Return the mesh without its tiny floating pieces, and the number of dropped pieces.
 
-    A piece is tiny if it has under 5 % of the extent of the piece with the most area. A tiny piece is
-    dropped if its distance from the larger pieces exceeds its extent. If they hold over 2 % of the area, none is.
+    A piece is tiny if it has under 5 % of the extent of the piece with the most area. A tiny piece is dropped if
+    its distance from the larger pieces exceeds its extent. If tiny pieces hold over 2 % of the area, none is dropped.
     """
     piece = face_components(mesh)
     count = int(piece.max()) + 1
@@ -114,7 +114,7 @@ def _grown(
     among: Bool[np.ndarray, "points"],
     reach: float,
 ) -> Bool[np.ndarray, "points"]:
-    """Return which points are on the longest piece in `among`, or on pieces in `among` that small gaps connect to it."""
+    """Return which points lie on the longest piece of `among`, or on pieces connected by gaps below `reach` [m]."""
     low, high = np.full((2, int(owner.max()) + 1, 3), np.inf)
     np.minimum.at(low, owner[among], points[among])
     np.minimum.at(high, owner[among], -points[among])

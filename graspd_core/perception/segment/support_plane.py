@@ -2,7 +2,8 @@
 
 A support faces the cameras, is larger than the objects on it, and has at least one object on it. The object reaches
 down to the support, lies over the visible part of the support, and has a graspable size. Other flat parts fail this:
-nothing is above a convex body's face, and no object touches a wall. A tray's rim is no smaller than the tray's floor.
+nothing is above a convex body's face, and no object touches a wall. A tray's floor does not support the tray's rim,
+because the rim is not smaller than the floor.
 """
 
 from __future__ import annotations
@@ -118,7 +119,7 @@ def _falls_off(scene: VoxelScene, part: FlatPart, margin: float) -> bool:
 def _standing(
     scene: VoxelScene, part: FlatPart, left: Mask, viewpoints: Eyes, settings: SegmentationConfig
 ) -> tuple[int, int]:
-    """Count voxels of objects that may stand on a flat part. Return the count for those that touch it, then for all."""
+    """Count voxels of objects that may stand on a flat part. Return the counts for touching objects and for all."""
     points, distance = scene.mean[left], scene.mean_distance[left]
     label = link_points(points, scene.weight[left], link_length(points, settings), settings.neighbour_share)
     touching, standing = 0, 0
