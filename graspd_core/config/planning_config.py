@@ -11,7 +11,7 @@ from graspd_core.errors import ConfigError
 
 @dataclass(frozen=True)
 class ProblemConfig:
-    """Settings of the optimisation problem made from scene and hand. All methods rank their grasps by this problem.
+    """Settings of the optimisation problem made from scene and hand. All methods rank grasps by this problem.
 
     Attributes:
         candidates: number of contact candidates (points on the hand) in most optimiser steps.
@@ -90,7 +90,7 @@ class RobustConfig:
     Attributes:
         rank: whether to run the further trials. Grasps that hold in more trials rank higher.
         trials: number of further trials for each verified grasp.
-        hold_time: duration of each of the six pulls of a trial [s].
+        hold_time: duration of the pull in each of the six directions of a trial [s].
         friction: whether to measure the least friction at which each verified grasp holds.
     """
 

@@ -24,7 +24,7 @@ class SegmentationConfig:
         max_range: points farther than this from their camera are ignored [m].
         voxel: edge length of the voxels to which the scene is downsampled, below half of `gap` [m].
         max_voxels: maximum number of voxels of a scene. Larger scenes get larger voxels, which bounds the time.
-        plane_tolerance: points up to this height above a plane belong to the plane [m]. Camera noise increases it.
+        plane_tolerance: points up to this height above a plane belong to the plane [m]. Camera noise raises the height.
         max_plane_tolerance: greatest plane tolerance, for the noisiest cameras [m].
         plane_search_width: greatest distance of inliers from a plane during the search [m]. Use more for noisy cameras.
         ransac_trials: number of planes that RANSAC tries. Use more if the support is a small part of the scene.
@@ -40,7 +40,7 @@ class SegmentationConfig:
         smallest_object: objects smaller than this are noise [m].
         largest_object: objects larger than this are background: walls, floors, furniture [m].
         min_points: objects with fewer points than this are noise.
-        border_width: an object this near to the image border may continue beyond it [rad]. This is about three pixels.
+        border_width: an object this near to the image border may extend beyond it [rad]. The default is about 3 pixels.
         target_reach: a target point selects an object within this distance [m].
         target_share: a box or mask that covers this fraction of an object selects the whole object.
         obstacle_range: other objects up to this distance from the object to grasp become obstacles [m].

@@ -1,6 +1,6 @@
 """Define the hand model: a tree of links with joints, masses, collision primitives and contact candidates.
 
-Link frames are those of the URDF. The base frame is the frame of `base_link`. Units are m, rad, kg, N, N·m.
+Link frames are the frames of the URDF. The base frame is the frame of `base_link`. Units are m, rad, kg, N, N·m.
 """
 
 from __future__ import annotations

@@ -1,6 +1,7 @@
 """Sample points on the sharp convex parts of a surface: edges, corners, rims, thin walls.
 
-Points on a hand are millimetres apart, so an object's edge can enter between them. Points on the edge detect this.
+Points on a hand are millimetres apart, so an object's edge can enter the hand between the points. Points on the edge
+detect such an overlap.
 """
 
 from __future__ import annotations
@@ -33,8 +34,8 @@ def sharp_points(mesh: TriangleMesh, count: int, seed: int = 0, *, pool: int = _
     """Return evenly spread points [m] on edges, corners and thin walls, where little material lies below the surface.
 
     A probe point is placed 3 mm below each candidate. Under a flat surface, the probe is 3 mm from the surface. Under
-    an edge or in a thin wall, it is nearer. Thin-walled objects get more than `count` points, smooth objects fewer or
-    none. The points are in farthest-point order, so the first k points are evenly spread for every k.
+    an edge or in a thin wall, the probe is nearer. Thin-walled objects get more than `count` points, smooth objects
+    fewer or none. The points are in farthest-point order, so the first k points are evenly spread for every k.
 
     Args:
         pool: number of candidates at vertices, and number of candidates on edges. Half as many lie on faces.

@@ -53,7 +53,7 @@ def make_obstacles(
 
     Args:
         points: seen points of each neighbour [m]. Neighbours with too few finite points are left out.
-        support: plane that the neighbours stand on, or None. Their points are extruded down to this plane.
+        support: plane that the neighbours stand on, or None. The seen points are extruded down to this plane.
         target: the object to grasp.
         reach: greatest distance from the target [m]. Farther neighbours are left out.
         settings: settings of the hulls.
@@ -118,7 +118,7 @@ def held_hull(mesh: TriangleMesh, base: Posture) -> TriangleMesh:
 def with_neighbours(
     scene: Scene, things: Mapping[str, Sequence[TriangleMesh]], settings: SceneConfig | None = None
 ) -> Scene:
-    """Return the scene with collision objects of a planning scene added as obstacles.
+    """Return the scene with collision objects, e.g. of a MoveIt planning scene, added as obstacles.
 
     A collision object that largely overlaps the target is taken for the target, and left out with a warning. Collision
     objects that do not rise above the support, or that are too far away, are left out without a warning.

@@ -63,7 +63,7 @@ _NEAR_SURFACE_CELLS = 2.0
 def confidence_grid(
     vertices: Float[np.ndarray, "vertices 3"], confidence: Float[np.ndarray, "vertices"], sdf: GridSDF
 ) -> Float[Tensor, "x y z"]:
-    """Give nodes near the surface the confidence of the nearest vertex. Other nodes copy the nearest of these nodes."""
+    """Give nodes near the surface the confidence of the nearest vertex. All other nodes copy the nearest such node."""
     spacing = float(sdf.spacing)
     near = sdf.field[0].abs().cpu().numpy() < _NEAR_SURFACE_CELLS * spacing
     nodes = sdf.origin.cpu().numpy() + spacing * np.argwhere(near)

@@ -163,7 +163,7 @@ def empty_depth(free_space: FreeSpace, points: Places) -> Depths:
 
 
 def weigh(free_space: FreeSpace, points: Places, normals: Places) -> tuple[Bool[np.ndarray, "*batch"], Depths]:
-    """Return which points a camera confirms (on seen surface, facing it), and how much cameras contradict each point."""
+    """Return which points a camera confirms (on seen surface, facing it), and each point's contradiction, 0 to 1."""
     confirmed, deep = _classify(free_space, points, normals)
     return confirmed, np.clip((deep - free_space.slack) / CONTRADICTION_DEPTH_M, 0.0, 1.0)
 

@@ -1,7 +1,7 @@
 """Closed surfaces from oriented points: screened Poisson (Kazhdan and Hoppe 2013), cut by the cameras' free space.
 
-Where points are missing, a Poisson surface bulges outwards or stays open. So its distance field is sampled on a grid,
-cut by the space seen to be empty and by the support, and meshed again. The new mesh is closed.
+Where points are missing, a Poisson surface bulges outwards or stays open. So the surface's distance field is sampled on
+a grid, cut by the space seen to be empty and by the support, and meshed again. The new mesh is closed.
 
 The field is computed on a regular grid by Fourier transforms (Kazhdan 2005), or by Open3D on an adaptive grid. On small
 grids, Fourier transforms take a sixth of the time. The field is then drawn to zero at the points, as in screened

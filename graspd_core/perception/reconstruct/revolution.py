@@ -86,7 +86,7 @@ def half_plane(surfels: Surfels, axis: Axis) -> tuple[Points, Float[np.ndarray, 
     """Rotate points about the axis into one half-plane.
 
     Return the unit direction of each point from the axis, and one row per point. A row holds height along the axis and
-    distance from it [m], and the normal's components along the axis and away from it.
+    distance from it [m], and the normal's components along the axis and away from the axis.
     """
     offset = surfels.points - axis.point
     height = offset @ axis.direction
@@ -132,7 +132,8 @@ def _thinner(
     """Return a Gauss-Newton step of four motions of the axis: two shifts [m] and two tilts [rad].
 
     `rates` holds how fast each motion changes a point's height and radius. Cells group points of the profile. A point's
-    residual is its distance from its cell's mean, along the cell's normal. Residuals beyond `scale` [m] count little.
+    residual is the distance from the mean of the point's cell, along the cell's normal. Residuals beyond `scale` [m]
+    count little.
     """
     height, radius, along, across = rows.T
     wall = np.abs(across) > np.abs(along)

@@ -89,7 +89,7 @@ def _left(scene: VoxelScene, support: FlatPart | None, background: Sequence[Mask
 
 
 def _covered(scene: VoxelScene, part: FlatPart, margin: float) -> Mask:
-    """Return which voxels are on a flat part or within `margin` [m] beside it, in its plane."""
+    """Return which voxels are on a flat part, or in the part's plane at most `margin` [m] beside the part."""
     height, tolerance = np.abs(part.height(scene.mean)), part.tolerance(scene.mean_distance)
     band = np.flatnonzero(height <= (1 + NEIGHBOURHOOD_TOLERANCES) * tolerance.max())
     band = band[part.beneath(scene.mean[band], 2 * margin)]

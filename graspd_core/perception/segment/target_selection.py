@@ -105,7 +105,7 @@ def select_target(
 def select_part(
     scene: VoxelScene, part: Labels, target: Target, views: Sequence[PointCloud], settings: SegmentationConfig
 ) -> Mask:
-    """Return the voxels of those parts of the selected object that the target selects.
+    """Return the voxels of the parts that the target selects, among the parts of the selected object.
 
     Args:
         part: part number of each voxel of the selected object, split at seams, -1 for other voxels.
