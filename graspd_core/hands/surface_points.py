@@ -55,7 +55,7 @@ def surface_points(primitive: Primitive, count: int, rng: np.random.Generator) -
 
 
 def feature_points(primitive: Primitive, spacing: float) -> tuple[Points, Points, Bool[np.ndarray, "points"]]:
-    """Return points on edges and rims at most `spacing` [m] apart, their mean normals, and True for corners."""
+    """Return points on edges and rims at most `spacing` [m] apart, the mean normal at each, and a mask of corners."""
     if primitive.kind == "box":
         points, normals, corner = _box_edges(np.asarray(primitive.size), spacing)
     elif primitive.kind == "cylinder":

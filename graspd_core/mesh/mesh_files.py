@@ -249,7 +249,7 @@ def check_mesh(
 
 
 def simplify(mesh: TriangleMesh, faces: int, *, aggressiveness: int = 7) -> TriangleMesh:
-    """Reduce a mesh to about `faces` faces by quadric edge collapse. Low `aggressiveness` is slower but tears less."""
+    """Reduce a mesh to about `faces` faces by quadric edge collapse. A low `aggressiveness` is slow but tears less."""
     import fast_simplification
 
     if len(mesh.faces) <= faces:

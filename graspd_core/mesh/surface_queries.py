@@ -187,7 +187,7 @@ def pressed_points(
 def first_hits(
     mesh: TriangleMesh, directions: Float[np.ndarray, "*batch 3"]
 ) -> tuple[Float[np.ndarray, "*batch"], Integer[np.ndarray, "*batch"], Float[np.ndarray, "*batch 3"]]:
-    """Cast rays from the origin. Return distances divided by ray lengths (inf: no hit), hit faces and unit normals."""
+    """Cast rays from the origin. Return distances per length of `directions` (inf: no hit), hit faces and normals."""
     with Extra("clouds"):
         import open3d as o3d
 

@@ -3,7 +3,7 @@
 An organised cloud (with one point per pixel) is checked by the pixels: a homography must map the pixels of a pinhole
 camera to the lines of sight. Depth errors only move points along these lines. Without pixels, two rules are checked: a
 camera sees no surface through another surface, and no surface from behind. If the given position is wrong, some points
-seem to be hidden behind other points, and a part of each curved surface seems to face away from the camera.
+seem to be hidden behind other points. A part of each curved surface then seems to face away from the camera.
 """
 
 from __future__ import annotations

@@ -85,8 +85,8 @@ def meeting_direction(surfels: Surfels) -> Vector:
 def half_plane(surfels: Surfels, axis: Axis) -> tuple[Points, Float[np.ndarray, "n 4"]]:
     """Rotate points about the axis into one half-plane.
 
-    Return the unit direction of each point from the axis, and one row per point. A row holds height along the axis and
-    distance from it [m], and the normal's components along the axis and away from the axis.
+    Return the unit direction of each point from the axis, and one row per point. A row holds height along the axis [m],
+    distance from the axis [m], and the normal's components along the axis and away from the axis.
     """
     offset = surfels.points - axis.point
     height = offset @ axis.direction

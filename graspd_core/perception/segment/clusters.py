@@ -209,7 +209,7 @@ def _outline(points: Points, normals: Points, near: Int[np.ndarray, "n near"]) -
 def _bend(
     points: Points, normals: Points, one: Int[np.ndarray, "pairs"], other: Int[np.ndarray, "pairs"]
 ) -> Float[np.ndarray, "n"]:
-    """Return each point's curvature [1/m], negative if concave: the mean over its pairs in `one` and `other`."""
+    """Return each point's curvature [1/m], averaged over the point's pairs (`one`, `other`). Concave is negative."""
     way = points[other] - points[one]
     squared = np.einsum("pd,pd->p", way, way)
     # Close pairs measure noise rather than curvature.

@@ -149,8 +149,8 @@ def _thing_of(
 ) -> int:
     """Return the index of the object that contains a point, else of the nearest object within `target_reach`.
 
-    An object contains points in its hull or hidden behind its surface, down to a depth of half its length. For a point
-    deeper than `MIDDLE_SHARE` of the length, the nearest object within `target_reach` is preferred.
+    An object contains points in its hull or hidden behind it, at most half its length from the seen surface. For a
+    point deeper than `MIDDLE_SHARE` of the length, the nearest object within `target_reach` is preferred.
     """
     away = np.linalg.norm(scene.mean - point, axis=1)
     things = [np.flatnonzero(label == k) for k in range(int(label.max(initial=-1)) + 1)]
