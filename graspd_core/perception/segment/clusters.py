@@ -168,7 +168,7 @@ def touching_things(points: Points, eyes: Eyes, height: Float[np.ndarray, "n"], 
 
 
 def heaped_things(points: Points, eyes: Eyes, spacing: float) -> Int[np.ndarray, "n"]:
-    """Split a heap at seams and waists, and each part likewise until no part has any. Return each point's part number.
+    """Split a heap at seams and waists until no part has a seam or waist. Return each point's part number.
 
     The arguments are those of `touching_things`. Parts need not stand, because objects of a heap lie on each other.
     """
