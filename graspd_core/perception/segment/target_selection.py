@@ -195,7 +195,7 @@ def _holds(points: Points, point: Vector) -> bool:
 
 
 def _masked(scene: VoxelScene, label: Labels, many: int, meant: Mask, least: float) -> Mask:
-    """Take objects at least half masked or with most masked points. Below `least`, take only an object's masked voxels."""
+    """Take objects at least half masked or with most masked points. Below `least`, take only the masked voxels."""
     of_first = scene.voxel[scene.of_view(0)]
     shown, covered = (
         np.bincount(label[rows][label[rows] >= 0], minlength=many) for rows in (of_first, of_first[meant[of_first]])
