@@ -45,7 +45,7 @@ def _shapes(
 
 
 def _with_capsules(shapes: Sequence[Primitive]) -> tuple[Primitive, ...]:
-    """Replace each cylinder that has a sphere at each end by a capsule. URDF files often write a capsule as such shapes."""
+    """Replace each cylinder that has a sphere at each end by a capsule. URDF files often write a capsule so."""
     found, taken = list(shapes), set[int]()
     for i, shape in enumerate(shapes):
         if shape.kind != "cylinder":
