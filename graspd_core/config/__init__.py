@@ -1,4 +1,4 @@
-"""Hold the settings that several folders share, as frozen dataclasses. Each method's folder holds its own settings."""
+"""Hold the settings that several folders share, as frozen dataclasses. Settings of one method are in its folder."""
 
 from __future__ import annotations
 

@@ -50,8 +50,8 @@ def coerced(
 def yaml_values(path: Path) -> Iterator[Any]:
     """Yield the values of a YAML file. An empty file gives an empty mapping.
 
-    If a ConfigError inside the block begins with a dotted key, the error gets the file's path and the key's line.
-    Raises ConfigError: the file is missing or malformed.
+    If a ConfigError inside the `with` block begins with a dotted key, the error gets the file's path and the key's
+    line. Raises ConfigError: the file is missing or malformed.
     """
     try:
         node, values = parse_yaml(path.read_text(encoding="utf-8"))

@@ -1,4 +1,4 @@
-"""Hold the planning settings of all methods, and the certainty required of grasps of objects that cameras saw."""
+"""Hold the planning settings of all methods, and the certainty that grasps need if cameras saw the object."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from graspd_core.errors import ConfigError
 
 @dataclass(frozen=True)
 class ProblemConfig:
-    """Settings of the optimisation problem made from scene and hand. All methods rank their grasps by this problem.
+    """Settings of the optimisation problem made from scene and hand. All methods rank grasps by this problem.
 
     Attributes:
         candidates: number of contact candidates (points on the hand) in most optimiser steps.
@@ -38,7 +38,7 @@ class ProblemConfig:
 
 @dataclass(frozen=True)
 class GraspStagesConfig:
-    """Settings of the pregrasp and squeeze postures.
+    """Settings of the pregrasp posture (just before contact) and the squeeze posture (which applies the grip force).
 
     Attributes:
         touch_reach: a link counts as touching up to this distance from the object [m].
@@ -49,8 +49,8 @@ class GraspStagesConfig:
         effort_share: fraction of a joint's effort limit that the squeeze may use.
         clearance: distance from the object to which the pregrasp opens [m].
         open_steps: number of steps in the search for the pregrasp.
-        open_joint_rate: step size of revolute joints in this search [rad]. Prismatic joints move 0.05 m per radian.
-        open_base_rate: step size of the hand's base in this search [m].
+        open_joint_rate: step size of revolute joints in the search [rad]. Prismatic joints move 0.05 m per radian.
+        open_base_rate: step size of the hand's base in the search [m].
     """
 
     touch_reach: float = 0.002
@@ -67,10 +67,10 @@ class GraspStagesConfig:
 
 @dataclass(frozen=True)
 class RoundsConfig:
-    """Settings for rounds of optimisation and trials. If too few grasps hold, the next round starts from other poses.
+    """Settings for rounds of optimisation and trials. If too few grasps hold, a further round starts from other poses.
 
     An effort of 1 leaves the method's settings unchanged. An effort below 1 multiplies the number of steps. An effort
-    above 1 multiplies the number of starts.
+    above 1 multiplies the number of starting poses.
 
     Attributes:
         most: maximum number of rounds.
@@ -88,9 +88,9 @@ class RobustConfig:
     """Settings for further trials of verified grasps, with the hand misplaced by up to 5 mm and 5°.
 
     Attributes:
-        rank: whether to run these trials. Grasps that hold in more trials rank higher.
-        trials: number of these hold trials for each verified grasp.
-        hold_time: duration of each of the six pulls of a trial [s].
+        rank: whether to run the further trials. Grasps that hold in more trials rank higher.
+        trials: number of further trials for each verified grasp.
+        hold_time: duration of the pull in each of the six directions of a trial [s].
         friction: whether to measure the least friction at which each verified grasp holds.
     """
 
@@ -144,7 +144,7 @@ def light_end(heavy: float) -> float:
 
 @dataclass(frozen=True)
 class CertaintyConfig:
-    """The certainty that a grasp needs to count as verified, if cameras saw its object.
+    """The certainty that a grasp needs to count as verified, if cameras saw the object.
 
     Attributes:
         probability: least probability that a grasp holds on the true object, if the object weighs no more than in the

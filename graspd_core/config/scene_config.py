@@ -24,14 +24,14 @@ class SegmentationConfig:
         max_range: points farther than this from their camera are ignored [m].
         voxel: edge length of the voxels to which the scene is downsampled, below half of `gap` [m].
         max_voxels: maximum number of voxels of a scene. Larger scenes get larger voxels, which bounds the time.
-        plane_tolerance: points up to this height above a plane belong to the plane [m]. Camera noise increases it.
+        plane_tolerance: points up to this height above a plane belong to the plane [m]. Camera noise raises the height.
         max_plane_tolerance: greatest plane tolerance, for the noisiest cameras [m].
-        plane_search_width: greatest distance of inliers in the search for a plane [m]. Use more for noisy cameras.
+        plane_search_width: greatest distance of inliers from a plane during the search [m]. Use more for noisy cameras.
         ransac_trials: number of planes that RANSAC tries. Use more if the support is a small part of the scene.
         support_size: least width of the visible part of a support plane [m].
         support_margin: a support is assumed to continue this far beyond its visible part [m].
         support_area_ratio: least ratio of the area of a support to the area of the objects on the support.
-        contact: an object up to this far above the support touches it [m]. Noise or occlusion raises the limit.
+        contact: an object up to this far above the support counts as touching [m]. Noise or occlusion raises the limit.
         gap: points at least this far apart belong to two objects [m].
         max_link: points farther apart than this never belong to one object, even in a sparse cloud [m].
         neighbour_share: points with fewer neighbours than this fraction of the median number are flying pixels.
@@ -40,12 +40,12 @@ class SegmentationConfig:
         smallest_object: objects smaller than this are noise [m].
         largest_object: objects larger than this are background: walls, floors, furniture [m].
         min_points: objects with fewer points than this are noise.
-        border_width: an object this near to the image border may continue beyond it [rad]. This is about three pixels.
+        border_width: an object this near to the image border may extend beyond it [rad]. The default is about 3 pixels.
         target_reach: a target point selects an object within this distance [m].
         target_share: a box or mask that covers this fraction of an object selects the whole object.
         obstacle_range: other objects up to this distance from the object to grasp become obstacles [m].
         piled: True if objects lie on each other. Parts divided by a seam are then separate objects, even if stacked. If
-            a target point selects such a part, its grasps are never verified. The heap may have any size.
+            a target point selects such a part, no grasp counts as verified. The heap may have any size.
     """
 
     roi_low: tuple[float, float, float] | None = None
@@ -83,7 +83,7 @@ class ReconstructionConfig:
     Attributes:
         max_points: maximum number of used points, all views together. This bounds the time.
         neighbours: number of points to which each local plane is fitted. More points smooth both noise and detail.
-        stray_distance: points farther than this from their neighbours' plane are flying pixels [m].
+        stray_distance: points farther than this from the plane of their neighbours are flying pixels [m].
         outline_slack: error with which cameras see outlines and surfaces [m].
         surface_tolerance: a guessed point up to this far from a seen surface confirms the guess [m].
         open_share: the hidden side is guessed only if at least this fraction of the surface is missing.

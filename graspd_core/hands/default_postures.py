@@ -1,4 +1,4 @@
-"""Guess the palm, the approach and two postures of a hand whose description does not give them.
+"""Guess the palm, the approach direction and two postures of a hand, if its description gives none.
 
 A finger is a chain of links that ends in a link without children. All fingers branch from the palm. In a human-like
 hand most fingers bend the same way. Then the palm normal is the direction in which the fingertips move from straight to
@@ -109,7 +109,7 @@ def around_ball(
 def _missed(
     fingers: Fingers, goal: FingertipGoal, away: Float[Tensor, "starts tips 3"]
 ) -> tuple[Float[Tensor, "starts"], Float[Tensor, "starts"]]:
-    """Return the tips' squared error [finger lengths²], and 0 (all round) to 1 (one side). `away`: ball to tip."""
+    """Return the tips' squared error [finger lengths²] and one-sidedness (0 to 1). `away`: vectors, ball to tips."""
     if goal.directions is not None:
         missed = ((away - goal.radius * torch.as_tensor(goal.directions)) / fingers.length).square().sum(-1)
         mean = missed.mean(-1) if goal.weights is None else missed @ torch.as_tensor(goal.weights)
@@ -187,7 +187,7 @@ def default_postures(hand: HandModel, which: tuple[str, ...] = ("open", "closed"
 
 
 def _along(hand: HandModel, fingers: Fingers) -> Float[np.ndarray, "3"]:
-    """Return a gripper's mid-range finger direction, made normal to the plane or line of joints if over 30° from it."""
+    """Return a gripper's mean finger direction at mid-range, if possible turned normal to the row of finger joints."""
     middle = middle_joints(hand, fingers)
     half_way = placed_tips(hand, fingers, middle) - fingers.roots
     along = units(half_way.mean(0), 1e-6)
@@ -197,7 +197,7 @@ def _along(hand: HandModel, fingers: Fingers) -> Float[np.ndarray, "3"]:
     _, sizes, rows = np.linalg.svd(stands - stands.mean(0))
     ground = rows[: len(sizes)][sizes > max(0.3 * sizes[0], 1e-3)]
     upright = along - ground.T @ (ground @ along)
-    if np.linalg.norm(upright) > 0.5:
+    if np.linalg.norm(upright) > 0.5:  # Over 30° from the plane or line of joints.
         return units(upright, 0.0)
     return along if along.any() else np.array([0.0, 0.0, 1.0])
 
@@ -259,7 +259,7 @@ def _own_sides(hand: HandModel, fingers: Fingers, normal: Float[np.ndarray, "3"]
 
 
 def _apart(hand: HandModel, fingers: Fingers) -> Float[np.ndarray, "tips 3"]:
-    """Return how each finger of a human-like hand opens: a direction in the palm plane. The thumb's is opposite."""
+    """Return each finger's opening direction in the palm plane of a human-like hand. The thumb opens oppositely."""
     plane = np.eye(3) - np.outer(hand.palm_normal, hand.palm_normal)
     straight = (fingers.tips - fingers.roots)[fingers.mates].mean(0) @ plane
     if fingers.mates.sum() > 1:

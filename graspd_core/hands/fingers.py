@@ -30,9 +30,9 @@ class Fingers:
         links: link of each fingertip.
         roots: position of each finger's joint at the palm, base frame [m].
         tips: fingertips in the base frame [m].
-        palm: rigid group of links from which all fingers branch, see `HandModel.link_group`.
+        palm: rigid group of links from which all fingers branch (see `HandModel.link_group`).
         wrist: indices of the actuated joints that move the palm.
-        mates: True for fingers of a human-like hand that bend the same way, not for the thumb. All False in a gripper.
+        mates: True for each finger that bends the same way as most others, so not for a thumb. All False in a gripper.
         bend: unit direction in which `mates` bend, base frame. Zero in a gripper.
     """
 
@@ -47,7 +47,7 @@ class Fingers:
 
     @property
     def length(self) -> float:
-        """Mean length of the fingers from root to tip [m]. If this is zero, 0.05."""
+        """Mean length of the fingers from root to tip [m]. 0.05 if the mean is zero."""
         return float(np.linalg.norm(self.tips - self.roots, axis=1).mean()) or 0.05
 
 
@@ -95,7 +95,7 @@ def find_fingers(hand: HandModel) -> Fingers:
 def _far_end(
     reached: Float[np.ndarray, "points 3"], root: Float[np.ndarray, "3"], middle: Float[np.ndarray, "3"]
 ) -> Float[np.ndarray, "3"]:
-    """Return the mean of the points farthest from the root. If this mean is near the root, measure from the palm."""
+    """Return the mean of the points farthest from `root`, or from `middle` if the first mean is near `root`."""
     for origin in (root, middle):
         distance = np.linalg.norm(reached - origin, axis=1)
         end = reached[distance >= np.quantile(distance, 0.85)].mean(0)
@@ -114,7 +114,7 @@ def _chain(group: int, above: dict[int, int]) -> list[int]:
 def _mates(
     hand: HandModel, points: LinkPoints, links: LinkNumbers, straight: LinkPoints, wrist: list[int]
 ) -> tuple[Bool[np.ndarray, "points"], Float[np.ndarray, "3"]]:
-    """Return a mask of fingers that point and bend the same way, and their bending direction. A gripper gives zeros."""
+    """Return which fingers point and bend the same way, and the bending direction. Both are zero for a gripper."""
     q = straight_joints(hand)
     travel = 0.5 * (hand.lower + hand.upper) - q
     travel[wrist] = 0.0
@@ -129,7 +129,7 @@ def _mates(
 
 
 def _stand_up(roots: Float[np.ndarray, "3 3"], pair: Float[np.ndarray, "2 3"]) -> bool:
-    """Return True if two fingers' mean direction is within 60° of the normal to the roots' plane, as in a gripper."""
+    """Return True if the mean of the directions `pair` is within 60° of the normal to the plane of the `roots`."""
     across = np.cross(roots[1] - roots[0], roots[2] - roots[0])
     return bool(abs(pair.mean(0) @ units(across, 1e-6)) > _UPRIGHT)
 
@@ -156,7 +156,7 @@ def placed_tips(hand: HandModel, fingers: Fingers, q: Float[np.ndarray, "joints"
 
 
 def knuckle_row(fingers: Fingers) -> Float[np.ndarray, "3"]:
-    """Return the unit direction along the row of knuckles, the roots of `mates`. There must be at least two."""
+    """Return the unit direction along the row of knuckles, which are the roots of `mates`. At least two are needed."""
     knuckles = fingers.roots[fingers.mates]
     return np.linalg.svd(knuckles - knuckles.mean(0))[2][0]
 

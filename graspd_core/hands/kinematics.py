@@ -39,7 +39,8 @@ class Kinematics:
         joint: actuated joint of each sorted link. 0 for a fixed link, whose sine, cosine and slide are zero.
         multiplier, shift: a coupled joint has the value multiplier · q + shift. None if no joint is coupled.
         level_sizes: number of links at each depth, starting with the base.
-        level_parents: index of the links' parents in the level above, from depth 2 on. None if link i has parent i.
+        level_parents: index of each link's parent among the links one level up, for each depth from 2 on. None for a
+            depth at which link i has parent i.
         order: position of each link of the hand in the sorted list.
     """
 
@@ -58,7 +59,7 @@ class Kinematics:
 def make_kinematics(
     hand: HandModel, device: torch.device | str = "cpu", dtype: torch.dtype = torch.float32
 ) -> Kinematics:
-    """Return the constants that `forward` needs. The last results are cached."""
+    """Return the constants that `forward` needs. The most recent results are cached."""
     return _make_kinematics(hand, torch.device(device), dtype)
 
 
@@ -149,8 +150,8 @@ def point_jacobian(
 ) -> Float[np.ndarray, "points 3 joints"]:
     """Return the geometric Jacobian of link-frame points at one posture, base frame: `dx = J dq`, `τ = Σ Jᵀ f`.
 
-    A revolute joint with axis a through o moves a point x beyond it by `a × (x − o)`. A prismatic joint moves the
-    point by `a`. A coupled joint adds its motion times its multiplier to the column of the actuated joint.
+    A revolute joint with axis a through o moves a point x of a descendant link by `a × (x − o)`. A prismatic joint
+    moves the point by `a`. A coupled joint adds motion times multiplier to the column of the actuated joint.
     """
     rotation, translation = link_poses(hand, q)
     x = in_base((rotation, translation), points, links)

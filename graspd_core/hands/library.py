@@ -36,10 +36,10 @@ def load_hand(name_or_path: str | Path, *, candidates: int = 600, prefix: str = 
     """Load a hand by name, or from a description (.yaml), a URDF or MJCF file (.urdf, .xml) or a MANO file (.pkl).
 
     Without a description, palm and postures are guessed, with a warning in `HandModel.warnings`. `candidates` is the
-    number of contact candidates. `prefix` is put before all names, because two hands on one robot need different ones.
+    number of contact candidates. `prefix` is put before all names, because two hands on one robot need different names.
 
     Raises:
-        HandError: the hand or file does not exist or cannot be used. The message names the file and the culprit.
+        HandError: the hand or file does not exist or cannot be used. The message names the file and the fault.
     """
     if candidates < 1:
         raise HandError(f"candidates: {candidates}; valid: 1 or more")
@@ -69,7 +69,7 @@ def _prefixed(hand: HandModel, prefix: str) -> HandModel:
 
 
 def read_hand_file(path: Path, root_link: str | None = None) -> HandModel:
-    """Read a URDF or an MJCF file. The root element decides which of the two it is.
+    """Read a URDF or an MJCF file. The file's root element tells its format.
 
     `root_link` names the link of a URDF at which the hand begins. Raises HandError: the file is neither URDF nor MJCF,
     cannot be used, or has no shape that could touch an object.
@@ -115,7 +115,7 @@ _APART = 0.2
 
 
 def hand_warnings(hand: HandModel) -> tuple[str, ...]:
-    """Return warnings about implausible properties: excessive efforts, an open linkage, fingers on two palms."""
+    """Return warnings about implausible properties: excessive efforts, uncoupled joints of a linkage, two palms."""
     rotations, translations = link_poses(hand, np.clip(0.0, hand.lower, hand.upper))
     linkages = _open_linkages(hand, rotations, translations)
     return (*_strong_joints(hand), *linkages, *_palms(hand, translations))
@@ -154,7 +154,7 @@ def _open_linkages(
 
 
 def _palms(hand: HandModel, translations: Float[np.ndarray, "links 3"]) -> tuple[str, ...]:
-    """Return a warning if there are two palms: distant links with several fingers each, neither above the other."""
+    """Return a warning if there are two palms: distant links on different branches, each with several fingers."""
     counts = Counter(int(hand.link_parent[link]) for link in np.flatnonzero(hand.link_joint >= 0))
     branches = sorted(link for link, count in counts.items() if count > 1)
 
@@ -172,7 +172,7 @@ def _palms(hand: HandModel, translations: Float[np.ndarray, "links 3"]) -> tuple
 
 @lru_cache
 def hand_hash(name: str) -> str:
-    """Return the hash of a hand's file, description and meshes. Raises HandError: no such hand, or it is unusable."""
+    """Return the hash of a hand's file, description and meshes. Raises HandError: the hand is missing or unusable."""
     hand = load_hand(name, candidates=1)
     boxed = config_dir() / "hands" / f"{name}.yaml"
     files = [Path(hand.urdf), boxed if boxed.is_file() else Path(name)]

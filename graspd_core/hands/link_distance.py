@@ -5,7 +5,7 @@ or an axis the gradient is zero (see `se3.safe_norm`). There are two approximati
 greatest depth in a single primitive, which may be too small. For a hull, the result is the greatest distance to its
 face planes. It is exact inside the hull, and may be too small outside near edges and corners.
 
-`CollisionTensors` hold all primitives of a hand except hulls, to compute the distance of object points to every link.
+`CollisionTensors` holds all primitives of a hand except hulls, to compute the distance of object points to every link.
 For hulls, the hand's contact candidates are tested instead.
 """
 
@@ -45,7 +45,7 @@ def primitive_sdf(primitive: Primitive, points: _Places) -> _Distances:
 
 
 def core_of(primitive: Primitive) -> tuple[tuple[float, ...], float]:
-    """Return a core and the radius by which it grows to the primitive [m], see `CollisionTensors`. Hulls give zeros."""
+    """Return the core and the radius of a primitive [m], as in `CollisionTensors`. For a hull, return zeros."""
     size = primitive.size
     if primitive.kind == "hull":
         return (0.0, 0.0, 0.0), 0.0
@@ -138,7 +138,7 @@ class CollisionTensors:
 
 
 def make_collision_tensors(hand: HandModel, device: torch.device | str, dtype: torch.dtype) -> CollisionTensors:
-    """Return the hand's primitives except hulls as tensors. The last results are cached."""
+    """Return the hand's primitives except hulls as tensors. The most recent results are cached."""
     return _make_collision_tensors(hand, torch.device(device), dtype)
 
 
@@ -171,7 +171,7 @@ def solid_distance(
 def solid_bound(
     solids: CollisionTensors, links: SE3, points: Float[Tensor, "batch points 3"]
 ) -> Float[Tensor, "batch points solids"]:
-    """Return a cheap lower bound of `solid_distance` [m]: the greatest signed distance to a face of a solid's box."""
+    """Return a lower bound of `solid_distance` [m]: the greatest signed distance to a face of a primitive's box."""
     box = solids.core + solids.radius[:, None]
     return _in_parts(solids, links, points, lambda local: (local.abs() - box).amax(-1))
 

@@ -1,6 +1,6 @@
 """Define the hand model: a tree of links with joints, masses, collision primitives and contact candidates.
 
-Link frames are those of the URDF. The base frame is the frame of `base_link`. Units are m, rad, kg, N, N·m.
+Link frames are the frames of the URDF. The base frame is the frame of `base_link`. Units are m, rad, kg, N, N·m.
 """
 
 from __future__ import annotations
@@ -70,7 +70,7 @@ class Mount:
     """The pose of a hand's base link on an arm: `T_parent_base`.
 
     Attributes:
-        parent: link of the arm: its flange or tool frame.
+        parent: link of the arm to which the hand is fixed, e.g. its flange or tool frame.
         position: position of the base link in the parent's frame [m].
         quaternion_wxyz: orientation of the base link in the parent's frame, a unit quaternion.
     """
@@ -114,7 +114,7 @@ class HandModel:
         candidate_normals: outward unit normals at the candidates, in the frames of their links.
         candidate_link: link of each candidate.
         warnings: guesses and doubtful values, found while loading.
-        base_place: pose of the base link in the frame of its file: position [m] and quaternion wxyz.
+        base_place: pose of the base link in the frame of the hand's file: position [m] and quaternion wxyz.
         mimics: coupled joints, in the order of their links.
         mount: pose of the base link on an arm. None if it is unknown.
         skins: index and surface mesh, link frame [m], of each link whose contact candidates lie on a mesh.
@@ -186,7 +186,7 @@ class HandModel:
 
     @cached_property
     def fingertip_groups(self) -> Int[np.ndarray, "tips"]:
-        """The rigid groups at the ends of the fingers, which have no child group."""
+        """The rigid groups without a child group. They are at the ends of the fingers."""
         groups, parents = self.link_group, self.link_parent
         inner = {int(groups[p]) for link, p in enumerate(parents) if p >= 0 and groups[link] != groups[p]}
         return np.array(sorted(set(groups.tolist()) - inner), dtype=int)

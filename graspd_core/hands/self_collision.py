@@ -5,9 +5,9 @@ Metrics use signed distances instead. The term tests every pair of spheres, so t
 hand has too many, the spheres that extend farthest beyond the others are kept.
 
 The overlap of two primitives is found by the separating axis test. A separating axis of two boxes is a face normal or
-a cross product of two edges. For boxes the least overlap along these fifteen directions is the exact depth. Round
-primitives need three more directions. If an edge meets a rim, the depth is slightly too large. Hulls are excluded.
-Gradients are exact if a single direction has the least overlap.
+a cross product of two edges. Two boxes have fifteen such directions, and the least overlap along them is the exact
+depth. Round primitives need three more directions. If an edge meets a rim, the depth is slightly too large. Hulls are
+excluded. Gradients are exact if a single direction has the least overlap.
 """
 
 from __future__ import annotations
@@ -76,7 +76,7 @@ def _spread(
 
 
 def _fill(primitive: Primitive) -> tuple[Float[np.ndarray, "spheres 3"], float]:
-    """Fill a primitive with spheres. Return their centres in its frame [m] and their common radius [m]."""
+    """Fill a primitive with spheres. Return the centres in the primitive's frame [m] and the common radius [m]."""
     size = primitive.size
     if primitive.kind == "sphere":
         return np.zeros((1, 3)), size[0]
@@ -182,7 +182,7 @@ _RATHER_FACES = 1e-6
 
 
 def solid_pairs(hand: HandModel) -> Int[np.ndarray, "pairs 2"]:
-    """Return the index pairs of primitives whose links are not adjacent. Hulls are skipped in the numbering."""
+    """Return the index pairs of primitives whose links are not adjacent. Indices count all primitives except hulls."""
     link = np.array([p.link for p in hand.primitives if p.kind != "hull"], dtype=np.int64)
     return np.argwhere(np.triu(~hand.adjacent[np.ix_(link, link)], 1))
 

@@ -55,7 +55,7 @@ def surface_points(primitive: Primitive, count: int, rng: np.random.Generator) -
 
 
 def feature_points(primitive: Primitive, spacing: float) -> tuple[Points, Points, Bool[np.ndarray, "points"]]:
-    """Return points on edges and rims at most `spacing` [m] apart, their mean normals, and True for corners."""
+    """Return points on edges and rims at most `spacing` [m] apart, the mean normal at each, and a mask of corners."""
     if primitive.kind == "box":
         points, normals, corner = _box_edges(np.asarray(primitive.size), spacing)
     elif primitive.kind == "cylinder":
@@ -185,7 +185,7 @@ class _Pool:
 
 @lru_cache(maxsize=8)
 def with_candidates(hand: HandModel, count: int) -> HandModel:
-    """Return the hand with `count` contact candidates, unchanged if it has that many. Raises HandError: count < 1."""
+    """Return the hand with `count` contact candidates. If the hand has them, return it. Raises HandError: count < 1."""
     if count < 1:
         raise HandError(f"candidates: {count}; valid: 1 or more")
     if count == len(hand.candidate_link):
@@ -197,9 +197,9 @@ def with_candidates(hand: HandModel, count: int) -> HandModel:
 def candidates(hand: HandModel, count: int, seed: int) -> tuple[Points, Points, LinkNumbers]:
     """Return evenly spread contact candidates: points [m] and outward normals in link frames, and their links.
 
-    Corners that face the grasp are chosen first. Then farthest-point sampling (Gonzalez 1985) runs within each rigid
-    group. Candidates are denser on fingertips and sparser on the hand's back (`_weights`). The first n candidates cover
-    the hand evenly too. If a link has a skin, its candidates lie on the skin.
+    Corners that face a grasped object are chosen first. Then farthest-point sampling (Gonzalez 1985) runs within each
+    rigid group. Candidates are denser on fingertips and sparser on the hand's back (`_weights`). The first n candidates
+    cover the hand evenly too. If a link has a skin, its candidates lie on the skin.
     """
     rng = np.random.default_rng(seed)
     features = _exposed(hand, _feature_pool(hand))
@@ -369,10 +369,10 @@ def parent_groups(hand: HandModel) -> Int[np.ndarray, "links"]:
 
 
 def _weights(hand: HandModel, pool: _Pool) -> tuple[Float[np.ndarray, "points"], Bool[np.ndarray, "points"]]:
-    """Return the density of candidates around each point, and True for each point that faces the grasp.
+    """Return the density of candidates around each point, and True for each point that faces a grasped object.
 
-    A point on a finger faces the grasp if closing the hand moves it outwards along its normal. On the palm, the palm
-    normal replaces this motion. Density is higher on fingertips: the outer half of a finger's last rigid group.
+    A point on a finger faces the object if closing the hand moves the point along its outward normal. On the palm, the
+    palm normal replaces this motion. Density is higher on fingertips: the outer half of a finger's last rigid group.
     """
     poses = rotations, origins = link_poses(hand, hand.open_posture)
     groups = hand.link_group[pool.links]

@@ -1,8 +1,9 @@
 """Reader of the surfaces in COLLADA (.dae) files, without a COLLADA library.
 
 The reader takes the triangles, strips, fans, polylists and polygons of the visual scene, or of all geometries if there
-is no scene. It applies the node transforms, and converts lengths to metres by `<unit>`. Fans replace polygons, which
-is exact for convex polygons. The up axis is ignored, as in ROS viewers. Format: COLLADA 1.4.1, Khronos Group, 2008.
+is no scene. It applies the node transforms, and converts lengths to metres by `<unit>`. Polygons become
+triangle fans, which is exact if they are convex. The up axis is ignored, as in ROS viewers. Format: COLLADA 1.4.1,
+Khronos Group, 2008.
 """
 
 from __future__ import annotations

@@ -23,8 +23,8 @@ TINY, STAYS = 0.05, 0.98
 def drop_small_components(mesh: TriangleMesh) -> tuple[TriangleMesh, int]:
     """Return the mesh without its tiny floating pieces, and the number of dropped pieces.
 
-    A piece is tiny if it has under 5 % of the extent of the piece with the most area. Tiny pieces are dropped if they
-    are farther from the rest than their own extent. If the tiny pieces hold over 2 % of the area, all of them stay.
+    A piece is tiny if it has under 5 % of the extent of the piece with the most area. A tiny piece is dropped if
+    its distance from the larger pieces exceeds its extent. If tiny pieces hold over 2 % of the area, none is dropped.
     """
     piece = face_components(mesh)
     count = int(piece.max()) + 1
@@ -98,7 +98,7 @@ def bodies_apart(mesh: TriangleMesh) -> tuple[int, float]:
 def _points(
     mesh: TriangleMesh, pieces: Int[np.ndarray, "faces"]
 ) -> tuple[Float[np.ndarray, "points 3"], Int[np.ndarray, "points"]]:
-    """Return points of the surface and the piece of each: all used vertices, and points spread evenly by area."""
+    """Return surface points and the piece of each point. The points are the used vertices and points spread by area."""
     rng = np.random.default_rng(0)
     corners = mesh.vertices[mesh.faces]
     area = np.linalg.norm(scaled_normals(mesh.vertices, mesh.faces), axis=1)
@@ -114,7 +114,7 @@ def _grown(
     among: Bool[np.ndarray, "points"],
     reach: float,
 ) -> Bool[np.ndarray, "points"]:
-    """Return which points of `among` are on its longest piece, or on pieces linked to it by gaps below `reach` [m]."""
+    """Return which points lie on the longest piece of `among`, or on pieces connected by gaps below `reach` [m]."""
     low, high = np.full((2, int(owner.max()) + 1, 3), np.inf)
     np.minimum.at(low, owner[among], points[among])
     np.minimum.at(high, owner[among], -points[among])

@@ -1,6 +1,6 @@
 """Approximate convex decomposition of an object by greedy planar cuts, in the object frame [m]. Hollows stay hollow.
 
-Each part is the convex hull of a cluster of surface points. The bulge of a cluster is how far its hull extends outside
+Each part is the convex hull of a cluster of surface points. A cluster's bulge is how far the hull extends outside
 the object, by the signed distance grid. Each cut divides the cluster with the largest bulge. Cutting ends when all
 bulges are within tolerance or there are enough parts. Then touching clusters are joined.
 """
@@ -65,7 +65,7 @@ def convex_parts(
         sdf: the object's signed distance grid.
         tolerance: largest bulge of a part [m]. 98 % of a part's surface lies at most this far outside the object.
         max_parts: maximum number of parts. If the object needs more, the bulges of some parts exceed the tolerance.
-        surface_points: number of surface samples to form clusters of. Up to half as many mesh vertices are added.
+        surface_points: number of surface samples to cluster. Up to half as many mesh vertices are added.
     """
     points = np.vstack([_thin(mesh.vertices[np.unique(mesh.faces)], surface_points // 2),
                         surface_samples(mesh, surface_points, 0)[0]])  # fmt: skip
@@ -113,9 +113,9 @@ def _best_cut(sdf: GridSDF, cluster: Points) -> _Cut | None:
 def _promising_cuts(sdf: GridSDF, cluster: Points) -> list[_Cut]:
     """Return at most `SHORTLIST` cuts, best first. Each is the best across one coordinate axis or principal axis.
 
-    Segments between points of a cluster lie in its hull. So the bulge is measured by how far their midpoints lie
-    outside the object. After a cut, only segments with both ends on one side remain. On each side, their mean distance
-    times the number of points estimates the bulge's volume. So one set of segments scores all cuts without any hull.
+    Segments between points of a cluster lie in its hull. So the bulge is measured by how far the midpoints of
+    segments lie outside the object. A cut leaves only segments with both ends on one side. On each side, the mean of
+    the distances times the number of points estimates the bulge's volume. So one set of segments scores all cuts.
     """
     pairs = (PAIRS * len(cluster)).astype(int)
     outside = (_outside(sdf, cluster[pairs].mean(1)) - _blur(sdf, cluster)).clip(0)
@@ -157,7 +157,7 @@ def _bulge_left(sdf: GridSDF, points: Points, cut: _Cut) -> float:
 
 
 def _join(sdf: GridSDF, clusters: list[Points], tolerance: float, most: int) -> list[Points]:
-    """Join touching clusters, least bulge first, within `tolerance` [m] or while more than `most` clusters are left."""
+    """Join touching clusters, least bulge first. Stop above `tolerance` [m] if at most `most` clusters are left."""
     alive = dict(enumerate(clusters))
     boxes = {name: (cluster.min(0), cluster.max(0) + OVERLAP) for name, cluster in alive.items()}
     heap: list[tuple[float, bool, int, int]] = []
@@ -255,7 +255,7 @@ def even_directions(count: int) -> Float[np.ndarray, "3 count"]:
 
 
 def limited_hull(points: Points, most: int) -> TriangleMesh:
-    """Return the hull of at most `most` of the points, which approximates the full hull. Flat points give a plate."""
+    """Return the hull of at most `most` points, which approximates the hull of all. For flat points, return a plate."""
     hull = _hull(points)
     if hull is None:
         return _slab(points)

@@ -126,7 +126,7 @@ def _cut_obj(tail: bytes) -> str:
 
 
 def _cut_rows(text: bytes, ply: bool) -> str:
-    """Return how many rows an OFF or a text PLY lacks, empty if none."""
+    """Return text that tells how many rows an OFF or a text PLY lacks, empty if none."""
     head, _, body = text.partition(b"end_header" if ply else b"OFF")
     body = re.sub(rb"#.*", b"", body)
     counts = re.findall(rb"(?m)^element +\S+ +(\d+)", head) if b"format ascii" in head else []
@@ -158,7 +158,7 @@ def load_mesh(path: str | Path, *, scale: float = 1.0) -> TriangleMesh:
     """Read a mesh file. Join the parts of its scene at their poses, and multiply coordinates by `scale`.
 
     Raises:
-        MeshError: there is no such file, its ending is unknown, it holds no complete mesh with a finite surface, or
+        MeshError: the file does not exist, has an unknown ending or holds no complete mesh with a finite surface, or
             the scale is not positive.
     """
     return read_mesh(path, scale=scale)[0]
@@ -249,7 +249,7 @@ def check_mesh(
 
 
 def simplify(mesh: TriangleMesh, faces: int, *, aggressiveness: int = 7) -> TriangleMesh:
-    """Reduce a mesh to about `faces` faces by quadric edge collapse. Low `aggressiveness` is slower but tears less."""
+    """Reduce a mesh to about `faces` faces by quadric edge collapse. A low `aggressiveness` is slow but tears less."""
     import fast_simplification
 
     if len(mesh.faces) <= faces:
@@ -384,7 +384,7 @@ def _distinct(mesh: TriangleMesh, source: str) -> tuple[TriangleMesh, int, int]:
 
 
 def _solid_moments(mesh: TriangleMesh) -> tuple[float, Float[np.ndarray, "3"], Float[np.ndarray, "3 3"]]:
-    """Return volume, centre and inertia of a closed body of either winding, summed over tetrahedra from the origin."""
+    """Return volume, centre and inertia of a closed body of either winding, by tetrahedra with a corner at zero."""
     corners = mesh.vertices[mesh.faces]
     sixfold = np.einsum("fi,fi->f", corners[:, 0], np.cross(corners[:, 1], corners[:, 2]))
     total, middle = sixfold.sum(), corners.sum(1)

@@ -66,7 +66,7 @@ def build_sdf(
 
     The generalised winding number gives the sign, so open, overlapping, doubled and inverted surfaces are allowed. If a
     surface encloses nothing, φ ≥ 0 everywhere (see `is_solid`). Distances up to √3 cells (`BAND`) are exact. Farther
-    away, a node may use a surface point that is not its closest, so |φ| can be too large but never too small. On the
+    away, a node may use a surface point that is not the closest, so |φ| can be too large but never too small. On the
     built-in shapes, the error is at most 0.5 cells, 0.03 on average. On ten scans, it is at most 0.43, 0.02 on average.
 
     Args:
@@ -138,7 +138,7 @@ def is_solid(sdf: GridSDF) -> bool:
 
 
 def _closest_to_nodes(surface: Surface, nodes: _Vectors, spacing: float) -> tuple[_Vectors, _Vectors]:
-    """For each node, return a surface point and its face normal. Up to `BAND` cells away, it is the closest point.
+    """Return a surface point and its face normal for each node. Up to `BAND` cells away, the point is the closest.
 
     In each block of nodes, the middle node's exact distance gives lower bounds for the other nodes. A node with a bound
     above `BAND` cells gets a zero normal, and the middle node's point or a neighbour's point (`_sweep`).
@@ -164,7 +164,7 @@ def _closest_to_nodes(surface: Surface, nodes: _Vectors, spacing: float) -> tupl
 
 
 def _sweep(nodes: _Vectors, closest: _Vectors, squared: _Lengths) -> None:
-    """Give nodes a neighbour's surface point if it is nearer. Change `closest` and the `squared` distances in place."""
+    """Give each node a neighbour's surface point if that point is nearer. Change `closest` and `squared` in place."""
     for axis in range(3):
         # All three are NumPy views with this axis first, so writing to them changes the arrays.
         at, to, best = np.moveaxis(nodes, axis + 1, 1), np.moveaxis(closest, axis + 1, 1), np.moveaxis(squared, axis, 0)

@@ -114,7 +114,7 @@ def _box(half: tuple[float, float, float], centre: tuple[float, float, float] = 
 
 
 def _revolve(profile, closed: bool = False) -> TriangleMesh:
-    """Revolve an (r, z) profile about z. The profile rises from axis to axis, or is a `closed` anticlockwise loop."""
+    """Revolve an (r, z) profile about z: a rising line with both ends on the axis, or a `closed` anticlockwise loop."""
     profile = np.asarray(profile, dtype=float)
     if not closed:
         profile[[0, -1], 0] = 0.0

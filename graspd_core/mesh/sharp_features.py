@@ -1,6 +1,7 @@
 """Sample points on the sharp convex parts of a surface: edges, corners, rims, thin walls.
 
-Points on a hand are millimetres apart, so an object's edge can enter between them. Points on the edge detect this.
+Points on a hand are millimetres apart, so an object's edge can enter the hand between the points. Points on the edge
+detect such an overlap.
 """
 
 from __future__ import annotations
@@ -32,9 +33,9 @@ _AREA_OF_POINT, _MOST = 5e-5, 16
 def sharp_points(mesh: TriangleMesh, count: int, seed: int = 0, *, pool: int = _POOL) -> tuple[Points, float]:
     """Return evenly spread points [m] on edges, corners and thin walls, where little material lies below the surface.
 
-    A probe is placed 3 mm below each candidate. Under a flat surface, the probe is 3 mm from the surface. Under an edge
-    or in a thin wall, it is nearer. Thin-walled objects get more than `count` points, smooth objects fewer or none. The
-    points are in farthest-point order, so the first k points are evenly spread for every k.
+    A probe point is placed 3 mm below each candidate. Under a flat surface, the probe is 3 mm from the surface. Under
+    an edge or in a thin wall, the probe is nearer. Thin-walled objects get more than `count` points, smooth objects
+    fewer or none. The points are in farthest-point order, so the first k points are evenly spread for every k.
 
     Args:
         pool: number of candidates at vertices, and number of candidates on edges. Half as many lie on faces.
@@ -108,8 +109,8 @@ def farthest_first(
         size: number of points.
         count: maximum number of indices to return. All of `chosen` are returned even if they are more.
         chosen: indices of the first points.
-        distances: returns a chosen point's distances, or numbers that grow with them, to the points of `mates`.
-        mates: returns the points that a chosen point is compared with. All other points count as infinitely far away.
+        distances: function that returns the distances (or a growing function of them) from a chosen point to `mates`.
+        mates: function that returns the points to compare a chosen point with. Other points count as infinitely far.
     """
     picked, gap = [int(index) for index in chosen], np.full(size, np.inf)
     for number in range(max(min(count, size), len(picked))):

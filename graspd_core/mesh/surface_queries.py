@@ -163,7 +163,7 @@ _AROUND = _AROUND[np.abs(_AROUND).any(1)] / np.linalg.norm(_AROUND[np.abs(_AROUN
 def pressed_points(
     surface: Surface, points: Float[np.ndarray, "n 3"], normals: Float[np.ndarray, "n 3"]
 ) -> tuple[Float[np.ndarray, "n 3"], Float[np.ndarray, "n 3"]]:
-    """Return the closest surface points [m], and the outward unit normals there that are nearest to `normals`.
+    """Return the closest surface points [m], and at each point the outward unit normal nearest to that in `normals`.
 
     On a face, the face's normal is returned. On an edge or a corner, any direction between the face normals is valid.
     """
@@ -187,7 +187,7 @@ def pressed_points(
 def first_hits(
     mesh: TriangleMesh, directions: Float[np.ndarray, "*batch 3"]
 ) -> tuple[Float[np.ndarray, "*batch"], Integer[np.ndarray, "*batch"], Float[np.ndarray, "*batch 3"]]:
-    """Cast rays from the origin. Return distances divided by ray lengths (inf: no hit), hit faces and unit normals."""
+    """Cast rays from the origin. Return distances per length of `directions` (inf: no hit), hit faces and normals."""
     with Extra("clouds"):
         import open3d as o3d
 

@@ -67,7 +67,7 @@ def scaled_normals(vertices: Vertices, faces: Faces) -> Float[np.ndarray, "faces
 
 
 def drop_degenerate(vertices: Vertices, faces: Faces) -> Int[np.ndarray, "kept 3"]:
-    """Return the faces with an area. A face has one if its height is above 1e-9 of its longest side."""
+    """Return the faces with an area. A face has an area if its height is above 1e-9 of its longest side."""
     a, b, c = vertices[faces].transpose(1, 0, 2)
     area = np.linalg.norm(scaled_normals(vertices, faces), axis=1)
     longest = np.max([np.einsum("ij,ij->i", e, e) for e in (b - a, c - b, a - c)], axis=0)
@@ -144,7 +144,7 @@ _FAR = 100.0
 
 
 def far_centre(vertices: Float[np.ndarray, "vertices 3"]) -> Float[np.ndarray, "3"]:
-    """Return the centre of a mesh [m] if it is over a hundred times the mesh's size from the origin, else zero."""
+    """Return a mesh's centre [m]. Return zero if the centre is within a hundred times the mesh's size of the origin."""
     low, high = vertices.min(0), vertices.max(0)
     centre = (low + high) / 2
     return centre if np.linalg.norm(centre) > _FAR * (high - low).max() else np.zeros(3)

@@ -53,7 +53,7 @@ def make_obstacles(
 
     Args:
         points: seen points of each neighbour [m]. Neighbours with too few finite points are left out.
-        support: plane that the neighbours stand on, or None. Their points are extruded down to this plane.
+        support: plane that the neighbours stand on, or None. The seen points are extruded down to this plane.
         target: the object to grasp.
         reach: greatest distance from the target [m]. Farther neighbours are left out.
         settings: settings of the hulls.
@@ -82,7 +82,7 @@ def _obstacle(points: Points, support: Plane | None, padding: float) -> Obstacle
 
 
 def _cells(points: Points, support: Plane | None, side: float) -> list[Float[np.ndarray, "_ 3"]]:
-    """Split the points by a grid of cubes, or by a grid of columns normal to the support if there is one."""
+    """Split the points by a grid of cubes, or by a grid of columns normal to the support if there is a support."""
     if support is None:
         local = points
     else:
@@ -94,7 +94,7 @@ def _cells(points: Points, support: Plane | None, side: float) -> list[Float[np.
 
 
 def padded_hull(points: Points, support: Plane | None, padding: float) -> TriangleMesh:
-    """Return the convex hull of points and of their projection onto the support, grown by `padding` [m]."""
+    """Return the convex hull of the points and their projection onto the support, grown by `padding` [m]."""
     corners = points
     if support is not None:
         height = points @ support.normal - support.offset
@@ -118,7 +118,7 @@ def held_hull(mesh: TriangleMesh, base: Posture) -> TriangleMesh:
 def with_neighbours(
     scene: Scene, things: Mapping[str, Sequence[TriangleMesh]], settings: SceneConfig | None = None
 ) -> Scene:
-    """Return the scene with collision objects of a planning scene added as obstacles.
+    """Return the scene with collision objects, e.g. of a MoveIt planning scene, added as obstacles.
 
     A collision object that largely overlaps the target is taken for the target, and left out with a warning. Collision
     objects that do not rise above the support, or that are too far away, are left out without a warning.
@@ -137,7 +137,7 @@ def with_neighbours(
     for name, shapes in things.items():
         near = [s for s in shapes if (s.vertices.min(0) <= high).all() and (s.vertices.max(0) >= low).all()]
         if near and _overlap(np.concatenate([s.vertices for s in shapes]), mesh.vertices) >= _SAME:
-            same.append(f"collision object {name!r} fills the object's own place and counts as the object")
+            same.append(f"collision object {name!r} fills the place of the object to grasp and counts as that object")
             continue
         points = [_points_within(shape, low, high) for shape in near]
         found += [p for p in points if len(p) and (support is None or (p @ support.normal).max() > level)]
@@ -167,7 +167,7 @@ def _hull_corners(points: Float[np.ndarray, "_ 3"]) -> Float[np.ndarray, "_ 3"]:
 
 
 def _points_within(shape: TriangleMesh, low: Vector, high: Vector) -> Float[np.ndarray, "_ 3"]:
-    """Clip a shape to a box. Return surface points and inner box corners. Their hull is that of the clipped shape."""
+    """Clip a shape to a box. Return points with the same hull as the clipped shape: on its surface, and box corners."""
     from trimesh.intersections import slice_faces_plane
 
     vertices, faces = shape.vertices, shape.faces

@@ -3,7 +3,7 @@
 A scene keeps the coordinates of its file. Float32 would round an object far from the origin, for example in map
 coordinates. `near_scene` moves such a scene near the origin, and `moved_grasp` moves grasps back.
 
-The confidence grid has the nodes of the signed distance grid. It falls from 1 at seen to 0 at guessed surface.
+The confidence grid has the nodes of the signed distance grid. Confidence falls from 1 at seen to 0 at guessed surface.
 """
 
 from __future__ import annotations
@@ -63,7 +63,7 @@ _NEAR_SURFACE_CELLS = 2.0
 def confidence_grid(
     vertices: Float[np.ndarray, "vertices 3"], confidence: Float[np.ndarray, "vertices"], sdf: GridSDF
 ) -> Float[Tensor, "x y z"]:
-    """Give nodes near the surface the confidence of the nearest vertex. Other nodes copy the nearest of these nodes."""
+    """Give nodes near the surface the confidence of the nearest vertex. All other nodes copy the nearest such node."""
     spacing = float(sdf.spacing)
     near = sdf.field[0].abs().cpu().numpy() < _NEAR_SURFACE_CELLS * spacing
     nodes = sdf.origin.cpu().numpy() + spacing * np.argwhere(near)
@@ -163,7 +163,7 @@ class Scene:
         timing: time for loading and time for building the distance grid [s].
         support: plane that the object stands on, or None. Gravity points against the normal of the plane.
         obstacles: other bodies that the hand could reach.
-        confidence: at each node of `sdf`, from 1 near seen surface to 0 near guessed. None if all is known.
+        confidence: value at each node of `sdf`, from 1 near seen to 0 near guessed surface. None if all is known.
         evidence: camera evidence for other possible shapes of the object. None if the object was given as a mesh.
     """
 

@@ -164,7 +164,7 @@ def _camera_doubts(seen: Segmentation, views: Sequence[PointCloud]) -> tuple[str
 
 
 def _is_whole_object(views: Sequence[PointCloud]) -> bool:
-    """Return False if `check_scene` passes, True if it fails for a single all-round cloud. Else, raise its error."""
+    """Return True if `check_scene` refuses a single all-round cloud, False if it accepts the views. Else, raise."""
     try:
         check_scene(views)
     except CloudError:

@@ -213,4 +213,4 @@ def test_what_stands_about_a_known_object_is_kept_clear_of(folder: Path, hand: H
 
     assert farthest(free) > high[0] + 0.02
     assert not any(grasp.usable for grasp in walled.grasps) or farthest(walled) < high[0] + 0.012
-    assert ["'ball' fills the object's own place" in warning for warning in walled.warnings] == [True]
+    assert ["'ball' fills the place of the object to grasp" in warning for warning in walled.warnings] == [True]

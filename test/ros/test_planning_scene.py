@@ -77,7 +77,7 @@ def test_later_requests_keep_clear_of_the_scene_and_bad_messages_do_no_harm(clie
     client.event(event="refused", source="collision_objects")
     answer = ask("walled")
     assert farthest(answer) < WALL + 0.002
-    assert [w for w in answer.warnings if "collision object 'mug' fills the object's own place" in w]
+    assert [w for w in answer.warnings if "collision object 'mug' fills the place of the object to grasp" in w]
 
     things.publish(box("lost", [0.1, 0.1, 0.1], 0.0, "nowhere"))
     things.publish(CollisionObject(id="nobody", operation=CollisionObject.REMOVE))

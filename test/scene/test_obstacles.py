@@ -131,7 +131,7 @@ def test_the_object_as_a_planning_scene_holds_it_is_left_out_and_told(scene):
     for shape in (scene.object.mesh, about(scene), about(scene, grown=0.004), about(scene, moved=0.01)):
         found = with_neighbours(scene, {"the thing": [shape]})
         assert found.obstacles == ()
-        assert found.object.warnings[-1].startswith("collision object 'the thing' fills the object's own place")
+        assert found.object.warnings[-1].startswith("collision object 'the thing' fills the place of the object")
 
 
 def test_what_touches_or_holds_the_object_is_not_the_object(scene):

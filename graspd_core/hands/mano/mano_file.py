@@ -33,7 +33,7 @@ _MAX_DENSE, _MAX_DEPTH = 2**22, 8
 
 
 def read_pickle(path: Path) -> Any:
-    """Return the content of a MANO file: numbers, text, lists, dictionaries, and `Inert` data of class instances.
+    """Return the content of a MANO file: numbers, text, lists, dictionaries, and class instances as `Inert` data.
 
     Raises HandError: the file does not exist, is too large, is no pickle, or has a class or function not in `ADMITTED`.
     """
@@ -127,8 +127,8 @@ class ManoData:
         path: path of the file.
         template: vertices of the mean shape at rest [m].
         shape_directions: displacement of each vertex per unit of each shape coefficient [m].
-        pose_directions: displacement of each vertex per entry of R − I [m], row by row, for each body's rotation R.
-        joint_regressor: weights that combine the vertices to each joint position.
+        pose_directions: displacement of each vertex per entry of R − I, row by row [m]. R is the rotation of a body.
+        joint_regressor: weights of the vertices in the weighted sum that gives each joint position.
         weights: skinning weights. Each row sums to one.
         faces: triangles, counter-clockwise seen from outside. The mesh is open at the wrist.
         mean: mean pose, as axis-angle vectors of bodies 1 to 15 [rad].
@@ -147,7 +147,7 @@ class ManoData:
 def read_mano(path: Path) -> ManoData:
     """Read and check a MANO file (.pkl) as downloaded.
 
-    Raises HandError, which names file and entry: the file cannot be read, would run code, or has a wrong entry.
+    Raises HandError: the file cannot be read, would run code, or has a wrong entry. The message names file and entry.
     """
     content = read_pickle(path)
     if not isinstance(content, Mapping):

@@ -10,9 +10,9 @@ Each of MANO's fifteen ball joints becomes three hinges. A body turns relative t
 Ry(abduction) Rz(twist) Bᵀ`. B is the anatomical frame at rest: z along the bone, x the flexion axis, y = z × x. The
 order of the hinges follows the ISB (Wu et al. 2005, after Grood and Suntay 1983).
 
-The anatomical frames come from the joints of the shape. The palm normal is normal to the plane through wrist, index
-knuckle and little knuckle. The normal points to the side to which the fingers bend in the mean pose. A finger flexes
-towards the palm normal. The thumb flexes towards a point in front of the palm.
+The anatomical frames come from the joint positions of the shape. The palm normal is normal to the plane through wrist,
+index knuckle and little knuckle. The normal points to the side to which the fingers bend in the mean pose. A finger
+flexes towards the palm normal. The thumb flexes towards a point in front of the palm.
 """
 
 from __future__ import annotations
@@ -90,14 +90,14 @@ def postures() -> tuple[Float[np.ndarray, "45"], Float[np.ndarray, "45"]]:
 
 
 def efforts(joints: Float[np.ndarray, "16 3"], tips: Float[np.ndarray, "5 3"]) -> Float[np.ndarray, "45"]:
-    """Return the joint torque limits [N·m], with which a straight finger presses `_TIP_FORCE` with its tip."""
+    """Return the joint torque limits [N·m] at which the tip of a straight finger presses with `_TIP_FORCE`."""
     reach = np.linalg.norm(np.repeat(tips, 3, axis=0) - joints[1:], axis=1)
     lever = np.maximum(np.column_stack([reach, reach, np.zeros(15)]), _LEAST_LEVER)
     return (_TIP_FORCE * lever).ravel()
 
 
 def palm_normal(data: ManoData, joints: Float[np.ndarray, "16 3"]) -> Float[np.ndarray, "3"]:
-    """Return the unit direction out of the palm at rest, model frame. Fingers of the mean pose bend to this side."""
+    """Return the unit direction out of the palm at rest, model frame. In the mean pose, fingers bend to this side."""
     wrist, index, little = joints[0], joints[1], joints[7]
     normal = np.cross(index - wrist, little - wrist)
     normal /= np.linalg.norm(normal)
@@ -188,7 +188,7 @@ class ManoHand:
     frames: Float[np.ndarray, "16 3 3"]
 
     def skinned_mesh(self, posture: Posture) -> TriangleMesh:
-        """Return MANO's own surface at a posture [m], closed at the wrist, in the frame of `posture.position`."""
+        """Return MANO's own surface at a posture [m], closed at the wrist, in the frame of the posture's position."""
         betas = torch.as_tensor(self.betas)[None]
         rotations = rotations_from_joints(torch.as_tensor(self.frames), torch.as_tensor(posture.joint_positions)[None])
         origin = rest(self.data, betas)[1][:, 0]
@@ -268,7 +268,7 @@ def _bare_hand(still: _Rest) -> HandModel:
 
 
 def _skins(hand: HandModel, still: _Rest) -> tuple[tuple[int, TriangleMesh], ...]:
-    """Return link and skin mesh of each body, link frame [m]. The mesh has all faces with a vertex of the body."""
+    """Return the link and skin mesh of each body, link frame [m]. A mesh has all faces with a vertex of the body."""
     faces = still.data.faces
     own = [faces[(still.owner[faces] == body).any(1)] for body in range(len(BODIES))]
     return tuple(
@@ -320,7 +320,7 @@ def _inertial(hull: Primitive) -> tuple[float, Float[np.ndarray, "3"], Float[np.
 def _palm_center(
     palm: Primitive, joints: Float[np.ndarray, "16 3"], normal: Float[np.ndarray, "3"]
 ) -> Float[np.ndarray, "3"]:
-    """Follow the palm normal from the middle of the palm's bones. Return where it leaves the hull, base frame [m]."""
+    """Follow the palm normal from the middle of the palm's bones to the hull. Return the end point, base frame [m]."""
     middle = joints[[1, 4, 7, 10]].mean(0) * 0.7 + joints[0] * 0.3 - joints[0]
     a, b, c = (palm.vertices[palm.faces[:, i]] for i in range(3))
     outward = np.cross(b - a, c - a)

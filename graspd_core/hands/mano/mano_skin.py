@@ -38,7 +38,7 @@ def skin_vertices(
     Args:
         data: MANO model.
         betas: shape coefficients.
-        rotations: rotation of every body relative to its parent, in model axes. The first turns the whole hand.
+        rotations: rotation of every body relative to its parent, in model axes. Rotation 0 turns the whole hand.
         translation: shift of all vertices and joints [m].
     """
     shaped, joints = rest(data, betas)
@@ -65,7 +65,7 @@ def rotation_from_vector(vector: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*b
 
 
 def wrist_loop(data: ManoData) -> Int[np.ndarray, "loop"]:
-    """Return the indices of the vertices around the wrist opening, in the direction of face edges. Empty if closed.
+    """Return the indices of the vertices around the wrist opening, in the direction of face edges. Empty if no opening.
 
     Raises HandError: the boundary is not a single loop, faces have opposite winding, or three faces share an edge.
     """

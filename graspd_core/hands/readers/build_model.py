@@ -101,7 +101,7 @@ def assemble(
     couplings: Mapping[str, Coupling],
     warnings: tuple[str, ...] = (),
 ) -> HandModel:
-    """Return the hand, yet without candidates and `adjacent`. Postures are mid-range, the palm is at the base's origin.
+    """Return the hand without candidates and adjacent pairs. Postures are mid-range. The palm is at the base's origin.
 
     Args:
         path, name: path of the file for error messages, and name of the hand.
@@ -110,7 +110,7 @@ def assemble(
         warnings: warnings from reading the file.
 
     Raises:
-        HandError: the links do not form one tree, or no joint moves. The message names the file and the culprit.
+        HandError: the links do not form one tree, or no joint moves. The message names the file and the fault.
     """
     order = _depth_first(path, links, joints)
     by_name, into = {link.name: link for link in links}, {joint.child: joint for joint in joints}
@@ -147,7 +147,7 @@ def _actuated(joints: Sequence[JointSpec]) -> dict[str, Any]:
 
 
 def _linked(order: Sequence[str], chain: Sequence[JointSpec], couplings: Mapping[str, Coupling]) -> dict[str, Any]:
-    """Return the fields of a hand model that describe its tree. `chain` has the joint above each link but the base."""
+    """Return the fields of a hand model that describe its tree. `chain` has the joint above each link except link 0."""
     index = {link: i for i, link in enumerate(order)}
     actuated = [joint.name for joint in chain if joint.kind != "fixed" and joint.name not in couplings]
     number = {joint: i for i, joint in enumerate(actuated)}

@@ -31,7 +31,7 @@ class Source:
     lines: Mapping[str, int]
 
     def error(self, key: str, message: str) -> HandError:
-        """Return an error about a key. The message names file, line and key."""
+        """Return an error about a key. The message names the file, the line and the key."""
         line = self.lines.get(key, self.lines.get(key.partition(".")[0], 1))
         return HandError(f"{self.path}:{line}: {key}: {message}")
 
@@ -90,7 +90,7 @@ class Source:
         return efforts if isinstance(efforts, dict) else float(efforts)
 
     def mount(self, value: Any) -> Mount:
-        """Read the `mount` entry: a link of the arm, and the base link's pose in that link, by default the identity."""
+        """Read the `mount` entry: a link of the arm, and the base link's pose in that link (default: identity)."""
         given = self.section("mount", value, _MOUNT_KEYS, ("parent",))
         parent = self.text("mount.parent", given["parent"])
         x, y, z = self.numbers("mount.position", given.get("position", [0, 0, 0]), 3).tolist()

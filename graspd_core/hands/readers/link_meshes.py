@@ -32,8 +32,8 @@ def resolve_mesh(urdf: Path, shape: ET.Element, filename: str) -> Path:
     """Find a mesh file of a URDF. `filename` is a `package://`, `model://` or `file://` address, or a path.
 
     Packages are searched by folder name or by the name in package.xml: first in ROS_PACKAGE_PATH and AMENT_PREFIX_PATH,
-    then above the URDF and beside its package. Relative paths start at the URDF's folder or any folder above it. Raises
-    HandError: the file does not exist or is on the network.
+    then above the URDF and beside the URDF's package. Relative paths start at the URDF's folder or any folder above it.
+    Raises HandError: the file does not exist or is on the network.
     """
     scheme, rest = _address(filename)
     if scheme in ("http", "https", "ftp"):
@@ -70,7 +70,7 @@ def missing_packages(urdf: Path, meshes: Iterable[ET.Element]) -> tuple[str, ...
 
 
 def corners_each(meshes: int) -> int:
-    """Return the number of corners that each hull may have in a hand with this number of meshes."""
+    """Return the number of corners that each hull may have in a hand with `meshes` meshes."""
     return int(np.clip(_ALL_CORNERS // max(meshes, 1), _FEWEST_CORNERS, _CORNERS))
 
 

@@ -1,7 +1,8 @@
 """Read a `HandModel` from an MJCF file. MuJoCo parses and compiles the file.
 
 MuJoCo gets the XML of `read_xml`, reduced to the sections that describe how the hand moves. MuJoCo opens no file.
-graspd itself reads the meshes as convex hulls, in more formats. Unsupported elements that affect motion are an error.
+graspd itself reads the meshes, in more formats than MuJoCo, and makes convex hulls. Unsupported elements that affect
+motion are an error.
 """
 
 from __future__ import annotations
@@ -74,7 +75,7 @@ def _read_assets(path: Path, spec: Any) -> dict[str, _MeshAsset]:
 
 
 def fault(path: Path, element: Any, message: str) -> HandError:
-    """Return an error about an element of an `MjSpec`. The message names file, line, and the element or its parent."""
+    """Return an error about an element of an `MjSpec`. The message names file and line, and element or parent."""
     return wrong(path, _place(element), message)
 
 
@@ -172,8 +173,8 @@ class _Parts:
 def read_mjcf(path: Path, root: ET.Element | None = None) -> HandModel:
     """Read the hand of an MJCF file. Palm and postures are set as by `read_urdf`.
 
-    The only body directly in the world is the base. Raises HandError: MuJoCo refuses the file, the world has several
-    bodies, or the file uses unsupported elements.
+    The base is the only body directly in `<worldbody>`. If hinges or slides move this body, a new link `world` is the
+    base. Raises HandError: MuJoCo refuses the file, `<worldbody>` has several bodies, or an element is unsupported.
     """
     root = read_xml(path) if root is None else root
     _include(path, path, root, {path.resolve()})
@@ -207,7 +208,7 @@ def read_mjcf(path: Path, root: ET.Element | None = None) -> HandModel:
 
 
 def _include(path: Path, holder: Path, parent: ET.Element, seen: set[Path], depth: int = 0) -> None:
-    """Replace each `<include>` below `parent` by the included elements, as MuJoCo does. `holder` is parent's file.
+    """Replace each `<include>` below `parent` by the included elements, as in MuJoCo. `holder`: the file of `parent`.
 
     Raises HandError: an included file does not exist, is no MJCF file, or is included twice.
     """

@@ -45,7 +45,7 @@ def _shapes(
 
 
 def _with_capsules(shapes: Sequence[Primitive]) -> tuple[Primitive, ...]:
-    """Make a capsule of a cylinder with a sphere at each end. URDF files write capsules this way."""
+    """Replace each cylinder that has a sphere at each end by a capsule. URDF files often write a capsule so."""
     found, taken = list(shapes), set[int]()
     for i, shape in enumerate(shapes):
         if shape.kind != "cylinder":
@@ -122,14 +122,14 @@ _HEAVIEST = 1e3
 def read_urdf(path: Path, root: ET.Element | None = None, *, keep_world: bool = False) -> HandModel:
     """Read a hand from a URDF. Contact candidates are not set.
 
-    Open and closed posture are both mid-range. The palm is at the base's origin. A missing or zero effort or velocity
-    becomes infinite. The following changes add a warning. A `continuous` joint is limited to ±π. A link without
-    collision shapes gets its visual shapes. A `world` link or a floating joint above the base is dropped.
+    The open and the closed posture are mid-range. The palm is at the base's origin. A missing or zero effort or
+    velocity becomes infinite. The following changes add a warning. A `continuous` joint is limited to ±π. A link
+    without collision shapes gets its visual shapes. A `world` link or a floating joint above the base is dropped.
 
     Args:
         path: path of the file.
         root: root element, if it has been read already.
-        keep_world: whether to keep a `world` link above a fixed joint, because poses refer to it.
+        keep_world: whether to keep a `world` link above a fixed joint. An arm needs this link: poses refer to it.
 
     Raises:
         HandError: the file is missing, malformed or not a tree, has no moving joint, or has an unknown joint type.
@@ -166,8 +166,8 @@ def read_urdf(path: Path, root: ET.Element | None = None, *, keep_world: bool = 
 def visual_solids(hand: HandModel, prefix: str = "") -> tuple[Primitive, ...]:
     """Return the shapes for a viewer, in link frames.
 
-    A shape of kind `hull` may be non-convex here. All meshes together are simplified to about 4000 triangles. Links
-    without visual shapes, and hands without a URDF, get their collision shapes.
+    In the result, a shape of kind `hull` may be non-convex. All meshes together are simplified to about 4000 triangles.
+    Links without visual shapes, and hands without a URDF, get their collision shapes.
 
     Args:
         hand: any loaded hand.

@@ -31,7 +31,7 @@ _OWNERS = ("link", "joint", "body", "geom", "mesh")
 
 
 class Element(ET.Element):
-    """An XML element with its `line` in the file. `owner` is tag and name of the link, body or joint around it."""
+    """An XML element with its `line` in the file. `owner`: tag and name of the enclosing link, body or joint."""
 
     line = 0
     owner = ""

@@ -1,1 +1,1 @@
-"""Cameras, depth images, point clouds, and files of these."""
+"""Cameras, depth images and point clouds, and reading of files with such data."""

@@ -163,7 +163,7 @@ def undistort(seen: _Places, coefficients: _Numbers) -> _Places:
 
 
 def _lens(ideal: _Places, coefficients: _Numbers) -> tuple[_Places, Float[np.ndarray, "*batch 3"]]:
-    """Return distorted positions, and (a, b, d): their derivative by the ideal positions is [[a, b], [b, d]]."""
+    """Return distorted positions, and (a, b, d). The Jacobian by the ideal positions is [[a, b], [b, d]]."""
     k1, k2, p1, p2, k3, k4, k5, k6 = (*coefficients, *[0.0] * (8 - len(coefficients)))
     x, y = ideal[..., 0], ideal[..., 1]
     s = x * x + y * y
@@ -185,7 +185,8 @@ def reaches_image_border(
 ) -> bool:
     """Return True if an object reaches an image border of the camera at `eye`. `mine` marks the object's points.
 
-    A long side of the points' hull in the image is a border. Object and other points must be within `width` [rad].
+    A long side of the hull of all points in the image is a border. Points of the object, and other points, must lie
+    within `width` [rad] of the side.
     """
     if not mine.any():
         return False

@@ -1,6 +1,6 @@
 """Reading of point clouds from files: point formats, arrays, and depth images with their camera.
 
-Open3D reads only xyz and compressed pcd files here. For a ply or pcd file that is cut short, Open3D would return
+Open3D reads only xyz and compressed pcd files in graspd. For a ply or pcd file that is cut short, Open3D would return
 uninitialised memory. Formats: "The PLY Polygon File Format" (Turk, 1994) and "The PCD file format", version 0.7 (Point
 Cloud Library).
 """
@@ -193,8 +193,9 @@ def is_cloud_file(path: str | Path) -> bool:
 def load_views(path: str | Path, viewpoint: Vector | None = None, scale: float = 1.0) -> tuple[PointCloud, ...]:
     """Read the views of one or several cameras from a file, in one frame.
 
-    For a file of points, `viewpoint` [m] replaces the camera's position in the file. It is not valid with depth.
-    `scale` is in metres per unit of points and viewpoint, or per unit of depth. 1 means the units below. Poses stay.
+    For a file of points, `viewpoint` [m] replaces the camera's position in the file. With depth, `viewpoint` is an
+    error. `scale` is in metres per unit of points and viewpoint, or per unit of depth. 1 means the units below. Poses
+    are not scaled.
 
     * ply, xyz, npy (n×3 or h×w×3): points [m], seen from the origin.
     * pcd: points [m], seen from its `VIEWPOINT`. The format does not give the camera's direction.
@@ -204,7 +205,7 @@ def load_views(path: str | Path, viewpoint: Vector | None = None, scale: float =
     * npz with `depths` (views×h×w), `K`, `poses` (views×4×4, each `T_world_camera`), and optionally `distortion`.
 
     Raises:
-        CloudError: the file is missing, has an unknown ending, is unreadable, or holds none of these.
+        CloudError: the file is missing, has an unknown ending, is unreadable, or holds none of the listed content.
     """
     path = Path(path)
     ending = path.suffix.lower().lstrip(".")

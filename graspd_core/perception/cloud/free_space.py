@@ -42,9 +42,9 @@ class ViewDepth:
         eye: position of the camera [m].
         frame: axes of the camera, as columns right, down and forward.
         low, cell: corner of the first cell, and width of a cell, in image coordinates (x/z and y/z).
-        depth: depth of the object's surface in each cell [m]. Cells beside its outline copy the nearest seen cell, or
-            are infinite if an occluder covers them.
-        nearest: depth up to which the camera saw empty space [m]: the least depth of 3×3 cells, or the occluder's.
+        depth: depth of the object's surface in each cell [m]. Cells beside the outline copy the nearest seen cell, or
+            are infinite if an occluder covers the cell.
+        nearest: depth up to which the camera saw empty space [m]: least depth of 3×3 cells, or depth of the occluder.
         beside: distance from the outline in cells, 0 inside the outline and where an occluder hides the object.
     """
 
@@ -90,7 +90,7 @@ def make_view_depths(views: Sequence[PointCloud], whole: Sequence[PointCloud] = 
 
 
 def _make_view_depth(view: PointCloud, whole: PointCloud | None) -> ViewDepth | None:
-    """Return the depth image of a view's points. Holes of a few cells are filled, since they are missing pixels.
+    """Return the depth image of a view's points. Holes of a few cells count as missing pixels and are filled.
 
     Return None if fewer than five points are in front of the camera, or if all points are in one line of sight.
     """
@@ -163,7 +163,7 @@ def empty_depth(free_space: FreeSpace, points: Places) -> Depths:
 
 
 def weigh(free_space: FreeSpace, points: Places, normals: Places) -> tuple[Bool[np.ndarray, "*batch"], Depths]:
-    """Return which points lie on seen surface and face its camera, and how much cameras contradict each (0 to 1)."""
+    """Return which points a camera confirms (on seen surface, facing it), and each point's contradiction, 0 to 1."""
     confirmed, deep = _classify(free_space, points, normals)
     return confirmed, np.clip((deep - free_space.slack) / CONTRADICTION_DEPTH_M, 0.0, 1.0)
 
@@ -179,7 +179,7 @@ def on_seen(free_space: FreeSpace, points: Places) -> Bool[np.ndarray, "*batch"]
 
 
 def facing(free_space: FreeSpace, points: Points, normals: Points) -> Float[np.ndarray, "n"]:
-    """Return the cosine between each normal and the direction to the camera that it faces most."""
+    """Return the cosine between each normal and the direction to the camera that the normal faces most."""
     most = np.full(len(points), -1.0)
     for view_depth in free_space.view_depths:
         way = view_depth.eye - points

@@ -1,9 +1,9 @@
 """Check whether a cloud can have been seen from the given position of its camera.
 
-An organised cloud is checked by its pixels: a homography must map the pixels of a pinhole camera to the lines of sight.
-Depth errors only move points along these lines. Without pixels, two rules are checked: a camera sees no surface through
-another surface, and no surface from behind. If the given position is wrong, some points seem to be hidden behind other
-points, and a part of each curved surface seems to face away from the camera.
+An organised cloud (with one point per pixel) is checked by the pixels: a homography must map the pixels of a pinhole
+camera to the lines of sight. Depth errors only move points along these lines. Without pixels, two rules are checked: a
+camera sees no surface through another surface, and no surface from behind. If the given position is wrong, some points
+seem to be hidden behind other points. A part of each curved surface then seems to face away from the camera.
 """
 
 from __future__ import annotations
@@ -276,7 +276,7 @@ def hidden_share(points: Points, viewpoint: Vector, nearer: Float[np.ndarray, "p
 
 
 def _away_share(points: Points, surfaces: Surfaces, viewpoint: Vector) -> float:
-    """Return the fraction of points that face away from the viewpoint. Most of a surface is assumed to face it."""
+    """Return the fraction of points that face away from the viewpoint, if most of each surface faces the viewpoint."""
     normal, surface, clear = surfaces
     ray = viewpoint - points
     cosine = (normal * ray).sum(1) / np.maximum(np.linalg.norm(ray, axis=1), 1e-12)
@@ -293,7 +293,7 @@ def bulge(points: Points, surfaces: Surfaces, viewpoint: Vector) -> float:
 
 
 def _surfaces(points: Points) -> Surfaces:
-    """Return normals with a consistent sign within each surface, each point's surface, and whether both are certain.
+    """Return normals of consistent sign within each surface, each point's surface index, and whether both are certain.
 
     In a graph, each point has two nodes, one for each sign of its normal. Edges join neighbours whose normals agree.
     """
@@ -320,7 +320,7 @@ def _surfaces(points: Points) -> Surfaces:
 
 
 def _roughness(points: Points, tree: Any) -> float:
-    """Return the RMS distance of a point's neighbours from their fitted plane [m], as the median over the points."""
+    """Return the RMS distance [m] of a point's neighbours from a plane fitted to them, as the median of all points."""
     around = tree.query(points[::8], k=NEIGHBOURS + 1)[1]
     patch = points[around] - points[around].mean(1, keepdims=True)
     spread = np.linalg.eigvalsh(np.einsum("nka,nkb->nab", patch, patch) / (NEIGHBOURS + 1))
@@ -367,7 +367,7 @@ def things_behind(points: Points, viewpoint: Vector) -> bool:
 
 
 def _thinned(thing: PointCloud) -> Float[np.ndarray, "m 3"]:
-    """Return at most `MOST_POINTS` of an object's points [m]. Return none if a coordinate is too large for metres."""
+    """Return at most `MOST_POINTS` of an object's points [m]. Return none if a coordinate is too large to be metres."""
     known = thing.points[measured(thing.points, thing.viewpoint)]
     if not len(known) or np.abs(known).max() > FARTHEST:
         return np.zeros((0, 3))

@@ -52,7 +52,7 @@ class VoxelScene:
 
     @property
     def weight(self) -> Float[np.ndarray, "voxels"]:
-        """Return each voxel's point count times squared camera distance [m²], which is similar near and far."""
+        """Return each voxel's point count times squared camera distance [m²], which hardly depends on the distance."""
         return self.count * self.mean_distance**2
 
     def of_view(self, view: int) -> slice:

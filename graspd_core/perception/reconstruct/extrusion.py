@@ -26,7 +26,7 @@ MIN_ENCLOSED_SHARE = 0.6
 def extrude(seen: Surfels, free_space: FreeSpace, step: float) -> Surfels:
     """Return vertical walls from the object's outline, seen from above, down to the support.
 
-    At each wall's top, cameras must see empty space just outside the outline. They must not contradict the wall.
+    At each wall's top, cameras must see empty space just outside the outline. The cameras must not contradict the wall.
     """
     from scipy.ndimage import binary_closing, binary_erosion, distance_transform_edt, gaussian_filter, maximum_filter
     from scipy.spatial import KDTree
@@ -66,7 +66,7 @@ def _contradicted(
 
 
 def with_foot(surfels: Surfels, free_space: FreeSpace, step: float) -> Surfels:
-    """Return the surfels. If the object stands on a support, add the guessed surface between them and the support."""
+    """Return the surfels. If the object stands on a support, add guessed surface from the surfels to the support."""
     return join(surfels, stand(surfels, free_space, step)) if free_space.standing else surfels
 
 

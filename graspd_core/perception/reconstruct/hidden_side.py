@@ -1,6 +1,6 @@
 """The hidden side of an object: the camera view that would show most of it, and other shapes that it may have.
 
-The other shapes come from the completion rules that the reconstruction did not choose.
+The other shapes come from the completion rules, such as mirror symmetry, that the reconstruction did not choose.
 """
 
 from __future__ import annotations

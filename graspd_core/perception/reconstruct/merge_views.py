@@ -1,7 +1,7 @@
 """Merging of views, or of one cloud that shows an object from all round, into one set of points with normals.
 
 Depth noise runs along the line of sight. So each point is moved along its line of sight to the plane of its neighbours,
-and its normal is turned to its camera. So the sides of a thin wall stay apart, unlike with orientation by neighbours.
+and the point's normal is turned to the camera. The two sides of a thin wall therefore stay apart.
 
 Truncated signed distances (Curless and Levoy 1996) would wear thin walls and edges away. On 15 rendered views, Open3D's
 volume of 2 mm cells had a Chamfer distance of 0.82 mm and an overlap of 0.87. This module had 0.49 mm and 0.92.
@@ -127,7 +127,7 @@ def orient_view(view: PointCloud, step: float, settings: ReconstructionConfig) -
 
 
 def thin(surfels: Surfels, step: float) -> Surfels:
-    """Return the mean surfel of each group: all in one cube of side `step` [m] that face one of six directions."""
+    """Return the mean surfel of each group. A group shares a cube of side `step` [m] and one of six directions."""
     if len(surfels.points) == 0:
         return surfels
     facing = np.abs(surfels.normals).argmax(1)
@@ -190,7 +190,7 @@ def is_all_round(view: PointCloud) -> bool:
     """Return True if points enclose a body.
 
     By the divergence theorem, normals n and positions p on a closed surface have mean n = 0 and mean
-    n pᵀ = volume / area · I. If one side of a body has mean n = 0 by chance, it fails the second equation.
+    n pᵀ = volume / area · I. If one side of a body has mean n = 0 by chance, the second equation fails.
     """
     points = view.points[measured(view.points, view.viewpoint)]
     if len(points) < MIN_POINTS:
@@ -208,7 +208,7 @@ def orient_unposed(view: PointCloud, step: float) -> Surfels:
     """Return points of an all-round cloud, about `step` [m] apart, with outward normals.
 
     View the cloud from many directions. In each image cell, the nearest point is taken to face the viewer. So the two
-    sides of a thin wall stay apart. Agreement with neighbours would mix them.
+    sides of a thin wall stay apart. Orientation by neighbours would mix the two sides.
     """
     from scipy.spatial import KDTree
 
@@ -252,7 +252,7 @@ def _seen_from(points: Points) -> Points:
 
 @dataclass(frozen=True, eq=False)
 class Evidence:
-    """What the cameras saw of an object. Other guesses of its hidden part start from this.
+    """What the cameras saw of an object, as input for other guesses of the object's hidden part.
 
     Attributes:
         seen, free_space, step: seen surface, space seen to be empty, and point spacing [m], in the local frame.

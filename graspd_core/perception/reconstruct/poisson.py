@@ -1,11 +1,11 @@
 """Closed surfaces from oriented points: screened Poisson (Kazhdan and Hoppe 2013), cut by the cameras' free space.
 
-Where points are missing, a Poisson surface bulges outwards or stays open. So its distance field is sampled on a grid,
-cut by the space seen to be empty and by the support, and meshed again. The new mesh is closed.
+Where points are missing, a Poisson surface bulges outwards or stays open. So the surface's distance field is sampled on
+a grid, cut by the space seen to be empty and by the support, and meshed again. The new mesh is closed.
 
 The field is computed on a regular grid by Fourier transforms (Kazhdan 2005), or by Open3D on an adaptive grid. On small
-grids, Fourier transforms take a sixth of the time. Their field is then drawn to zero at the points, as in screened
-Poisson. This would also fit noise, so the points are first checked to lie on one surface.
+grids, Fourier transforms take a sixth of the time. The field is then drawn to zero at the points, as in screened
+Poisson. The drawing would also fit noise, so the points are first checked to lie on one surface.
 """
 
 from __future__ import annotations
@@ -61,7 +61,7 @@ def grid_cell(surfels: Surfels, least: float, cells: int = GRID_CELLS) -> float:
 
 
 def part_walls(surfels: Surfels, cell: float) -> Surfels:
-    """Move the two sides of thin walls `MIN_WALL_CELLS` cells apart. On the grid, closer sides would cancel."""
+    """Increase the thickness of thin walls to `MIN_WALL_CELLS` cells. On the grid, closer sides would cancel."""
     from scipy.spatial import KDTree
 
     points, normals = surfels.points, surfels.normals
@@ -127,7 +127,7 @@ def close_surface(surfels: Surfels, field: Field, free_space: FreeSpace, cell: f
 
 
 def _beneath_floors(surfels: Surfels, lowest: float) -> Points:
-    """Return the points of low floors, such as a cup's, moved down to the support, so the hull reaches it."""
+    """Return the points of low floors, such as a cup's floor, moved to the support, so that the hull reaches it."""
     floor = (surfels.normals[:, 2] > MIN_FLOOR_COSINE) & (surfels.points[:, 2] < lowest + MAX_FLOOR_RISE_M)
     return surfels.points[floor] * np.array([1.0, 1.0, 0.0])
 
@@ -154,7 +154,7 @@ def _signed(surface: TriangleMesh, nodes: Nodes, cell: float) -> Grid:
     """Return the signed distance [m] at nodes near the surface, and plus or minus `BAND_CELLS` cells at other nodes.
 
     The surface has no border within the grid, so it divides the grid into regions. Near the surface, the normal of the
-    nearest face gives a node's sign. Each region takes the sign that most of these nodes in it have.
+    nearest face gives a node's sign. Each region takes the sign of most of its nodes near the surface.
     """
     from scipy.ndimage import label
 

@@ -1,8 +1,8 @@
 """Fitting of bodies of revolution: find the axis, revolve the seen profile about it, and close its ends.
 
-The normals give a first axis, because all meet the axis. For a point p with normal n, the axis through c along a obeys
+All normals meet the axis, so they give a first axis. For a point p with normal n, the axis through c along a obeys
 n·(c × a) + (p × n)·a = 0, which is linear in (a, c × a) (Pottmann and Wallner, Computational Line Geometry, 2001).
-Normals are noisy, so the points then refine the axis: rotated into one half-plane, they must form a thin profile.
+Normals are noisy, so the points then refine the axis. Rotated into one half-plane, the points must form a thin profile.
 """
 
 from __future__ import annotations
@@ -85,8 +85,8 @@ def meeting_direction(surfels: Surfels) -> Vector:
 def half_plane(surfels: Surfels, axis: Axis) -> tuple[Points, Float[np.ndarray, "n 4"]]:
     """Rotate points about the axis into one half-plane.
 
-    Return the unit direction of each point from the axis, and one row per point. A row holds height along the axis and
-    distance from it [m], and the normal's components along the axis and away from it.
+    Return the unit direction of each point from the axis, and one row per point. A row holds height along the axis [m],
+    distance from the axis [m], and the normal's components along the axis and away from the axis.
     """
     offset = surfels.points - axis.point
     height = offset @ axis.direction
@@ -98,7 +98,7 @@ def half_plane(surfels: Surfels, axis: Axis) -> tuple[Points, Float[np.ndarray, 
 
 
 def turned(rows: Float[np.ndarray, "n 4"], step: float) -> Bool[np.ndarray, "n"]:
-    """Return which rows of `half_plane` fit a body of revolution: off the axis, with normals that almost meet it."""
+    """Return which rows of `half_plane` fit a body of revolution: off the axis, normals nearly through the axis."""
     return (rows[:, 2] ** 2 + rows[:, 3] ** 2 > 1 - MAX_SKEW**2) & (rows[:, 1] > 0.5 * step)
 
 
@@ -106,7 +106,7 @@ def settle_axis(surfels: Surfels, axis: Axis, step: float) -> Axis:
     """Tilt the axis by Gauss-Newton steps until the profile of the points is as thin as possible.
 
     Points far from the profile, such as those of a handle, count less and less. Use only the tilts of each step. Take
-    the position from the normals, because points seen from one side leave it uncertain along the view.
+    the position from the normals, because points seen from one side leave the position uncertain along the view.
     """
     for round_ in range(GAUSS_NEWTON_STEPS):
         right = perpendicular(axis.direction)
@@ -132,7 +132,8 @@ def _thinner(
     """Return a Gauss-Newton step of four motions of the axis: two shifts [m] and two tilts [rad].
 
     `rates` holds how fast each motion changes a point's height and radius. Cells group points of the profile. A point's
-    residual is its distance from its cell's mean, along the cell's normal. Residuals beyond `scale` [m] count little.
+    residual is the distance from the mean of the point's cell, along the cell's normal. Residuals beyond `scale` [m]
+    count little.
     """
     height, radius, along, across = rows.T
     wall = np.abs(across) > np.abs(along)
@@ -250,7 +251,7 @@ def _ends(profile: Rows, axis: Axis, right, up, free_space: FreeSpace, step: flo
 
 
 def _foot(rim, way: float, ground: float, step: float) -> Rows:
-    """Return rows of a parabola from the rim, along its tangent, to where the axis meets the support, or no rows."""
+    """Return rows of a parabola that continues the rim's slope and ends where axis and support meet, or no rows."""
     height, radius = way * -rim[0] + ground, rim[1]
     along, across = way * rim[2], rim[3]
     if along < 0.15 or height < 2 * step:

@@ -183,7 +183,7 @@ def _some(surfels: Surfels, count: int) -> Surfels:
 
 
 def _directions(standing: bool) -> Float[np.ndarray, "k 3"]:
-    """Return normals of planes to try: horizontal ones over 180° for a standing object, else over half a sphere."""
+    """Return normals of planes to try: over a horizontal half circle for a standing object, else over half a sphere."""
     if standing:
         turn = np.pi * np.arange(UPRIGHT_DIRECTIONS) / UPRIGHT_DIRECTIONS
         return np.column_stack([np.cos(turn), np.sin(turn), np.zeros(UPRIGHT_DIRECTIONS)])
@@ -194,7 +194,7 @@ def _directions(standing: bool) -> Float[np.ndarray, "k 3"]:
 
 
 def _around(normal: Vector, angle: float, standing: bool) -> Float[np.ndarray, "k 3"]:
-    """Return directions within `angle` [rad] of a normal, horizontal ones if the object stands."""
+    """Return directions within `angle` [rad] of a normal, only horizontal directions if the object stands."""
     steps = angle * np.array([-1.0, -0.5, 0.0, 0.5, 1.0])[:, None]
     side = np.cross(normal, UP) if standing else perpendicular(normal)
     turned = normal + steps * side

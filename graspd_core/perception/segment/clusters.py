@@ -168,7 +168,7 @@ def touching_things(points: Points, eyes: Eyes, height: Float[np.ndarray, "n"], 
 
 
 def heaped_things(points: Points, eyes: Eyes, spacing: float) -> Int[np.ndarray, "n"]:
-    """Split a heap at seams and waists, then each part again, until none has any. Return each point's part number.
+    """Split a heap at seams and waists until no part has a seam or waist. Return each point's part number.
 
     The arguments are those of `touching_things`. Parts need not stand, because objects of a heap lie on each other.
     """
@@ -209,7 +209,7 @@ def _outline(points: Points, normals: Points, near: Int[np.ndarray, "n near"]) -
 def _bend(
     points: Points, normals: Points, one: Int[np.ndarray, "pairs"], other: Int[np.ndarray, "pairs"]
 ) -> Float[np.ndarray, "n"]:
-    """Return each point's curvature [1/m], negative if concave: the mean over its pairs in `one` and `other`."""
+    """Return each point's curvature [1/m], averaged over the point's pairs (`one`, `other`). Concave is negative."""
     way = points[other] - points[one]
     squared = np.einsum("pd,pd->p", way, way)
     # Close pairs measure noise rather than curvature.

@@ -75,7 +75,7 @@ class FlatPart:
         return replace(self.plane, margin=float(np.median(self.tolerance(distance))) / INLIER_DEVIATIONS)
 
     def beneath(self, points: Points, margin: float) -> Bool[np.ndarray, "n"]:
-        """Return which points project into the hull of the visible part, or to at most `margin` [m] outside."""
+        """Return which points project into the hull of the visible part, or at most `margin` [m] outside the hull."""
         flat = points @ self.axes
         return np.asarray((flat @ self.hull[:, :2].T + self.hull[:, 2] <= margin).all(1))
 

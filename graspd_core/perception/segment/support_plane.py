@@ -2,7 +2,8 @@
 
 A support faces the cameras, is larger than the objects on it, and has at least one object on it. The object reaches
 down to the support, lies over the visible part of the support, and has a graspable size. Other flat parts fail this:
-nothing is above a convex body's face, and no object touches a wall. A tray's rim is no smaller than the tray's floor.
+nothing is above a convex body's face, and no object touches a wall. A tray's floor does not support the tray's rim,
+because the rim is not smaller than the floor.
 """
 
 from __future__ import annotations
@@ -88,7 +89,7 @@ def _left(scene: VoxelScene, support: FlatPart | None, background: Sequence[Mask
 
 
 def _covered(scene: VoxelScene, part: FlatPart, margin: float) -> Mask:
-    """Return which voxels are on a flat part or within `margin` [m] beside it, in its plane."""
+    """Return which voxels are on a flat part, or in the part's plane at most `margin` [m] beside the part."""
     height, tolerance = np.abs(part.height(scene.mean)), part.tolerance(scene.mean_distance)
     band = np.flatnonzero(height <= (1 + NEIGHBOURHOOD_TOLERANCES) * tolerance.max())
     band = band[part.beneath(scene.mean[band], 2 * margin)]
@@ -118,7 +119,7 @@ def _falls_off(scene: VoxelScene, part: FlatPart, margin: float) -> bool:
 def _standing(
     scene: VoxelScene, part: FlatPart, left: Mask, viewpoints: Eyes, settings: SegmentationConfig
 ) -> tuple[int, int]:
-    """Count voxels of objects that may stand on a flat part. Return the count for those that touch it, then for all."""
+    """Count voxels of objects that may stand on a flat part. Return the counts for touching objects and for all."""
     points, distance = scene.mean[left], scene.mean_distance[left]
     label = link_points(points, scene.weight[left], link_length(points, settings), settings.neighbour_share)
     touching, standing = 0, 0

@@ -105,7 +105,7 @@ def select_target(
 def select_part(
     scene: VoxelScene, part: Labels, target: Target, views: Sequence[PointCloud], settings: SegmentationConfig
 ) -> Mask:
-    """Return the voxels of those parts of the selected object that the target selects.
+    """Return the voxels of the parts that the target selects, among the parts of the selected object.
 
     Args:
         part: part number of each voxel of the selected object, split at seams, -1 for other voxels.
@@ -149,8 +149,8 @@ def _thing_of(
 ) -> int:
     """Return the index of the object that contains a point, else of the nearest object within `target_reach`.
 
-    An object contains points in its hull or hidden behind its surface, down to a depth of half its length. For a point
-    deeper than `MIDDLE_SHARE` of the length, the nearest object within `target_reach` is preferred.
+    An object contains points in its hull or hidden behind it, at most half its length from the seen surface. For a
+    point deeper than `MIDDLE_SHARE` of the length, the nearest object within `target_reach` is preferred.
     """
     away = np.linalg.norm(scene.mean - point, axis=1)
     things = [np.flatnonzero(label == k) for k in range(int(label.max(initial=-1)) + 1)]
@@ -195,7 +195,7 @@ def _holds(points: Points, point: Vector) -> bool:
 
 
 def _masked(scene: VoxelScene, label: Labels, many: int, meant: Mask, least: float) -> Mask:
-    """Take the object with most masked points and all at least half masked. If below `least`, drop unmasked voxels."""
+    """Take objects at least half masked or with most masked points. Below `least`, take only the masked voxels."""
     of_first = scene.voxel[scene.of_view(0)]
     shown, covered = (
         np.bincount(label[rows][label[rows] >= 0], minlength=many) for rows in (of_first, of_first[meant[of_first]])
