@@ -84,12 +84,12 @@ def still_holds(hold: Hold, hand: HandModel, reading: JointReading) -> Held:
     own, toward = reading.of(hand.joint_names), np.sign(hold.target - hold.touch)
     before, now = (np.maximum((toward * efforts)[hold.presses], 0.0).sum() for efforts in (hold.efforts, own.efforts))
     if before > 0 and now < _EFFORT_LEFT * before:
-        return Held(False, f"the joints press with {100 * now / before:.0f} % of their effort after the squeeze")
+        return Held(False, f"the joint efforts fell to {100 * now / before:.0f} % of the efforts after the squeeze")
     return _stopped(hold, hand, own.positions, _MEETING_LATER)
 
 
 def _stopped(hold: Hold, hand: HandModel, positions: Joints, meeting: float) -> Held:
-    """Decide whether an object is held: not if fingers touch each other beyond the share `meeting` of the squeeze."""
+    """Decide whether an object is held. Beyond the fraction `meeting` of the squeeze, fingers must not touch."""
     if not hold.presses.any():
         return Held(True)
     way = (hold.target - hold.touch)[hold.presses]

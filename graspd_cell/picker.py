@@ -176,7 +176,7 @@ class Picker:
         self.why_ended = f"{most} attempts"
 
     def attempt(self, offer: Offer, world: SeenWorld, began: float, number: int = 1) -> Attempt:
-        """Carry one object to the place bin and return the outcome. `began` is the image's robot time [s]."""
+        """Carry one object to the place bin and return the outcome. `began` is the robot time of the image [s]."""
         taking: _Taking | None = None
         try:
             assert offer.grasp is not None

@@ -147,7 +147,7 @@ class GraspNode(Node):
     def close(self, timeout: float) -> bool:
         """Cancel all requests and stop publishing. Return True if worker and planner ended in time.
 
-        The executor must still spin, because it ends the goals.
+        The caller must still spin the executor, which sends the results of the action goals.
         """
         ended = self._worker.stop(timeout) and self._planner.rest(PATIENCE)
         end = time.monotonic() + GOAL_PATIENCE

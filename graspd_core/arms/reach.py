@@ -1,4 +1,4 @@
-"""Restrict starts and candidates to those that an arm can reach with the hand."""
+"""Restrict initial hand poses and candidate grasps to those that an arm can reach with the hand."""
 
 from __future__ import annotations
 
