@@ -46,7 +46,7 @@ _BANDS = (0.5, 0.7, 0.85, 0.95, 1.01)
 
 @dataclass(frozen=True)
 class CellCase(Case):
-    """One bin and one robot. The bin gets `size` objects of `things`. If `things` is empty, it gets random ones."""
+    """One bin and one robot. The bin gets `size` objects of `things` or, if `things` is empty, random objects."""
 
     pair: str
     size: int
@@ -171,7 +171,7 @@ class AttemptWatch:
         self.about_to_look()
 
     def about_to_look(self) -> None:
-        """Store the true object poses before an attempt and reset the contact forces."""
+        """Store the true object poses before an attempt and reset the referee's peak forces."""
         self._before: Report = self._robot.referee()
         self._poses = self._robot.thing_poses()
         self._robot.clear_forces()

@@ -1,8 +1,8 @@
 """Detection of a held object from joint positions and efforts, which real hands report.
 
-A joint presses if its squeeze target lies beyond the grasp. An object in the hand stops the joint before the target. A
-joint that reaches its target presses on nothing, and its effort drops. Joints also stop early if fingers press on each
-other, or if an object rotates between jaws. Only in the first case do surface points of two fingers meet.
+A joint presses if its squeeze target lies beyond its position at the grasp. An object in the hand stops the joint
+before the target. A joint that reaches its target presses on nothing, and its effort drops. Joints also stop early if
+fingers press on each other, or if an object rotates between jaws. Only in the first case do points of fingers meet.
 """
 
 from __future__ import annotations

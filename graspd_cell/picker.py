@@ -320,7 +320,7 @@ class Picker:
             self._stop_if_cancelled()
 
     def _learn(self, attempt: Attempt, offer: Offer) -> None:
-        """Store a failed grasp. After a success, forget objects without a grasp, as they may be reachable now."""
+        """Store a failed grasp. After a success, forget which objects had no grasp: they may have one now."""
         if attempt.ending is Ending.PICKED:
             self._failures = [failure for failure in self._failures if failure.grasp is not None]
         elif offer.grasp is not None:

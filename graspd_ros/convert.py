@@ -148,7 +148,7 @@ def moved_points(points: Float[np.ndarray, "n 3"], T: Matrix) -> Float[np.ndarra
 
 
 def moved_result(result: GraspResult, T_new_old: Matrix) -> GraspResult:
-    """Return a result transformed to another frame: postures, contacts, support plane and next camera pose."""
+    """Return a result in another frame: its postures, contacts, support plane and proposed next camera pose."""
     return replace(
         result,
         tried=tuple(moved_grasp(grasp, T_new_old) for grasp in result.tried),

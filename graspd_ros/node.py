@@ -53,7 +53,7 @@ def run_command(
     parse: Callable[[list[str]], argparse.Namespace],
     work: Callable[[argparse.Namespace, threading.Event], None],
 ) -> int:
-    """Run `work` with rclpy initialised. A signal sets the event of `work`. Return 0 after `work`, 2 for bad input.
+    """Run `work` with rclpy initialised. A signal sets the event passed to `work`. Return 0, or 2 for bad input.
 
     `args` exclude the program name. None means this process's arguments. `parse` gets `args` without ROS arguments.
     """

@@ -66,7 +66,7 @@ class Request:
         exclude_poses: frames and base-link poses of more grasps to exclude.
         known: key of the object in a grasp library. None if no library is used.
         surface: support plane in the object's frame. None if the request gives none.
-        steering: makes the constraints on hand and contacts. It is slow, and may raise GraspdError. None without any.
+        steering: makes the constraints on hand and contacts. Slow, may raise a GraspdError. None without constraints.
         region_points: returns the points inside `region_mask`, in `frame` [m]. None for sources without an image.
         closes_late: True if the hand closes only after it has arrived, so that grasps need an `arrival` posture.
         collision_objects: collision objects of the planning scene by id. Empty if the node has no topic for them.

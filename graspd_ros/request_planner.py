@@ -293,7 +293,7 @@ class Planner:
         return lambda target, source: self._lookup(target, source, stamp, stop)
 
     def _placing(self, request: Request, stop: StopHook) -> FrameLookup:
-        """Return the frame lookup for excluded poses: at the cloud's time, because the camera may have moved since."""
+        """Return the lookup for excluded poses: at a single cloud's time, as its camera may move, else the newest."""
         one_cloud = request.region_points is not None and not request.timeless
         return self._lookup_at(request.stamp if one_cloud else Time(), stop)
 

@@ -60,7 +60,7 @@ class Admission:
 
 @dataclass(frozen=True)
 class Report(Generic[V]):
-    """Outcome of a request. `error` is set if the request failed. `value` may be partial or None if it was stopped."""
+    """Outcome of a request. `error` is set if the request failed. If stopped, `value` may be partial or None."""
 
     ending: WorkerEnding
     value: V | None = None

@@ -160,7 +160,7 @@ def _seed_links(arm: Arm) -> SE3:
 
 @lru_cache(maxsize=8)
 def _samples(arm: Arm) -> tuple[Float[Tensor, "points columns"], Float[Tensor, "points"], Int[np.ndarray, "points"]]:
-    """Return samples of all segments: points as a matrix for `place_points`, padded radii [m], and capsule indices."""
+    """Return samples of all segments: points as a matrix for `place_points`, larger radii [m], and capsule indices."""
     points, radii, owner = [], [], []
     for k in range(len(arm.capsules.link)):
         start, end, radius = arm.capsules.start[k], arm.capsules.end[k], arm.capsules.radius[k]

@@ -5,7 +5,7 @@ Solvability-unconcerned inverse kinematics by the Levenberg-Marquardt method, IE
 joint beyond its limit, the step is computed without this joint. This solver is five times faster than that of
 pytorch-kinematics, because it starts near the solution and skips reached poses (docs/arms.md).
 
-The starts are the postures of a table whose tip poses are nearest to the target. The table also bounds how far the tip
+The starts are those postures of a table that have the nearest tip poses. The table also bounds how far the tip
 and points fixed to it can be from the shoulder. A pose beyond these bounds counts as out of reach. For hands around
 objects at 0.3 to 0.95 m, the bounds of graspd's two arms accept 99.3 and 99.7 % of reachable poses. They accept 18 and
 4 % of unreachable poses. If no posture is found, `why_unreached` says which joint limit is the reason, if any.

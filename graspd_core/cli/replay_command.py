@@ -45,7 +45,7 @@ from graspd_core.types import GraspResult
 
 @dataclass(frozen=True)
 class _Job:
-    """Views of one scene for one run of the planner. If its cloud is unusable, `refusal` says why, without `views`."""
+    """Views of one scene for one run of the planner. An unusable cloud gives no `views`, and `refusal` says why."""
 
     name: str
     label: str

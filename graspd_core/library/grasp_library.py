@@ -42,7 +42,7 @@ class LibraryEntry:
 
     Attributes:
         name: name of the object. The default is the file's name, followed by the scale if the scale is not 1.
-        source: absolute path of the mesh file, or shape:NAME. Empty for a mesh without a file, or of a changed file.
+        source: absolute path of the mesh file, or shape:NAME. Empty if the mesh has no file, or the file has changed.
         file_sha256: hash of the file's content. Empty for a mesh without a file.
         mesh_sha256: hash of the cleaned mesh in metres.
         scale: metres per unit of the file.

@@ -103,7 +103,7 @@ def plane_of(surface: PlaneMessage, T_object_frame: Matrix | None = None) -> Pla
 
 
 def with_support(load: Callable[[], Scene], plane: Plane | None) -> Callable[[], Scene]:
-    """Return a loader like `load`. If `plane` is given, it is the scene's support, with the normal to the object."""
+    """Return a loader like `load`. If `plane` is given, it is the scene's support. Its normal points to the object."""
     if plane is None:
         return load
 
