@@ -1,4 +1,4 @@
-"""Arm motions that graspd does not plan: straight lines of the tip, and postures above a bin to release an object."""
+"""Arm motions that graspd does not plan: straight lines of the arm's tip, and postures to release objects in a bin."""
 
 from __future__ import annotations
 
@@ -68,7 +68,7 @@ _HEIGHTS = (0.08, 0.12, 0.17, 0.22, 0.28)
 
 
 def dropped_box(thing: Points) -> Box:
-    """Return a released object's bounding box, put on the table. `thing` has its surface points at release [m]."""
+    """Return the bounding box of a released object, lowered to the table. `thing`: surface points at release [m]."""
     low, high = thing.min(0), thing.max(0)
     half, rise = 0.5 * (high - low)[:2], 0.5 * float(high[2] - low[2])
     x, y = (0.5 * (low + high))[:2].tolist()
@@ -76,7 +76,7 @@ def dropped_box(thing: Points) -> Box:
 
 
 def release_posture(mover: Mover, q: Joints, thing: Points, bin_: Bin, number: int) -> Joints | None:
-    """Return a collision-free posture near `q` with the object above a bin, or None. Turn the object about z only.
+    """Return a collision-free posture near `q` with the object above a bin, or None. The object turns only about z.
 
     Args:
         mover: arm and hand with the object in the hand.

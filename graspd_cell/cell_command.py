@@ -31,14 +31,14 @@ _PATIENCE = 20.0
 
 
 def add_command(commands: Any) -> None:
-    """Add the subcommand cell to the parsers in `commands`."""
+    """Add the command `cell` to the parsers in `commands`."""
     parser = commands.add_parser("cell")
     parser.set_defaults(run=run)
     parser.add_argument("--arm", default="ur5e_like", metavar="NAME|PATH", help="default: ur5e_like")
     parser.add_argument("--hand", default="allegro_right", metavar="NAME|PATH", help="default: allegro_right")
     parser.add_argument(
         "--things", nargs="+", default=["families"], metavar="THING",
-        help="family:NAME[:NUMBER], shape:NAME or a folder of meshes with a csv of masses (default: families)",
+        help="family:NAME[:NUMBER] (irregular), shape:NAME, a mesh folder with a csv of masses (default: families)",
     )  # fmt: skip
     parser.add_argument("--count", type=int, default=5, metavar="N", help="things in the bin (default 5)")
     parser.add_argument("--seed", type=int, default=0, help="seed of the things and of their fall (default 0)")
@@ -122,7 +122,7 @@ def _filled_cell(options: argparse.Namespace, arm: Arm, hand: HandModel, seed: i
 
 
 def _many_picks(options: argparse.Namespace, arm: Arm, hand: HandModel) -> int:
-    """Empty bins until `--picks` attempts were made. Print failed attempts, counts of endings, and memory use.
+    """Empty bins until `--picks` attempts were made. Print failed attempts, the number of each outcome, and memory use.
 
     The first bin has the seed `--seed`. Each later bin has the next seed. Return the exit status.
     """
@@ -186,7 +186,7 @@ def _greet(live: LiveCell | None, stop: Callable[[], bool]) -> None:
 
 
 def _tell(live: LiveCell | None, attempt: Attempt, report: Report) -> None:
-    """Print one line about an attempt. The page shows the same line and the count of objects in the place bin."""
+    """Print one line about an attempt. The web page also gets the line, and the count of objects in the place bin."""
     out = sum(place == "place bin" for place in report.places.values())
     sure = "verified" if attempt.verified else "likely"
     chance = "" if attempt.probability is None else f" {attempt.probability:.2f}"

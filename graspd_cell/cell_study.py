@@ -46,7 +46,7 @@ _BANDS = (0.5, 0.7, 0.85, 0.95, 1.01)
 
 @dataclass(frozen=True)
 class CellCase(Case):
-    """One bin and one robot. The bin gets `size` objects of `things` or, if this is empty, of random families."""
+    """One bin and one robot. The bin gets `size` objects of `things` or, if `things` is empty, random objects."""
 
     pair: str
     size: int
@@ -59,7 +59,7 @@ class CellCase(Case):
         return f"{self.pair} {self.size} {self.seed} {self.preset} {'folder' if self.things else 'families'}"
 
     def inputs(self) -> Record:
-        """Return all inputs except the code. Files of objects, arm and hand count by content."""
+        """Return all inputs except the code. Files of objects, arm and hand are given by hashes of their content."""
         arm, hand = self.pair.split("+")
         files = [source_hash(source) for source, mass in self.things if mass is not None]
         files += [hand_hash(hand)] if Path(hand).is_file() else []
@@ -171,7 +171,7 @@ class AttemptWatch:
         self.about_to_look()
 
     def about_to_look(self) -> None:
-        """Store the true object poses before an attempt and reset the contact forces."""
+        """Store the true object poses before an attempt and reset the referee's peak forces."""
         self._before: Report = self._robot.referee()
         self._poses = self._robot.thing_poses()
         self._robot.clear_forces()
@@ -228,7 +228,7 @@ _HEADINGS = [
 
 
 def cell_sections(records: Sequence[Record], chart: Path | None) -> Sections:
-    """Return three tables (results, calibration of the probability, endings) and a line with median times."""
+    """Return three tables (results, calibration of the probability, outcomes) and a line with median times."""
     groups: dict[tuple[str, str], list[Record]] = {}
     for record in records:
         groups.setdefault((_stock(record), str(record["size"])), []).append(record)

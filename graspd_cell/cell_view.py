@@ -71,7 +71,7 @@ def cell_picture(
 
 
 class Film:
-    """Recorder of one attempt, which it saves as eight frames. The robot calls it as one of its `watchers`."""
+    """Recorder that saves one attempt as eight frames. The robot calls the recorder as one of its `watchers`."""
 
     def __init__(self, robot: SimulatedRobot) -> None:
         self._robot, self._due = robot, 0.0

@@ -1,8 +1,8 @@
 """Detection of a held object from joint positions and efforts, which real hands report.
 
-A joint presses if its squeeze target lies beyond the grasp. An object in the hand stops the joint before the target. A
-joint that reaches its target presses on nothing, and its effort drops. Joints also stop early if fingers press on each
-other, or if an object rotates between jaws. Only in the first case do surface points of two fingers meet.
+A joint presses if its squeeze target lies beyond its position at the grasp. An object in the hand stops the joint
+before the target. A joint that reaches its target presses on nothing, and its effort drops. Joints also stop early if
+fingers press on each other, or if an object rotates between jaws. Only in the first case do points of fingers meet.
 """
 
 from __future__ import annotations
@@ -84,12 +84,12 @@ def still_holds(hold: Hold, hand: HandModel, reading: JointReading) -> Held:
     own, toward = reading.of(hand.joint_names), np.sign(hold.target - hold.touch)
     before, now = (np.maximum((toward * efforts)[hold.presses], 0.0).sum() for efforts in (hold.efforts, own.efforts))
     if before > 0 and now < _EFFORT_LEFT * before:
-        return Held(False, f"the joints press with {100 * now / before:.0f} % of their effort after the squeeze")
+        return Held(False, f"the joint efforts fell to {100 * now / before:.0f} % of the efforts after the squeeze")
     return _stopped(hold, hand, own.positions, _MEETING_LATER)
 
 
 def _stopped(hold: Hold, hand: HandModel, positions: Joints, meeting: float) -> Held:
-    """Decide whether an object is held: not if fingers touch each other beyond the share `meeting` of the squeeze."""
+    """Decide whether an object is held. Beyond the fraction `meeting` of the squeeze, fingers must not touch."""
     if not hold.presses.any():
         return Held(True)
     way = (hold.target - hold.touch)[hold.presses]

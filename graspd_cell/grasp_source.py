@@ -34,7 +34,7 @@ class Offer:
     Attributes:
         grasp: the grasp with its arm path. None if no object can be grasped.
         place: centre of the object's points [m].
-        surface: completed surface of the object. None without a grasp.
+        surface: object's surface with the reconstructed hidden side. None without a grasp.
         mass: mass used in the trials [kg].
         verified: True if the grasp's verdict is `VERIFIED`.
         things: number of objects seen.

@@ -102,7 +102,7 @@ _ELEVATION, _DISTANCE = np.deg2rad(62.0), 0.75
 def layout_of(arm: Arm) -> CellLayout:
     """Return the cell of an arm. The bins lie in the direction (rounded to 90°) of the tip in the arm's `seed` posture.
 
-    The first joint must rotate about the vertical. In posture `CellLayout.start`, it turns the arm past the place bin.
+    The first joint must rotate about the vertical. In `CellLayout.start`, it has turned the arm past the place bin.
     """
     tip = arm_links(arm, torch.as_tensor(arm.seed)[None]).translation[0, arm.tip].numpy()
     # Rotate by a multiple of 90°, so that the table's edges stay along the axes.

@@ -79,7 +79,7 @@ class SeenWorld:
 def seen_world(points: Points, floor: float, boxes: Sequence[Box] = (), slack: float = 0.012) -> SeenWorld:
     """Build the obstacles from a camera's points [m], base frame, and known solids.
 
-    Points within `slack` [m] of the floor or of a box are dropped as part of it. So are points out of the arm's reach.
+    Points within `slack` [m] of the floor or of a box, and points out of the arm's reach, are dropped.
     """
     known = SeenWorld(floor, tuple(boxes))
     points = points[(np.abs(points) < _FARTHEST).all(1)]

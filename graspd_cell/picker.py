@@ -176,7 +176,7 @@ class Picker:
         self.why_ended = f"{most} attempts"
 
     def attempt(self, offer: Offer, world: SeenWorld, began: float, number: int = 1) -> Attempt:
-        """Carry one object to the place bin and return the outcome. `began` is the image's robot time [s]."""
+        """Carry one object to the place bin and return the outcome. `began` is the robot time of the image [s]."""
         taking: _Taking | None = None
         try:
             assert offer.grasp is not None
@@ -320,7 +320,7 @@ class Picker:
             self._stop_if_cancelled()
 
     def _learn(self, attempt: Attempt, offer: Offer) -> None:
-        """Store a failed grasp. After a success, forget objects without a grasp, as they may be reachable now."""
+        """Store a failed grasp. After a success, forget which objects had no grasp: they may have one now."""
         if attempt.ending is Ending.PICKED:
             self._failures = [failure for failure in self._failures if failure.grasp is not None]
         elif offer.grasp is not None:

@@ -106,7 +106,7 @@ def place_of(world: CellWorld, data: Any, index: int) -> str:
 def thing_in_hand(world: CellWorld, data: Any) -> int | None:
     """Return the index of the held object. None if no object is held.
 
-    An object is held if the hand presses on it, and it touches no table or bin. Of several, take the hardest pressed.
+    A held object touches the hand, but no table or bin. Of several such objects, return the one pressed hardest.
     """
     forces = _pair_forces(world, data)
     pressed = {b - THING: force for (a, b), force in forces.items() if a == HAND and b >= THING and force > _TOUCH}

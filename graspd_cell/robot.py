@@ -62,7 +62,7 @@ class DepthView:
 class JointMotion:
     """Timed trajectory of the joints of the arm, the hand, or both.
 
-    If a tolerance is None, the controller's default applies. Hand controllers allow any error: objects stop fingers.
+    If a tolerance is None, the controller's default applies. Hand controllers allow any error, as objects stop fingers.
 
     Attributes:
         names: joint names.

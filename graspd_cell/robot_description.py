@@ -1,6 +1,6 @@
 """URDF of arm and hand as one robot, and its frames for /tf.
 
-Frames of the arm keep their names. Frames of the hand begin with `hand_`, because both have a base link.
+Frames of the arm keep their names. Frame names of the hand begin with `hand_`, because both have a base link.
 """
 
 from __future__ import annotations
@@ -56,7 +56,7 @@ def robot_description(arm: Arm, hand: HandModel) -> str:
 
 
 def _with_addresses(path: Path) -> ET.Element:
-    """Return a file's XML, in which relative names of mesh files are replaced by addresses."""
+    """Return a file's XML, in which relative paths of mesh files are replaced by absolute file:// addresses."""
     root = read_xml(path)
     for mesh in root.iter("mesh"):
         name = mesh.get("filename")

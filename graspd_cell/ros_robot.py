@@ -185,7 +185,7 @@ class RosRobot:
         return self._begun(client.send_goal_async, goal_of(motion))
 
     def _wait_for(self, future: Any, end: float, stop: Callable[[], bool], watched: Any = ()) -> None:
-        """Wait for `future` until `end` [s]. Raises MotionAborted: stopped, late, no joint states, `watched` failed."""
+        """Wait for `future` until `end` [s]. Raises MotionAborted: stop, timeout, no joint states, failed action."""
         while not future.done() or watched:
             if stop():
                 raise MotionAborted("the motion was stopped")

@@ -130,7 +130,7 @@ class SimulatedRobot:
             self.step(min(_LOOK_EVERY, steps - done))
 
     def parts_of(self, motion: JointMotion) -> list[tuple[TrajectoryController, JointMotion]]:
-        """Return each controller with its part of the motion. The arm controller gets and rejects unknown joints."""
+        """Return each controller with its motion. Unknown joints go to the arm controller, which rejects them."""
         hand = tuple(name for name in motion.names if name in self.hand.limits.names)
         arm = tuple(name for name in motion.names if name not in hand)
         if not hand or not arm:

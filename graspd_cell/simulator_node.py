@@ -324,7 +324,7 @@ def feedback_of(names: tuple[str, ...], targets: np.ndarray, positions: np.ndarr
 
 
 def motion_of(goal: Any, controller: TrajectoryController) -> JointMotion:
-    """Return the motion of a FollowJointTrajectory goal. Raises ConfigError: a field is inconsistent or not served."""
+    """Return the motion of a FollowJointTrajectory goal. Raises ConfigError: a field is inconsistent or unsupported."""
     names, points = tuple(goal.trajectory.joint_names), goal.trajectory.points
     for kind in ("positions", "velocities"):
         for index, point in enumerate(points):

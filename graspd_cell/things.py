@@ -1,4 +1,4 @@
-"""Objects with realistic masses: random families, built-in shapes, or a folder of meshes with a csv of masses."""
+"""Objects with realistic masses: random irregular objects, built-in shapes, or a mesh folder with a csv of masses."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ class Thing:
 
 @dataclass(frozen=True)
 class ThingSource:
-    """Source of an object: `family:NAME:SEED`, `shape:NAME`, or a mesh file with its mass [kg]."""
+    """Source of an object: `family:NAME:SEED` (random irregular shape), `shape:NAME`, or a mesh file with mass [kg]."""
 
     source: str
     mass: float | None = None
@@ -55,7 +55,7 @@ class ThingSource:
 
 
 def family_sources(seeds: Sequence[int], families: Sequence[str] = tuple(FAMILIES)) -> tuple[ThingSource, ...]:
-    """Return one object source per family and seed."""
+    """Return one object source per seed and family, which is a kind of random irregular object."""
     return tuple(ThingSource(f"{PREFIX}{family}:{seed}") for seed in seeds for family in families)
 
 

@@ -87,12 +87,12 @@ def wxyz_of_matrix(T: Matrix) -> Float[np.ndarray, "4"]:
 
 
 def matrix_of_pose(pose: Pose) -> Matrix:
-    """Return a pose as a matrix. Raises TransformError: not finite, or not a unit quaternion."""
+    """Return a pose as a matrix. Raises TransformError: not finite, or the quaternion is not a unit one."""
     return matrix_of(array_of(pose.position), wxyz_of(pose.orientation))
 
 
 def near(point: Point, name: str, what: str = "") -> Float[np.ndarray, "3"]:
-    """Return a point [m]. Raises RequestError (text: `name`, `what`): a coordinate is not finite or over 1 km."""
+    """Return a point [m]. Raises RequestError about field `name`, part `what`: not finite, or farther than 1 km."""
     place = array_of(point)
     if not (np.abs(place) <= _FARTHEST).all():
         raise bad_request(f"{name}: {what}{place.tolist()}; valid: finite, within {_FARTHEST:g} m")
@@ -100,7 +100,7 @@ def near(point: Point, name: str, what: str = "") -> Float[np.ndarray, "3"]:
 
 
 def pose_matrix(pose: Pose, name: str = "object_pose") -> Matrix:
-    """Return a pose as a matrix. A zero quaternion means no rotation. Raises RequestError: field `name` is invalid."""
+    """Return the pose in field `name` as a matrix. A zero quaternion is no rotation. Raises RequestError: invalid."""
     near(pose.position, name, "position ")
     length = float(np.linalg.norm(wxyz_of(pose.orientation)))
     if length == 0:
@@ -111,7 +111,7 @@ def pose_matrix(pose: Pose, name: str = "object_pose") -> Matrix:
 
 
 def matrix_of_transform(transform: Transform) -> Matrix:
-    """Return a transform as a matrix. Raises TransformError: not finite, or not a unit quaternion."""
+    """Return a transform as a matrix. Raises the error of `matrix_of`."""
     place, turn = transform.translation, transform.rotation
     return matrix_of((place.x, place.y, place.z), (turn.w, turn.x, turn.y, turn.z))
 
@@ -122,7 +122,7 @@ def matrix_of_posture(posture: Posture) -> Matrix:
 
 
 def matrix_of(position: Sequence[float] | np.ndarray, quaternion_wxyz: Sequence[float] | np.ndarray) -> Matrix:
-    """Return position [m] and quaternion as a matrix. Raises TransformError: not finite, or not a unit quaternion."""
+    """Return a pose as a matrix [m]. Raises TransformError: not finite, or the quaternion is not a unit one."""
     px, py, pz = map(float, position)
     w, x, y, z = map(float, quaternion_wxyz)
     # Plain numbers are faster than small arrays. Robots send thousands of transforms a second.
@@ -148,7 +148,7 @@ def moved_points(points: Float[np.ndarray, "n 3"], T: Matrix) -> Float[np.ndarra
 
 
 def moved_result(result: GraspResult, T_new_old: Matrix) -> GraspResult:
-    """Return a result transformed to another frame: postures, contacts, support plane and next camera pose."""
+    """Return a result in another frame: its postures, contacts, support plane and proposed next camera pose."""
     return replace(
         result,
         tried=tuple(moved_grasp(grasp, T_new_old) for grasp in result.tried),

@@ -68,7 +68,7 @@ RESULT_TIMEOUT = 60  # seconds for which clients can fetch a result. rclpy's def
 class GraspNode(Node):
     """ROS node that receives objects and answers with grasps.
 
-    The node calls `on_failure` if its warm-up fails. Raises GraspdError if the hand or a parameter is unusable.
+    The node calls `on_failure` if it cannot get ready. Raises GraspdError if the hand or a parameter is unusable.
     """
 
     def __init__(self, on_failure: Callable[[], None]) -> None:
@@ -147,7 +147,7 @@ class GraspNode(Node):
     def close(self, timeout: float) -> bool:
         """Cancel all requests and stop publishing. Return True if worker and planner ended in time.
 
-        The executor must still spin, because it ends the goals.
+        The caller must still spin the executor, which sends the results of the action goals.
         """
         ended = self._worker.stop(timeout) and self._planner.rest(PATIENCE)
         end = time.monotonic() + GOAL_PATIENCE

@@ -32,14 +32,14 @@ def find_entry(known: KnownObject, settings: Settings, hand: HandModel | None) -
 
 
 def warm_up_library(settings: Settings, hand: HandModel) -> None:
-    """Read a library entry, so that the first request is fast. Raises FormatError if the library cannot be read."""
+    """Read one entry of the library, so that the first request is fast. Raises FormatError: library not readable."""
     library = GraspLibrary(Path(settings.grasp_library))
     for entry, _ in library.entries(hand_content=hand_hash(hand))[:1]:
         library.grasps(entry, hand)
 
 
 def named_loader(known: KnownObject, settings: Settings) -> Callable[[], Scene]:
-    """Return a function that loads the library object with the name in `known` as a scene."""
+    """Return a function that loads the library's object named `known.name` as a scene."""
 
     def load() -> Scene:
         entry = find_entry(known, settings, None)

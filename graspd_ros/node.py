@@ -53,9 +53,9 @@ def run_command(
     parse: Callable[[list[str]], argparse.Namespace],
     work: Callable[[argparse.Namespace, threading.Event], None],
 ) -> int:
-    """Run `work` with rclpy initialised. A signal sets the event given to `work`. Return 0 at its end, 2 for bad input.
+    """Run `work` with rclpy initialised. A signal sets the event passed to `work`. Return 0, or 2 for bad input.
 
-    `args` exclude the program name. None means this process's arguments. `parse` gets them without the ROS arguments.
+    `args` exclude the program name. None means this process's arguments. `parse` gets `args` without ROS arguments.
     """
     if conflict := foreign_ros():
         sys.stderr.write(f"{name}: {conflict}\n")
@@ -82,7 +82,7 @@ def run_command(
 
 
 def foreign_ros() -> str:
-    """Return a message if Python would import another ROS than this environment's, otherwise ""."""
+    """Return a message if Python would import ROS from outside this environment, otherwise ""."""
     for package in ROS_PACKAGES:
         own = next((Path(sys.prefix) / "lib").glob(f"python3*/site-packages/{package}/__init__.py"), None)
         # Find the package without importing it, because importing a package of another Python fails.
@@ -198,7 +198,7 @@ def stop_spinning(executor: Executor, spinner: threading.Thread) -> bool:
 
 
 def exit_at_once(status: int) -> NoReturn:
-    """End the process without the interpreter's shutdown, which a thread inside a library call would crash."""
+    """End the process without the interpreter's shutdown, which crashes if a thread is inside a library call."""
     sys.stdout.flush()
     sys.stderr.flush()
     os._exit(status)

@@ -275,7 +275,7 @@ def parameter_warnings(settings: Settings) -> list[str]:
 
 
 def _unknown_frames(settings: Settings, changed: Collection[str], known: Sequence[str]) -> list[str]:
-    """Return a warning for each changed parameter whose frame is not in /tf. Return none if /tf is still empty."""
+    """Return a warning for each changed parameter whose frame is not in /tf. No warnings if /tf is still empty."""
     found = []
     for name in ("sensor_frame", "output_frame", "fixed_frame", "arm_base_frame"):
         frame = getattr(settings, name).removeprefix("/")
@@ -285,7 +285,7 @@ def _unknown_frames(settings: Settings, changed: Collection[str], known: Sequenc
 
 
 def _of_their_types(parameters: list[Parameter]) -> list[Parameter]:
-    """Return parameters in the types of `Settings`: floats instead of integers, and `off` instead of YAML's false."""
+    """Convert parameters to the types of `Settings`: integers to floats where needed, and YAML's false to `off`."""
     kept = []
     for parameter in parameters:
         setting = Settings.__dataclass_fields__.get(parameter.name)
@@ -303,7 +303,7 @@ _QOS = {
 
 
 def check_parameters(parameters: list[Parameter]) -> SetParametersResult:
-    """Return whether all values are valid, and the reason if not. ROS checks types and ranges not checked here."""
+    """Check the values, which ROS checks only in part. Return whether all are valid, and the reason if not."""
     try:
         for parameter in parameters:
             _check_value(parameter.name, parameter.value)
@@ -337,7 +337,7 @@ def _check_value(name: str, value: Any) -> None:
 
 
 def _word(setting: dataclasses.Field, value: Any) -> Any:
-    """Return a value in its field's type. YAML reads an unquoted `off` as a boolean and `1` as an integer."""
+    """Convert a value to its field's type. YAML reads an unquoted `off` as a boolean and `1` as an integer."""
     if isinstance(value, int) and not isinstance(value, bool) and _is_number(setting):
         return float(value)
     if setting.name in _CORNERS:

@@ -77,7 +77,7 @@ def _parse(arguments: list[str]) -> argparse.Namespace:
     parser = Parser(prog="graspd_play", description="Publish the topics of a rosbag2 recording.")
     parser.add_argument("bag", metavar="BAG", type=Path, help="a directory, or a .mcap or .db3 file")
     parser.add_argument("--rate", type=float, default=1.0, metavar="R", help="factor on the recorded speed (default 1)")
-    parser.add_argument("--loop", action="store_true", help="start again at the end")
+    parser.add_argument("--loop", action="store_true", help="restart the recording at its end")
     parser.add_argument("--topics", nargs="+", default=[], metavar="NAME", help="play only these topics")
     parser.add_argument("--now", action="store_true", help="shift all stamps to the present time")
     parser.add_argument("--wait", type=float, default=0.0, metavar="SEC", help="wait this long for a subscriber")

@@ -61,12 +61,12 @@ class Request:
         only_newest: if True, a newer `only_newest` request replaces this request while it waits.
         listener: receives the request's messages in addition to the topics. May be None.
         timeless: True if the request has no stamp, so that the newest transforms are used.
-        object_key: key of the object and its measurement. Equal keys mean the same object. An empty key equals no key.
+        object_key: key of the object and its measurement. Equal keys mean the same object. An empty key matches none.
         exclude: ids of earlier grasps. The answer must contain no grasp similar to them.
         exclude_poses: frames and base-link poses of more grasps to exclude.
         known: key of the object in a grasp library. None if no library is used.
         surface: support plane in the object's frame. None if the request gives none.
-        steering: makes the steering constraints. It is slow and may raise a GraspdError. None without constraints.
+        steering: makes the constraints on hand and contacts. Slow, may raise a GraspdError. None without constraints.
         region_points: returns the points inside `region_mask`, in `frame` [m]. None for sources without an image.
         closes_late: True if the hand closes only after it has arrived, so that grasps need an `arrival` posture.
         collision_objects: collision objects of the planning scene by id. Empty if the node has no topic for them.

@@ -82,7 +82,7 @@ class Planned:
         objects: if the request allows any object: each object's position [m], and why it has no verified grasp. The
             grasps belong to the first object.
         surface: the object's mesh in its own frame [m]. None if it was not loaded.
-        held: the object's hull in the base link's frame at the first grasp [m]. None without a usable grasp or mesh.
+        held: the object's hull in the hand's base frame at the first grasp [m]. None without a usable grasp or mesh.
     """
 
     result: GraspResult
@@ -117,7 +117,7 @@ class RecentRuns:
     def keep(self, request: Request, planned: Planned, T_out_object: Matrix) -> None:
         """Store a result under the id of its request, so that later requests can exclude its grasps.
 
-        Grasps are placed in the answer's frame by `T_out_object` [m], because the frame of a camera may move.
+        `T_out_object` [m] places the grasps in the answer's frame, because a camera's frame may move later.
         """
         about = request.object_key, request.frame_out, T_out_object, _terms(request)
         self._runs[request.id] = _Run(*about, planned)
@@ -163,9 +163,9 @@ class RecentRuns:
         return run, found
 
     def next_best(self, request: Request, excluded: Sequence[Matrix]) -> Planned | None:
-        """Return good grasps of earlier runs on the same object, none similar to `excluded`. None if none is left.
+        """Return earlier grasps of the same object that are not similar to `excluded`. None if no grasp is left.
 
-        The runs had the same trials and preset as the request.
+        Only runs with equal trials, preset and `closes_late` count, and only grasps that passed every requested trial.
         """
         same = [run for run in self._runs.values() if run.object_key == request.object_key and request.object_key]
         runs = [run for run in same if run.terms == _terms(request)]
@@ -183,7 +183,7 @@ class RecentRuns:
 
 
 def _terms(request: Request) -> tuple[str, str, bool]:
-    """Return what decides, for one object, which grasps are verified and what is known of each."""
+    """Return the settings that must be equal, so that a request can reuse the grasps of an earlier run."""
     return request.settings.verify, request.settings.preset, request.closes_late
 
 
@@ -193,7 +193,7 @@ def unlike(grasps: Iterable[Grasp], excluded: Sequence[Matrix]) -> list[Grasp]:
 
 
 def without(result: GraspResult, excluded: Sequence[Matrix], count: int) -> GraspResult:
-    """Drop grasps similar to `excluded`. Of the rest, return at most `count` good grasps and all failed grasps."""
+    """Drop grasps similar to `excluded`. Of the rest, keep all failed grasps, and at most `count` others."""
     left = unlike(result.tried, excluded)
     good = [grasp for grasp in left if grasp.verdict is not Verdict.FAILED]
     failed = [grasp for grasp in left if grasp.verdict is Verdict.FAILED]
@@ -293,7 +293,7 @@ class Planner:
         return lambda target, source: self._lookup(target, source, stamp, stop)
 
     def _placing(self, request: Request, stop: StopHook) -> FrameLookup:
-        """Return the lookup for excluded poses: at the time of the cloud, because its camera may have moved since."""
+        """Return the lookup for excluded poses: at a single cloud's time, as its camera may move, else the newest."""
         one_cloud = request.region_points is not None and not request.timeless
         return self._lookup_at(request.stamp if one_cloud else Time(), stop)
 
@@ -350,7 +350,7 @@ class Planner:
 def _any_object(
     request: Request, hand: HandModel, failures: Sequence[Failure], **plan: Any
 ) -> tuple[GraspResult, Scene | None, tuple[tuple[Float[np.ndarray, "3"], str], ...]]:
-    """Plan for any object seen. Return result, scene, and each object's position [m] with the reason for no grasp."""
+    """Plan for any object seen. Return result, scene, and per object its position [m] and why it has no grasp."""
     assert request.views is not None
     (views, told), settings = request.views(), request.settings
     about = {"settings": load_scene_config(settings.scene_config) if settings.scene_config else None}

@@ -104,7 +104,7 @@ class Follower:
             self._viewer.show(make_session(title, hand, grasps, self._scene, PlanConfig(), seen, notes))
 
     def _seen(self, frame: str) -> np.ndarray:
-        """Return the points of the newest cloud [m]. They are empty if the cloud is not in the answer's frame."""
+        """Return the points of the newest cloud [m], or no points if the cloud is not in the answer's frame."""
         from graspd_core.io.messages import points_from_message
 
         if self._cloud is None or self._cloud.header.frame_id != frame:
@@ -119,7 +119,7 @@ class Follower:
 
 @lru_cache(maxsize=4)
 def _hand(name: str, base_link: str, *, named_by_message: bool) -> Any:
-    """Return a hand, with the prefix that the message's `base_link` has because of the node's `hand_prefix`."""
+    """Return a hand with the node's `hand_prefix`, which is the start of `base_link` in the message."""
     from graspd_core import hand_names, load_hand
 
     if named_by_message and name not in hand_names():

@@ -60,7 +60,7 @@ class Admission:
 
 @dataclass(frozen=True)
 class Report(Generic[V]):
-    """Outcome of a request. `error` is set if the request failed. After a stop, `value` may be partial or None."""
+    """Outcome of a request. `error` is set if the request failed. If stopped, `value` may be partial or None."""
 
     ending: WorkerEnding
     value: V | None = None
@@ -165,7 +165,7 @@ class Worker(Generic[R, V]):
         return dropped
 
     def state(self) -> tuple[str | None, int]:
-        """Return the running request's id (or None), and how many requests wait, `only_newest` ones not counted."""
+        """Return the running request's id (or None), and the number of waiting requests without `only_newest` ones."""
         with self._condition:
             running = self._running.id if self._running else None
             return running, len(self._waiting)

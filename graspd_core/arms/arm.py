@@ -225,8 +225,8 @@ class ArmFile:
     """The keys of an arm description.
 
     Attributes:
-        urdf: path of the URDF, relative to the description's folder. For `robot_description`, the caller passes the
-            URDF's text. The URDF may contain more than the arm.
+        urdf: path of the URDF, relative to the description's folder. If it is `robot_description`, the caller
+            passes the URDF's text. The URDF may contain more than the arm.
         tip: name of the link that carries the hand.
         base: name of the first link of the arm. Empty for the root of the URDF.
         name: name of the arm. Empty for the stem of the file name.

@@ -63,7 +63,7 @@ def hits_of_scene(arm: Arm, scene: Scene, base: SE3, links: SE3) -> Hits:
 def hits_of_support(
     arm: Arm, scene: Scene, base: SE3, ends: tuple[Float[Tensor, "batch n 3"], Float[Tensor, "batch n 3"]]
 ) -> Hits:
-    """Return the depths of the arm's capsules in the support, if any. `ends`: both segment ends, base frame [m]."""
+    """Return the depths of the arm's capsules in the scene's support. `ends`: both segment ends, base frame [m]."""
     start, end = ends
     if scene.support is None:
         return Hits(start.new_zeros(len(start), 0), ())
@@ -90,7 +90,7 @@ def _worst_of_each(
 
 
 def hits_of_self(arm: Arm, links: SE3) -> Hits:
-    """Return the collision depths of pairs of arm links. Neighbours and links that touch at the seed are left out."""
+    """Return collision depths of pairs of arm links. Neighbours and links that touch in posture `seed` are left out."""
     start, end, radius = placed(arm.capsules, links)
     first, second = _pairs(arm)
     distance = segment_distance(start[:, first], end[:, first], start[:, second], end[:, second])
@@ -101,7 +101,7 @@ def hits_of_self(arm: Arm, links: SE3) -> Hits:
 
 
 def hits_of_hand(arm: Arm, hand: HandModel, links: SE3, joints: Float[Tensor, "batch hand_joints"]) -> Hits:
-    """Return the collision depths of arm and hand at the hand's `joints`. Links that touch at the seed do not count."""
+    """Return collision depths of arm and hand at the hand's `joints`, without links that touch in posture `seed`."""
     own_start, own_end, own_radius = placed(arm.capsules, links)
     start, end, radius = _hand_capsules(arm, hand, links, joints)
     # Arm links outside a bounding ball of the hand cannot collide with the hand.
@@ -132,7 +132,7 @@ def _capsules_of_hand(hand: HandModel) -> Capsules:
 
 @lru_cache(maxsize=8)
 def _pairs(arm: Arm) -> tuple[Int[np.ndarray, "pairs"], Int[np.ndarray, "pairs"]]:
-    """Return the pairs of capsules to check. Neighbouring links and pairs that touch at the seed are left out."""
+    """Return the pairs of capsules to check. Neighbouring links and pairs that touch in posture `seed` are left out."""
     group = arm.chain.link_group[arm.capsules.link]
     parent = arm.chain.link_parent[group]
     above = np.where(parent < 0, -1, arm.chain.link_group[parent])
@@ -160,7 +160,7 @@ def _seed_links(arm: Arm) -> SE3:
 
 @lru_cache(maxsize=8)
 def _samples(arm: Arm) -> tuple[Float[Tensor, "points columns"], Float[Tensor, "points"], Int[np.ndarray, "points"]]:
-    """Return samples of all segments: points as a matrix for `place_points`, padded radii [m], and capsule indices."""
+    """Return samples of all segments: points as a matrix for `place_points`, larger radii [m], and capsule indices."""
     points, radii, owner = [], [], []
     for k in range(len(arm.capsules.link)):
         start, end, radius = arm.capsules.start[k], arm.capsules.end[k], arm.capsules.radius[k]

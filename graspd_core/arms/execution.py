@@ -41,7 +41,7 @@ class ExecutionPace:
         base_speed: greatest speed of the hand's base in approach and lift, and of prismatic hand joints [m/s].
         closing_speed: greatest speed of the hand's base from the pregrasp to the grasp [m/s].
         shortest: least duration of a stage [s].
-        payload_share: fraction of the grasp's payload that may carry and accelerate the object.
+        payload_share: fraction of the grasp's payload that weight and acceleration of the object may use in the lift.
         gentlest, strongest: least and greatest acceleration of the lift [m/s²].
     """
 
@@ -156,7 +156,7 @@ def lift_time(grasp: Grasp, mass: float | None, pace: ExecutionPace) -> float:
 def squeeze_efforts(
     grasp: Grasp, hand: HandModel, settings: GraspStagesConfig | None = None
 ) -> Float[np.ndarray, "joints"]:
-    """Return the joint efforts, within limits, if the hand is at the grasp but its targets are the squeeze [N·m, N]."""
+    """Return the joint efforts [N·m, N], within limits, for joints at the grasp with targets at the squeeze."""
     settings = settings or GraspStagesConfig()
     gain = np.where(hand.slides, settings.slide_stiffness, settings.stiffness)
     return np.clip(gain * (grasp.squeeze.joint_positions - grasp.grasp.joint_positions), -hand.effort, hand.effort)

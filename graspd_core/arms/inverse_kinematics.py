@@ -5,7 +5,7 @@ Solvability-unconcerned inverse kinematics by the Levenberg-Marquardt method, IE
 joint beyond its limit, the step is computed without this joint. This solver is five times faster than that of
 pytorch-kinematics, because it starts near the solution and skips reached poses (docs/arms.md).
 
-The starts come from a table of postures: the postures with the nearest tip poses. The table also bounds how far the tip
+The starts are those postures of a table that have the nearest tip poses. The table also bounds how far the tip
 and points fixed to it can be from the shoulder. A pose beyond these bounds counts as out of reach. For hands around
 objects at 0.3 to 0.95 m, the bounds of graspd's two arms accept 99.3 and 99.7 % of reachable poses. They accept 18 and
 4 % of unreachable poses. If no posture is found, `why_unreached` says which joint limit is the reason, if any.
@@ -63,7 +63,7 @@ def pose_error(target: SE3, tip: SE3) -> Float[Tensor, "batch 6"]:
 def rotation_vector(
     target: Float[Tensor, "batch 3 3"], current: Float[Tensor, "batch 3 3"]
 ) -> Float[Tensor, "batch 3"]:
-    """Return the rotation vector from `current` to `target`, base frame [rad]. Every half turn gets the axis x."""
+    """Return the rotation vector from `current` to `target`, base frame [rad]. A half turn gets the axis x."""
     turn = target @ current.transpose(-1, -2)
     # `sine` and `cosine` are twice the sine and twice the cosine of the angle.
     axis = turn[:, _ROWS, _COLUMNS] - turn[:, _COLUMNS, _ROWS]
@@ -199,7 +199,7 @@ def tip_features(tip: SE3) -> Float[Tensor, "batch 12"]:
 def nearest_postures(
     table: StartTable, tip: SE3, count: int, usable: Bool[Tensor, "entries"] | None = None
 ) -> Float[Tensor, "batch count joints"]:
-    """Return the `count` postures nearest to each pose `tip`, nearest first. If any is `usable`, skip the rest."""
+    """Return the `count` postures nearest to each pose `tip`, nearest first. If any are `usable`, skip the others."""
     q, features = table.q, table.features
     if usable is not None and usable.any():
         q, features = q[usable], features[usable]

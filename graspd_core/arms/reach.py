@@ -1,4 +1,4 @@
-"""Restrict starts and candidates to those that an arm can reach with the hand."""
+"""Restrict initial hand poses and candidate grasps to poses that an arm with the hand can reach."""
 
 from __future__ import annotations
 
@@ -102,7 +102,7 @@ class BoundReach(BoundRestriction):
         )
 
     def why_none(self, others: BoundRestrictions) -> str:
-        """Return, as text, why and how often the arm cannot reach hand poses at the object that `others` allow."""
+        """Return, as text, how often and why the arm cannot reach hand poses that `others` allow around the object."""
         task = self.task
         starts = draw_starts(task.scene, task.hand, _PROBES, 0, "cpu", torch.float64, restrictions=others)
         rows = zip(*(rows.numpy() for rows in (starts.translation, starts.quaternion, starts.joints)), strict=True)

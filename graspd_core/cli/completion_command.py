@@ -16,7 +16,7 @@ from graspd_core.errors import ConfigError
 
 
 def add_command(commands: Any) -> None:
-    """Add this command to the parser."""
+    """Add the command `completion` to the parsers in `commands`."""
     parser = commands.add_parser("completion")
     parser.set_defaults(run=run, json=False)
     parser.add_argument("shell", choices=("bash", "zsh", "tcsh"))

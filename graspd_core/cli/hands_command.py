@@ -19,17 +19,17 @@ from graspd_core.hands.model import HandModel, all_joint_names
 
 
 def add_command(commands: Any) -> None:
-    """Add this command to the parser."""
+    """Add the command `hands` to the parsers in `commands`."""
     hands = commands.add_parser("hands")
     hands.set_defaults(run=run)
     actions = hands.add_subparsers(metavar="inspect", dest="action")
-    inspect = actions.add_parser("inspect", help="the tree, joints, palm and postures of a hand")
+    inspect = actions.add_parser("inspect", help="show links, joints, palm and postures of a hand")
     inspect.set_defaults(run=run_inspect)
     inspect.add_argument(
         "hand", metavar="FILE|NAME", help="URDF, MJCF, hand description, or the name of a built-in hand"
     )
     inspect.add_argument(
-        "--picture", type=Path, metavar="out.png", help="draw the hand open and closed, with palm and candidates"
+        "--picture", type=Path, metavar="out.png", help="draw open and closed hand, palm and contact candidates"
     )
     inspect.add_argument("--yaml", type=Path, metavar="out.yaml", help="write a hand description to edit")
     inspect.add_argument("--candidates", type=int, default=600, help="number of contact candidates (default 600)")

@@ -16,7 +16,7 @@ if TYPE_CHECKING:
 
 
 def add_command(commands: Any) -> None:
-    """Add this command to the parser."""
+    """Add the command `library` to the parsers in `commands`."""
     parser = commands.add_parser("library")
     actions = parser.add_subparsers(required=True, metavar="ACTION", dest="action")
     build = actions.add_parser("build", help="plan for meshes and add the verified grasps; stored grasps stay")

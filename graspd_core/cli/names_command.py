@@ -15,7 +15,7 @@ from graspd_core.paths import config_dir
 
 
 def add_command(commands: Any) -> None:
-    """Add these commands to the parser."""
+    """Add the commands `methods`, `presets` and `metrics` to the parsers in `commands`."""
     for name, rows in _TABLES.items():
         commands.add_parser(name).set_defaults(run=partial(run, rows))
 

@@ -58,7 +58,7 @@ def add_planning_options(parser: argparse.ArgumentParser) -> None:
     )  # fmt: skip
     parser.add_argument("--friction", type=float, default=0.6, metavar="MU", help="friction coefficient (default 0.6)")
     parser.add_argument(
-        "--deadline", type=float, default=None, metavar="SEC", help="time limit, including loading; found grasps stay"
+        "--deadline", type=float, default=None, metavar="SEC", help="time limit with loading; found grasps are kept"
     )
     parser.add_argument("--verify", choices=VERIFICATIONS, default="standard")
     parser.add_argument("--robust", action="store_true", help="rank grasps by trials with a misplaced hand")
@@ -201,7 +201,7 @@ def plan_any_object(
     source: str,
     **request: Any,
 ) -> tuple[GraspResult, Scene, dict[str, Any]]:
-    """Plan for any object in the views (`--any`). Return result, its scene, and JSON entries about all objects.
+    """Plan for any object in the views (`--any`). Return result, its scene, and JSON entries about all objects seen.
 
     Args:
         source: name of the views for messages.
@@ -216,7 +216,7 @@ def plan_any_object(
     result = result_of_things(things, options.seed)
     places = [thing.place.round(3).tolist() for thing in things]
     if things[0].grasp is not None:
-        print_note(f"{source}: the object about {tuple(places[0])} m, of {len(things)} seen")
+        print_note(f"{source}: the object at about {tuple(places[0])} m, one of {len(things)} seen")
     entries = [{"center": place, "reason": thing.reason} for place, thing in zip(places, things, strict=True)]
     return result, next(thing.scene for thing in things if thing.scene is not None), {"objects": entries}
 

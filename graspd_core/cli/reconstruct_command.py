@@ -20,7 +20,7 @@ from graspd_core.cli.running import EXIT_OK
 
 
 def add_command(commands: Any) -> None:
-    """Add this command to the parser."""
+    """Add the command `reconstruct` to the parsers in `commands`."""
     parser = commands.add_parser("reconstruct")
     parser.set_defaults(run=run)
     parser.add_argument("cloud", metavar="CLOUD_OR_BAG", type=Path, help="cloud, depth image, or bag (its first cloud)")

@@ -45,7 +45,7 @@ from graspd_core.types import GraspResult
 
 @dataclass(frozen=True)
 class _Job:
-    """Views of one scene for one run of the planner. If its cloud is unusable, `views` is empty. `refusal` says why."""
+    """Views of one scene for one run of the planner. An unusable cloud gives no `views`, and `refusal` says why."""
 
     name: str
     label: str
@@ -54,7 +54,7 @@ class _Job:
 
 
 def add_command(commands: Any) -> None:
-    """Add this command to the parser."""
+    """Add the command `replay` to the parsers in `commands`."""
     parser = commands.add_parser("replay")
     parser.set_defaults(run=run)
     parser.add_argument("bag", metavar="BAG", type=Path, help="a directory, or a .mcap or .db3 file")
@@ -66,7 +66,7 @@ def add_command(commands: Any) -> None:
 
 
 def run(options: argparse.Namespace) -> int:
-    """Plan on every cloud. Return 0 if all have enough grasps, 3 if not, 2 without usable cloud, 130 if interrupted."""
+    """Plan on every cloud. Return 0 if all have enough grasps, 3 if not, 2 if no cloud is usable, 130 if stopped."""
     from graspd_core.hands.library import load_hand
     from graspd_core.io.grasps_json import check_writable
 

@@ -28,7 +28,7 @@ _ENDS = (signal.SIGINT, signal.SIGTERM)
 
 
 class Interrupt:
-    """Context for Ctrl-C and SIGTERM. The first signal ends the run with its result. The second ends the process."""
+    """Context for Ctrl-C and SIGTERM. The first signal ends the run, not the process. The second ends the process."""
 
     def __init__(self) -> None:
         self._event = threading.Event()

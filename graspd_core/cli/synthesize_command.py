@@ -38,7 +38,7 @@ _UNITS = {"m": 1.0, "cm": 1e-2, "mm": 1e-3, "inch": 0.0254}
 
 
 def add_command(commands: Any) -> None:
-    """Add this command to the parser."""
+    """Add the command `synthesize` to the parsers in `commands`."""
     parser = commands.add_parser("synthesize")
     parser.set_defaults(run=run)
     parser.add_argument("object", metavar="OBJECT", help="mesh, cloud, depth image, or shape:NAME")

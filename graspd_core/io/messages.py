@@ -73,7 +73,7 @@ def finite_points(pixels: Float[np.ndarray, "height width 3"]) -> Float[np.ndarr
 
 
 def pixels_from_message(message: Any) -> Float[np.ndarray, "height width 3"]:
-    """Return all points of a PointCloud2 as an image, with NaN. Raises CloudError: the cloud is empty or malformed."""
+    """Return the points of a PointCloud2 as an image, with NaN. Raises CloudError: the cloud is empty or malformed."""
     width, height, data = message.width, message.height, memoryview(message.data)
     if width == 0 or height == 0:
         raise CloudError(f"the cloud is empty: width={width}, height={height}")
@@ -159,7 +159,7 @@ class CameraPlace:
         """Return the cloud of a sensor_msgs/PointCloud2 with its viewpoint. `lookup` returns `T_target_source` [m].
 
         Raises:
-            CloudError: see `points_from_message`. Also if the pixels show that the camera was at another position.
+            CloudError: see `points_from_message`. It is also raised if the pixels contradict the camera position.
             TransformError: the pose of the camera's frame is not known.
         """
         T, frame = np.eye(4), message.header.frame_id
@@ -328,7 +328,7 @@ def depth_and_camera(image: Any, info: Any, *, rectified: bool = False) -> tuple
 def cloud_from_depth_message(image: Any, info: Any, *, rectified: bool = False) -> PointCloud:
     """Return the point cloud of a depth image, in the camera's optical frame. Arguments as for `depth_and_camera`.
 
-    Raises CloudError: see `depth_and_camera`. Also if no pixel has a depth, or the image does not fit the calibration.
+    Raises CloudError: as in `depth_and_camera`, or no pixel has a depth, or the image does not fit the calibration.
     """
     depth, camera = depth_and_camera(image, info, rectified=rectified)
     cloud = cloud_from_depth(depth, camera)

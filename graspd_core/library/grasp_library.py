@@ -42,7 +42,7 @@ class LibraryEntry:
 
     Attributes:
         name: name of the object. The default is the file's name, followed by the scale if the scale is not 1.
-        source: absolute path of the mesh file, or shape:NAME. Empty for a mesh without a file, or of a changed file.
+        source: absolute path of the mesh file, or shape:NAME. Empty if the mesh has no file, or the file has changed.
         file_sha256: hash of the file's content. Empty for a mesh without a file.
         mesh_sha256: hash of the cleaned mesh in metres.
         scale: metres per unit of the file.
@@ -165,7 +165,7 @@ class GraspLibrary:
     def of_mesh(self, wanted: LibraryEntry, *, any_mass: bool = False) -> list[LibraryEntry]:
         """Return the entries with mesh, hand, friction and mass of `wanted`. With `any_mass`, the mass may differ.
 
-        Their trials are at least as strict as those of `wanted`. The strictest entries come first, then the heaviest.
+        Only entries with trials at least as strict as those of `wanted` count. Order: strictest first, then heaviest.
         """
         names = ("mesh_sha256", "hand_content", "friction", *(() if any_mass else ("mass",)))
         same = {name: getattr(wanted, name) for name in names}
@@ -259,7 +259,7 @@ class GraspLibrary:
 
 
 def strict_enough(entries: Sequence[LibraryEntry], verify: str) -> list[LibraryEntry]:
-    """Return entries of trials no less strict than `verify`, strictest first. Raises ConfigError: unknown `verify`."""
+    """Return entries with trials at least as strict as `verify`, strictest first. Raises ConfigError: bad `verify`."""
     if verify not in STRICTNESS:
         raise ConfigError(f"verify: {verify!r}; valid: {', '.join(STRICTNESS)}")
     enough = [entry for entry in entries if STRICTNESS[entry.verify] >= STRICTNESS[verify]]

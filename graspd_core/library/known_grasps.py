@@ -1,8 +1,8 @@
 """Find stored grasps of a known object for the present scene. Missing grasps are planned and added to the library.
 
 A name or a mesh file identifies the object. If the library lacks the object, the error lists valid names. A stored
-grasp is refused if the hand would collide with support or obstacles. If hand or object is near them, also while they
-rise, the trials are repeated. Otherwise the stored trials remain valid.
+grasp is refused if the hand would collide with support or obstacles. If the hand comes near to support or obstacles,
+or hand or object come near to an obstacle in the lift, the grasp is simulated once more. Else its stored trials count.
 """
 
 from __future__ import annotations
@@ -52,7 +52,7 @@ _MOST_NAMED = 8
 
 @dataclass(frozen=True)
 class Physics:
-    """Conditions of trials: the object's mass [kg] (None for any mass), its friction, and the `--verify` name."""
+    """Conditions of trials: the object's mass [kg] (None for any mass), its friction, and the name of the trials."""
 
     mass: float | None
     friction: float
@@ -71,7 +71,7 @@ class Physics:
 def entry_by_name(library: GraspLibrary, hand: HandModel | None, name: str, physics: Physics) -> LibraryEntry:
     """Return the entry of the object with this name, for this hand (None for any hand).
 
-    If all entries of the object have the same mass and friction, `physics` may have other values of both.
+    If all entries of the object have one mass and one friction, mass and friction in `physics` are ignored.
 
     Raises:
         ConfigError: the name is unknown, has no entry for this hand or physics, or several objects have this name.
@@ -161,7 +161,7 @@ def _changed(library: GraspLibrary, entry: LibraryEntry) -> MeshError:
     )
 
 
-# A stored grasp is tried again if hand or object is nearer than this to an obstacle [m].
+# A stored grasp is simulated once more if hand or object is nearer than this to an obstacle [m].
 NEAR = 0.03
 # A stored grasp is refused if the hand is deeper than this in an obstacle [m]. The search allows equal depth.
 _DEEP = 0.005
@@ -227,7 +227,7 @@ def known_grasps(
 
 
 def _least_mass(scene: Scene, masses: Sequence[float]) -> dict[str, float | None]:
-    """Return the fields `mass` and `tried_mass` of a result whose grasps were tried at these masses [kg]."""
+    """Return the fields `mass` and `tried_mass` of a result whose grasps were simulated with these `masses` [kg]."""
     least = min(masses, default=None)
     return {"tried_mass": least, "mass": least if least is not None and least < scene.object.mass else None}
 
@@ -324,7 +324,7 @@ def add_planned(
 def _held(
     scene: Scene, hand: HandModel, grasps: Sequence[Grasp], verify: str, stop: StopHook
 ) -> Iterable[tuple[Grasp, str]]:
-    """Yield each grasp and why it is refused, "" if it is accepted. Try grasps near support or obstacles again."""
+    """Yield each grasp and why it is refused, or "". Simulate grasps near support or obstacles once more."""
     scene, far = near_scene(scene)
     near = [moved_grasp(grasp, -far) for grasp in grasps]
     gaps = clearance(scene, hand, near)
@@ -348,7 +348,7 @@ def _held(
 
 
 def clearance(scene: Scene, hand: HandModel, grasps: Sequence[Grasp]) -> Float[np.ndarray, "grasps"]:
-    """Return each hand's least distance to support and obstacles, retreat to squeeze [m]. Infinite if none exist."""
+    """Return the hand's least distance to support and obstacles from retreat to squeeze [m]. Infinite without any."""
     obstacles = make_obstacle_tensors(scene, hand, "cpu", torch.float64)
     if obstacles is None or not grasps:
         return np.full(len(grasps), np.inf)
@@ -366,7 +366,7 @@ def clearance(scene: Scene, hand: HandModel, grasps: Sequence[Grasp]) -> Float[n
 
 
 def lift_clearance(scene: Scene, hand: HandModel, grasps: Sequence[Grasp]) -> Float[np.ndarray, "grasps"]:
-    """Return the least distance of hand and object to the obstacles from squeeze to lift [m], infinity without any."""
+    """Return the least distance of hand and object to obstacles from squeeze to lift [m]. Infinite without any."""
     least = torch.full((len(grasps),), torch.inf, dtype=torch.float64)
     if not scene.obstacles or not grasps:
         return least.numpy()

@@ -199,11 +199,11 @@ def check_request(message: GraspRequest, hand: str) -> None:
     _check_camera_and_mask(message)
     _check_any_object(message)
     if message.source not in (GraspRequest.MESH, GraspRequest.KNOWN) and any(message.surface.coef):
-        raise bad_request(f"surface: given with source {message.source}, a cloud; valid with MESH=1 and KNOWN=4")
+        raise bad_request(f"surface: source is {message.source}, a cloud; valid sources: MESH=1, KNOWN=4")
     if message.known_object and (message.source != GraspRequest.KNOWN or message.mesh_uri):
         fault = f"source {message.source}" if message.source != GraspRequest.KNOWN else "mesh_uri too"
         name = message.known_object[:MOST_ID]
-        raise bad_request(f"known_object: {name!r} with {fault}; valid with KNOWN=4, without mesh_uri")
+        raise bad_request(f"known_object: {name!r} with {fault}; valid: source KNOWN=4, no mesh_uri")
     if len(message.exclude) + len(message.exclude_poses) > MOST_EXCLUDED:
         counts = f"{len(message.exclude)} ids, {len(message.exclude_poses)} poses"
         raise bad_request(f"exclude: {counts}; valid: at most {MOST_EXCLUDED} together")
@@ -226,12 +226,12 @@ def _check_any_object(message: GraspRequest) -> None:
     for other in (name for name, value in given.items() if value):
         raise bad_request(f"any_object: {other} is given too and selects an object; remove one of them")
     if message.source in (GraspRequest.MESH, GraspRequest.KNOWN):
-        raise bad_request(f"any_object: given with source {message.source}; valid: CLOUD=0, LATEST_CLOUD=2, VIEWS=3")
+        raise bad_request(f"any_object: source is {message.source}; valid sources: CLOUD=0, LATEST_CLOUD=2, VIEWS=3")
 
 
 def _check_mask_source(message: GraspRequest, name: str, height: int) -> None:
     if height and message.source not in _OF_ONE_CLOUD:
-        raise bad_request(f"{name}: given with source {message.source}; valid with CLOUD=0 and LATEST_CLOUD=2")
+        raise bad_request(f"{name}: source is {message.source}; valid sources: CLOUD=0, LATEST_CLOUD=2")
 
 
 def settings_of(message: GraspRequest, settings: Settings) -> Settings:
@@ -380,8 +380,8 @@ def frame_loader(
 ) -> Callable[[], Scene]:
     """Return a function that makes a scene from one sensor frame. The worker's thread calls `lookup` and `point`.
 
-    `point` returns a point [m] on or near the target object, in the frame of the points, or None. Or `mask` marks the
-    target's pixels.
+    `point` returns a point [m] on or near the target object, in the frame of the points, or None. If `mask` is
+    given, it marks the target's pixels, and `point` is not used.
     """
 
     def load() -> Scene:
@@ -401,7 +401,7 @@ def frame_loader(
 
 
 def frame_views(frame: SensorFrame, settings: Settings, place: CameraPlace, lookup: Lookup) -> SeenViews:
-    """Return a function that reads the frame. It returns one view and warnings. The worker's thread calls `lookup`."""
+    """Return a function that returns the frame's one view and its warnings. The worker's thread calls `lookup`."""
 
     def read() -> tuple[tuple[PointCloud, ...], tuple[str, ...]]:
         cloud = seen.seen_by_camera(frame, place, lookup)
@@ -505,7 +505,7 @@ def _of_frame(given: SourceInput, frame: SensorFrame) -> Request:
 
 
 def _cut(given: SourceInput) -> str:
-    """Return the settings that decide which object a cloud shows."""
+    """Return, as text, the settings that decide which object a cloud shows."""
     used = given.settings
     workspace = f"{used.roi_min} {used.roi_max} {used.voxel_size}"
     return f"{used.segment} {used.mass} {used.friction} {workspace} {used.scene_config}"
@@ -517,7 +517,7 @@ def _region_points(frame: SensorFrame, mask: Image) -> Float[np.ndarray, "points
 
 
 def _target(given: SourceInput, frame: str, stamp: Time, lookup: Lookup) -> Float[np.ndarray, "3"] | None:
-    """Return the target point in `frame` at a time [m]. None if the request has none."""
+    """Return the target point in `frame` at the time `stamp` [m]. None if the request has no target point."""
     message = given.message
     if not message.use_target_point:
         return None

@@ -68,7 +68,7 @@ class SensorFrame:
         read: returns the points in `frame` [m] and the camera's position. Its arguments are the configured camera
             position and a frame lookup. It takes some milliseconds and may raise a CloudError or TransformError.
         pixels: returns one point per pixel in `frame` [m], NaN without a measurement. May raise a CloudError.
-        content: returns a digest of what was measured. Two clouds cut out of one image have one stamp, but two digests.
+        content: returns a digest of what was measured. Two clouds cut out of one image differ only in the digest.
     """
 
     kind: str

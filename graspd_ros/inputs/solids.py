@@ -86,7 +86,7 @@ def _solid(kind: int, sizes: np.ndarray) -> Any:
 
 
 def bad_message(owner: str, message: str) -> RequestError:
-    """Return the error about an object. Its text begins with the object's name, `owner`."""
+    """Return an error about an object. The error text begins with the object's name, `owner`."""
     return bad_request(f"{owner}: {message}")
 
 
@@ -103,7 +103,7 @@ def plane_of(surface: PlaneMessage, T_object_frame: Matrix | None = None) -> Pla
 
 
 def with_support(load: Callable[[], Scene], plane: Plane | None) -> Callable[[], Scene]:
-    """Return `load`. If `plane` is given, the loaded scene gets it as support, with the normal towards the object."""
+    """Return a loader like `load`. If `plane` is given, it is the scene's support. Its normal points to the object."""
     if plane is None:
         return load
 

@@ -1,6 +1,6 @@
-"""Transforms from /tf and /tf_static, with a wait for late transforms, and the reach of the arm with the hand.
+"""Transforms from /tf and /tf_static, with a wait for late transforms. Also the restriction to the arm's reach.
 
-ROS and `make setup` install tf2_msgs. Without tf2_msgs the node works, but has no transforms.
+ROS or `make setup` installs tf2_msgs. Without tf2_msgs the node works, but has no transforms.
 """
 
 from __future__ import annotations

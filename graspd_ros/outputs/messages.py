@@ -320,7 +320,7 @@ def base_poses(grasp: Grasp, frame: str, stamp: Time) -> list[PoseStamped]:
 def posture_times(grasp: Grasp, hand: HandModel, pace: Pace) -> tuple[float, float, float]:
     """Return the times of pregrasp, grasp and squeeze from the start of the trajectory [s].
 
-    The first time lets every joint cross its whole range. By then, the arm must bring the base to the pregrasp.
+    The first time is enough for every joint to cross its whole range. At this time, the base must be at the pregrasp.
     """
     speed = _greatest_speeds(hand, pace)
     first = max(pace.shortest, _PEAK * float(np.max((hand.upper - hand.lower) / speed, initial=0.0)))

@@ -257,7 +257,7 @@ class Publishers:
         self.publish(String(data=status_line(line)))
 
     def forget(self) -> None:
-        """Renew all latched publishers except ~/grasps and ~/status, so that late subscribers get no old messages.
+        """Recreate all latched publishers except ~/grasps and ~/status. Late subscribers then get no old messages.
 
         ~/grasps keeps its publisher, because subscribers need a moment to find a new one and would miss answers.
         """

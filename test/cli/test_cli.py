@@ -374,7 +374,7 @@ def test_where_the_camera_of_a_cloud_stood_can_be_said_and_is_checked(tmp_path, 
     assert main(["synthesize", str(file), "--view-point", *place, *to]) == EXIT_OK
     assert np.linalg.norm(load_document(tmp_path / "out.json")["object"]["center_of_mass"][:2]) < 0.01
     assert main(["synthesize", str(file), "--view-point", *place, *quick, "--any"]) == EXIT_OK
-    assert f"{file}: the object about (" in capsys.readouterr().err
+    assert f"{file}: the object at about (" in capsys.readouterr().err
     for wrong in ([], ["--view-point", *turned]):
         for command in (["synthesize", str(file)], ["reconstruct", str(file)]):
             rest = to if command[0] == "synthesize" else ["--out", str(tmp_path / "x.ply")]
@@ -401,7 +401,7 @@ def test_any_object_of_a_recording_is_told_with_all_seen(bags, capsys, quick):
     (scene,) = json.loads(out)["scenes"]
     (seen,) = scene["objects"]
     assert scene["outcome"]["name"] == "SUCCEEDED"
-    assert f"the object about {tuple(seen['center'])} m, of 1 seen" in err
+    assert f"the object at about {tuple(seen['center'])} m, one of 1 seen" in err
 
 
 def test_a_long_recording_is_not_fused_whole(bags, capsys, monkeypatch, quick):

@@ -157,12 +157,12 @@ def test_a_direction_and_a_surface_are_kept(folder: Path, hand: HandModel):
     [
         (known(), {"grasp_library": ""}, GraspdError, "KNOWN=4 needs a library; set the parameter grasp_library"),
         (known(), {"verify": "hard"}, ConfigError, "does not have it with any mass, friction 0.6, hard trials"),
-        (known(mesh_uri="ball.obj"), {}, GraspdError, "known_object: 'ball' with mesh_uri too; valid with KNOWN=4"),
+        (known(mesh_uri="ball.obj"), {}, GraspdError, "known_object: 'ball' with mesh_uri too; valid: source KNOWN=4"),
         (
             {"source": GraspRequest.LATEST_CLOUD, "surface": Plane(coef=[0.0, 0.0, 1.0, 0.0])},
             {},
             GraspdError,
-            "surface: given with source 2, a cloud; valid with MESH=1 and KNOWN=4",
+            "surface: source is 2, a cloud; valid sources: MESH=1, KNOWN=4",
         ),
         (known(surface=Plane(coef=[0.0, 0.0, 0.0, 1.0])), {}, GraspdError, "surface: .* is no plane"),
     ],

@@ -101,11 +101,11 @@ def refusal(**fields) -> RequestError:
             {"target_mask": Image(height=1), "use_target_point": True},
             "target_mask: cannot be combined with target_point",
         ),
-        ({"target_mask": Image(height=1), "source": GraspRequest.MESH}, "target_mask: given with source 1"),
+        ({"target_mask": Image(height=1), "source": GraspRequest.MESH}, "target_mask: source is 1"),
         ({"any_object": True, "alone": True}, "any_object: alone is given too"),
         ({"any_object": True, "target_mask": Image(height=1)}, "any_object: target_mask is given too"),
-        ({"any_object": True, "source": GraspRequest.MESH}, "any_object: given with source 1; valid: CLOUD=0"),
-        ({"any_object": True, "source": GraspRequest.KNOWN}, "any_object: given with source 4; valid: CLOUD=0"),
+        ({"any_object": True, "source": GraspRequest.MESH}, "any_object: source is 1; valid sources: CLOUD=0"),
+        ({"any_object": True, "source": GraspRequest.KNOWN}, "any_object: source is 4; valid sources: CLOUD=0"),
     ],
 )
 def test_a_field_out_of_range_is_named(fields, culprit):
@@ -522,7 +522,7 @@ def test_a_box_may_be_the_region(tmp_path):
         ({"region": solid(BALL, -0.1)}, "sphere radius: -0.1 m; valid: above 0"),
         ({"region": solid(SolidPrimitive.CONE, 0.1, 0.1)}, "region: type 4 of 2 dimensions"),
         ({"region": solid(BALL, 0.1), "region_pose": Pose(position=Point(x=float("inf")))}, "region_pose: position"),
-        ({"region_mask": Image(height=1)}, "region_mask: given with source 1; valid with CLOUD=0"),
+        ({"region_mask": Image(height=1)}, "region_mask: source is 1; valid sources: CLOUD=0"),
         ({"region_mask": Image(height=1), "region": solid(BALL, 0.1)}, "region_mask: region is given too"),
         ({"avoid": [solid(BOX, 1, 1, 1)]}, "avoid: 1 boxes, 0 poses; valid: one pose for each box, at most 64"),
         ({"avoid_poses": [Pose()]}, "avoid: 0 boxes, 1 poses; valid: one pose for each box"),
