@@ -78,7 +78,7 @@ class KernelProblem:
         Args:
             function: name of the function.
             arguments: tensors are passed as addresses of their values and must be contiguous.
-            watch: called in this thread every few milliseconds with the sum of steps of all rows. True ends the call.
+            watch: called in this thread every few milliseconds with the steps of all rows so far. True ends the call.
 
         Raises:
             MemoryError: the threads need more memory than there is.
@@ -176,7 +176,7 @@ def _links(hand: HandTensors, arrays: Arrays) -> structs.Hand:
 
 
 def _candidates(points: PointSet, arrays: Arrays) -> structs.Points:
-    """Return the contact candidates sorted by rigid group, then by link."""
+    """Return the contact candidates sorted by rigid group (links without joints between them), then by link."""
     at, links = (values.numpy() for values in placed_points(points.matrix))
     group = np.zeros(len(at), dtype=int)
     for index, members in enumerate(points.groups.numpy()):

@@ -220,8 +220,8 @@ def _tried_lighter(
 ) -> RoundsResult:
     """Try the best grasps again, strongest first, with a lower mass that the strongest grasp can lift.
 
-    If even the strongest grasp is too weak to be verified, later rounds use another mass. It is the least mass at which
-    a grasp may be verified.
+    `light_end` is the least mass at which a grasp may be verified. If even the strongest grasp cannot lift `light_end`,
+    later rounds try grasps at `light_end`.
     """
     if state.context is None:
         return state

@@ -200,7 +200,7 @@ class BoundSteering(BoundRestriction):
         return np.all([box.distance(palm) > 0.0 for box in self.steering.avoid for palm in palms], axis=0)
 
     def admit(self, grasps: Sequence[Grasp]) -> Sequence[Grasp | Refusal]:
-        """Return each candidate that meets all constraints. Else return the constraint that it violates first."""
+        """Return each candidate that meets all constraints. In place of any other, return its `Refusal`."""
         if not grasps:
             return grasps
         steering, wanted, missed = self.steering, self.wanted, dict[str, Bool[np.ndarray, "grasps"]]()

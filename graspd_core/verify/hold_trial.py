@@ -1,4 +1,4 @@
-"""Run the hold trial: close the hand on a free object, pull along ±x, ±y, ±z in turn, check that the object stays.
+"""Run the hold trial: close the hand on a free object, pull the object along ±x, ±y, ±z, check that it stays.
 
 The trial re-implements DexGraspBench's floating protocol from the protocol's parameters. Travel and rotation of the
 object are measured from the object's pose at the start of the trial. So they include motion while the hand closes. A
@@ -95,7 +95,7 @@ def step_until_known(
     """Simulate `steps` steps. Stop earlier if the stop rule finds that the object will stay within the limits.
 
     Return why the trial failed, "" if it did not. Update `worst`, the greatest travel [m] and rotation [rad]. If
-    `rough` is set, the pull stops earlier (`stop_rule`), and the limits are checked more often.
+    `rough` is set, the pull may stop earlier (`stop_rule`), and the limits are checked more often.
     """
     rule, done = stop_rule(protocol, world.fingers, rough=rough), 0
     recent = deque[ObjectState](maxlen=1 + max(rule.windows) // LOOK_EVERY if rule else 0)

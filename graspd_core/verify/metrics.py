@@ -1,4 +1,4 @@
-"""Define the grasp metrics in a registry, and measure them. Files, messages and tables take names and units from it.
+"""Define the grasp metrics in a registry, and measure them. Files, messages and tables use its names and units.
 
 The metrics are static and do not depend on the choice of frame. docs/metrics.md defines them, and a test compares that
 page with the registry. `distinct` removes near-duplicate grasps.

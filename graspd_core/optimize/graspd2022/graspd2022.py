@@ -299,7 +299,7 @@ class Evaluation(NamedTuple):
 
 
 class Slope(NamedTuple):
-    """Cost, constraint violations, Lagrangian's gradients in pose and in forces (None if `pose_only`), and normals."""
+    """Cost, constraint violations, the Lagrangian's gradients and normals. `by_force` is None if `pose_only` is set."""
 
     cost: Values
     broken: Float[Tensor, "batch constraints"]
