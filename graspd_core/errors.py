@@ -34,7 +34,7 @@ def choices(name: object, valid: Iterable[str], more: str = "") -> str:
 
 
 class GraspdError(Exception):
-    """Base class of all graspd errors. The message is one line. It names what is wrong, its value and valid values."""
+    """Base class of all graspd errors. The message is one line with the wrong input, its value and the valid values."""
 
 
 class MeshError(GraspdError):

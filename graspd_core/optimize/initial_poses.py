@@ -56,7 +56,7 @@ class StartPool:
         rotation: orientation of the base.
         translation: origin of the base, object frame [m].
         joints: joint values [rad] or [m].
-        depth: distance of the faced place behind the first surface before the palm [m]. 0 without `Aim.places`.
+        depth: distance of the faced place behind the first surface in front of the palm [m]. 0 without `Aim.places`.
     """
 
     grip: Float[Tensor, "batch 3"]
@@ -125,7 +125,7 @@ def draw_starts(
 def _draw_pool(
     hull: TriangleMesh, hand: HandModel, count: int, seed: int, generator: torch.Generator, fingertips: float
 ) -> StartPool:
-    """Draw hands with random roll that face random points of the hull, open or with half-closed fingers."""
+    """Draw open or half-closed hands that face random points of the hull, with random roll."""
     points, normals = surface_samples(hull, count, seed)
     outward = torch.as_tensor(normals)
     tilt_axis = torch.linalg.cross(outward, torch.randn(count, 3, generator=generator, dtype=torch.float64))

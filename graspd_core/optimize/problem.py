@@ -128,7 +128,7 @@ class ObjectTensors:
 
     Attributes:
         sdf: signed distance field.
-        features: sharp points of the surface [m]. They could penetrate the hand between its contact candidates.
+        features: sharp points of the surface [m]. They could penetrate the hand between two contact candidates.
         surface: many points on the surface and its edges [m], to measure how deep a grasp penetrates.
         coarse_features: number of leading `features` used in the coarse steps, 0 if the object has no thin walls.
         center: centre of mass [m].
@@ -272,7 +272,7 @@ class Problem:
     Attributes:
         hand, object: tensors of hand and object.
         directions: unit disturbance wrenches.
-        friction: friction coefficient for planning, never above the object's own.
+        friction: friction coefficient for planning, never above the object's friction.
         obstacles: support and obstacles within the hand's reach, None if there are none.
     """
 

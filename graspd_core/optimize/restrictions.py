@@ -1,6 +1,6 @@
 """Restrict the grasps of a run: the approach direction, the contact region, or the poses that an arm can reach.
 
-A restriction acts twice. Initial poses that cannot lead to an admissible grasp are drawn again. Candidates that are not
+A restriction acts twice. Initial poses that cannot lead to an admissible grasp are replaced. Candidates that are not
 admissible are refused before any trial. A run without restrictions skips both checks.
 """
 
@@ -96,7 +96,7 @@ class BoundRestriction:
 
     @property
     def impossible(self) -> str:
-        """The reason why no grasp can be admitted, worded as the run's message. Empty if a grasp may be possible."""
+        """The reason why no grasp can be admitted, as a message for the user. Empty if a grasp may be possible."""
         return ""
 
     @property

@@ -50,7 +50,7 @@ def planning_scene(scene: Scene, resolution: int) -> tuple[Scene, Float[np.ndarr
     """Move the scene near the origin (`near_scene`) for planning. Return the moved scene and the new origin [m].
 
     The distance grid is rebuilt if it has another resolution. It is also rebuilt after a move, because float32 had
-    rounded the positions of far nodes. Raises ConfigError: the resolution is out of range.
+    rounded node positions far from the origin. Raises ConfigError: the resolution is out of range.
     """
     if not 8 <= resolution <= 256:
         raise ConfigError(f"resolution: {resolution} nodes; valid: 8 to 256")
@@ -101,8 +101,8 @@ def plan_grasps(
         device: torch device of the optimiser.
         restrictions: further conditions on grasps. The result's `refused` counts the refused candidates.
         measure: whether to measure the metrics of grasps that did not fail. Measuring takes longer than a trial.
-        progress: hook that gets `Progress` values. This thread calls it.
-        watch: hook that gets `Snapshot` values, with the hands that the run is working on. This thread calls it.
+        progress: hook that gets `Progress` values. The calling thread runs it.
+        watch: hook that gets `Snapshot` values, with the hands that the run is working on. The calling thread runs it.
         stop: polled hook. If it returns true, the run ends within one optimiser step or 0.1 s of simulated time.
 
     Raises:

@@ -155,7 +155,7 @@ class _RefusedError(Exception):
 
 
 def read_bounded(path: Path, what: str) -> bytes:
-    """Read a file. Raises ValueError: it is unreadable or too large. `what` names the format, e.g. "MANO file"."""
+    """Read a file. Raises ValueError: the file is unreadable or too large. `what` is the format, e.g. "MANO file"."""
     try:
         with path.open("rb") as file:
             content = file.read(MAX_BYTES + 1)

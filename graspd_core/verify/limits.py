@@ -109,7 +109,7 @@ def _estimated(world: World, data: Any, protocol: Protocol, direction: np.ndarra
 def _greatest(holds: Callable[[float], bool], low: float, high: float, start: float | None = None) -> float:
     """Find by bisection the greatest value that `holds` accepts. `holds` must accept `low` and refuse `high`.
 
-    If `start` is given, the search begins there. Successive tried values then differ at most by the factor `_STRIDE`.
+    The search begins at `start`, if given. Successive tried values then differ at most by the factor `_STRIDE`.
     """
     middle, stride = (math.sqrt(low * high), math.inf) if start is None else (start, _STRIDE)
     while high > FINENESS * low:

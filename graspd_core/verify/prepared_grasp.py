@@ -204,8 +204,8 @@ def arrival(context: MetricsContext, grasp: Grasp, support: Plane | None) -> Pos
     """Return a posture near the grasp with open fingers and a collision-free path from the pregrasp.
 
     Some planners move the open hand to the grasp, then close the fingers. The open fingers may penetrate the object. So
-    this function closes the fingers in part, or moves the hand back by at most 3 mm, or both. It prefers a small move,
-    then open fingers. Return None if every tried posture collides with the object or the support.
+    this function closes the fingers in part, or moves the hand back by at most 3 mm, or both. A small move has priority
+    over open fingers. Return None if every tried posture collides with the object or the support.
     """
     open_joints, closing = grasp.pregrasp.joint_positions, grasp.grasp.joint_positions - grasp.pregrasp.joint_positions
     back = grasp.pregrasp.position - grasp.grasp.position

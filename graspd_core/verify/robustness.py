@@ -3,7 +3,7 @@
 A grasp that holds on the likeliest scene, the best guess from the clouds, must also pass these checks. The hidden side
 may be guessed wrong, so the grasp must also hold on three other shapes. On these shapes, the limit of rotation is two
 thirds of the usual limit. docs/clouds.md reports how often grasps that pass all checks hold on the true object. Trials
-run on several threads. Their number changes neither results nor their order (`results_in_order`).
+run on several threads. The number of threads changes neither results nor order (`results_in_order`).
 """
 
 from __future__ import annotations
@@ -46,7 +46,7 @@ _POLL_RESULTS = 0.02
 
 
 def begin_in_thread(name: str, work: Callable[[], Result]) -> Future[Result]:
-    """Start `work` in a new thread and return its future. The process waits for the thread before it exits."""
+    """Start `work` in a new thread and return its future. Before the process exits, it waits for the thread."""
     pool = ThreadPoolExecutor(max_workers=1, thread_name_prefix=name)
     begun = pool.submit(work)
     pool.shutdown(wait=False)
@@ -150,7 +150,7 @@ class CheckStage:
 
 
 class LaterWorld:
-    """A world (MuJoCo model of a trial) that a thread builds on the first request. None if there is no such world."""
+    """A world (MuJoCo model of a trial) that a thread builds on the first request. None if building failed."""
 
     def __init__(self, make: Callable[[], World | None]):
         self._make, self._begun, self._lock = make, None, threading.Lock()
@@ -188,8 +188,8 @@ def begin_other_worlds(
 ) -> tuple[LaterWorld, ...]:
     """Return worlds (MuJoCo models) with other possible shapes of the object. Empty if no other shape is needed.
 
-    For each world, another rule guesses the hidden side. Threads now build the first three, which every grasp needs.
-    Others are built on request. A world is None if its rule gives no other shape, or the run ended.
+    For each world, another rule guesses the hidden side. Threads now build the first three worlds, which every grasp
+    needs. Others are built on request. A world is None if its rule gives no other shape, or the run ended.
     """
     making = threading.Lock()
 
@@ -248,7 +248,7 @@ def _places(scene: Scene, trials: TrialContext, though_failed: float) -> CheckSt
 
 
 def doubted_if_weak(checks: RobustnessChecks, most: float, heavy: float) -> RobustnessChecks:
-    """Replace the checks by a doubt if too many objects of this volume weigh more than the payload `most` [kg].
+    """Replace the checks by a doubt if too many objects of the same volume weigh more than the payload `most` [kg].
 
     `heavy` is the greatest mass that the object's volume allows [kg]. If there are doubts already, change nothing.
     """
@@ -259,7 +259,7 @@ def doubted_if_weak(checks: RobustnessChecks, most: float, heavy: float) -> Robu
 
 
 def less_sure(checks: RobustnessChecks, most: float, heavy: float) -> RobustnessChecks:
-    """Scale all probabilities by the fraction of objects of this volume that weigh at most the payload `most` [kg].
+    """Scale all probabilities by the fraction of objects of equal volume that weigh at most the payload `most` [kg].
 
     First, `doubted_if_weak` may replace the checks by a doubt. `heavy` is the greatest mass the volume allows [kg].
     """

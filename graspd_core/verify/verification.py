@@ -1,4 +1,4 @@
-"""Try grasps in MuJoCo: build the simulation models (worlds), try candidates in rank order, sort the verified ones.
+"""Try grasps in MuJoCo: build the models (worlds) once, try candidates in rank order, sort the verified grasps.
 
 `verify_grasps` tries and measures given grasps, for example from another planner or from a file.
 """
@@ -95,7 +95,7 @@ class Prefetched:
 
 
 def prefetch(run: Run, scene: Scene, hand: HandModel, verify: str, certainty: CertaintyConfig) -> Prefetched:
-    """Start to build the trial worlds in background threads. This takes about as long as the optimiser.
+    """Start to build the trial worlds in background threads. Building takes about as long as the optimiser.
 
     Only one object at a time is cut into convex parts. The object of an ended run is skipped, so that quickly cancelled
     runs do not pile up work.
