@@ -160,8 +160,8 @@ def find_pregrasp(
     """Find a nearby pregrasp, from which the hand closes without pushing the object. The base shifts, never turns.
 
     The path to the grasp is straight in joint space. After the fraction a of the path, every contact candidate shall
-    be at least (1 − a) times the clearance away from the object. So all contacts arrive together. The whole path
-    also avoids obstacles, and the pregrasp avoids self-collision.
+    be at least (1 − a) times `clearance` away from the object. So all contacts arrive together. The whole path also
+    avoids obstacles, and the pregrasp avoids self-collision.
 
     Returns:
         The pregrasps, and the fraction of the wanted clearance that each path keeps (1 if it keeps all).

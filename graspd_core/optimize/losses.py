@@ -117,6 +117,6 @@ def self_collision(
 
 
 def posture(joints: Joints, lower: Float[Tensor, "joints"], upper: Float[Tensor, "joints"]) -> Values:
-    """Return the sum of the joints' squared distances from mid-range. Half a joint's range counts as 1."""
+    """Return the sum of the joints' squared distances from mid-range. A distance of half the range counts as 1."""
     middle, half = (lower + upper) / 2, (upper - lower) / 2
     return (((joints - middle) / half) ** 2).sum(-1)

@@ -206,7 +206,7 @@ def _sphere_tensors(hand: HandModel, device: str, dtype: torch.dtype) -> SphereT
 
 @lru_cache(maxsize=4)
 def make_object_tensors(scene: Scene, settings: ProblemConfig, device: str, dtype: torch.dtype) -> ObjectTensors:
-    """Convert the scene's object to tensors. The last scenes are cached, by the identity of the scene."""
+    """Convert the scene's object to tensors. A cache keeps the tensors of the last scenes, by scene identity."""
     sharp, thin_share = object_sharp_points(scene.object, 2 * settings.features)
     thin = thin_share > THIN_WALLED
     floor, confidence = settings.confidence_floor, None

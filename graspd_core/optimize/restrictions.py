@@ -115,7 +115,7 @@ class BoundRestriction:
 
     @property
     def obstacles(self) -> tuple[Obstacle, ...]:
-        """Additional obstacles that the hand avoids in the search. The trials do not contain them."""
+        """Additional obstacles that the hand avoids in the search. The trials do not contain these obstacles."""
         return ()
 
     def starts(self, positions: Places, quaternions: Turns, joints: JointRows) -> Allowed:

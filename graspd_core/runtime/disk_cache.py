@@ -75,7 +75,7 @@ def forget() -> None:
 
 
 def digest(values: Iterable[Any]) -> str:
-    """Return the hexadecimal SHA-256 of arrays, tuples, dataclasses and other values. Other values count by `repr`."""
+    """Return the hexadecimal SHA-256 of arrays, tuples, dataclasses and, by their `repr`, other values."""
     found = hashlib.sha256()
 
     def add(value: Any) -> None:

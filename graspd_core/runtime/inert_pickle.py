@@ -189,7 +189,7 @@ _MOST_AXES = 8
 
 
 def array_of(value: Inert) -> np.ndarray:
-    """Return the numeric array of an inert object, in native byte order. Raises ValueError: it is no numeric array."""
+    """Return the numeric array of an inert object, in native byte order. Raises ValueError: no numeric array."""
     state = value.state
     if not isinstance(state, tuple) or len(state) != 5:
         raise ValueError("its array has no content")

@@ -59,7 +59,7 @@ def signed_distance(
     order: Int[np.ndarray, "n"] | None = None,
     reach: float = np.inf,
 ) -> Float[np.ndarray, "n"]:
-    """Return each point's distance [m] to the mesh, negative inside. If it exceeds `reach` [m], return a lower bound.
+    """Return each point's distance [m] to the mesh, negative inside. Beyond `reach` [m], return a lower bound.
 
     Pass `order` for a faster query: the int32 indices of the points, with near points next to each other.
     """

@@ -321,7 +321,7 @@ def _placed_solids(hand: HandModel, placed: PlacedHand) -> _PlacedSolids:
 def _root_cells(
     solids: _PlacedSolids, placed: PlacedHand
 ) -> tuple[Int[np.ndarray, "cells 3"], Int[np.ndarray, "cells"]]:
-    """Return the coarsest octree cells about each primitive, base frame, and each cell's primitive index, ascending."""
+    """Return the coarsest octree cells around the primitives, base frame. The primitive index of each cell ascends."""
     size, base, cells = 2**_HALVINGS, placed.rotations[0], [np.zeros((0, 3), dtype=np.int64)]
     for primitive in solids.primitives:
         low, high = bounds(primitive)

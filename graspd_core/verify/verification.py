@@ -314,7 +314,7 @@ def surest_first(grasps: Sequence[Grasp]) -> tuple[Grasp, ...]:
 def rank_by_robustness(
     run: Run, context: VerificationContext, grasps: tuple[Grasp, ...], config: RobustConfig, seed: int
 ) -> tuple[Grasp, ...]:
-    """Sort the verified grasps by robustness: the fraction of noisy trials that a grasp passes.
+    """Sort the verified grasps by robustness: the fraction of noisy hold trials that a grasp passes.
 
     The robustness is added to each verified grasp's metrics. If the run ends early, a grasp without noisy trials is
     sorted as if its robustness were 0.5. Unverified and failed grasps follow unchanged.
