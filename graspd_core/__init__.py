@@ -151,7 +151,7 @@ def __dir__() -> list[str]:
 
 
 class _MovedModules:
-    """Import finder whose error names the new path of a moved module. Python asks it only after all other finders."""
+    """Import finder for old paths of moved modules, after all other finders. Its ImportError names the new path."""
 
     def find_spec(self, fullname: str, path: Any = None, target: Any = None) -> ModuleSpec | None:
         if not fullname.startswith(f"{__name__}."):

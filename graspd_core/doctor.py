@@ -77,9 +77,9 @@ print(", ".join(f"{name} ({len(load_hand(name).joint_names)} joints)" for name i
 
 @dataclass(frozen=True)
 class Check:
-    """The result of one check of a library or part. `needed` says whether graspd needs the library or part.
+    """The result of checking one library or one part of the installation. `needed` says whether graspd needs it.
 
-    `detail` is a version or a number. After a failure it is the error in one line, and `hint` says what to do.
+    `detail` is a version or a number. If the check failed, `detail` is the error in one line, and `hint` is the remedy.
     """
 
     name: str
@@ -107,7 +107,7 @@ def run_checks() -> list[Check]:
 
 
 def try_code(name: str, code: str, hint: str, needed: bool) -> Check:
-    """Run Python code in a subprocess. If the code fails, the check fails. The last output line is the detail."""
+    """Run Python code in a subprocess. If the code fails, the check fails. The last line of output is the `detail`."""
     try:
         done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=PROBE_TIMEOUT)
     except subprocess.TimeoutExpired:
@@ -118,7 +118,7 @@ def try_code(name: str, code: str, hint: str, needed: bool) -> Check:
 
 
 def format_checks(checks: Iterable[Check]) -> str:
-    """Return the report as text. Each line has verdict, name and detail. The hint follows after each failure."""
+    """Return the report as text: one line per check, and one line with the hint below each failed check."""
     lines = []
     for check in checks:
         verdict = "ok  " if check.ok else "FAIL" if check.needed else "-   "
@@ -129,7 +129,7 @@ def format_checks(checks: Iterable[Check]) -> str:
 
 
 def add_command(commands: Any) -> None:
-    """Add this command to the parser."""
+    """Add the command `doctor` to the parser."""
     commands.add_parser("doctor").set_defaults(run=lambda options: main())
 
 

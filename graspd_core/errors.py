@@ -1,4 +1,4 @@
-"""Define the exceptions for bad input. Planning that finds no grasp raises nothing: its result has an `Outcome`."""
+"""Define the exceptions for bad input. Planning that finds no grasp raises no exception, but returns an `Outcome`."""
 
 import difflib
 import reprlib
@@ -26,7 +26,7 @@ def first_line(error: BaseException) -> str:
 
 
 def choices(name: object, valid: Iterable[str], more: str = "") -> str:
-    """Return a hint for an unknown name: the most similar valid name, or if none is similar, all names and `more`."""
+    """Return a hint for an unknown name: the most similar valid name. If no name is similar, all names and `more`."""
     names = [*valid]
     # In a file, a name may be any value, not only text.
     near = difflib.get_close_matches(name, names, 1, _NEAR) if isinstance(name, str) else ()
@@ -34,7 +34,7 @@ def choices(name: object, valid: Iterable[str], more: str = "") -> str:
 
 
 class GraspdError(Exception):
-    """Base class of all graspd errors. The message is one line. It names what is wrong, its value and valid values."""
+    """Base class of all graspd errors. The message is one line with the wrong input, its value and the valid values."""
 
 
 class MeshError(GraspdError):
@@ -78,7 +78,7 @@ class SimulatorError(GraspdError):
 
 
 class Extra:
-    """Context that imports libraries of a pip extra of graspd: `with Extra("clouds"): import open3d`.
+    """Context for importing a library that a pip extra installs, e.g. `with Extra("clouds"): import open3d`.
 
     Raises ConfigError: a library is not installed. The message has the pip command that installs the extra.
     """

@@ -128,7 +128,7 @@ def random_rotations(count: int, generator: torch.Generator, dtype: torch.dtype)
 
 
 def aligning_rotation(source: Float[Tensor, "3"], targets: Float[Tensor, "batch 3"]) -> Float[Tensor, "batch 3 3"]:
-    """Return rotations that turn the unit vector `source` onto each unit vector in `targets`. The roll is arbitrary."""
+    """Return rotations that turn the unit vector `source` onto each unit vector of `targets`, with arbitrary roll."""
     # Two Householder reflections make a rotation. The first maps `source` to `middle`, the second to the target.
     helper = torch.eye(3, dtype=targets.dtype)[source.abs().argmin()]
     middle = torch.linalg.cross(source, helper)

@@ -38,7 +38,7 @@ class TransformBuffer:
     """A thread-safe buffer that returns the transform between any two connected frames.
 
     Args:
-        history: time before a frame's newest sample for which samples are kept [ns]. None keeps all samples.
+        history: greatest age of a kept sample, relative to the frame's newest sample [ns]. None keeps all samples.
     """
 
     def __init__(self, history: int | None = HISTORY) -> None:
@@ -51,8 +51,8 @@ class TransformBuffer:
     ) -> None:
         """Add the pose of `child` in `parent` at `stamp` [ns]. A static transform is valid at all times.
 
-        If a child gets a new parent, or becomes static or moving, its earlier poses are dropped. Raises TransformError:
-        a frame has no valid name, the frames form a loop, or the transform is not rigid.
+        If a child gets a new parent, or changes between static and moving, the child's earlier poses are dropped.
+        Raises TransformError: a frame has no valid name, the frames form a loop, or the transform is not rigid.
         """
         parent, child = _name(parent), _name(child)
         pose = _rigid(T_parent_child, parent, child)
@@ -67,7 +67,7 @@ class TransformBuffer:
             self._insert(link, stamp, pose)
 
     def lookup(self, target: str, source: str, stamp: int | None = None) -> Float[np.ndarray, "4 4"]:
-        """Return `T_target_source` at `stamp` [ns]. None takes the newest time that all transforms on the way cover.
+        """Return `T_target_source` at `stamp` [ns], by default at the newest time that all frames in between cover.
 
         Raises TransformError: a frame is unknown, the frames are not connected, or the time is outside the known span.
         """
@@ -98,7 +98,7 @@ class TransformBuffer:
             return tuple(sorted({*self._links, *(link.parent for link in self._links.values())}))
 
     def clear(self) -> None:
-        """Remove all moving transforms, for example after a jump back in time. Static ones are valid at all times."""
+        """Remove all moving transforms, for example after a jump back in time. Keep static transforms."""
         with self._lock:
             self._links = {child: link for child, link in self._links.items() if link.static}
 

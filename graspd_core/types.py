@@ -26,7 +26,7 @@ class Verdict(StrEnum):
 
 
 class Outcome(Enum):
-    """Outcome of a run, with its message as value. A run that finds no grasp does not raise."""
+    """Outcome of a run. The enum's value is the message. A run that finds no grasp does not raise."""
 
     SUCCEEDED = "as many grasps as asked for were found"
     TOO_FEW = "fewer grasps passed the trial than were asked for"
@@ -124,9 +124,9 @@ class TrialResult:
     Attributes:
         name: name of the trial.
         passed: whether the object stayed within the limits.
-        displacement: greatest distance of the object's centre of mass from its start until the trial ends [m]. In a
-            lift trial, the start rises with the hand. A trial may end early (`early_stop`).
-        rotation: greatest rotation of the object from its start until the trial ends [rad].
+        displacement: greatest travel of the object's centre of mass during the trial [m]. In a lift trial, the travel
+            is measured relative to the moving hand. A trial may end early (`early_stop`).
+        rotation: greatest rotation of the object during the trial [rad].
         reason: why the trial failed. Empty if it passed.
     """
 
@@ -208,8 +208,8 @@ class Grasp:
         trials: trial results in the order of the trials. No trial runs after a failed trial.
         probability: probability that the grasp holds on the true object (docs/clouds.md). None without camera data.
         arm: arm path to the grasp (docs/arms.md). None without an arm.
-        arrival: collision-free open posture at the grasp, for planners that close the fingers only after arriving. None
-            if no such posture was computed or found.
+        arrival: collision-free open posture at the grasp, for planners that close the fingers only after the hand has
+            arrived. None if no such posture was computed or found.
     """
 
     pregrasp: Posture
@@ -225,7 +225,7 @@ class Grasp:
 
     @property
     def verdict(self) -> Verdict:
-        """VERIFIED if all trials passed, FAILED if a trial on the likeliest scene failed, otherwise UNVERIFIED."""
+        """VERIFIED if all trials passed. FAILED if a trial other than the robustness checks failed. Else UNVERIFIED."""
         failed = {trial.name for trial in self.trials if not trial.passed}
         if self.trials and not failed:
             return Verdict.VERIFIED
@@ -267,13 +267,13 @@ class Progress:
 
 @dataclass(frozen=True)
 class Snapshot:
-    """Hand poses that a run is working on, object frame: first all starts of the optimiser, then the tried candidates.
+    """Hand poses that a run is working on, object frame: while optimising the starts, during trials the candidates.
 
     Attributes:
         positions: positions of the base links [m].
         quaternions_wxyz: orientations of the base links, quaternions of any non-zero length.
         joint_positions: joint values [rad] or [m].
-        verdicts: verdict of each candidate, unverified before its trial. Empty while optimising.
+        verdicts: verdict of each candidate, UNVERIFIED before the candidate's trials. Empty while optimising.
     """
 
     positions: Float[np.ndarray, "hands 3"]
@@ -291,7 +291,7 @@ StopHook = Callable[[], bool]
 class Timing:
     """Wall-clock times of a run's stages [s]. `first_verified` is None without a verified grasp.
 
-    `load` and `sdf` are the times for building the scene. `total` includes them.
+    `load` and `sdf` are the times for building the scene. `total` includes both times. `compile` is always 0.
     """
 
     load: float = 0.0
@@ -316,11 +316,11 @@ class GraspResult:
     """The result of a run: its outcome, a `message` and all tried grasps.
 
     `tried` holds every tried grasp in rank order, verified grasps first. `support` is the plane on which the object
-    stands, None for a floating object. `audits` is always zero, and version 0.3 removes it. `next_view` is
-    `T_object_camera` [m] of a camera pose that shows more of the hidden side. `next_view` is set only if grasps hold on
-    the likeliest shape but none is verified. `refused` counts the candidates that restrictions refused, by reason.
-    `tried_mass` is the object's mass in the trials [kg]. `mass` equals it if the hand could not hold the assumed mass,
-    else it is None. `count` is the requested number of grasps.
+    stands, None for a floating object. `audits` is always zero, and version 0.3 removes it. `next_view` is the camera
+    pose `T_object_camera` [m] that shows more of the object's hidden side. It is None unless grasps hold on the
+    likeliest shape but none is verified. `refused` counts the candidates that restrictions refused, by reason.
+    `tried_mass` is the object's mass in the trials [kg]. If the hand could not hold the mass that graspd assumed,
+    `mass` equals `tried_mass`. Else `mass` is None. `count` is the requested number of grasps.
     """
 
     outcome: Outcome

@@ -1,4 +1,4 @@
-"""Find grasp candidates: draw starts, optimise them, compute the three postures and rank. No trial runs here."""
+"""Find grasp candidates, before any trial: draw initial poses (starts), optimise, compute postures and rank."""
 
 from __future__ import annotations
 
@@ -67,7 +67,7 @@ class PlannerInput:
         )
 
     def allowed(self, starts: Poses) -> Poses:
-        """Return the initial poses that the restrictions allow. A method that draws its own poses calls this."""
+        """Return the initial poses that the restrictions allow, for methods that draw their own initial poses."""
         if not self.restrictions.each:
             return starts
         turns = starts.quaternion / starts.quaternion.norm(dim=-1, keepdim=True)
@@ -100,8 +100,8 @@ def find_candidates(task: PlannerInput, *, searches: int | None = None) -> Candi
     """Run the configured method and return its ranked candidates, perhaps fewer than `task.count`.
 
     If too few candidates are expected to pass the hold trial, the search is repeated from new starts. This helps on
-    small, large and long objects. `searches` limits the number of searches. None takes the limit of the method's
-    settings. Restrictions limit only the starts here. The caller must check the candidates against the restrictions.
+    small, large and long objects. `searches` limits the number of searches. By default the method's settings limit it.
+    This function restricts only the starts. The caller must check the candidates against the restrictions.
     """
     config, count = task.config, task.count
     found = _searched(task)
@@ -134,7 +134,7 @@ def _best_first(grasps: Iterable[Grasp]) -> tuple[Grasp, ...]:
 def assemble(
     problem: Problem, hand: HandModel, poses: Poses, config: PlanConfig, stop: Callable[[], bool] = lambda: False
 ) -> tuple[Grasp, ...]:
-    """Turn poses into grasps with pregrasp, grasp and squeeze posture. Return them with their scores, best first.
+    """Turn poses into scored grasps with pregrasp, grasp and squeeze posture. Return the grasps, best first.
 
     Poses that penetrate an obstacle at the grasp or on the approach path are dropped. Poses whose fingers penetrate the
     object deeply are kept, because some methods produce such poses and their grasps hold.

@@ -1,8 +1,8 @@
 """Find the contacts of a grasp posture, and compute the pregrasp and the squeeze posture.
 
-From the pregrasp the hand closes without touching anything on its path. The squeeze has the joint targets that produce
-balanced contact forces, as far as the joints' efforts allow. If the problem fits the compiled kernel, the kernel runs
-the same steps in place of torch.
+On the path from the pregrasp to the grasp, the hand touches nothing. The squeeze has the joint targets that produce
+balanced contact forces, within the joints' effort limits. If the compiled C++ kernel supports the problem, the kernel
+runs the same steps in place of torch.
 """
 
 from __future__ import annotations
@@ -75,9 +75,9 @@ class ContactSet:
 
 @torch.no_grad()
 def find_contacts(problem: Problem, poses: Poses, reach: float) -> ContactSet:
-    """Return contacts at three candidates of each link, and at the object's sharp point nearest to each primitive.
+    """Return contacts at three points of each link, and at the object's sharp point nearest to each hand primitive.
 
-    The three candidates of a link are far apart. A contact is active within `reach` [m] of the object's surface.
+    The three points are contact candidates far apart. A contact is active within `reach` [m] of the object's surface.
     """
     points = problem.hand.fine
     placed = hand_forward(problem, points, poses)
@@ -109,7 +109,7 @@ def find_contacts(problem: Problem, poses: Poses, reach: float) -> ContactSet:
 
 
 def _with_features(problem: Problem, poses: Poses, found: ContactSet, reach: float) -> ContactSet:
-    """Add a slot for each hand primitive at the object's nearest sharp point. Its normal points into the primitive."""
+    """Add a slot for each hand primitive at the object's nearest sharp point. The normal points into the primitive."""
     pick, nearest, outward = nearest_features(problem, poses)
     return ContactSet(
         torch.cat([found.link, problem.hand.solids.link]),
@@ -123,7 +123,7 @@ def _with_features(problem: Problem, poses: Poses, found: ContactSet, reach: flo
 def nearest_features(
     problem: Problem, poses: Poses
 ) -> tuple[Int[Tensor, "batch solids"], Float[Tensor, "batch solids"], Float[Tensor, "batch solids 3"]]:
-    """Return for each hand primitive its nearest sharp point's index, signed distance [m] and distance gradient."""
+    """Return the nearest sharp point of each hand primitive: index, signed distance [m], gradient of the distance."""
     solids = problem.hand.solids
     if (compiled := problem.compiled) is not None:
         x = pack(poses).contiguous()
@@ -160,8 +160,8 @@ def find_pregrasp(
     """Find a nearby pregrasp, from which the hand closes without pushing the object. The base shifts, never turns.
 
     The path to the grasp is straight in joint space. After the fraction a of the path, every contact candidate shall
-    be at least (1 − a) times the clearance away from the object. So all contacts arrive together. The whole path
-    also avoids obstacles, and the pregrasp avoids self-collision.
+    be at least (1 − a) times `clearance` away from the object. So all contacts arrive together. The whole path also
+    avoids obstacles, and the pregrasp avoids self-collision.
 
     Returns:
         The pregrasps, and the fraction of the wanted clearance that each path keeps (1 if it keeps all).
@@ -309,7 +309,7 @@ def _descended(
 def approach_depth(problem: Problem, obstacles: ObstacleTensors, pregrasp: Poses) -> Values:
     """Return how deep the hand penetrates the object on the straight path from the retreat to the pregrasp [m].
 
-    0 if the path is free. The retreat is the pregrasp drawn back. `RETREAT_SHARES` leaves out the pregrasp itself.
+    0 if the path is free. The retreat is the pregrasp moved back against the approach. The pregrasp is not tested.
     """
     rotation = rotation_from_quaternion(pregrasp.quaternion)
     begun = [drawn_back(pregrasp.translation, rotation, obstacles.approach, RETREAT * s) for s in RETREAT_SHARES]
@@ -325,7 +325,7 @@ def hand_distance(problem: Problem, base: SE3, joints: Joints) -> Distances:
 
 @dataclass(frozen=True)
 class Squeeze:
-    """Balanced contact forces and the joint targets that produce them, as far as the joints' efforts allow.
+    """Balanced contact forces and the joint targets that produce these forces, within the joints' effort limits.
 
     Attributes:
         joints: position targets [rad] or [m].
@@ -372,7 +372,7 @@ def by_link(contact_set: ContactSet, values: Float[Tensor, "batch slots n"]) -> 
 def joint_torques(
     problem: Problem, poses: Poses, contact_set: ContactSet, forces: Float[Tensor, "batch slots 3"]
 ) -> Joints:
-    """Return the joint torques τ = JᵀF [N·m] or [N]: the gradient of Σ F·x. The joints move the contact points x."""
+    """Return joint torques τ = JᵀF [N·m] or [N]: the gradient of Σ F·x in the joints, with x fixed to the links."""
     base = poses.base
     x = base.apply_inverse(contact_set.position)
     joints = poses.joints.detach().requires_grad_(True)
@@ -398,7 +398,7 @@ def balanced_forces(
         normals: outward unit normals.
         active: True for slots that are contacts.
         length: length that torques are divided by [m].
-        friction: Coulomb coefficient of the cones.
+        friction: Coulomb coefficient of the friction cones.
 
     Returns:
         Forces, and the norm of their net wrench (torque over `length`).
@@ -437,9 +437,9 @@ def _balancing_weights(
 ) -> Float[np.ndarray, "batch edges"]:
     """Return the x ≥ 0 that minimises ‖W x‖² + 10² (Σ x − 1)² + ridge² ‖x‖². W has the `allowed` `wrenches` as columns.
 
-    Let G be W with a seventh row of tens, and t = (0, …, 0, 10). The unknown of the dual is the residual r = t − G x.
-    The dual minimises ‖r‖²/2 + ‖max(Gᵀr, 0)‖² / 2 ridge² − t·r. Then x = max(Gᵀr, 0) / ridge². The dual is
-    piecewise quadratic. So Newton's method with step halving needs few steps.
+    Let G be W with a seventh row of tens, and t = (0, …, 0, 10). The dual problem seeks the residual r = t − G x. It
+    minimises ‖r‖²/2 + ‖max(Gᵀr, 0)‖² / 2 ridge² − t·r. Then x = max(Gᵀr, 0) / ridge². The dual problem is piecewise
+    quadratic. So Newton's method with step halving needs few steps.
     """
     batch, count, _ = wrenches.shape
     g = np.concatenate([wrenches, np.full((batch, count, 1), _SUM)], -1) * allowed[..., None]

@@ -1,4 +1,4 @@
-"""Draw seeded initial poses: the open palm, or half-closed fingertips, at a random point of the object's convex hull.
+"""Draw seeded initial poses: an open or half-closed hand that faces a random point of the object's convex hull.
 
 An `Aim` restricts the approach direction, the roll, and the part of the object that the palm faces.
 """
@@ -56,7 +56,7 @@ class StartPool:
         rotation: orientation of the base.
         translation: origin of the base, object frame [m].
         joints: joint values [rad] or [m].
-        depth: how far a wanted place lies behind the first surface in front of the palm [m]. 0 without wanted places.
+        depth: distance of the faced place behind the first surface in front of the palm [m]. 0 without `Aim.places`.
     """
 
     grip: Float[Tensor, "batch 3"]
@@ -84,11 +84,11 @@ def draw_starts(
 ) -> Poses:
     """Draw `count` seeded starts with the palm near the object's convex hull, where the hand can span the object.
 
-    As in Grasp'D, the palm faces a random surface point with a random roll. Points are on the hull, so that no palm
-    starts inside a hollow. Narrow cross-sections are preferred. A share `fingertips` of the starts has half-closed
-    fingers, with the fingertips at the point, because an open hand does not reach small or low objects. A pose is
-    rarely chosen if the hand penetrates an obstacle there or at the retreat. With restrictions, at most `_MOST_POOLS`
-    pools are drawn. If these contain too few allowed poses, fewer than `count` starts are returned, perhaps none.
+    As in Grasp'D, the palm faces a random point with a random roll. The points are on the hull, so that no palm starts
+    inside a hollow. Narrow cross-sections are preferred. A share `fingertips` of the starts has half-closed fingers,
+    with the fingertips at the point, because an open hand does not reach small or low objects. A pose is rarely chosen
+    if the hand penetrates an obstacle at the pose or at its retreat. With restrictions, at most `_MOST_POOLS` pools of
+    poses are drawn. If all pools contain too few allowed poses, fewer than `count` starts are returned, perhaps none.
     """
     generator = torch.Generator().manual_seed(seed)
     obstacles = make_obstacle_tensors(scene, hand, "cpu", torch.float64)
@@ -125,7 +125,7 @@ def draw_starts(
 def _draw_pool(
     hull: TriangleMesh, hand: HandModel, count: int, seed: int, generator: torch.Generator, fingertips: float
 ) -> StartPool:
-    """Draw hands with random roll that face random points of the hull, open or with half-closed fingers."""
+    """Draw open or half-closed hands that face random points of the hull, with random roll."""
     points, normals = surface_samples(hull, count, seed)
     outward = torch.as_tensor(normals)
     tilt_axis = torch.linalg.cross(outward, torch.randn(count, 3, generator=generator, dtype=torch.float64))
@@ -160,7 +160,7 @@ def _aimed(
     """Turn and move the hands of a pool so that they meet `aim`. The joints do not change.
 
     The grip of each hand faces a random place of `aim`, or a random `surface` point [m] if `aim` has no places. The
-    grip keeps its standoff from the first surface that the palm meets on its way to that point.
+    grip keeps its standoff from the first surface on the line from the palm to the faced point.
     """
     count, rotation = len(pool.joints), pool.rotation
     if aim.direction is not None:
@@ -224,9 +224,9 @@ def _depth(obstacles: ObstacleTensors, base: SE3, links: SE3) -> Values:
 
 
 def _lowered(preference: Values, count: int, penalty: Callable[[Tensor], Values]) -> Values:
-    """Subtract the `penalty` of each row. A row that cannot be among the `count` greatest may get −inf instead.
+    """Return `preference` minus `penalty`. Rows that cannot be among the `count` greatest may get −inf.
 
-    A penalty is not negative and slow to compute, so rows get theirs in descending order until `count` are known.
+    A penalty is at least 0 and slow to compute, so it is computed by descending `preference` and only where needed.
     """
     lowered = torch.full_like(preference, -torch.inf)
     for rows in preference.argsort(descending=True).split(count):
@@ -237,7 +237,7 @@ def _lowered(preference: Values, count: int, penalty: Callable[[Tensor], Values]
 
 
 def depth_of_starts(scene: Scene, hand: HandModel, count: int, restrictions: BoundRestrictions) -> float:
-    """Return the hand's depth in obstacles at the best of `count` starts or its retreat [m]. 0 without obstacles."""
+    """Draw `count` starts. Return the least depth in obstacles (`_depth`) of any start [m], 0 without obstacles."""
     obstacles = make_obstacle_tensors(scene, hand, "cpu", torch.float64)
     if obstacles is None:
         return 0.0
@@ -273,7 +273,7 @@ def closing_axis(hand: HandModel) -> Float[np.ndarray, "3"]:
 
 
 def between_fingertips(hand: HandModel, joints: Joints) -> Positions:
-    """Return the middle between the fingertips that close from one side and those from the other, base frame [m]."""
+    """Return the middle between the fingertips of the two sides from which the hand closes, base frame [m]."""
     fingers = find_fingers(hand)
     travel = placed_tips(hand, fingers, hand.closed_posture) - placed_tips(hand, fingers, hand.open_posture)
     along = torch.as_tensor(travel @ closing_axis(hand))

@@ -78,10 +78,10 @@ class KernelProblem:
         Args:
             function: name of the function.
             arguments: tensors are passed as addresses of their values and must be contiguous.
-            watch: called in this thread every few milliseconds with the sum of steps of all rows. True ends the call.
+            watch: called in this thread every few milliseconds with the steps done in all rows. True ends the call.
 
         Raises:
-            MemoryError: the threads need more memory than there is.
+            MemoryError: the threads need more memory than is available.
         """
         failures: list[BaseException] = []
 
@@ -129,7 +129,7 @@ def kernel_problem(problem: Problem) -> KernelProblem:
 
 @lru_cache(maxsize=8)
 def _hand(hand: HandTensors) -> tuple[dict[str, Structure], Arrays]:
-    """Return the fields of `builds.Problem` that describe the hand, and their arrays."""
+    """Return the fields of `builds.Problem` that describe the hand, and the arrays of these fields."""
     arrays = Arrays()
     spheres, links = placed_points(hand.spheres.matrix)
     order = np.argsort(links.numpy(), kind="stable")
@@ -176,7 +176,7 @@ def _links(hand: HandTensors, arrays: Arrays) -> structs.Hand:
 
 
 def _candidates(points: PointSet, arrays: Arrays) -> structs.Points:
-    """Return the contact candidates sorted by rigid group, then by link."""
+    """Return the contact candidates sorted by candidate group (`PointSet.groups`), then by link."""
     at, links = (values.numpy() for values in placed_points(points.matrix))
     group = np.zeros(len(at), dtype=int)
     for index, members in enumerate(points.groups.numpy()):

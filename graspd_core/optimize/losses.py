@@ -69,12 +69,12 @@ def wrench_support(
 
 
 def soft_contact(distance: Distances, radius: Values, delta: float) -> Distances:
-    """Return exp(−|`distance` − `radius`| / `delta`). It is 1 at distance `radius`. Elsewhere it has a gradient."""
+    """Return exp(−|`distance` − `radius`| / `delta`). It is 1 at distance `radius` and decays on both sides."""
     return (-(distance - radius[:, None]).abs() / delta).exp()
 
 
 def hard_contact(distance: Distances, radius: Values, delta: float) -> Distances:
-    """Return 1 within `delta` [m] of the padded surface, else 0. An ablation uses it instead of `soft_contact`."""
+    """Return 1 within `delta` [m] of distance `radius`, else 0. An ablation study replaces `soft_contact` by it."""
     return ((distance - radius[:, None]).abs() <= delta).to(distance)
 
 
@@ -95,7 +95,7 @@ def touch(gap: Float[Tensor, "batch groups"], reach: Float[Tensor, "groups"]) ->
 
 
 def penetration(distance: Distances, radius: Values) -> Values:
-    """Return a tenth of the sum of squared depths below the padded surface [mm²]. Great depths count linearly."""
+    """Return a tenth of the summed squared depths below distance `radius` [mm²], nearly linear far above 10 mm."""
     depth = (radius[:, None] - distance).clamp_min(0.0) / _MILLIMETRE
     return (depth * depth / (1.0 + 0.1 * depth)).sum(-1) / 10.0
 
@@ -117,6 +117,6 @@ def self_collision(
 
 
 def posture(joints: Joints, lower: Float[Tensor, "joints"], upper: Float[Tensor, "joints"]) -> Values:
-    """Return the sum of the joints' squared distances from mid-range. Half a joint's range counts as 1."""
+    """Return the sum of the joints' squared distances from mid-range. A distance of half the range counts as 1."""
     middle, half = (lower + upper) / 2, (upper - lower) / 2
     return (((joints - middle) / half) ** 2).sum(-1)

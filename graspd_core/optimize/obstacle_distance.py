@@ -49,16 +49,16 @@ class ObstacleTensors:
     """Support and obstacles, and the points of the hand that are tested against them.
 
     Attributes:
-        corner_matrix: with it, `place_points` computes the extreme points of the hand's primitives.
+        corner_matrix: matrix from which `place_points` computes the extreme points of the hand's primitives.
         corner_radii: radii of the balls about the extreme points [m].
-        sphere_matrix: with it, `place_points` computes the centres of the collision spheres.
+        sphere_matrix: matrix from which `place_points` computes the centres of the collision spheres.
         sphere_radii: radii of the collision spheres [m].
         normal: unit normal of the support, towards the free side. None without a support.
         offset: n·x on the support, raised by the margin of the support [m]. 0 without a support.
         sdfs: signed distance fields of the obstacles within the hand's reach.
         approach: unit direction in which the hand moves to its pregrasp, base frame.
         points, radii, links: centre in the link frame [m], radius [m] and link of each ball: corners, then spheres.
-        around: for each link, a ball around all its balls: centre in the link frame and radius [m].
+        around: for each link, a ball that encloses all balls of the link: centre in the link frame and radius [m].
     """
 
     corner_matrix: Float[Tensor, "corners columns"]
@@ -116,7 +116,7 @@ def make_obstacle_tensors(
 
 
 def _balls_about(count: int, points: np.ndarray, radii: np.ndarray, links: np.ndarray) -> Float[np.ndarray, "links 4"]:
-    """Return for each link a ball around all its balls: centre and radius. The radius is −inf without balls."""
+    """Return for each link a ball that encloses the link's balls: centre and radius. Without balls, radius −inf."""
     around = np.zeros((count, 4))
     around[:, 3] = -np.inf
     for link in np.unique(links):
@@ -141,7 +141,7 @@ def extreme_points(hand: HandModel) -> tuple[Float[np.ndarray, "corners 3"], Flo
 
 
 def extreme_points_of_solids(hand: HandModel) -> list[tuple[Float[np.ndarray, "n 3"], float, int]]:
-    """Return balls that span each primitive as their convex hull: centres in the link frame [m], radius [m], link."""
+    """Return balls whose convex hull is the primitive, by primitive: centres in link frame [m], radius [m], link."""
     found = ((*_extremes(primitive), primitive) for primitive in hand.primitives)
     return [(at @ solid.rotation.T + solid.translation, radius, solid.link) for at, radius, solid in found]
 
@@ -183,7 +183,7 @@ def obstacle_gaps(obstacles: ObstacleTensors, base: SE3, links: SE3, wide: float
 def least_gap(obstacles: ObstacleTensors, base: SE3, links: SE3, wide: float = WIDE) -> Values:
     """Return the least of `obstacle_gaps` of each hand [m].
 
-    Obstacles beyond `wide` are ignored. Only links near an obstacle's grid are tested, in a bin a tenth of the links.
+    Obstacles beyond `wide` are ignored. Only links near an obstacle's grid are tested: in a bin, a tenth of all links.
     """
     least = base.translation.new_full(base.translation.shape[:1], wide)
     if obstacles.normal is not None:

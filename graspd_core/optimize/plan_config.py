@@ -56,7 +56,7 @@ class Method:
     def plan(self, task: PlannerInput) -> PlannerOutput:
         """Find poses. A numerical failure drops the pose and never raises.
 
-        The module needs torch, so it is imported here and not at the top of this file.
+        This function imports the method's module, because the module needs torch and is slow to import.
         """
         return importlib.import_module(self.module).plan(task)
 
@@ -87,7 +87,7 @@ def _registered() -> dict[str, EntryPoint]:
 
 @cache
 def _run_plugins() -> None:
-    """Load the parent process's plugins. The import of this module cannot do so, because plugins import this module."""
+    """Load the parent process's plugins. Do so after the import of this module, because plugins import this module."""
     for path in filter(None, os.environ.get(_PLUGINS, "").split(os.pathsep)):
         load_plugin(path)
 
@@ -99,7 +99,7 @@ def method_names() -> tuple[str, ...]:
 
 
 def method_row(name: Any, where: str = "config") -> Method:
-    """Return the row of a method. Raises ConfigError: the method is unknown. `where` is the prefix of the message."""
+    """Return the row of a method. Raises ConfigError: the method is unknown. The message begins with `where`."""
     _run_plugins()
     if not isinstance(name, str) or (name not in METHODS and name not in _registered()):
         raise ConfigError(f"{where}.method: unknown method {short_repr(name)}; {choices(name, method_names())}")
@@ -113,7 +113,7 @@ class PlanConfig:
     """Settings of a run, apart from the scene, the hand and the seed.
 
     Attributes:
-        resolution: the object's distance grid has at most `resolution`³ nodes. A cubic grid has `resolution` per side.
+        resolution: the object's distance grid has at most `resolution`³ nodes, for a cube `resolution` per side.
         method: name of the method, one of `method_names`.
         settings: settings of the method, an instance of `Method.config`. None takes the defaults.
         problem: settings for converting scene and hand to tensors.
@@ -147,7 +147,7 @@ class PlanConfig:
         return dataclasses.replace(self, settings=method_row(self.method).at_budget(self.settings, budget))
 
     def with_method(self, method: str) -> PlanConfig:
-        """Return the settings with `method` at its defaults. If it is the method already, nothing changes."""
+        """Return the settings with `method` at its defaults. Return them unchanged if they already have this method."""
         return self if method == self.method else dataclasses.replace(self, method=method, settings=None)
 
 
@@ -215,7 +215,7 @@ def load_preset(name: str) -> PlanConfig:
 
 
 def load_plugin(path: str) -> str:
-    """Run a Python file that registers methods, metrics or trials. Child processes run the file too. Returns its path.
+    """Run a Python file that registers methods, metrics or trials. Child processes run it too. Return its path.
 
     Raises:
         ConfigError: the file does not exist, its module name is taken, or the file raises.

@@ -58,9 +58,9 @@ class PointSet:
     """Contact candidates of a hand.
 
     Attributes:
-        matrix: with it, `place_points` computes the positions of the candidates from the link poses.
+        matrix: matrix from which `place_points` computes the candidates' positions, given the link poses.
         links: link of each candidate.
-        groups: a row of candidate indices for each rigid group of links, or each patch. Short rows repeat an index.
+        groups: rows of candidate indices, by rigid group of links or by patch (`_patches`). Short rows repeat an index.
     """
 
     matrix: Float[Tensor, "points columns"]
@@ -73,7 +73,7 @@ class SphereTensors:
     """Spheres that fill the hand's links, for self-collision.
 
     Attributes:
-        matrix: with it, `place_points` computes the centres from the link poses.
+        matrix: matrix from which `place_points` computes the centres, given the link poses.
         radii: radii of the spheres [m].
         weight: 1 / 2R for checked pairs [1/m], where R is the sum of both radii. Zero for other pairs.
     """
@@ -94,7 +94,7 @@ class HandTensors:
         fine: all contact candidates. Used in the last steps.
         reach: attraction range of each group of candidates [m].
         solids: collision primitives, without hulls.
-        group_of_solid: for each primitive, the first candidate group on its rigid group. If none, the number of groups.
+        group_of_solid: first candidate group on the rigid group of each primitive. If none, the number of groups.
         solid_pairs: pairs of `solids` whose links are not adjacent.
         spheres: spheres for self-collision.
         lower, upper: joint limits [rad] or [m].
@@ -128,7 +128,7 @@ class ObjectTensors:
 
     Attributes:
         sdf: signed distance field.
-        features: sharp points of the surface [m]. They could penetrate the hand between its contact candidates.
+        features: sharp points of the surface [m]. They could penetrate the hand between two contact candidates.
         surface: many points on the surface and its edges [m], to measure how deep a grasp penetrates.
         coarse_features: number of leading `features` used in the coarse steps, 0 if the object has no thin walls.
         center: centre of mass [m].
@@ -206,7 +206,7 @@ def _sphere_tensors(hand: HandModel, device: str, dtype: torch.dtype) -> SphereT
 
 @lru_cache(maxsize=4)
 def make_object_tensors(scene: Scene, settings: ProblemConfig, device: str, dtype: torch.dtype) -> ObjectTensors:
-    """Convert the scene's object to tensors. The last scenes are cached, by the identity of the scene."""
+    """Convert the scene's object to tensors. A cache keeps the tensors of the last scenes, by scene identity."""
     sharp, thin_share = object_sharp_points(scene.object, 2 * settings.features)
     thin = thin_share > THIN_WALLED
     floor, confidence = settings.confidence_floor, None
@@ -237,10 +237,10 @@ def make_object_tensors(scene: Scene, settings: ProblemConfig, device: str, dtyp
 
 
 def _patches(hand: HandModel, candidates: int, size: int) -> Int[np.ndarray, "points"]:
-    """Return the index of each contact candidate's patch, the nearest in its rigid group.
+    """Return for each contact candidate the index of the nearest patch in the same rigid group of links.
 
     A group has about one patch per `size` coarse candidates (the first `candidates`). Patch centres are far apart.
-    Without coarse candidates the index is −1.
+    In a group without coarse candidates, the index is −1.
     """
     posture = link_poses(hand, (hand.lower + hand.upper) / 2)
     points = in_base(posture, hand.candidate_points, hand.candidate_link)
@@ -272,7 +272,7 @@ class Problem:
     Attributes:
         hand, object: tensors of hand and object.
         directions: unit disturbance wrenches.
-        friction: friction coefficient for planning, never above the object's own.
+        friction: friction coefficient for planning, never above the object's friction.
         obstacles: support and obstacles within the hand's reach, None if there are none.
     """
 
@@ -356,7 +356,7 @@ def self_collision(problem: Problem, links: SE3) -> Values:
 
 
 def solid_collision(problem: Problem, links: SE3) -> Values:
-    """Return a tenth of the squared overlap of the hand's primitives with each other [mm²], exact for boxes."""
+    """Return a tenth of the sum of squared overlaps of hand primitives with each other [mm²], exact for boxes."""
     row, depth = solid_overlaps(problem.hand.solids, problem.hand.solid_pairs, links)
     return depth.new_zeros(len(links.translation)).index_add(0, row, (1e3 * depth) ** 2 / 10.0)
 
@@ -416,7 +416,7 @@ def evaluate(
 
     Args:
         fine: use all contact candidates, not only the coarse ones.
-        sharp: use all sharp points of the object. Attract only candidate groups within `REACH_WHEN_SHARP` of it.
+        sharp: use all sharp points of the object. Attract only candidate groups nearer than `REACH_WHEN_SHARP`.
         activate: contact weight of a candidate as a function of its distance, `radius` and `delta`.
     """
     points = problem.hand.fine if fine else problem.hand.coarse

@@ -1,6 +1,6 @@
 """Score candidates by their predicted chance to pass the hold trial, before the trial runs.
 
-The score comes from a network with two small hidden layers. `benchmarks/ranking.py` fits it to trials and writes
+The score comes from a neural network with two small hidden layers. `benchmarks/ranking.py` fits it to trials and writes
 `ranking.npz`. docs/method.md describes the data and the accuracy.
 """
 
@@ -62,7 +62,7 @@ def score(problem: Problem, staged: Staged) -> Values:
 
 
 def log_odds(network: Mapping[str, Tensor], figures: Float[Tensor, "batch figures"]) -> Values:
-    """Return the log-odds of passing the hold trial, from a network that `benchmarks/ranking.py` fitted."""
+    """Return the log-odds of passing the hold trial, from a neural network that `benchmarks/ranking.py` fitted."""
     x = ((figures - network["mean"]) / network["deviation"]).clamp(-FARTHEST, FARTHEST)
     for layer in range(2):
         x = torch.nn.functional.silu(x @ network[f"weight{layer}"] + network[f"bias{layer}"])
@@ -71,7 +71,7 @@ def log_odds(network: Mapping[str, Tensor], figures: Float[Tensor, "batch figure
 
 @torch.no_grad()
 def ranking_figures(problem: Problem, staged: Staged) -> Float[Tensor, "batch figures"]:
-    """Return the inputs of the network, on the CPU. They are scaled by object size, joint range or a fixed unit."""
+    """Return the inputs of the neural network (on the CPU), scaled by object size, joint range or a fixed unit."""
     poses, opened, pressed = staged.poses, staged.opened, staged.pressed
     hand, length = problem.hand, problem.object.length
     normal_forces = pressed.forces.norm(dim=-1)

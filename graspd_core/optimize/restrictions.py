@@ -1,6 +1,6 @@
 """Restrict the grasps of a run: the approach direction, the contact region, or the poses that an arm can reach.
 
-A restriction acts twice. Initial poses that cannot lead to an admissible grasp are drawn again. Candidates that are not
+A restriction acts twice. Initial poses that cannot lead to an admissible grasp are replaced. Candidates that are not
 admissible are refused before any trial. A run without restrictions skips both checks.
 """
 
@@ -33,8 +33,8 @@ class Roll:
     """A wanted rotation of the hand about its approach direction.
 
     Attributes:
-        side: unit vector perpendicular to the hand's approach, base frame.
-        zero: direction of `side` at a roll of 0, object frame. Its part along the approach is ignored.
+        side: unit vector perpendicular to the hand's approach direction, base frame.
+        zero: direction of `side` at a roll of 0, object frame. The component along the approach is ignored.
         angle: wanted roll, right-handed about the approach [rad].
         tolerance: allowed deviation to either side [rad].
     """
@@ -45,7 +45,7 @@ class Roll:
     tolerance: float
 
     def missing(self, approach: Positions, rotation: Float[Tensor, "batch 3 3"]) -> Values:
-        """Return the rotation about the approach that each hand needs to have the wanted roll [rad], in −π to π."""
+        """Return the rotation about the approach that would give each hand the wanted roll [rad], in −π to π."""
         zero, side = torch.as_tensor(self.zero).to(approach), rotation @ torch.as_tensor(self.side).to(approach)
         square = zero - (approach @ zero)[:, None] * approach
         roll = torch.atan2((torch.linalg.cross(square, side) * approach).sum(-1), (square * side).sum(-1))
@@ -71,7 +71,7 @@ class Aim:
 
 @dataclass(frozen=True)
 class Refusal:
-    """The reason for refusing a candidate: a phrase that follows a number, such as "outside the approach cone"."""
+    """The reason for refusing a candidate. Messages put a number first: "7" + "outside the approach cone"."""
 
     reason: str
 
@@ -96,7 +96,7 @@ class BoundRestriction:
 
     @property
     def impossible(self) -> str:
-        """The reason why no grasp can be admitted, worded as the run's message. Empty if a grasp may be possible."""
+        """The reason why no grasp can be admitted, as a message for the user. Empty if a grasp may be possible."""
         return ""
 
     @property
@@ -105,7 +105,7 @@ class BoundRestriction:
         return type(self).__name__
 
     def why_none(self, others: BoundRestrictions) -> str:
-        """Return why no candidate satisfies this restriction and the run's `others`. Empty if the reason is unknown."""
+        """Return why no candidate meets this restriction and all `others` of the run. Empty if unknown."""
         return ""
 
     @property
@@ -115,7 +115,7 @@ class BoundRestriction:
 
     @property
     def obstacles(self) -> tuple[Obstacle, ...]:
-        """Additional obstacles that the hand avoids in the search. The trials do not contain them."""
+        """Additional obstacles that the hand avoids in the search. The trials do not contain these obstacles."""
         return ()
 
     def starts(self, positions: Places, quaternions: Turns, joints: JointRows) -> Allowed:
@@ -133,7 +133,7 @@ class BoundRestrictions:
 
     Attributes:
         each: the restrictions, applied in order. The first restriction that refuses a candidate gives the reason.
-        origin: origin of the poses that this class takes and returns, in the frame of `each` [m].
+        origin: origin of the frame in which this class takes and returns poses, in the frame of `each` [m].
     """
 
     each: tuple[BoundRestriction, ...] = ()
@@ -187,7 +187,7 @@ def restrictions_in_words(restrictions: BoundRestrictions, refused: Mapping[str,
 
     Example: "12 candidates held, 9 refused: 7 outside the approach cone, 2 with a contact outside the region".
     If no candidate was found, the text names the restrictions. If all candidates were admitted, the text is empty.
-    `held` counts the candidates that held in the trials, and `tried` the admitted candidates.
+    `held` is the number of candidates that passed the trials. `tried` is the number of admitted candidates.
     """
     if refused:
         reasons = ", ".join(f"{n} {reason}" for reason, n in sorted(refused.items(), key=lambda item: -item[1]))

@@ -1,9 +1,9 @@
 """Plan for any object of a scene: find an object with a verified grasp, else rank the objects by their best grasp.
 
 Objects with fewer earlier failures come first. At equal numbers of failures, higher objects come first, because nothing
-lies on them. An object gets one round of the planner. It gets all rounds if an earlier try failed with it or with an
-unknown object. The first verified grasp ends the search. After `enough` objects, a grasp with a probability of at least
-0.5 also ends it, to limit the time. `result_of_things` returns the result of one request.
+lies on them. An object gets one round of the planner, but all rounds if an earlier try failed with this or an unknown
+object. The first verified grasp ends the search. After `enough` objects, a grasp with a probability of at least 0.5
+also ends the search, to limit the time. `result_of_things` returns the result of one request.
 """
 
 from __future__ import annotations
@@ -52,7 +52,7 @@ class Failure:
     Attributes:
         place: mean of the object's points [m]. None if the object is unknown. Then only the failed grasp is avoided.
         grasp: hand posture at the failed grasp. None if no grasp was found.
-        executed: whether a robot executed the grasp. If so, its object gets a doubt, so no grasp of it is verified.
+        executed: whether a robot executed the grasp. If so, the object gets a doubt, so that no grasp is verified.
     """
 
     place: Float[np.ndarray, "3"] | None
@@ -66,7 +66,7 @@ class ThingPlan:
 
     Attributes:
         points: points of the object [m].
-        scene: scene of the object with its obstacles. None if the scene could not be built.
+        scene: scene with the object and the obstacles around it. None if the scene could not be built.
         result: result of planning. None if planning did not run.
         grasp: the best grasp, verified or unverified. None if no grasp was found.
         reason: why there is no verified grasp. Empty if there is a verified grasp.
@@ -122,7 +122,7 @@ def plan_any_thing(
         settings: settings for segmentation, reconstruction and obstacles.
         surface: support plane of all objects, if it is known.
         solids: known solids by name, in the frame of the views [m]. They are obstacles and never grasped.
-        mass: mass of each object [kg]. None assumes the greatest mass that its volume allows (`heavy_mass`).
+        mass: mass of each object [kg]. None assumes the greatest mass that the object's volume allows (`heavy_mass`).
         friction: Coulomb friction coefficient between hand and objects.
         source: name of the views, for messages.
         failures: failures of earlier requests. Grasps like a failed grasp are left out (`unlike`).
@@ -130,7 +130,7 @@ def plan_any_thing(
         deadline: time after which the whole search ends [s]. None for no limit.
         enough: number of objects after which a grasp with a probability of at least 0.5 ends the search.
         most: greatest number of objects to plan for. None for all objects.
-        plan: other keyword arguments of `plan_grasps`. `seed` grows by 1 per failure with this or an unknown object.
+        plan: other arguments of `plan_grasps`. `seed` grows by 1 per failure with this object or an unknown object.
 
     Raises:
         CloudError: a cloud is empty, all NaN, or has too few points.
@@ -211,7 +211,7 @@ def _scene_among(
 ) -> Scene | str:
     """Return the scene of the object with the given points, or the error message if the scene cannot be built.
 
-    `about` holds other arguments of `scene_from_views`. If an executed grasp of the object failed, doubt the scene.
+    `about` holds other arguments of `scene_from_views`. If an executed grasp failed, add a doubt to the scene.
     """
     again = any(failure.grasp is not None and failure.executed for failure in failed)
     # The target is a point on the object, because the middle of a ring is empty.

@@ -91,7 +91,7 @@ def kind_of(reason: str) -> str:
 # The cache keeps the last eight hands. Hands are hashed by identity.
 @lru_cache(maxsize=8)
 def reach_of(hand: HandModel) -> tuple[float, float]:
-    """Return the open hand's greatest distance between two contact candidates, and its widest fingertip gap [m]."""
+    """Return the open hand's greatest distance between two contact candidates, and between two fingertips [m]."""
     poses = forward(make_kinematics(hand, dtype=torch.float64), torch.as_tensor(hand.open_posture)[None])
     links = poses[0, torch.as_tensor(hand.candidate_link)]
     points = (links.rotation @ torch.as_tensor(hand.candidate_points)[..., None]).squeeze(-1) + links.translation

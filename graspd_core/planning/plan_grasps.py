@@ -47,10 +47,10 @@ _WEIGHED = 8
 
 
 def planning_scene(scene: Scene, resolution: int) -> tuple[Scene, Float[np.ndarray, "3"]]:
-    """Move the scene near the origin (`near_scene`) for planning. Return it, and the new origin in the given frame [m].
+    """Move the scene near the origin (`near_scene`) for planning. Return the moved scene and the new origin [m].
 
     The distance grid is rebuilt if it has another resolution. It is also rebuilt after a move, because float32 had
-    rounded the positions of far nodes. Raises ConfigError: the resolution is out of range.
+    rounded node positions far from the origin. Raises ConfigError: the resolution is out of range.
     """
     if not 8 <= resolution <= 256:
         raise ConfigError(f"resolution: {resolution} nodes; valid: 8 to 256")
@@ -96,13 +96,13 @@ def plan_grasps(
         count: number of verified grasps to find.
         seed: random seed. On one machine, equal seeds give equal grasps.
         preset: name of a preset, path of a preset file, or the settings.
-        verify: "standard" or "hard" trials, "full" or "hard_full" for these trials without early stop, or "none".
+        verify: "standard" or "hard" trials, "full" or "hard_full" for the same trials without early stop, or "none".
         deadline: time after which the run ends with the grasps found so far [s]. None for no limit.
         device: torch device of the optimiser.
         restrictions: further conditions on grasps. The result's `refused` counts the refused candidates.
         measure: whether to measure the metrics of grasps that did not fail. Measuring takes longer than a trial.
-        progress: hook that gets `Progress` values. This thread calls it.
-        watch: hook that gets `Snapshot` values, with the hands that the run is working on. This thread calls it.
+        progress: hook that gets `Progress` values. The calling thread runs it.
+        watch: hook that gets `Snapshot` values, with the hands that the run is working on. The calling thread runs it.
         stop: polled hook. If it returns true, the run ends within one optimiser step or 0.1 s of simulated time.
 
     Raises:
@@ -184,7 +184,7 @@ def _why_few(run: Run, scene: Scene, bound: BoundRestrictions, found: RoundsResu
 
 
 def _less_sure(scene: Scene, far: Float[np.ndarray, "3"], result: GraspResult) -> GraspResult:
-    """Say in the result that no grasp is robust. Add the next view if possible. `far`: the planning frame's origin."""
+    """Say in the result that no grasp is robust. Add the next view if possible. `far`: origin of the planning frame."""
     held = sum(grasp.verdict is Verdict.UNVERIFIED for grasp in result.tried)
     if scene.evidence is None or not held:
         return result
@@ -234,8 +234,8 @@ def check_request(*, count: int, seed: int, verify: str, deadline: float | None,
 def warm_up(hand: HandModel, stop: StopHook | None = None) -> None:
     """Plan once on a small sphere. This loads all libraries, so that the first request is as fast as later requests.
 
-    Servers call `warm_up` at start. It also starts the child process of `run_isolated`, which cuts objects into convex
-    parts while other threads go on.
+    Servers call `warm_up` at start. The call also starts the child process of `run_isolated`, which cuts objects into
+    convex parts while other threads go on.
     """
     from graspd_core.perception.scene_from_views import scene_from_views
 

@@ -83,7 +83,7 @@ class RoundsResult:
         optimise_time: time spent in the optimiser [s].
         first: time at which the first grasp was verified, a `time.perf_counter()` value. None if none was verified.
         refused: number of candidates that restrictions refused, by reason.
-        lowered: mass at which the best grasps were tried again [kg]. None if they were not tried again.
+        lowered: lower mass for a second trial of the best grasps [kg]. None without a second trial.
     """
 
     began: float
@@ -187,7 +187,7 @@ class _Batch:
         config: settings of the round.
         most: greatest number of grasps to find.
         searches: greatest number of optimiser runs (searches) for the candidates. None for the method's setting.
-        ends_round: number of the round that ends after this batch, from 1. 0 if no round ends then.
+        ends_round: number (from 1) of the round whose last batch this is. 0 for any other batch.
     """
 
     config: PlanConfig
@@ -218,10 +218,10 @@ def _searched_since(state: RoundsResult, began: float) -> RoundsResult:
 def _tried_lighter(
     run: Run, scene: Scene, prefetched: Prefetched, state: RoundsResult, certainty: CertaintyConfig, count: int
 ) -> RoundsResult:
-    """Try the best grasps again, strongest first, with a lower mass that the strongest grasp can lift.
+    """Repeat the trials of the best grasps with a lower mass, which the strongest grasp can lift.
 
-    If even the strongest grasp is too weak to be verified, later rounds use another mass. It is the least mass at which
-    a grasp may be verified.
+    The strongest grasp is tried first. `light_end` is the least mass at which a grasp may be verified. If even the
+    strongest grasp cannot lift `light_end`, later rounds try grasps at `light_end`.
     """
     if state.context is None:
         return state

@@ -200,7 +200,7 @@ class BoundSteering(BoundRestriction):
         return np.all([box.distance(palm) > 0.0 for box in self.steering.avoid for palm in palms], axis=0)
 
     def admit(self, grasps: Sequence[Grasp]) -> Sequence[Grasp | Refusal]:
-        """Return each candidate that meets all constraints. Else return the constraint that it violates first."""
+        """Return each candidate that meets all constraints. For any other, return a `Refusal`."""
         if not grasps:
             return grasps
         steering, wanted, missed = self.steering, self.wanted, dict[str, Bool[np.ndarray, "grasps"]]()
@@ -274,5 +274,5 @@ def _part_of_object(scene: Scene, region: Region, avoid: Sequence[Box]) -> Float
         )
     for number, box in enumerate(avoid):
         if (box.distance(inside) <= 0.0).all():
-            raise ConfigError(f"region: avoid box {number} covers the object in the region; move one of them")
+            raise ConfigError(f"region: avoid box {number} covers the object in the region; move the box or the region")
     return inside[:: len(inside) // _MOST_PLACES + 1]

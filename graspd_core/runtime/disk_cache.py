@@ -1,8 +1,8 @@
 """Cache arrays by key, in the memory of this process and on disk for other processes.
 
 Files are in `$XDG_CACHE_HOME/graspd`, by default `~/.cache/graspd`. `GRASPD_CACHE=off` disables the files. A damaged
-file is built again. On a read-only disk no file is written. The least recently used files are removed, because every
-cloud is new and adds files. Files are written atomically.
+file is replaced. On a read-only disk no file is written. The least recently used files are removed, because every cloud
+is new and adds files. Files are written atomically.
 """
 
 from __future__ import annotations
@@ -75,7 +75,7 @@ def forget() -> None:
 
 
 def digest(values: Iterable[Any]) -> str:
-    """Return the hexadecimal SHA-256 of arrays, tuples, dataclasses and other values. Other values count by `repr`."""
+    """Return the hexadecimal SHA-256 of arrays, tuples, dataclasses and, by their `repr`, other values."""
     found = hashlib.sha256()
 
     def add(value: Any) -> None:
@@ -144,7 +144,7 @@ def _write(path: Path, arrays: Arrays) -> None:
 def _prune(directory: Path) -> None:
     """Remove the least recently used files until the remaining files have at most `MOST_BYTES`.
 
-    Files of killed processes, which end with .part, count too.
+    Unfinished files (.part) of killed processes count too.
     """
     files = []
     for path in (path for pattern in ("*.npz", "*.part") for path in directory.glob(pattern)):

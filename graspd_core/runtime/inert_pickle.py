@@ -155,7 +155,7 @@ class _RefusedError(Exception):
 
 
 def read_bounded(path: Path, what: str) -> bytes:
-    """Read a file. Raises ValueError: it is unreadable or too large. `what` names the format, e.g. "MANO file"."""
+    """Read a file. Raises ValueError: the file is unreadable or too large. `what` is the format, e.g. "MANO file"."""
     try:
         with path.open("rb") as file:
             content = file.read(MAX_BYTES + 1)
@@ -189,7 +189,7 @@ _MOST_AXES = 8
 
 
 def array_of(value: Inert) -> np.ndarray:
-    """Return the numeric array of an inert object, in native byte order. Raises ValueError: it is no numeric array."""
+    """Return the numeric array of an inert object, in native byte order. Raises ValueError: no numeric array."""
     state = value.state
     if not isinstance(state, tuple) or len(state) != 5:
         raise ValueError("its array has no content")

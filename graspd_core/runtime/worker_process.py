@@ -241,5 +241,5 @@ _MODULES = ("graspd_core.perception.scene_from_views", "graspd_core.verify.robus
 
 
 def start_planning_worker() -> None:
-    """Start the child process if it does not run yet. In the background, it imports the libraries of planning."""
+    """Start the child process if it does not run yet. The child imports the libraries of planning."""
     start_worker_process(*_MODULES)

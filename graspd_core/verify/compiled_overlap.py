@@ -29,7 +29,7 @@ _NODE = 15
 class CompiledQuery:
     """A mesh in the form that the kernel needs for distance queries. Several threads may use it at the same time.
 
-    `surface` holds the addresses of the arrays `nodes` and `triangles`. The kernel reads the arrays from there.
+    `surface` holds the addresses of the arrays `nodes` and `triangles`. The kernel reads the arrays at these addresses.
     """
 
     library: CDLL
@@ -39,7 +39,7 @@ class CompiledQuery:
 
 
 def make_query(mesh: TriangleMesh) -> CompiledQuery | DistanceQuery:
-    """Prepare a mesh for distance queries with the kernel. If there is no kernel, prepare it for libigl."""
+    """Prepare a mesh for distance queries with the kernel. If there is no kernel, prepare the mesh for libigl."""
     library = kernel().library
     if library is None:
         return make_distance_query(mesh)
@@ -59,7 +59,7 @@ def signed_distance(
     order: Int[np.ndarray, "n"] | None = None,
     reach: float = np.inf,
 ) -> Float[np.ndarray, "n"]:
-    """Return each point's distance [m] to the mesh, negative inside. If it exceeds `reach` [m], return a lower bound.
+    """Return each point's distance [m] to the mesh, negative inside. Beyond `reach` [m], return a lower bound.
 
     Pass `order` for a faster query: the int32 indices of the points, with near points next to each other.
     """

@@ -1,11 +1,11 @@
 """End a hold early, once the object drifts too slowly to reach a limit. A hold is a pull, or the wait after a lift.
 
-Up to the stop, a shortened trial has the same states as a full trial. A grasp may pass the shortened trial although it
-would fail the full trial. The opposite never happens. A slowly sliding object may reach an edge and slip suddenly, so
-the drift is multiplied by a safety factor. Over a few steps, contact jitter is larger than the drift. The drift is
-therefore measured over windows of several lengths. The hold ends if the drift of any one window is small enough. At low
-friction or with few fingers, the object must also be at rest. The rules were chosen from simulated pulls with four
-hands, on eleven shapes and ten scans. `graspd bench early` measures how many verdicts the early stop changes.
+Up to the stop, a shortened trial and a full trial are identical. A grasp may pass the shortened trial although it would
+fail the full trial. The opposite never happens. The drift is the object's motion in a window, the last few steps. A
+slowly sliding object may reach an edge and slip suddenly, so the drift is multiplied by a safety factor. In short
+windows, contact jitter exceeds the drift. So windows of several lengths are checked. The hold ends if the drift in any
+window is small enough. At low friction or with few fingers, the object must also be at rest. The rules were chosen from
+simulated pulls with four hands, on eleven shapes and ten scans. `graspd bench early` counts the verdicts that change.
 """
 
 from __future__ import annotations
@@ -73,7 +73,7 @@ class ObjectState:
 def stop_rule(protocol: Protocol, fingers: int, *, rough: bool = False) -> StopRule | None:
     """Return the stop rule for a protocol and a number of fingers. Return None if the protocol forbids early stops.
 
-    With `rough`, `ROUGH` replaces `FIRM`, the rule for high friction. `ROUGH` stops sooner but may miss a late slip.
+    If `rough` is set, `ROUGH` replaces `FIRM` at high friction. `ROUGH` stops sooner but may miss a late slip.
     """
     if protocol.full_length:
         return None
@@ -87,7 +87,7 @@ def stop_rule(protocol: Protocol, fingers: int, *, rough: bool = False) -> StopR
 def answer_known(
     rule: StopRule, protocol: Protocol, states: Sequence[ObjectState], moved: tuple[float, float], left: int
 ) -> bool:
-    """Return True if a hold can stop, as the object will stay within the limits. Return False for non-finite states.
+    """Return True if a hold can stop, because the object will stay within limits. Return False for non-finite states.
 
     Args:
         rule: stop rule of the hold.

@@ -1,6 +1,6 @@
-"""Run the hold trial: close the hand on a free object, pull along ±x, ±y, ±z in turn, check that the object stays.
+"""Run the hold trial: close the hand on a free object, pull the object along ±x, ±y, ±z, check that it stays.
 
-The trial re-implements DexGraspBench's floating protocol from the protocol's parameters. Travel and rotation of the
+The trial re-implements the floating protocol of DexGraspBench from its published parameters. Travel and rotation of the
 object are measured from the object's pose at the start of the trial. So they include motion while the hand closes. A
 pull may stop early (`early_stop`). If the protocol asks for the full length, no pull stops early.
 
@@ -42,8 +42,8 @@ def hold_trial(
 
     Returns:
         The result, with the greatest displacement [m] of the object's centre of mass and the greatest rotation [rad]
-        until the trial ended. If the simulation diverges or runs out of contact memory, the trial fails. The result's
-        reason then says so.
+        until the trial ended. If the simulation diverges or runs out of contact memory, the trial fails, and the
+        result's `reason` says so.
     """
     import mujoco
 
@@ -95,7 +95,7 @@ def step_until_known(
     """Simulate `steps` steps. Stop earlier if the stop rule finds that the object will stay within the limits.
 
     Return why the trial failed, "" if it did not. Update `worst`, the greatest travel [m] and rotation [rad]. If
-    `rough` is set, the pull stops earlier (`stop_rule`), and the limits are checked more often.
+    `rough` is set, the pull may stop earlier (`stop_rule`), and the limits are checked more often.
     """
     rule, done = stop_rule(protocol, world.fingers, rough=rough), 0
     recent = deque[ObjectState](maxlen=1 + max(rule.windows) // LOOK_EVERY if rule else 0)
@@ -184,7 +184,7 @@ def posture_fault(world: World, data: Any, grasp: Grasp, protocol: Protocol) -> 
 
 
 def limit_fault(world: World, posture: Posture) -> str:
-    """Return a text about the joint that is farthest beyond its limits. Return "" if all joints are within them."""
+    """Return a text about the joint that is farthest beyond its limits. Return "" if no joint is beyond them."""
     # MuJoCo lists joints by ascending address.
     joints = np.searchsorted(world.model.jnt_qposadr, world.joint_addresses)
     low, high = world.model.jnt_range[joints].T
@@ -205,7 +205,7 @@ def start_penetration(world: World, data: Any) -> float:
 
 
 def self_fault(world: World, data: Any, protocol: Protocol) -> str:
-    """Return which two links penetrate each other most in the current state. Return "" if none exceed the limit."""
+    """Return which two links penetrate each other most in the current state, "" if no depth exceeds the limit."""
     first, second, distance = data.contact.geom1, data.contact.geom2, data.contact.dist
     deep = np.flatnonzero(distance < -protocol.max_self_penetration)
     own = deep[np.isin(first[deep], world.hand_geoms) & np.isin(second[deep], world.hand_geoms)]

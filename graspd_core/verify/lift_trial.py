@@ -1,11 +1,11 @@
 """Run the lift trial: approach an object on its support, close the hand, lift the object, and hold the object.
 
 The hand starts at the retreat, 10 cm before the pregrasp, and moves over the pregrasp to the grasp. First, MuJoCo's
-distances show whether these commanded postures penetrate the support or a neighbour. The simulation cannot show this,
-because a mocap base passes through fixed bodies. Then the trial simulates under gravity, and checks that the object
-rises with the hand and stays in the hand. The lift is simulated in the hand's frame: the base stands still, support and
-neighbours move down, and an inertial force acts on the object. MuJoCo gives mocap bodies no velocity, so a rising base
-would not carry the object by friction.
+distances show whether these commanded postures penetrate the support or a neighbour. The simulation cannot show such
+penetration, because a mocap body, such as the hand's base, passes through fixed bodies. Then the trial simulates under
+gravity, and checks that the object rises with the hand and stays in the hand. The lift is simulated in the hand's
+frame: the base stands still, support and neighbours move down, and an inertial force acts on the object. MuJoCo gives
+mocap bodies no velocity, so a rising base would not carry the object by friction.
 """
 
 from __future__ import annotations
@@ -74,7 +74,7 @@ def lift_trial(
     settings: LiftSettings = LiftSettings(),
     stop: Callable[[], bool] = lambda: False,
 ) -> TrialResult:
-    """Run one lift trial in a world with a support or neighbours. The trial ends once the object exceeds a limit.
+    """Run one lift trial in a simulation with support or neighbours. It ends once the object exceeds a limit.
 
     The object is fixed until the first touch, so that it cannot fall over on a badly reconstructed bottom. In the
     rising hand's frame, the object must stay within the protocol's limits (5 cm, 15°) of its start pose. Without a
@@ -168,7 +168,7 @@ def _sink(world: World, data: Any, up: Float[np.ndarray, "3"], a: float, setting
 
 
 def reach_through(world: World, data: Any, postures: tuple[Posture, ...], limit: float) -> str:
-    """Return where the hand is deepest in an obstacle on the straight path. Return "" if at most `limit` [m] deep."""
+    """Return where on the path through `postures` the hand is deepest in an obstacle. "" if below `limit` [m]."""
     import mujoco
 
     worst, reason = 0.0, ""

@@ -84,7 +84,7 @@ def payload(
 
 
 def least_friction(world: World, grasp: Grasp, protocol: Protocol, *, stop: StopHook = lambda: False) -> float:
-    """Return the least sliding friction at which the grasp passes the hold trial. It is not above the protocol's."""
+    """Return the least sliding friction at which the grasp passes the hold trial. At most the protocol's friction."""
 
     def holds(fraction: float) -> bool:
         slippery = at_friction(protocol, Protocol.friction[0] / fraction)
@@ -94,7 +94,7 @@ def least_friction(world: World, grasp: Grasp, protocol: Protocol, *, stop: Stop
 
 
 def _estimated(world: World, data: Any, protocol: Protocol, direction: np.ndarray, least: float) -> float:
-    """Estimate the payload [kg]: pull ever harder along `direction`, from 2 · `least` [kg] on, until the hand fails."""
+    """Estimate the payload [kg]: pull ever harder along `direction` until the hand fails. Begin at 2 · `least` [kg]."""
     force, resisted = slice(world.object_velocity, world.object_velocity + 3), list[float]()
     for step in range(max(math.ceil(_DOUBLING * math.log2(MOST_PAYLOAD / least)), _WINDOW)):
         data.xfrc_applied[world.object_body, :3] = 2 * protocol.pull * least * 2 ** (step / _DOUBLING) * direction
@@ -107,9 +107,9 @@ def _estimated(world: World, data: Any, protocol: Protocol, direction: np.ndarra
 
 
 def _greatest(holds: Callable[[float], bool], low: float, high: float, start: float | None = None) -> float:
-    """Find by bisection the greatest value that `holds` accepts. It must accept `low` and refuse `high`.
+    """Find by bisection the greatest value that `holds` accepts. `holds` must accept `low` and refuse `high`.
 
-    If `start` is given, the search begins there. Successive tried values then differ at most by the factor `_STRIDE`.
+    The search begins at `start`, if given. Successive tried values then differ at most by the factor `_STRIDE`.
     """
     middle, stride = (math.sqrt(low * high), math.inf) if start is None else (start, _STRIDE)
     while high > FINENESS * low:

@@ -1,4 +1,4 @@
-"""Define the grasp metrics in a registry, and measure them. Files, messages and tables take names and units from it.
+"""Measure the grasp metrics, which a registry defines with the names and units for files, messages and tables.
 
 The metrics are static and do not depend on the choice of frame. docs/metrics.md defines them, and a test compares that
 page with the registry. `distinct` removes near-duplicate grasps.

@@ -78,7 +78,7 @@ class MetricsContext:
         query: the object's mesh, prepared for distance queries.
         points: points on the object's surface and edges [m].
         tree: `scipy.spatial.KDTree` of `points`.
-        world: world of the hold trial. If it is None, the contact depth is not measured.
+        world: MuJoCo model of the hold trial. If it is None, the contact depth is not measured.
     """
 
     target: ObjectModel
@@ -155,7 +155,7 @@ def placed_hand(context: MetricsContext, posture: Posture) -> PlacedHand:
 
 
 def contact_area(placed: PlacedHand, within: float = CONTACT_DISTANCE) -> float:
-    """Return the area [m²] of hand samples at most `within` [m] from the object's surface. `within` is up to 0.015."""
+    """Return the area [m²] of hand samples at most `within` [m] from the object's surface, with `within` ≤ 0.015."""
     return float(placed.areas[np.abs(placed.distance) <= within].sum())
 
 
@@ -203,9 +203,9 @@ def _link_balls(hand: HandModel) -> tuple[Float[np.ndarray, "links 3"], Float[np
 def arrival(context: MetricsContext, grasp: Grasp, support: Plane | None) -> Posture | None:
     """Return a posture near the grasp with open fingers and a collision-free path from the pregrasp.
 
-    Some planners move the hand with open fingers to the grasp and close the fingers there. Open fingers may penetrate
-    the object there. So this function closes the fingers in part, or moves the hand back by at most 3 mm, or both. It
-    prefers a small move, then open fingers. Return None if every tried posture collides with the object or the support.
+    Some planners move the open hand to the grasp, then close the fingers. The open fingers may penetrate the object. So
+    this function closes the fingers in part, or moves the hand back by at most 3 mm, or both. A small move has priority
+    over open fingers. Return None if every tried posture collides with the object or the support.
     """
     open_joints, closing = grasp.pregrasp.joint_positions, grasp.grasp.joint_positions - grasp.pregrasp.joint_positions
     back = grasp.pregrasp.position - grasp.grasp.position
@@ -321,7 +321,7 @@ def _placed_solids(hand: HandModel, placed: PlacedHand) -> _PlacedSolids:
 def _root_cells(
     solids: _PlacedSolids, placed: PlacedHand
 ) -> tuple[Int[np.ndarray, "cells 3"], Int[np.ndarray, "cells"]]:
-    """Return the coarsest octree cells about each primitive, base frame, and each cell's primitive index, ascending."""
+    """Return the coarsest octree cells around the primitives, base frame. The primitive index of each cell ascends."""
     size, base, cells = 2**_HALVINGS, placed.rotations[0], [np.zeros((0, 3), dtype=np.int64)]
     for primitive in solids.primitives:
         low, high = bounds(primitive)

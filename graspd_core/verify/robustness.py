@@ -3,7 +3,7 @@
 A grasp that holds on the likeliest scene, the best guess from the clouds, must also pass these checks. The hidden side
 may be guessed wrong, so the grasp must also hold on three other shapes. On these shapes, the limit of rotation is two
 thirds of the usual limit. docs/clouds.md reports how often grasps that pass all checks hold on the true object. Trials
-run on several threads. Their number changes neither results nor their order (`results_in_order`).
+run on several threads. The number of threads changes neither results nor order (`results_in_order`).
 """
 
 from __future__ import annotations
@@ -46,7 +46,7 @@ _POLL_RESULTS = 0.02
 
 
 def begin_in_thread(name: str, work: Callable[[], Result]) -> Future[Result]:
-    """Start `work` in a new thread and return its future. The process waits for the thread before it exits."""
+    """Start `work` in a new thread and return its future. Before the process exits, it waits for the thread."""
     pool = ThreadPoolExecutor(max_workers=1, thread_name_prefix=name)
     begun = pool.submit(work)
     pool.shutdown(wait=False)
@@ -150,19 +150,19 @@ class CheckStage:
 
 
 class LaterWorld:
-    """A world that a thread builds on the first request. Later requests get this world, or None if building failed."""
+    """A world (MuJoCo model of a trial) that a thread builds on the first request. None if building failed."""
 
     def __init__(self, make: Callable[[], World | None]):
         self._make, self._begun, self._lock = make, None, threading.Lock()
 
     def begin(self) -> Future[World | None]:
-        """Start to build the world, if nobody has started yet. Return the future of the world."""
+        """Start to build the world, unless an earlier call did so. Return the future of the world."""
         with self._lock:
             self._begun = self._begun or begin_in_thread(_SHAPES, self._make)
             return self._begun
 
     def altered(self, mass: float) -> LaterWorld:
-        """Return a world with another object mass [kg], which is also built on the first request."""
+        """Return the same world with another object mass [kg]. It is also built on the first request."""
         return LaterWorld(lambda: (world := self.begin().result()) and altered(world, mass=mass))
 
 
@@ -171,7 +171,7 @@ class RobustnessChecks:
     """The robustness checks that a grasp must pass.
 
     Attributes:
-        stages: first checks with displaced poses and less friction, because they are fast, then with other shapes.
+        stages: first the fast checks, with displaced poses and less friction. Then the checks with other shapes.
         probability: probability that a grasp holds on the true object if it passes all stages.
         waited_for: event that is set once a trial waits for its world, so that other trials may start.
         doubts: reasons to doubt the scene or the object's mass. If there is a doubt, no grasp passes.
@@ -186,10 +186,10 @@ class RobustnessChecks:
 def begin_other_worlds(
     run: Run, scene: Scene, hand: HandModel, protocol: Protocol, probability: float
 ) -> tuple[LaterWorld, ...]:
-    """Return the worlds of other possible shapes of the object. Empty if grasps need not be tried on other shapes.
+    """Return worlds (MuJoCo models) with other possible shapes of the object. Empty if no other shape is needed.
 
-    For each world, another rule guesses the hidden side. Those that every grasp needs are built now, in turn. The
-    others are built when needed. A world is None if its rule gives no other shape, or the run ended.
+    For each world, another rule guesses the hidden side. Threads now build the first three worlds, which every grasp
+    needs. Others are built on request. A world is None if its rule gives no other shape, or the run ended.
     """
     making = threading.Lock()
 
@@ -209,7 +209,7 @@ def robustness_checks_of(
 ) -> RobustnessChecks | None:
     """Return the checks that a grasp must pass to reach the requested `probability`. None if no check is needed.
 
-    `others` comes from `begin_other_worlds`. If the mass is known, a grasp must hold on all displaced poses and with
+    `others` comes from `begin_other_worlds`. If the mass is known, a grasp must hold at all displaced poses and with
     less friction.
     """
     shares, doubts = held_shares(scene.object), scene.evidence.doubts if scene.evidence else ()
@@ -248,7 +248,7 @@ def _places(scene: Scene, trials: TrialContext, though_failed: float) -> CheckSt
 
 
 def doubted_if_weak(checks: RobustnessChecks, most: float, heavy: float) -> RobustnessChecks:
-    """Replace the checks by a doubt if too many objects of this volume weigh more than the payload `most` [kg].
+    """Replace the checks by a doubt if too many objects of the same volume weigh more than the payload `most` [kg].
 
     `heavy` is the greatest mass that the object's volume allows [kg]. If there are doubts already, change nothing.
     """
@@ -259,7 +259,7 @@ def doubted_if_weak(checks: RobustnessChecks, most: float, heavy: float) -> Robu
 
 
 def less_sure(checks: RobustnessChecks, most: float, heavy: float) -> RobustnessChecks:
-    """Scale all probabilities by the fraction of objects of this volume that weigh at most the payload `most` [kg].
+    """Scale all probabilities by the fraction of objects of equal volume that weigh at most the payload `most` [kg].
 
     First, `doubted_if_weak` may replace the checks by a doubt. `heavy` is the greatest mass the volume allows [kg].
     """
@@ -346,7 +346,7 @@ def _begun(evidence: Evidence) -> dict[str, Future[Scene | None]]:
 def begin_other_shapes(probability: float, likeliest: ObjectModel, evidence: Evidence) -> None:
     """Start background threads that build the other shapes on which every grasp will be tried.
 
-    `scene_from_views` calls this function early: the likeliest shape's distance grid is built at the same time.
+    `scene_from_views` calls this function before it builds the distance grid of the likeliest shape.
     """
     for rule in _rules_needed(evidence, probability, held_shares(likeliest))[:OTHER_SHAPES]:
         work = partial(run_isolated, other_scene, evidence, rule, likeliest)

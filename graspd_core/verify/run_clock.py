@@ -92,7 +92,7 @@ def result_of(
 ) -> GraspResult:
     """Return the result of a run. The outcome is success if at least `count` grasps are usable.
 
-    Otherwise it is `ended_early` if given, else too few or none. `refused` counts the refused candidates by reason.
+    Else it is `ended_early` if given, TOO_FEW, or NO_CANDIDATES. `refused` counts the refused candidates by reason.
     """
     few = Outcome.TOO_FEW if grasps else Outcome.NO_CANDIDATES
     enough = sum(grasp.usable for grasp in grasps) >= count

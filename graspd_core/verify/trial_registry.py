@@ -15,7 +15,7 @@ from graspd_core.verify.world import Protocol, World, build_world
 
 @dataclass(frozen=True)
 class TrialContext:
-    """Worlds and physics settings for the trials of one scene.
+    """Worlds (MuJoCo models) and physics settings for the trials of one scene.
 
     Attributes:
         protocol: physics settings of the trials.

@@ -1,4 +1,4 @@
-"""Try grasps in MuJoCo: build the worlds once, try candidates in rank order, sort the verified grasps.
+"""Try grasps in MuJoCo: build the models (worlds) once, try candidates in rank order, sort the verified grasps.
 
 `verify_grasps` tries and measures given grasps, for example from another planner or from a file.
 """
@@ -86,8 +86,8 @@ class Prefetched:
     """Worlds of the trials, which background threads build while the optimiser runs.
 
     Attributes:
-        worlds: future of the likeliest scene's worlds. Its result is None if the run ended before they were built.
-        others: worlds of other possible shapes of the object. Empty if grasps are not tried on them.
+        worlds: future of the worlds of the likeliest scene. The result is None if the run ended before they were built.
+        others: worlds with other possible shapes of the object. Empty if grasps are not tried on other shapes.
     """
 
     worlds: Future[TrialContext | None]
@@ -95,7 +95,7 @@ class Prefetched:
 
 
 def prefetch(run: Run, scene: Scene, hand: HandModel, verify: str, certainty: CertaintyConfig) -> Prefetched:
-    """Start to build the trial worlds in background threads. This takes about as long as the optimiser.
+    """Start to build the trial worlds in background threads. Building takes about as long as the optimiser.
 
     Only one object at a time is cut into convex parts. The object of an ended run is skipped, so that quickly cancelled
     runs do not pile up work.
@@ -135,7 +135,7 @@ def lighter(
 ) -> VerificationContext:
     """Return the context for trials at `mass` [kg], which is below the assumed mass.
 
-    The probability of a grasp is then lower, because the object may weigh more than the grasp can lift. `most` is the
+    A grasp then gets a lower probability, because the object may weigh more than the grasp can lift. `most` is the
     greatest payload of any grasp [kg]. If `most` is too low for any grasp to be verified, no robustness check runs.
     """
     trials, others = context.trials, [world.altered(mass) for world in ahead.others]
@@ -148,7 +148,7 @@ def lighter(
 
 
 def payloads(context: VerificationContext, grasps: Sequence[Grasp], stop: StopHook) -> list[float]:
-    """Return each grasp's payload [kg]. Return 0 for a grasp that does not beat the best earlier payload by 10 %."""
+    """Return each grasp's payload [kg], but 0 if it is not 10 % above the payloads of all preceding grasps."""
     trials, found = context.trials, list[float]()
     for grasp in grasps:
         least = FINENESS * max(found, default=LEAST_PAYLOAD)
@@ -212,8 +212,8 @@ def run_trials(
 ) -> TriedGrasps:
     """Try candidates in rank order until `count` are verified, and measure each verified grasp.
 
-    `before` is the number of grasps that earlier rounds verified. The trials use torch's number of threads. This number
-    changes neither verdicts nor order. Grasps are measured in parallel with the next trials.
+    `before` is the number of grasps that earlier rounds verified. As many trials run in parallel as torch has threads.
+    This number changes neither verdicts nor order. Grasps are measured in parallel with the next trials.
     """
     verified: list[Grasp] = []
     others: list[Grasp] = []
@@ -275,7 +275,7 @@ def _tried(
 def _best_first(
     context: VerificationContext, checks: RobustnessChecks, best: Grasp, threads: int, grasp: Grasp, stop: StopHook
 ) -> Grasp:
-    """Try a candidate. All but `best` start when `best` is done or waits until a world is built."""
+    """Try a candidate. Candidates other than `best` first wait until `best` is done or waits for a world."""
     if grasp is not best:
         while not checks.waited_for.wait(_POLL) and not stop():
             pass
@@ -314,7 +314,7 @@ def surest_first(grasps: Sequence[Grasp]) -> tuple[Grasp, ...]:
 def rank_by_robustness(
     run: Run, context: VerificationContext, grasps: tuple[Grasp, ...], config: RobustConfig, seed: int
 ) -> tuple[Grasp, ...]:
-    """Sort the verified grasps by robustness: the fraction of noisy trials that a grasp passes.
+    """Sort the verified grasps by robustness: the fraction of noisy hold trials that a grasp passes.
 
     The robustness is added to each verified grasp's metrics. If the run ends early, a grasp without noisy trials is
     sorted as if its robustness were 0.5. Unverified and failed grasps follow unchanged.
@@ -340,7 +340,7 @@ def rank_by_robustness(
 
 
 def most_robust_first(verified: Sequence[Grasp]) -> list[Grasp]:
-    """Sort grasps by descending robustness. It counts as 0.5 if not measured. Equal grasps keep their order."""
+    """Sort grasps by descending robustness, 0.5 where it was not measured. Equal grasps keep their order."""
 
     def share(grasp: Grasp) -> float:
         known = grasp.metrics.get("robustness") if grasp.metrics else None
@@ -361,9 +361,9 @@ def verify_grasps(
     Args:
         scene: scene with the object. With a support or obstacles, the lift trial runs too. If cameras saw the object,
             the robustness checks run too.
-        hand: hand of the postures. Their joint values are in the order of `hand.joint_names`.
+        hand: hand of the postures. Joint values are in the order of `hand.joint_names`.
         grasps: grasps with `pregrasp`, `grasp` and `squeeze`. Earlier metrics and trials are replaced.
-        verify: "standard" or "hard" trials, "full" or "hard_full" for these trials without early stop, or "none".
+        verify: "standard" or "hard" trials, "full" or "hard_full" for the same trials without early stop, or "none".
         measure: whether to measure metrics, also for failed grasps.
 
     Raises:

@@ -68,7 +68,7 @@ class AdamState:
         return AdamState(**{name: value[rows] for name, value in vars(self).items()})
 
     def best(self) -> tuple[Poses, Values]:
-        """Return each start's best iterate and its loss. If no iterate was scored, take the last one."""
+        """Return each start's best iterate and its loss. Without a best iterate, return the last iterate."""
         scored = torch.isfinite(self.best_loss)
         poses = unpack(torch.where(scored[:, None], self.best_x, self.x))
         return moved_along(poses, -self.pivot), torch.where(scored, self.best_loss, self.loss)

@@ -78,7 +78,7 @@ class ClosedFormConfig:
 
 
 def drop_steps(settings: ClosedFormConfig) -> list[int]:
-    """Return the steps before which exploring drops starts."""
+    """Return the indices of the steps that begin by dropping starts."""
     return [round(settings.explore_steps * drop / settings.drops) for drop in range(1, settings.drops + 1)]
 
 

@@ -87,7 +87,7 @@ def contact_forces(
 
     Args:
         height: height of the hand's points above the level set, φ − r [m].
-        normals: ∇φ at these points. A zero vector gives no normal force.
+        normals: ∇φ at the hand's points. A zero vector gives no normal force.
         velocities: linear velocities of the object relative to the hand [m/s].
         contact: settings k_n, k_f, μ and `leak`, the gradient out of contact (`leaky_min`).
     """
@@ -299,7 +299,7 @@ class Evaluation(NamedTuple):
 
 
 class Slope(NamedTuple):
-    """Cost, constraint violations, Lagrangian's gradients in pose and in forces (None if `pose_only`), and normals."""
+    """Cost, constraint violations, the Lagrangian's gradients and normals. `by_force` is None if `pose_only` is set."""
 
     cost: Values
     broken: Float[Tensor, "batch constraints"]
@@ -310,7 +310,7 @@ class Slope(NamedTuple):
 
 @dataclass(frozen=True)
 class RelaxedState:
-    """Iterate of every start, and its best iterate so far. Only iterates for contact at r = 0 can become the best.
+    """Current and best iterate of every start. Only iterates for contact at r = 0 can become the best.
 
     Attributes:
         pose: rows of translation, quaternion, joints.

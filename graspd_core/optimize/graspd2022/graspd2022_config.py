@@ -113,7 +113,7 @@ class ConstraintsConfig:
     """Bounds on L_task and L_limit, and their multipliers.
 
     Attributes:
-        task_bound: bound on L_task, the motion left by desired forces (60 without forces). The released code has 10.
+        task_bound: bound on L_task, the motion left by desired forces. Without forces L_task is 60. Released code: 10.
         limit_bound: bound on the sum by which joints exceed their limits [rad].
         damping: damping coefficient of the multipliers.
         multiplier_rate: step size of the multipliers.

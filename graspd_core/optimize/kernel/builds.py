@@ -1,7 +1,7 @@
 """Load the build of the compiled kernel that this machine can run, or report why no build can run.
 
 The environment variable `GRASPD_KERNEL` is `off` (torch alone), the name of a build, or the path of a library. The
-default is the best build that runs here. The structures mirror those of src/layout.hpp. Loading compares their sizes.
+default is the best build that runs here. The structures mirror those of src/layout.hpp. Loading compares the sizes.
 """
 
 from __future__ import annotations
