@@ -150,7 +150,7 @@ def run_friction_mass(case: MapCase) -> tuple[MapCell, ...]:
 
 
 def run_size(case: MapCase) -> tuple[MapCell, ...]:
-    """Plan and try on a scaled shape of 0.1 kg. Its least width is `case.across` times the hand's span."""
+    """Plan and try on a shape of 0.1 kg, scaled to a least width of `case.across` times the hand's span."""
     config = settings(case.preset)
     width = float(case.across) * _span(case.hand, config.problem.fine_candidates)
     scale = width / least_width(make_shape(case.thing))

@@ -44,7 +44,7 @@ def load_hand_urdf(client: int, hand: HandModel, armature: float) -> tuple[int, 
     Args:
         client: id of the PyBullet client.
         hand: a hand without coupled joints.
-        armature: rotor inertia of every joint [kg·m²]. Bullet has none, so it is added to the moved link.
+        armature: rotor inertia of every joint [kg·m²]. Bullet has no rotors, so the moved link gets this inertia.
 
     Raises:
         SimulatorError: the hand has coupled joints.

@@ -211,7 +211,7 @@ def _misplaced() -> Views:
 
 
 def _shiny() -> Views:
-    """Return views with a hole of 15 mm radius in the middle of the visible object, as a reflection leaves."""
+    """Return views with a hole of 15 mm radius in the middle of the visible object, as a reflection causes."""
 
     def burn(view: PointCloud) -> PointCloud:
         above = view.points[:, 2] > 0.01

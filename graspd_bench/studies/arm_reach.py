@@ -1,7 +1,7 @@
 """Study `reach`: inverse kinematics of the arms, and planning with and without the `Reach` restriction.
 
 `Reach` refuses grasps that the arm cannot reach. Objects stand or lie on a table. The arm's base is 40 to 80 cm away,
-in a random direction with a random yaw. After a plan without `Reach`, the study counts the verified grasps in reach.
+in a random direction with a random yaw. After a plan without `Reach`, verified grasps in reach are counted.
 """
 
 from __future__ import annotations
@@ -172,7 +172,7 @@ def summary(record: Record) -> str:
 
 
 def reach_sections(records: Sequence[Record], chart: Path | None) -> Sections:
-    """Return a section with the table of inverse kinematics, and one with the table and refusals of the requests."""
+    """Return a section on inverse kinematics, and a section on the requests with the reasons of refusals."""
     alone, filtered = ([r for r in records if key in r] for key in ("own", "filtered"))
     return {
         "inverse-kinematics": [_alone_table(alone)] if alone else [],

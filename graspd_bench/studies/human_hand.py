@@ -56,7 +56,7 @@ class SkinMetrics:
 
 
 def measure_skin(query: DistanceQuery, skin: TriangleMesh) -> SkinMetrics:
-    """Measure how a closed skin mesh touches an object, in the object frame [m]. `query` is of the object's mesh."""
+    """Measure how a closed skin mesh touches an object, object frame [m]. `query` gives distances to the object."""
     points, _ = surface_samples(skin, _SAMPLES, _SEED)
     distance = signed_distance(query, points, reach=2 * CONTACT_DISTANCES[-1])
     corners = skin.vertices[skin.faces]

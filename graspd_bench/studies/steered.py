@@ -73,9 +73,9 @@ def drawn_constraint(case: SteeredCase, scene: Scene) -> Steering:
 
 
 def _end_of(vertices: Float[np.ndarray, "n 3"], rng: np.random.Generator, share: float, beyond: float) -> Box:
-    """Draw a box around an end of the object. All its faces but the inner one lie `beyond` [m] outside the object.
+    """Draw a box around an end of the object. The box's faces, except the inner one, are `beyond` [m] off the object.
 
-    The end is `share` of the object's length on a random axis. For `beyond` under 3 cm, it is at least 5 cm long.
+    The end is `share` of the object's length on a random axis. For `beyond` under 3 cm, it is at least 5 cm.
     """
     low, high = vertices.min(0), vertices.max(0)
     axis, side = int(rng.integers(3)), int(rng.integers(2))
