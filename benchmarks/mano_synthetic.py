@@ -168,7 +168,7 @@ def _surface(segments: list[tuple[int, np.ndarray, np.ndarray, float]]) -> tuple
 
 
 def _weights(segments: list[tuple[int, np.ndarray, np.ndarray, float]], vertices: np.ndarray) -> np.ndarray:
-    """Return skinning weights: of the nearest body, blended with its parent and children near the joints."""
+    """Return skinning weights. A vertex follows the nearest body, and near joints that body's parent and children."""
     depths = _depths(segments, vertices)
     nearest = np.full((len(vertices), BODIES), np.inf)
     for column, (body, *_) in enumerate(segments):

@@ -78,8 +78,7 @@ class Row:
         spent: CPU time [s] of optimiser and standard hold trials, or of the whole run if verified grasps are planned.
         values: numbers by name, None if not measured. Medians over grasps (`_grasp_figures`), shares of requested
             grasps (`TRIAL_FIGURES`), times [s], memory [MB], rounds. `cpu_per_grasp` is the optimiser's time per
-            requested grasp. `cpu_per_verified` is `spent` / `held`. `first_*` is the time until the first verified
-            grasp.
+            requested grasp. `cpu_per_verified` is `spent` / `held`. `first_*` ends at the first verified grasp.
         quartiles: lower and upper quartile over the grasps, for each value that is a median over grasps.
     """
 

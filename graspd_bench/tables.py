@@ -36,7 +36,7 @@ def sourced(command: str, records: Sequence[Record], sections: Sections) -> dict
 
 
 def written(parts: Sequence[str | Picture], document: Path | None = None) -> str:
-    """Return the parts of a section as Markdown. Pictures are links relative to `document`, or left out without it."""
+    """Return the parts of a section as Markdown. Pictures are links relative to `document`. None: no pictures."""
     texts = []
     for part in parts:
         if isinstance(part, str):

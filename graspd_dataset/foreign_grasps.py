@@ -1,4 +1,4 @@
-"""Read grasp files of other projects. Joint values get the hand's order, and poses become those of its base link.
+"""Read grasp files of other projects. Convert joint values to the hand's order, and poses to the hand's base link.
 
 DexGraspBench (.npy): one pickled dictionary per grasp. It holds three postures, each as position, quaternion wxyz and
 unnamed joint values. `runtime/inert_pickle` reads the pickle without running code from it.
@@ -97,7 +97,7 @@ def quaternion_of(value: Any, where: str) -> Float[np.ndarray, "4"]:
 
 
 def joints_by_name(values: Any, hand: HandModel, where: str) -> Float[np.ndarray, "joints"]:
-    """Return the values of the actuated joints [rad] or [m] from a mapping. It may also contain coupled joints.
+    """Return the values of the actuated joints [rad] or [m] from a mapping, which may also contain coupled joints.
 
     Raises FormatError: a name is unknown, an actuated joint is missing, or a coupled joint's value does not fit.
     """
@@ -202,7 +202,7 @@ def npy_dictionary(path: Path, content: bytes) -> dict[Any, Any]:
 
 
 def plain_entry(values: dict[Any, Any], key: str, path: Path) -> Any:
-    """Return the text, number or array of numbers of a key. Raises FormatError: the key is missing, or another type."""
+    """Return the text, number or array of numbers of a key. Raises FormatError: no such key, or another type."""
     value = entry(values, key, f"{path}")
     if not isinstance(value, Inert):
         return value

@@ -36,7 +36,7 @@ class DatasetStats:
         hands: counts of each hand, by its name.
         reasons: number of failed grasps for each text of `kind_of_reason`.
         codes: versions of the code that made the rows.
-        failed: records of failed blocks and objects. Without those that succeeded later.
+        failed: records of failed blocks and objects, except those that succeeded later.
     """
 
     hands: dict[str, HandCount] = field(default_factory=dict)
@@ -162,7 +162,7 @@ def faults_of_dataset(store: DatasetStore) -> Iterator[str]:
 
 
 def recorded_hashes(store: DatasetStore) -> dict[str, set[str]]:
-    """Return the SHA-256 hashes of each file in the run records, by path. Raises FormatError: a record is damaged."""
+    """Return by path the SHA-256 hashes that run records hold of each file. Raises FormatError: a record is damaged."""
     known: dict[str, set[str]] = {}
     for record in (read_record(store, path) for path in store.list("runs")):
         for path, digest in record.get("files", {}).items():

@@ -77,7 +77,7 @@ def ray_running(address: str | None, workers: int | None, folder: Path | None = 
 
 @contextmanager
 def _own_handler() -> Iterator[None]:
-    """Keep this process's handler of SIGTERM. Ray's own handler ends the process before it writes the run record."""
+    """Keep this process's handler of SIGTERM. Ray's handler ends the process without a run record."""
     handler = signal.getsignal(signal.SIGTERM)
     try:
         yield

@@ -104,7 +104,7 @@ def run_records(store: DatasetStore) -> list[RunRecord]:
 
 
 def with_unrecorded(store: DatasetStore, record: RunRecord) -> RunRecord:
-    """Return the record plus hashes of files that no record has. Killed sessions and earlier code leave such files."""
+    """Return the record plus hashes of unrecorded files. Killed sessions and earlier code leave such files."""
     known = recorded_hashes(store).keys() | record.files.keys()
     paths = [path for folder in ("grasps", "objects") for path in store.list(folder) if path not in known]
     return replace(record, files=record.files | {path: file_hash(store.read(path)) for path in paths})
@@ -174,14 +174,14 @@ _AHEAD = 2
 
 
 def missing_blocks(blocks: Sequence[Block], store: DatasetStore, *, retry_failed: bool = False) -> list[Block]:
-    """Return the blocks without a file. Skip those that failed, or whose object failed, unless `retry_failed`."""
+    """Return the blocks without a file. Skip failed blocks and blocks of failed objects, unless `retry_failed`."""
     there = keys_below(store, "grasps")
     failed = set() if retry_failed else keys_below(store, "failed")
     return [b for b in blocks if b.key not in there and not failed & {b.key, b.object.key}]
 
 
 def remove_failure(store: DatasetStore, report: Report, failed: Collection[str]) -> None:
-    """Remove the record of an earlier failure if the object or block has succeeded. `failed` are the recorded keys."""
+    """Remove the record of an earlier failure if the object or block has succeeded. `failed`: recorded keys."""
     if report.key in failed and not report.failed:
         store.remove(f"failed/{report.key}.json")
 

@@ -160,7 +160,7 @@ def _refuse_tunnels(server: Any) -> None:
 
 
 def _limit_uploads(server: Any) -> None:
-    """Refuse files over 64 MB, and a visitor's third upload at a time. End uploads that exceed their stated size."""
+    """Refuse files over 64 MB, and a visitor's third simultaneous upload. End uploads that exceed the stated size."""
     from viser import _messages
 
     gui = server.gui
@@ -174,7 +174,7 @@ def _limit_uploads(server: Any) -> None:
         visitor = server.get_clients().get(client)
         if visitor is not None:
             limit = f"at most {LARGEST_UPLOAD // 2**20} MB, {_UPLOADS_AT_ONCE} at a time"
-            visitor.add_notification("Refused", f"{message.filename[:80]}: files of {limit}", color="red")
+            visitor.add_notification("Refused", f"{message.filename[:80]}: not accepted; valid: files of {limit}", color="red")
 
     def part(client: int, message: Any) -> None:
         state = transfers.get(message.transfer_uuid)

@@ -352,7 +352,7 @@ def sampled_epsilon(
 ) -> Float[Tensor, "batch"]:
     """Return Ferrari and Canny's ε of each grasp, for contact forces that sum to one.
 
-    The support of a direction is the most that a single contact contributes along it. ε is the least support of all
+    For each direction, take the support: the most that any contact contributes. ε is the least support of all
     directions, and zero without force closure. Few directions are tested, so the result is an upper bound.
     """
     batch, slots = contact_set.active.shape

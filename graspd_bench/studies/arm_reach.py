@@ -168,7 +168,7 @@ def summary(record: Record) -> str:
     """Return the share of reached poses, or the numbers of grasps in reach, in a few words."""
     if "own" in record:
         return f"{record['own']['reached']:.1%} of the poses reached"
-    return f"{record['filtered']['verified']} verified in reach, without the filter {record['plain']['reached']}"
+    return f"verified in reach: {record['filtered']['verified']} with `Reach`, {record['plain']['reached']} without"
 
 
 def reach_sections(records: Sequence[Record], chart: Path | None) -> Sections:

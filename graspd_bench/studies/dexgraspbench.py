@@ -250,7 +250,7 @@ def why_failed(there: Record) -> str:
 def bench_summary(record: Record) -> str:
     """Return a text: how many of our verified grasps hold in DexGraspBench."""
     pairs = [pair for pair in _pairs([record], AS_IS) if pair[0]]
-    return f"{sum(there['held'] for _, there in pairs)} of {len(pairs)} verified hold there"
+    return f"{sum(there['held'] for _, there in pairs)} of {len(pairs)} verified grasps hold in DexGraspBench"
 
 
 def _pairs(records: Sequence[Record], variant: str) -> list[tuple[bool, Record]]:

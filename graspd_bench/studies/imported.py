@@ -2,9 +2,8 @@
 
     graspd bench --import FOLDER --hand NAME
 
-Grasps that the import refuses, such as those marked as failed in the file, count as failed. Requested grasps that our
-planner does not find count as failed too. Shares refer to all imported grasps of an object, or to the first `--count`
-of them.
+Grasps that the import refuses, such as those marked as failed in the file, count as failed. So do requested grasps that
+our planner does not find. Shares refer to all imported grasps of an object, or to the first `--count` of them.
 """
 
 from __future__ import annotations
