@@ -44,20 +44,20 @@ def add_command(commands: Any) -> None:
     parser.add_argument("--count", type=int, default=None, help="grasps of a case (default: by study and method)")
     parser.add_argument("--hand", default="", metavar="NAME|PATH", help="default: allegro_right")
     parser.add_argument("--trials", default="", metavar="A,B", help="trials of raw grasps (listed in docs/bench.md)")
-    parser.add_argument("--import", dest="imported", default="", metavar="PATH", help="file or folder of grasps to compare with graspd's")
+    parser.add_argument("--import", dest="imported", default="", metavar="PATH", help="grasps to compare with graspd's")
     parser.add_argument("--joint-order", default="", metavar="A,B,…", help="joint names of imported npy files")
     parser.add_argument("--python", default="", metavar="PATH", help="Python that runs the checkout of dexgraspbench")
-    parser.add_argument("--armature", action="store_true", help="dexgraspbench: also try its hand with graspd's armature")
-    parser.add_argument("--grasps", default="", metavar="FILE", help="dexgraspbench: graspd's grasps (default: plan)")
+    parser.add_argument("--armature", action="store_true", help="dexgraspbench: also try its hand with our armature")
+    parser.add_argument("--grasps", default="", metavar="FILE", help="dexgraspbench: our grasps (default: plan)")
     parser.add_argument("--quick", action="store_true", help="run few objects and grasps, which takes minutes")
     parser.add_argument("--out", type=Path, default=Path("results/bench"), metavar="DIR", help="folder of records")
     parser.add_argument("--processes", type=int, default=1, help="cases at a time, each on one thread (default 1)")
     parser.add_argument("--any-code", action="store_true", help="keep finished cases of other versions of the code")
     parser.add_argument("--no-run", action="store_true", help="only report on the finished cases")
-    parser.add_argument("--compare", type=Path, default=None, metavar="OLD.json", help="list changes since this results.json")
+    parser.add_argument("--compare", type=Path, default=None, metavar="OLD.json", help="list changes since OLD")
     parser.add_argument("--chart", type=Path, default=None, metavar="PATH", help="PATH.png, PATH.svg, …")
     parser.add_argument(
-        "--readme", type=Path, action="append", default=[], metavar="FILE", help="fill the file's marked sections (repeatable)"
+        "--readme", type=Path, action="append", default=[], metavar="FILE", help="fill marked sections (repeatable)"
     )
 
 

@@ -78,7 +78,7 @@ STUDIES: dict[str, Study] = {
         ("studies/seen_objects.py",),
         _PLANS,
         seen_objects.seen_seconds,
-        summary=lambda record: record.get("refused") or f"{record['held']} of {record['verified']} hold on the true object",
+        summary=lambda record: record.get("refused") or f"{record['held']} of {record['verified']} hold on the truth",
     ),
     "cameras": Study(
         "grasps on views by four kinds of cameras, tried on the true objects at their own mass",
@@ -88,7 +88,7 @@ STUDIES: dict[str, Study] = {
         ("studies/cameras.py", "studies/seen_objects.py", "rendering/*.py"),
         _PLANS,
         lambda case: 10.0,
-        summary=lambda record: record.get("refused") or f"{record['held']} of {record['verified']} hold on the true object",
+        summary=lambda record: record.get("refused") or f"{record['held']} of {record['verified']} hold on the truth",
         usual=False,
     ),
     "robust": Study(

@@ -101,7 +101,7 @@ def _result(scene: Scene, hand: HandModel, imported: Sequence[ImportedGrasp], co
         grasps,
         len(imported),
         method="imported",
-        message=f"{len(grasps)} of {len(imported)} imported grasps were accepted; {good} are verified, or untried with a contact",
+        message=f"{len(grasps)} of {len(imported)} imported grasps accepted; {good} verified, or untried with contacts",
         warnings=tuple(warnings),
         refused=completed.refused,
     )

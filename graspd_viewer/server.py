@@ -173,8 +173,8 @@ def _limit_uploads(server: Any) -> None:
             return
         visitor = server.get_clients().get(client)
         if visitor is not None:
-            limit = f"at most {LARGEST_UPLOAD // 2**20} MB, {_UPLOADS_AT_ONCE} at a time"
-            visitor.add_notification("Refused", f"{message.filename[:80]}: not accepted; valid: files of {limit}", color="red")
+            limit = f"the limit is {LARGEST_UPLOAD // 2**20} MB, and {_UPLOADS_AT_ONCE} files at a time"
+            visitor.add_notification("Refused", f"{message.filename[:80]}: {limit}", color="red")
 
     def part(client: int, message: Any) -> None:
         state = transfers.get(message.transfer_uuid)
