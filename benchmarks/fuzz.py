@@ -28,7 +28,7 @@ SECONDS_PER_INPUT, MEGABYTES = 5, 2048
 
 @dataclass(frozen=True)
 class Figures:
-    """Result of a target's run: number of inputs, edges of instrumented code reached, and duration [s]."""
+    """Result of fuzzing a target: number of inputs, number of reached edges in the code, and duration [s]."""
 
     inputs: int
     edges: int

@@ -255,7 +255,7 @@ def shot(
 
 
 def clearest(scene: Scene, shown: Sequence[Part], before: Sequence[Part]) -> float:
-    """Return the rotation of `TURNS` at which the parts `before` hide the least of the parts `shown` [rad]."""
+    """Return the rotation in `TURNS` [rad] at which the parts `before` hide the least of the parts `shown`."""
 
     def seen(turn: float) -> int:
         meshes, pose = stood(scene, [*shown, *before], 1.0, turn)

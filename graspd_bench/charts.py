@@ -224,7 +224,7 @@ def about_records(records: Sequence[Record], kind: str) -> str:
 
 
 def draw_planned(presets: dict[str, list[Row]], path: Path, about: str = "") -> Path | None:
-    """Draw CPU time per verified grasp against CPU time to the first. Return the PNG's path, or None without data."""
+    """Draw CPU time per verified grasp against CPU time to the first one. Return the PNG's path. None without data."""
     panel = Panel("cpu_per_verified", "CPU seconds per verified grasp, all included")
     points = points_of(presets, "first_cpu", panel)
     if not points:

@@ -352,7 +352,7 @@ _CELL, _EDGE = 0.52, "#D55E00"
 
 
 def draw_map(drawn: Map, methods: Mapping[str, Shares], path: Path) -> Path:
-    """Draw a map with one panel per method. `methods` has the caption and `shares` of each. Return the PNG's path.
+    """Draw a map with one panel per method. `methods` maps captions to `shares`. Return the PNG's path.
 
     Cells without a record are white. Rows and columns without any record are left out.
     """

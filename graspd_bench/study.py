@@ -40,7 +40,7 @@ Sections = Mapping[str, Sequence[str | Picture | None]]
 
 @dataclass(frozen=True)
 class Case:
-    """Base class of one run of a study. Files in `object`, `hand` and `preset` count by content, not by path."""
+    """Base class of one run of a study. Of files in `object`, `hand` and `preset`, the content counts, not the path."""
 
     @property
     def label(self) -> str:
@@ -81,7 +81,7 @@ class Request:
         joint_order: joint names in the order of the imported npy files.
         checkout: folder of DexGraspBench.
         python: Python program that runs DexGraspBench.
-        armature: whether to try grasps also with DexGraspBench's hand plus our joint armature.
+        armature: whether to try grasps a second time, with our joint armature in DexGraspBench's hand.
         grasps: file of our grasps, which DexGraspBench tries instead of newly planned ones.
     """
 
@@ -133,7 +133,7 @@ class Study:
     Attributes:
         about: what the study compares or measures, in one line.
         cases: returns the cases of a request. Raises GraspdError if the request has unknown names.
-        run: runs a case and returns its results. It must be a module-level function, because workers unpickle it.
+        run: module-level function (workers unpickle it) that runs a case and returns the results.
         sections: returns page sections from records and a path prefix for charts. None: no charts.
         sources: glob patterns of the files in graspd_bench that the study's results depend on.
         takes: names of the `Request` fields that the study uses.

@@ -78,7 +78,7 @@ def complete_grasps(
 
 
 def frame_doubt(scene: Scene, hand: HandModel, postures: Sequence[Posture]) -> str:
-    """Warn if 80 % of the hands are over 5 mm inside the object, or 80 % over 5 mm away. "" if fewer than 5 hands."""
+    """Return a warning if 80 % of at least 5 hands are over 5 mm inside the object, or 80 % over 5 mm off. Else ""."""
     if len(postures) < _FEWEST:
         return ""
     points = [

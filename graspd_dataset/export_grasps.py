@@ -2,7 +2,7 @@
 
 Poses are those of the hand's base link in the object frame, the frame of the exported mesh. Lengths are in metres.
 DexGraspBench reads one pickled dictionary per grasp and one folder per object. Its Allegro is MuJoCo Menagerie's right
-hand, with graspd's joint order. In its root frame, graspd's palm has the orientation (0, 1, 0, 1)/√2, wxyz.
+hand, with graspd's joint order. graspd's palm has the orientation (0, 1, 0, 1)/√2, wxyz, in the hand's root frame.
 """
 
 from __future__ import annotations

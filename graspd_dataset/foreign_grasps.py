@@ -48,7 +48,7 @@ class ImportedGrasp:
         grasp: the touching posture. If the format has no joint values, this is the open hand, still to be closed.
         pregrasp, squeeze: None if the format has no such posture.
         closed: whether the file gives the joint values of `grasp`.
-        squeeze_moved: distance between the base at the squeeze and at the grasp in the file [m]. graspd ignores it.
+        squeeze_moved: distance by which the file moves the base from grasp to squeeze [m]. graspd ignores this motion.
         refused: reason to refuse the grasp if its file marks it as failed. Otherwise empty.
     """
 
@@ -177,7 +177,7 @@ def read_dexgraspbench(
 
 
 def npy_dictionary(path: Path, content: bytes) -> dict[Any, Any]:
-    """Return the dictionary of an npy file. Its arrays are `Inert` objects, because no code of the pickle is run.
+    """Return the dictionary of an npy file. Arrays in it are `Inert` objects, because no code of the pickle is run.
 
     Raises FormatError: the file is not an npy file with one pickled dictionary.
     """

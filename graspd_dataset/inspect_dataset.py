@@ -30,7 +30,7 @@ class HandCount:
 
 @dataclass
 class DatasetStats:
-    """Counts of a data set, the code that made it, and its failures.
+    """Counts and failures of a data set, and the code versions that made it.
 
     Attributes:
         hands: counts of each hand, by its name.

@@ -59,7 +59,7 @@ class RunRecord:
 
 
 def command_of(request: DatasetRequest, out: str) -> str:
-    """Return the command line of a request, without options that have their default value."""
+    """Return the command line of a request, without options that have the default value."""
     usual, words = DatasetRequest(request.objects), ["graspd", "dataset", *request.objects]
     for item in fields(request):
         value = getattr(request, item.name)
@@ -71,7 +71,7 @@ def command_of(request: DatasetRequest, out: str) -> str:
 
 
 def _word(value: Any) -> str:
-    """Return a value as a word of a command line. Numbers are short, but give the same value again."""
+    """Return a value as a word of a command line. Numbers are shortened without loss."""
     short = f"{value:g}" if isinstance(value, float) else str(value)
     return short if not isinstance(value, float) or float(short) == value else repr(value)
 
@@ -189,10 +189,10 @@ def remove_failure(store: DatasetStore, report: Report, failed: Collection[str])
 def run_blocks(
     blocks: Sequence[Block], engine: RayEngine, stop: Callable[[], bool] = lambda: False
 ) -> Iterator[tuple[Block | DatasetObject, Report]]:
-    """Prepare objects and make their blocks. Yield each object and each block, with its report, when its task ends.
+    """Prepare objects and make their blocks. Yield each object or block with its report when the task ends.
 
-    The blocks of a failed object are skipped. The run ends when `stop` returns True.
-    Raises StorageError: a file could not be written. Files written before remain.
+    The blocks of a failed object are skipped. The run ends when `stop` returns True. Raises StorageError: a file could
+    not be written. Files that were written earlier remain.
     """
     waiting = deque(by_object(blocks))
     preparing: dict[Any, tuple[DatasetObject, list[Block], Any]] = {}

@@ -1,4 +1,4 @@
-"""HTML page of a benchmark: charts of speed against accuracy. A click on a point lists its runs and their grasps.
+"""HTML page of a benchmark: charts of speed against accuracy. A click on a point lists the preset's runs and grasps.
 
 The page is one file that needs no network. A benchmark stores the metrics of grasps, but no postures. To show the
 grasps of a run, the server plans again with the run's settings and seed. The same code finds the same grasps.

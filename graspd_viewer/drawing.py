@@ -57,7 +57,7 @@ def hand_parts(hand: HandModel) -> dict[int, Part]:
 
 
 def scene_parts(scene: Scene) -> list[Part]:
-    """Return meshes of object, support and obstacles. An object from clouds has two: seen and guessed surface."""
+    """Return meshes of object, support and obstacles. An object from clouds has two meshes: seen, guessed."""
     mesh, parts = scene.object.mesh, []
     if scene.confidence is None:
         parts.append(Part("object/known", mesh, OBJECT))

@@ -1,8 +1,8 @@
 """A viser server with limits, and the drawing thread.
 
 By default viser listens on every network interface, lets any web page connect and accepts files of any size. It also
-opens a public tunnel if a visitor asks. This server does none of these. The drawing thread runs only the newest job of
-each kind. So a moved slider does not leave a queue of drawings.
+opens a public tunnel if a visitor asks. graspd's server does not. The drawing thread runs only the newest job of each
+kind. So a moved slider does not leave a queue of drawings.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""Record a grasp's trial, and play it up to its end or failure.
+"""Record a grasp's trial, and play the recording up to the trial's end or failure.
 
 A recording contains the poses of hand and object in MuJoCo, and the contact forces. Recording changes neither the
 trial's steps nor its result.

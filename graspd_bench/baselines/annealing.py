@@ -292,7 +292,7 @@ class Annealing:
 
     @torch.no_grad()
     def pierced(self, problem: Problem, x: Float[Tensor, "batch variables"]) -> Bool[Tensor, "batch"]:
-        """Return for each state whether the hand overlaps the object. Test all contact candidates and sharp points."""
+        """Return for each state whether the hand overlaps the object. Test candidates and the object's sharp points."""
         if len(x) == 0:
             return torch.zeros(0, dtype=torch.bool, device=x.device)
         return link_gaps(problem, self.poses(x), self.sphere_links)[:, 0].amin(-1) < 0.0

@@ -41,7 +41,7 @@ _SIDE = ring_poses(1, elevation=0.9, azimuth=-1.57)
 
 
 def cloud_cases() -> tuple[Case, ...]:
-    """Return all cases of faulty clouds. Their scenes are made by `scene_from_views`."""
+    """Return all cases of faulty clouds. `scene_from_views` makes the scenes."""
     return (*_measured(), *_refused(), *_special())
 
 

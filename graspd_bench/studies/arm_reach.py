@@ -129,7 +129,7 @@ def _run_request(case: ReachCase) -> Record:
 
 
 class _Found:
-    """Progress hook. With each verified grasp it records the CPU time so far: total, and of the restriction [s]."""
+    """Progress hook. At each verified grasp it records the CPU time so far [s]: in total, and of the restriction."""
 
     def __init__(self, seconds: Sequence[float]) -> None:
         self.found: list[tuple[float, float, Grasp]] = []

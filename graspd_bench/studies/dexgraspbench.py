@@ -71,7 +71,7 @@ class BenchCase(ObjectCase):
     Attributes:
         checkout: folder of DexGraspBench.
         python: Python program that runs DexGraspBench.
-        armature: whether to try the grasps also with DexGraspBench's Allegro plus our joint armature.
+        armature: whether to try the grasps a second time, with our joint armature in DexGraspBench's Allegro.
         grasps: file of our grasps. If empty, they are planned.
         content: hash of the checkout's code and of the file of grasps.
     """

@@ -173,7 +173,7 @@ def mano_sections(records: Sequence[Record], chart: Path | None) -> Sections:
 
 
 def _row(name: str, softness: float, records: Sequence[Record]) -> list[str]:
-    """Return a table row with means over the measured grasps. Its cells are empty if no grasp was measured."""
+    """Return a table row with means over the measured grasps. If no grasp was measured, the cells are empty."""
     name = f"{name}, {1e3 * softness:g} mm" if softness else f"{name}, rigid"
     held = f"{sum(r['held'] for r in records)}/{sum(r['count'] for r in records)}"
     if not any(r["contact_area_cm2"] for r in records):

@@ -1,7 +1,7 @@
 """Study `steered`: requests with and without a steering constraint. Do grasps obey, and what does the constraint cost?
 
-Constraints are drawn at random from the case's seed, object and hand. Some cannot be met, such as an approach cone
-from a side where the object is too wide for the hand. Obedience is computed here from postures and contacts.
+Constraints are drawn at random from the case's seed, object and hand. Some cannot be met, such as an approach cone from
+a side where the object is too wide for the hand. This module computes obedience from postures and contacts.
 """
 
 from __future__ import annotations
