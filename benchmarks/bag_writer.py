@@ -68,7 +68,7 @@ def cloud_message(points: Float[np.ndarray, "*n 3"], frame: str, stamp: int) -> 
 
 
 def depth_message(depth: Float[np.ndarray, "height width"], frame: str, stamp: int, *, encoding: str = "16UC1") -> Any:
-    """Return an Image of a depth image [m]. 16UC1 and mono16 hold mm (0: no depth), 32FC1 holds m (NaN)."""
+    """Return an Image of a depth image [m]. 16UC1 and mono16: mm, 0 without depth. 32FC1: m, NaN."""
     height, width = depth.shape
     known = np.isfinite(depth) & (depth > 0)
     if encoding != "32FC1":

@@ -154,7 +154,7 @@ def clouds() -> list[bytes]:
 
 
 def layouts() -> list[bytes]:
-    """Return one file with a `LAYOUT_HEAD` and four points for each byte order."""
+    """Return two files, one per byte order: a `LAYOUT_HEAD` and the data of four points."""
     places = (0, 7, 4, 7, 8, 7)
     plain, big = LAYOUT_HEAD.pack(4, 1, 12, 48, 0, *places), LAYOUT_HEAD.pack(2, 2, 12, 24, 1, *places)
     return [plain + _POINTS.tobytes(), big + _POINTS.astype(">f4").tobytes()]

@@ -1,4 +1,4 @@
-"""Fuzzing targets: each of graspd's own parsers as a function of a file, which must give a value or one clear error.
+"""Fuzzing targets: functions that call graspd's own parsers on a file.
 
 A target returns a value or raises a documented error. Anything else is a finding: another exception, a warning, an
 error of several lines, or a number that is not finite. benchmarks/fuzz.py calls the targets with mutated bytes, and

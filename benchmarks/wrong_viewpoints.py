@@ -78,7 +78,7 @@ def frames(folder: Path) -> Iterator[Seen]:
 
 
 def wrong_place(seen: Seen, rng: np.random.Generator) -> tuple[str, Vector]:
-    """Draw a wrong camera position that sees the target from another direction. Return its kind and position [m]."""
+    """Draw a wrong camera position that sees the target from another direction. Return the kind and position [m]."""
     first = perpendicular(seen.up)
     away, said = seen.place - seen.target, np.zeros(3)
     while True:

@@ -175,7 +175,8 @@ _NAMED = 4
 class Point:
     """Point of one preset on a panel. `x` and `y` are (low, middle, high). `held` is True if any grasp held.
 
-    Low and high are quartiles over objects. For one object, they are quartiles over grasps or a 95 % interval.
+    Low and high are quartiles over objects. For one object, they are quartiles over grasps. For a share, they are the
+    95 % interval.
     """
 
     name: str

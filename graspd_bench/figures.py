@@ -78,7 +78,7 @@ class Row:
         spent: CPU time [s] of optimiser and standard hold trials, or of the whole run if verified grasps are planned.
         values: numbers by name, None if not measured. Medians over grasps (`_grasp_figures`), shares of requested
             grasps (`TRIAL_FIGURES`), times [s], memory [MB], rounds. `cpu_per_grasp` is the optimiser's time per
-            requested grasp. `cpu_per_verified` is `spent` / `held`. `first_*` ends at the first verified grasp.
+            requested grasp. `cpu_per_verified` is `spent` / `held`. `first_*`: time to the first verified grasp.
         quartiles: lower and upper quartile over the grasps, for each value that is a median over grasps.
     """
 
@@ -200,7 +200,8 @@ def _inner(grasp: dict[str, Any], trial: str, figure: str) -> float | None:
 def pareto_front(points: Float[np.ndarray, "points axes"]) -> Bool[np.ndarray, "points"]:
     """Return which points are on the Pareto front, if less is better on every axis.
 
-    A point is not on the front if another is no worse on every axis and better on one. Equal points can both be.
+    A point is not on the front if another is no worse on every axis and better on one. Equal points do not exclude each
+    other.
     """
     no_worse = (points[:, None] <= points[None]).all(-1)
     better = (points[:, None] < points[None]).any(-1)

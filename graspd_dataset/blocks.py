@@ -27,7 +27,7 @@ _DIGITS = 32
 
 
 def content_key(inputs: Any) -> str:
-    """Return the key of values that JSON can hold: the first 128 bits of their SHA-256 in hexadecimal."""
+    """Return the key of JSON-ready values: the first 128 bits of the values' SHA-256, in hexadecimal."""
     return hashlib.sha256(json.dumps(inputs, sort_keys=True).encode()).hexdigest()[:_DIGITS]
 
 

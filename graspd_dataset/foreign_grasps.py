@@ -233,7 +233,7 @@ def _posture(
     order: Sequence[str],
     path: Path,
 ) -> Posture:
-    """Return the hand's posture at `stage`, for example the pregrasp. Its pose is the base link's in the object frame.
+    """Return the hand's posture at `stage`, for example the pregrasp. The pose is that of the base link, object frame.
 
     `target` is the object's pose in the file's world frame: position, quaternion wxyz, no joint values.
     """
@@ -256,7 +256,7 @@ _ROTATION = 1e-3
 
 
 def read_isaac(path: Path, text: bytes, hand: HandModel, mesh: str | None) -> list[ImportedGrasp]:
-    """Read the grasps of one file. `mesh`, if given, replaces the file's mesh. Raises FormatError: malformed file."""
+    """Read the grasps of an isaac_grasp file. `mesh` replaces the file's mesh. Raises FormatError: the file is malformed."""
     try:
         _, document = parse_yaml(text.decode())
     except ValueError as error:
@@ -302,7 +302,7 @@ def _base_of(
 
 
 def read_graspgen(path: Path, text: bytes, hand: HandModel, mesh: str | None) -> list[ImportedGrasp]:
-    """Read the grasps of one file. `mesh`, if given, replaces the file's mesh. Raises FormatError: malformed file."""
+    """Read the grasps of a GraspGen file. `mesh` replaces the mesh in the file. Raises FormatError: malformed file."""
     try:
         document = json.loads(text)
     except (ValueError, RecursionError) as error:

@@ -176,7 +176,7 @@ def _changed(path: str, content: bytes, known: Mapping[str, set[str]]) -> Iterat
 
 
 def row_digests(table: Any) -> list[bytes]:
-    """Return for each row the SHA-256 of object, hand and grasp posture. It is equal for equal grasps in any block."""
+    """Return the SHA-256 of object, hand and grasp posture of each row. Equal grasps have equal hashes in any block."""
     names = ("object_sha256", "hand_sha256", "grasp_position", "grasp_quaternion_wxyz", "grasp_joint_positions")
     rows = zip(*(table[name].to_pylist() for name in names), strict=True)
     return [hashlib.sha256(repr(row).encode()).digest() for row in rows]

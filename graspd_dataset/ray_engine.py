@@ -36,7 +36,7 @@ _FOLDER = "graspd-ray-"
 
 @contextmanager
 def ray_running(address: str | None, workers: int | None, folder: Path | None = None) -> Iterator[Any]:
-    """Connect to the cluster at `address`. If None, start a private Ray with `workers` CPUs. Yield the module `ray`.
+    """Connect to the cluster at `address`. None: start a private Ray with `workers` CPUs. Yield the module `ray`.
 
     A private Ray ends with this context. It has no dashboard and reports no usage. It accepts only connections with a
     random token. Its files are in `folder`, or in a temporary folder if `folder` is None.

@@ -191,8 +191,8 @@ def run_blocks(
 ) -> Iterator[tuple[Block | DatasetObject, Report]]:
     """Prepare objects and make their blocks. Yield each object or block with its report when the task ends.
 
-    The blocks of a failed object are skipped. The run ends when `stop` returns True. Raises StorageError: a file could
-    not be written. Files that were written earlier remain.
+    The blocks of a failed object are skipped. The run ends when `stop` returns True.
+    Raises StorageError: a file could not be written. Files that were written earlier remain.
     """
     waiting = deque(by_object(blocks))
     preparing: dict[Any, tuple[DatasetObject, list[Block], Any]] = {}

@@ -123,8 +123,7 @@ def inner_contacts(hand: HandModel, per_link: int) -> Int[np.ndarray, "contacts"
     """Choose up to `per_link` contact candidates on the inside of each rigid group of links. Return their indices.
 
     Fixed joints connect the links of a group. The inside is the side towards the palm's normal or a finger's closing
-    motion. First choose the candidate nearest to the middle of the inside, then repeatedly the one farthest from all
-    chosen.
+    motion. First choose the candidate nearest to the inside's middle, then repeatedly the one farthest from all chosen.
     """
     chosen: list[int] = []
     facing = _facing(hand)

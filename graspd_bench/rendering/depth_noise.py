@@ -226,7 +226,7 @@ def _field(shape: tuple[int, ...], blur: float, white: float, rng: np.random.Gen
 
 @lru_cache(maxsize=16)
 def _blurred_scale(shape: tuple[int, ...], blur: float) -> float:
-    """Return the standard deviation of blurred white noise. All pixels have the same, as the blur wraps around."""
+    """Return the standard deviation of blurred white noise. The blur wraps around, so all pixels are equal."""
     from scipy.ndimage import gaussian_filter
 
     impulse = np.zeros(shape)

@@ -1,4 +1,4 @@
-"""Study `early`: whether trials that stop early give the same verdict as trials of full length, and the time saved.
+"""Study `early`: whether trials that stop early give the verdict of full-length trials, and how much time they save.
 
 The study uses the first grasps of the method's own ranking. No trial filters them. Each grasp goes through the trials
 of `trials_of`, once with early stopping and once at full length.

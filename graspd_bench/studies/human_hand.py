@@ -160,7 +160,7 @@ def run_mano(case: HumanGrasps) -> Record:
 
 
 def mano_sections(records: Sequence[Record], chart: Path | None) -> Sections:
-    """Return a table: for each softness the objects and their mean, then the published results of the paper."""
+    """Return a table: for each softness the objects and the mean over objects, then the results of the paper."""
     body = []
     for softness in dict.fromkeys(r["softness"] for r in records):
         alike = [r for r in records if r["softness"] == softness]
