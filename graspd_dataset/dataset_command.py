@@ -47,7 +47,7 @@ def add_command(commands: Any) -> None:
     make.add_argument("--seed", type=int, default=0)
     make.add_argument("--scales", nargs="+", type=float, default=(1.0,), metavar="FACTOR", help="default 1")
     make.add_argument("--random-scales", nargs=3, type=float, default=(0, 1, 1), metavar=("N", "LOW", "HIGH"))
-    make.add_argument("--mass", type=float, default=None, metavar="KG", help="default: heavy for the volume")
+    make.add_argument("--mass", type=float, default=None, metavar="KG", help="default: a heavy object's mass")
     make.add_argument("--friction", type=float, default=0.6, metavar="MU", help="default 0.6")
     make.add_argument("--verify", default="standard", metavar="TRIALS")
     make.add_argument("--measure", default="verified", metavar="WHICH", help="verified (default), all, or none")

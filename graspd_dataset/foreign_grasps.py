@@ -256,7 +256,7 @@ _ROTATION = 1e-3
 
 
 def read_isaac(path: Path, text: bytes, hand: HandModel, mesh: str | None) -> list[ImportedGrasp]:
-    """Read the grasps of an isaac_grasp file. `mesh` replaces the file's mesh. Raises FormatError: the file is malformed."""
+    """Read the grasps of an isaac_grasp file. `mesh` replaces the mesh in it. Raises FormatError: malformed file."""
     try:
         _, document = parse_yaml(text.decode())
     except ValueError as error:

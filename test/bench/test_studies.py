@@ -287,4 +287,4 @@ def test_ctrl_c_keeps_finished_cells(tmp_path: Path):
     assert process.returncode == EXIT_INTERRUPTED, errors
     assert "Traceback" not in errors
     kept = len(finished(tmp_path))
-    assert f"interrupted; {kept} of 40 cases are kept" in errors
+    assert f"interrupted; {kept} of 40 cases are finished" in errors
