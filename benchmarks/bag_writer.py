@@ -1,4 +1,4 @@
-"""Recordings for tests and fuzzing: clouds, depth images with their camera, and transforms, written by rosbags."""
+"""Write ROS 2 recordings for tests and fuzzing, by rosbags: clouds, depth images, camera data and transforms."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ _MOST_MILLIMETRES = 2**16 - 1
 
 @dataclass(frozen=True, eq=False)
 class Record:
-    """One message to write, with topic and time [ns]. `cloud_message` and other functions below make the message."""
+    """One message to write, with its topic and time [ns]. Functions such as `cloud_message` make the message."""
 
     topic: str
     stamp: int
@@ -56,7 +56,7 @@ def write_bag(path: str | Path, records: Iterable[Record], *, storage: str = "sq
 
 
 def cloud_message(points: Float[np.ndarray, "*n 3"], frame: str, stamp: int) -> Any:
-    """Return a PointCloud2 of float32 points [m]. A grid of rows becomes an organised cloud. NaN is kept."""
+    """Return a PointCloud2 of float32 points [m]. Points in rows and columns make an organised cloud. NaN is kept."""
     types = jazzy_types().types
     fields = [types["sensor_msgs/msg/PointField"](name, 4 * axis, 7, 1) for axis, name in enumerate("xyz")]
     data = np.ascontiguousarray(points, dtype="<f4").view(np.uint8).reshape(-1)
@@ -68,7 +68,7 @@ def cloud_message(points: Float[np.ndarray, "*n 3"], frame: str, stamp: int) -> 
 
 
 def depth_message(depth: Float[np.ndarray, "height width"], frame: str, stamp: int, *, encoding: str = "16UC1") -> Any:
-    """Return an Image of a depth image [m]. 16UC1 and mono16 hold mm, 32FC1 holds m. Without depth: 0 or NaN."""
+    """Return an Image of a depth image [m]. 16UC1 and mono16: mm, 0 without depth. 32FC1: m, NaN."""
     height, width = depth.shape
     known = np.isfinite(depth) & (depth > 0)
     if encoding != "32FC1":

@@ -1,9 +1,9 @@
-"""Measure the overhead of `graspd dataset`: the same blocks by `plan_grasps` in a loop, by one worker, and by two.
+"""Measure the overhead of `graspd dataset`: make the same blocks in a plain loop, on one Ray worker, and on two.
 
     dataset_overhead.py [--blocks 8] [--count 64] [--object shape:mug]
 
-Wall time shows how the work scales on an idle machine. CPU time shows the cost on any machine. CPU time includes all
-child processes, also those of Ray. The time to start Ray and its workers has a column of its own.
+A block is one call of `plan_grasps`. Wall time shows how the work scales on an idle machine. CPU time shows the cost on
+any machine, and includes all child processes. The time to start Ray and its workers has its own column.
 """
 
 from __future__ import annotations
@@ -48,7 +48,7 @@ def family_cpu() -> dict[int, float]:
 
 
 def on_ray(blocks: Sequence[Block], first: Sequence[Block], workers: int) -> tuple[float, float, int, float, float]:
-    """Run blocks on warm workers. Return wall time, CPU time [s], rows, start time [s], memory of children [MB]."""
+    """Run blocks on warm workers. Return wall time, CPU time [s], rows, time to start [s], memory of children [MB]."""
     with TemporaryDirectory() as folder, ray_running(None, workers) as ray:
         begin = time.perf_counter()
         engine = RayEngine(ray, DatasetStore(folder), Limits(), ship=False)

@@ -1,11 +1,11 @@
-"""Coverage-guided fuzzing of graspd's own parsers by atheris (libFuzzer). Not a test.
+"""Fuzz graspd's own parsers by atheris (libFuzzer), guided by code coverage. This program is not a test.
 
     python benchmarks/fuzz.py [--minutes 10] [--targets urdf mano ...] [--out results/fuzz] [--seed 1]
 
-The targets share the minutes and run one process at a time. Every input must give a value or one clear error. An input
-that does not, takes more than five seconds, or asks for more than 2 GB is a finding. OUT/findings keeps the bytes and
-the traceback of one finding for each place in the code. OUT/corpus keeps useful inputs for the next run. The exit
-status is 1 if there are findings. The program needs `pip install -e .[fuzz]`.
+A target is one parser. The targets run one after another and share the minutes. An input is a finding if it gives
+neither a value nor one clear error, takes more than five seconds, or asks for more than 2 GB. OUT/findings keeps the
+bytes and the traceback of one finding for each place in the code. OUT/corpus keeps useful inputs for the next run. The
+exit status is 1 if there are findings. The program needs `pip install -e .[fuzz]`.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ SECONDS_PER_INPUT, MEGABYTES = 5, 2048
 
 @dataclass(frozen=True)
 class Figures:
-    """Result of a target's run: number of inputs, edges of instrumented code reached, and duration [s]."""
+    """Result of fuzzing a target: number of inputs, number of reached edges in the code, and duration [s]."""
 
     inputs: int
     edges: int

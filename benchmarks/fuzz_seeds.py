@@ -100,7 +100,7 @@ _POINTS = np.array([[0.0, 0.0, 0.5], [0.01, 0.0, 0.5], [0.0, 0.01, 0.5], [np.nan
 
 
 def pickles() -> list[bytes]:
-    """Return a MANO file of 16 vertices in two pickle protocols, and a small pickle with other types in three."""
+    """Return a MANO file of 16 vertices in two pickle protocols, and a pickle of other types in three protocols."""
     from scipy.sparse import csc_matrix
 
     parents = (-1, *(0 if k % 3 == 0 else k for k in range(15)))
@@ -154,7 +154,7 @@ def clouds() -> list[bytes]:
 
 
 def layouts() -> list[bytes]:
-    """Return layout files of four points, one for each byte order."""
+    """Return two files, one per byte order: a `LAYOUT_HEAD` and the data of four points."""
     places = (0, 7, 4, 7, 8, 7)
     plain, big = LAYOUT_HEAD.pack(4, 1, 12, 48, 0, *places), LAYOUT_HEAD.pack(2, 2, 12, 24, 1, *places)
     return [plain + _POINTS.tobytes(), big + _POINTS.astype(">f4").tobytes()]
@@ -188,7 +188,7 @@ def messages() -> list[bytes]:
 
 
 def bags() -> list[bytes]:
-    """Return recordings with every kind of message, in both storages."""
+    """Return a recording with every kind of message as mcap and as sqlite3."""
     from bag_writer import Record, write_bag
 
     topics = ("/points", "/depth/image_raw", "/depth/camera_info", "/tf", "/depth/image_rect")

@@ -1,8 +1,8 @@
-"""Fuzzing targets: each of graspd's own parsers as a function of a file, which must give a value or one clear error.
+"""Fuzzing targets: functions that call graspd's own parsers on a file.
 
 A target returns a value or raises a documented error. Anything else is a finding: another exception, a warning, an
 error of several lines, or a number that is not finite. benchmarks/fuzz.py calls the targets with mutated bytes, and
-test/fuzz calls them with inputs that were findings once.
+test/fuzz calls them with the inputs of earlier findings.
 """
 
 from __future__ import annotations
@@ -40,7 +40,7 @@ LONGEST = 2000
 
 @dataclass(frozen=True)
 class Target:
-    """One parser.
+    """One parser to fuzz.
 
     Attributes:
         name: name of the target.
@@ -69,7 +69,7 @@ def try_input(target: Target, data: bytes, folder: Path) -> str | None:
 
 
 def outcome(run: Callable[[], Any], *refusals: type[Exception]) -> tuple[Any, str | None]:
-    """Return (value, None) of a call, or (None, message) if it raises one of `refusals`. Pass on all other errors."""
+    """Return (value, None) of a call, or (None, message) if the call raises one of `refusals`. Pass on other errors."""
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         try:

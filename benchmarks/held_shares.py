@@ -1,11 +1,11 @@
-"""Measure how often grasps of a single view hold on the true object: the `HeldShares` of planning_config.
+"""Measure how often grasps planned on one view hold on the true object (`HeldShares` in planning_config).
 
     python benchmarks/held_shares.py --out shares.jsonl [--seeds 50:58] [--scans FOLDER]
 
-Every object of `CHOSEN_ON` has one view per seed, compounds have three. The five scans `SCANS` have one too, if FOLDER
-has them and a stats.csv of masses. Four kinds of cameras take turns, and half of the views are crowded. Each view is
-planned without a mass and with the object's own mass. Grasps that hold on the likeliest shape run every robustness
-check, and are tried on the true object at its own mass. Views in the file are skipped. A view takes 15 CPU seconds.
+Each seed gives one view of every object in `CHOSEN_ON` (three of `compound`), and of the five scans `SCANS` if FOLDER
+has them and a stats.csv of masses. Four kinds of cameras take turns. Half of the views show neighbours. Each view is
+planned without a mass and with the object's own mass. A grasp that holds on the likeliest shape runs every robustness
+check, and is tried on the true object at its own mass. Views in the file are skipped. A view takes 15 CPU s.
 """
 
 from __future__ import annotations
@@ -54,7 +54,7 @@ def cases(seeds: range, scans: Path | None) -> Iterator[CameraView]:
 
 
 def grasps_of_view(case: CameraView) -> list[dict[str, Any]]:
-    """Return the checks passed by each grasp that holds on the likeliest shape, and whether it holds on the truth."""
+    """Return a row for each grasp that holds on the likeliest shape: checks passed, and if it holds the true object."""
     stage, cloud, mass, target = view_of(case)
     hand, config = load_hand(case.hand), replace(load_preset(case.preset), certainty=CertaintyConfig(0.0))
     disk_cache.forget()
@@ -100,7 +100,7 @@ def share(rows: list[dict[str, Any]]) -> str:
 
 
 def main() -> None:
-    """Add the missing views to the file, and print the shares held."""
+    """Measure the views that the file lacks, add them to the file, and print the shares of grasps that hold."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--out", type=Path, required=True)
     parser.add_argument("--seeds", default="50:58")

@@ -2,9 +2,9 @@
 
     python benchmarks/known_objects.py [--objects 1000] [--grasps 8] [--node]
 
-Grasps are planned once for each built-in shape. An object is a randomly scaled shape, but its record holds the grasps
-of the unscaled shape. This is enough, because only time and memory are measured. `--node` also times a node in another
-process over DDS, from the request to the answer.
+Grasps are planned once for each built-in shape. An object is a randomly scaled shape, but the object's record holds the
+grasps of the unscaled shape. This is enough, because only time and memory are measured. `--node` also times a node in
+another process over DDS, from the request to the answer.
 """
 
 from __future__ import annotations

@@ -2,8 +2,8 @@
 
     python benchmarks/mano_synthetic.py OUT.pkl [--seed 0]
 
-Bones have an adult's proportions, in capsules of flesh. One smooth surface covers them, open at the wrist. Lengths and
-breadths are round numbers, not measurements. Blend shapes are small and random. Tests and `make bench` use the hand.
+Bones have an adult's proportions and lie in capsules of flesh. One smooth surface covers all, open at the wrist.
+Lengths and breadths are round numbers. Blend shapes are small and random. Tests and `make bench` use the hand.
 """
 
 from __future__ import annotations
@@ -76,7 +76,7 @@ def write_synthetic(path: Path, seed: int = 0) -> dict[str, Any]:
 def mano_pickle(model: dict[str, Any]) -> bytes:
     """Return the entries as a pickle of protocol 2. `shapedirs` is a chumpy expression, as in the licensed files.
 
-    chumpy is not needed, because stand-ins for its classes exist while the pickle is written.
+    The package chumpy is not needed, because stand-ins for its classes exist while the pickle is written.
     """
     modules = {name: ModuleType(name) for name in ("chumpy", "chumpy.ch", "chumpy.reordering")}
     leaf = type("Ch", (), {"__module__": "chumpy.ch"})
@@ -168,7 +168,7 @@ def _surface(segments: list[tuple[int, np.ndarray, np.ndarray, float]]) -> tuple
 
 
 def _weights(segments: list[tuple[int, np.ndarray, np.ndarray, float]], vertices: np.ndarray) -> np.ndarray:
-    """Return skinning weights: of the nearest body, blended with its parent and children near the joints."""
+    """Return skinning weights. A vertex follows the nearest body, and near joints that body's parent and children."""
     depths = _depths(segments, vertices)
     nearest = np.full((len(vertices), BODIES), np.inf)
     for column, (body, *_) in enumerate(segments):
@@ -182,7 +182,7 @@ def _weights(segments: list[tuple[int, np.ndarray, np.ndarray, float]], vertices
 
 
 def _regressor(vertices: np.ndarray, joints: np.ndarray) -> np.ndarray:
-    """Return the joint regressor. A row gives a joint from its 40 nearest vertices, with least norm and sum one."""
+    """Return the joint regressor. A row has weights of the 40 vertices nearest to a joint: sum one, least norm."""
     rows = np.zeros((BODIES, len(vertices)))
     for row, joint in zip(rows, joints, strict=True):
         near = np.argsort(np.linalg.norm(vertices - joint, axis=1))[:40]

@@ -1,6 +1,6 @@
 """Measure grasps per second of large requests: `python benchmarks/many_at_once.py [--device cuda] [--counts 64,1024]`.
 
-Raw grasps are candidates without trials. A sample of them is tried in MuJoCo, which is not timed. With `--threads`, the
+Raw grasps are candidates without trials. A sample is tried in MuJoCo, outside the timed part. With `--threads`, the
 program also plans verified grasps on CPU threads, with and without metrics. Amdahl's law gives the serial fraction.
 """
 

@@ -1,10 +1,10 @@
-"""MJCF of an Allegro with the frames of Menagerie's right hand. Tests check exports for DexGraspBench with it."""
+"""MJCF of an Allegro with the frames of MuJoCo Menagerie's right hand. Tests of exports for DexGraspBench use it."""
 
 from __future__ import annotations
 
 
 def menagerie_like() -> str:
-    """Return the MJCF of an Allegro with Menagerie's names and frames. The palm is turned in the frame of the qpos."""
+    """Return the MJCF of an Allegro with Menagerie's names and frames. The palm is rotated against the root frame."""
 
     def finger(name: str, place: str) -> str:
         lengths, axes = ("0 0 0.0164", "0 0 0.054", "0 0 0.0384"), ("0 0 1", "0 1 0", "0 1 0", "0 1 0")

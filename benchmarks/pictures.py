@@ -93,7 +93,7 @@ def main() -> None:
 
 
 def pages(figures: Path, benchmark: Path) -> None:
-    """Save screenshots of the page (grasps, a failed trial, a slice, a run, the help) and of a benchmark's chart."""
+    """Save screenshots: the page (grasps, a failed trial, an SDF slice, a run, the help) and a benchmark's chart."""
     from playwright.sync_api import sync_playwright
 
     sys.path.insert(0, str(Path(__file__).parents[1] / "test" / "viewer"))
@@ -162,7 +162,7 @@ def pairs() -> np.ndarray:
 
 
 def hero(scene: Scene, hand: HandModel, grasp: Grasp) -> np.ndarray:
-    """Return a picture of a grasp, and beside it the object with contacts, squeeze forces and weakest push."""
+    """Return a picture of a grasp, and of the object with contacts, squeeze forces and the least resisted push."""
     push = weakest_push(make_metrics_context(scene.object, hand), grasp)
     marks = [*contact_parts(grasp.contacts), *squeeze_parts(grasp.contacts)]
     marks += weakest_parts(push, scene.object) if push is not None else []
@@ -214,7 +214,7 @@ def hands() -> np.ndarray:
 
 
 def failed() -> np.ndarray:
-    """Return pictures of a grasp that fails without squeeze: when the pull begins, half-way, and at the failure."""
+    """Return pictures of a trial without squeeze, which fails: when the pull begins, half-way, and at the failure."""
     scene, hand = load_scene("shape:bottle"), load_hand("barrett_like")
     grasp = plan_grasps(scene, hand, count=1, preset="fast", measure=False).grasps[0]
     soft = grasp.grasp.joint_positions
@@ -255,7 +255,7 @@ def shot(
 
 
 def clearest(scene: Scene, shown: Sequence[Part], before: Sequence[Part]) -> float:
-    """Return the rotation of `TURNS` at which the parts `before` hide the least of the parts `shown` [rad]."""
+    """Return the rotation in `TURNS` [rad] at which the parts `before` hide the least of the parts `shown`."""
 
     def seen(turn: float) -> int:
         meshes, pose = stood(scene, [*shown, *before], 1.0, turn)
@@ -267,7 +267,7 @@ def clearest(scene: Scene, shown: Sequence[Part], before: Sequence[Part]) -> flo
 def stood(
     scene: Scene, parts: Sequence[Part], near: float, turn: float
 ) -> tuple[list[TriangleMesh], Float[np.ndarray, "4 4"]]:
-    """Return the meshes with up along z and turned by `turn` about z, and the camera pose. Light comes from z."""
+    """Return the meshes, turned until up is z and by `turn` [rad] about z, and the camera pose. Light comes from z."""
     corners = scene.object.mesh.vertices
     middle = 0.5 * (corners.min(0) + corners.max(0))
     up = np.array([0.0, 0.0, 1.0]) if scene.support is None else scene.support.normal

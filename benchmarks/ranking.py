@@ -1,14 +1,14 @@
-"""Fit the network whose score orders candidates for their trials: `graspd_core/optimize/ranking.npz`.
+"""Fit `graspd_core/optimize/ranking.npz`, the network whose score orders the candidates before their trials.
 
     ranking.py try [--objects shape:mug PATH ...] [--hands allegro_right ...] [--out results/ranking]
     ranking.py fit [--out results/ranking] [--held-out results/ranking-scans]
 
-`try` finds the candidates of a request for 24 grasps per block, and tries all of them. Mass, trial friction and preset
-are random, and half of the objects stand on a table. A stopped `try` continues. Without --objects, `try` uses the
-eleven shapes at 0.2 to 2 times their size, five kinds of large objects with thin walls and random sizes (`hollow`), and
-the seven families of irregular objects that the study `cameras` does not use. `fit` trains a network on all blocks and
-writes it. `fit` also trains without each object and each hand in turn, and prints how good the network's order is.
-Chance and the earlier linear score are printed too, and for blocks of --held-out also the shipped network.
+`try` finds the candidates of requests for 24 grasps, and tries all of them. Each request is a block. Mass, trial
+friction and preset are random, and half of the objects stand on a table. A stopped `try` continues. Without --objects,
+`try` uses the eleven shapes at 0.2 to 2 times their size, five kinds of large objects with thin walls and random sizes
+(`hollow`), and the seven families of irregular objects that the study `cameras` does not use. `fit` writes a network
+trained on all blocks. It also trains without each object and each hand in turn, and prints how well such networks order
+the rest. For comparison, it prints a random order, the earlier linear score, and on --held-out the shipped network.
 """
 
 from __future__ import annotations
@@ -97,7 +97,7 @@ def thing_scene(source: str, rng: np.random.Generator, friction: float, resoluti
 
 
 def try_block(where: Path, source: str, hand_name: str, variant: int, count: int) -> None:
-    """Plan and try the candidates of one object, hand and variant. Write their figures and results to a file."""
+    """Plan and try the candidates of an object, hand and variant. Write the network's inputs and the results."""
     name = "".join(c if c.isalnum() else "_" for c in f"{Path(source).stem}-{hand_name}-{variant}")
     file = where / f"{name}.npz"
     if file.exists():
@@ -126,9 +126,9 @@ def try_block(where: Path, source: str, hand_name: str, variant: int, count: int
 
 
 def fitted(data: dict[str, np.ndarray], rows: np.ndarray, seed: int = 0) -> dict[str, np.ndarray]:
-    """Train a network on the trials of `rows`. Return mean and deviation of the figures, and the network's layers.
+    """Train a network on the candidates `rows`. Return mean and deviation of the inputs, and the network's layers.
 
-    The training predicts both trials, so that both shape the layers. The output for the hard trial is not kept.
+    Training predicts the standard and the hard trial, so that both shape the layers. The second output is not kept.
     """
     torch.manual_seed(seed)
     figures, held = data["figures"][rows], np.stack([data["standard"][rows], data["hard"][rows]], 1)
@@ -165,7 +165,7 @@ def linear(figures: np.ndarray) -> np.ndarray:
 
 
 def worth(order: np.ndarray, held: np.ndarray, group: np.ndarray) -> tuple[float, float, float]:
-    """Return the share held of the first 8 of 32, trials per verified grasp until 8 hold, and the ROC's area."""
+    """Return the share of the first 8 of 32 that holds, trials per verified grasp until 8 hold, and the ROC's area."""
     rng = np.random.default_rng(0)
     first, trials, area = [], [], []
     for name in np.unique(group):
@@ -203,7 +203,7 @@ def read(folder: Path) -> dict[str, np.ndarray]:
 
 
 def told(title: str, data: dict[str, np.ndarray], log_odds: np.ndarray) -> None:
-    """Print the share of the best candidates that should hold by the network, and the share that held."""
+    """Print which share of the best candidates should hold according to the network, and which share held."""
     group = np.char.add(np.char.add(data["object"], " "), data["hand"])
     blocks = [np.flatnonzero(group == name) for name in np.unique(group)]
     best = [rows[np.argsort(-log_odds[rows], kind="stable")[:BEST]] for rows in blocks]
@@ -226,7 +226,7 @@ def table(title: str, data: dict[str, np.ndarray], orders: dict[str, np.ndarray]
 
 
 def by_others(data: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
-    """Return the scores to compare with: random numbers and the linear score."""
+    """Return the scores that the network is compared with: random numbers and the linear score."""
     return {"chance": np.random.default_rng(0).random(len(data["standard"])), "linear": linear(data["figures"])}
 
 

@@ -1,10 +1,10 @@
-"""Test a node under mixed load for minutes: memory growth, waiting times, and whether each request ends once.
+"""Test a node under mixed load for minutes: memory growth, waiting times, and whether each request ends exactly once.
 
     python benchmarks/soak.py [--minutes 10] [--out results/soak] [--readme docs/reference/node_load.md]
 
 This process is the client. It starts three processes: the node with a timer that measures delays, a camera of 640×480
-at 30 Hz, and a control that only sleeps. The lateness of the control comes from the machine. Nothing is mocked. Code of
-`graspd bench` writes the record, the line on its origin, and the pages.
+at 30 Hz, and a control that only sleeps. The control wakes late only because of the machine. Nothing is mocked. Code of
+`graspd bench` writes the record, a line on the record's origin, and the pages.
 """
 
 from __future__ import annotations
@@ -130,7 +130,7 @@ def spread(values: Sequence[float]) -> dict[str, float]:
 
 
 def growth(memory: Sequence[float]) -> float | None:
-    """Return the growth of memory from the first to the last fifth after `SETTLED`, by medians. None if unknown."""
+    """Return the relative growth of memory after `SETTLED`, from the first to the last fifth. None if unknown."""
     flat = memory[int(SETTLED * len(memory)) :]
     fifth = max(len(flat) // 5, 1)
     return float(np.median(flat[-fifth:]) / np.median(flat[:fifth]) - 1) if len(flat) > 1 else None

@@ -107,7 +107,7 @@ class Client:
         return self.wait(lambda: self.answers[name], what)
 
     def settle(self) -> None:
-        """Wait for an answer to every request. Then wait 1 s longer for answers that come twice."""
+        """Wait for an answer to every request. Then wait 1 s longer for duplicate answers."""
         self.wait(lambda: all(self.answers[name] for name in self.sent), "all answers")
         end = time.monotonic() + 1.0
         self.wait(lambda: time.monotonic() > end, "the end")

@@ -58,7 +58,7 @@ def run_node(file: Path, arguments: list[str]) -> int:
 
 
 def run_camera(seconds: float) -> None:
-    """Publish clouds of a ball in front of an RGB-D camera: organised, 9.8 MB, noisy, best effort as from drivers."""
+    """Publish noisy organised clouds of a ball, 9.8 MB each, with best-effort QoS like an RGB-D camera's driver."""
     import rclpy
     from rclpy.qos import qos_profile_sensor_data
     from sensor_msgs.msg import PointCloud2, PointField

@@ -91,7 +91,7 @@ def planned(count: int) -> Path:
 
 
 def opened(viewer: Viewer, page: Any, path: Path) -> None:
-    """Print the time from opening a file until the page shows the first grasp, then the time after a reload."""
+    """Print the time from opening a file until the page shows the first grasp, then the same time after a reload."""
     page.goto(viewer.url)
     page.wait_for_selector("canvas")
     time.sleep(3.0)
@@ -137,7 +137,7 @@ def scrubbed(viewer: Viewer, page: Any, address: str) -> None:
 
 
 def watched(viewer: Viewer, who: str, repeats: int = 6) -> None:
-    """Print CPU time of the planning thread and the process, and wall time of a run, with and without live view."""
+    """Print the CPU time of planning thread and process, and the wall time, of a run with and without live view."""
     scene, hand, config = load_scene("shape:mug"), load_hand("allegro_right"), load_preset("balanced")
     session = make_session("mug", hand, (), scene, config, np.zeros((0, 3)), ())
     figures: dict[bool, list[tuple[float, float, float]]] = {False: [], True: []}

@@ -2,8 +2,8 @@
 
     python benchmarks/way_of_data.py synthesize shape:mug -n 1
 
-A file counts when a function in it runs on behalf of another file of graspd. Code that runs while modules are imported
-does not count. Caches are off, so that nothing is skipped. docs/architecture.md has the lists of a mesh and of a cloud.
+A file counts if another file of graspd calls one of its functions. Code that runs while modules are imported does not
+count. Caches are off, so that nothing is skipped. docs/architecture.md has the lists of a mesh and of a cloud.
 """
 
 from __future__ import annotations

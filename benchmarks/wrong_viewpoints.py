@@ -5,8 +5,8 @@
 Clouds come from ten rendered scenes (objects of `graspd bench cameras` on which no threshold was chosen, seeds from
 100), and from the depth frames in a folder (`NAME/camera.json` with K, `NAME/depth_mm.png`). Points are unordered, so
 that no pixel shows where the camera stood. Each cloud has three forms: all points, points thinned to 8 mm, and only the
-object's points. Wrong positions are a robot's base, the mirror image of the true position, 5 m away, or anywhere at the
-true distance. Each turns the line of sight by more than 20°. Verified grasps are tried on the true object, if known.
+object's points. A wrong position is a robot's base, the true position mirrored, 5 m away, or anywhere at the true
+distance. The line of sight turns by more than 20°. Verified grasps are tried on the true object, if known.
 """
 
 from __future__ import annotations
@@ -78,7 +78,7 @@ def frames(folder: Path) -> Iterator[Seen]:
 
 
 def wrong_place(seen: Seen, rng: np.random.Generator) -> tuple[str, Vector]:
-    """Draw a wrong camera position that sees the target from another direction. Return its kind and position [m]."""
+    """Draw a wrong camera position that sees the target from another direction. Return the kind and position [m]."""
     first = perpendicular(seen.up)
     away, said = seen.place - seen.target, np.zeros(3)
     while True:
@@ -104,7 +104,7 @@ def forms(seen: Seen, rng: np.random.Generator) -> dict[str, PointCloud]:
 
 
 def outcome(seen: Seen, form: str, cloud: PointCloud, place: Vector) -> str:
-    """Return graspd's answer: refused, doubted, none verified, or verified and whether all verified grasps hold."""
+    """Return graspd's answer: refused, doubted (a warning), none verified, or verified and whether all of them hold."""
     hand, protocol = load_hand("allegro_right"), out_of_place(PROTOCOLS["standard"])
     target = None if form == "alone" else Target(point=seen.target)
     try:

@@ -24,7 +24,7 @@ from graspd_core import (
 
 
 def report(progress: Progress) -> None:
-    """Print progress at the end of each stage. `plan_grasps` calls this."""
+    """Print progress at the end of each stage. `plan_grasps` calls this function."""
     if progress.step == progress.of:
         print(f"  {progress.elapsed:5.2f} s  {progress.stage}: {progress.verified} verified so far")
 

@@ -43,7 +43,7 @@ GRASPS = {
 
 
 def as_graspd(grasp: GripperGrasp, hand: HandModel) -> Grasp:
-    """Return the grasp as three postures: open away from the object, touching, and the targets that press."""
+    """Return the grasp as three postures: open and clear of the object, touching the object, and targets that press."""
     touch = grasp.width / 2
     jaws = [np.clip([jaw], hand.lower, hand.upper) for jaw in (touch + OPENING, touch, touch - PRESS)]
     position, quaternion = np.array(grasp.position), np.array(grasp.quaternion_wxyz)

@@ -4,8 +4,8 @@
     graspd bench --plugin examples/your_own_method.py --presets draws.yaml --objects shape:box
 
 `draws.yaml` has the line `method: draws` and settings as `draws: {per_grasp: 64}`. A method returns hand poses in the
-object's frame. graspd makes pregrasp, grasp and squeeze of each, ranks them and tries the best in simulation. A package
-registers its row by an entry point of the group `graspd.methods` and needs no `--plugin`.
+object's frame. From each pose, graspd makes a candidate with pregrasp, grasp and squeeze. It tries the best in
+simulation. An installed package adds its method by an entry point of the group `graspd.methods`, without `--plugin`.
 """
 
 from __future__ import annotations

@@ -1,7 +1,7 @@
 """Add your own metric, measured like the built-in metrics: python examples/your_own_metric.py [OBJECT].
 
-A metric is one row of `METRICS`. Every verified grasp then has the metric, and files and tables show the metric. A
-metric reads surface samples of the hand in the object's frame (`grasp.placed`), object and hand (`grasp.context`).
+A metric is one row of `METRICS`. Every verified grasp then has the metric, and files and tables show the metric.
+`grasp.placed` has surface samples of the hand in the object's frame, `grasp.context` has object and hand.
 """
 
 from __future__ import annotations

@@ -24,7 +24,7 @@ def add_command(commands: Any) -> None:
     parser.set_defaults(run=run)
     parser.add_argument("studies", nargs="*", metavar="STUDY", help="main (default), all, or a name of docs/bench.md")
     parser.add_argument("--suite", action="append", default=[], metavar="STUDY", help="another way to give STUDY")
-    parser.add_argument("--presets", nargs="+", default=(), metavar="PRESET", help="default: all built-in ones")
+    parser.add_argument("--presets", nargs="+", default=(), metavar="PRESET", help="default: all built-in presets")
     add_plugin_option(parser)
     parser.add_argument(
         "--objects",
@@ -44,20 +44,20 @@ def add_command(commands: Any) -> None:
     parser.add_argument("--count", type=int, default=None, help="grasps of a case (default: by study and method)")
     parser.add_argument("--hand", default="", metavar="NAME|PATH", help="default: allegro_right")
     parser.add_argument("--trials", default="", metavar="A,B", help="trials of raw grasps (listed in docs/bench.md)")
-    parser.add_argument("--import", dest="imported", default="", metavar="PATH", help="grasps to compare with ours")
+    parser.add_argument("--import", dest="imported", default="", metavar="PATH", help="grasps to compare with graspd's")
     parser.add_argument("--joint-order", default="", metavar="A,B,…", help="joint names of imported npy files")
     parser.add_argument("--python", default="", metavar="PATH", help="Python that runs the checkout of dexgraspbench")
     parser.add_argument("--armature", action="store_true", help="dexgraspbench: also try its hand with our armature")
-    parser.add_argument("--grasps", default="", metavar="FILE", help="dexgraspbench: use our grasps of this file")
+    parser.add_argument("--grasps", default="", metavar="FILE", help="dexgraspbench: our grasps (default: plan)")
     parser.add_argument("--quick", action="store_true", help="run few objects and grasps, which takes minutes")
     parser.add_argument("--out", type=Path, default=Path("results/bench"), metavar="DIR", help="folder of records")
     parser.add_argument("--processes", type=int, default=1, help="cases at a time, each on one thread (default 1)")
     parser.add_argument("--any-code", action="store_true", help="keep finished cases of other versions of the code")
     parser.add_argument("--no-run", action="store_true", help="only report on the finished cases")
-    parser.add_argument("--compare", type=Path, default=None, metavar="OLD.json", help="list changes since that run")
+    parser.add_argument("--compare", type=Path, default=None, metavar="OLD.json", help="list changes since OLD")
     parser.add_argument("--chart", type=Path, default=None, metavar="PATH", help="PATH.png, PATH.svg, …")
     parser.add_argument(
-        "--readme", type=Path, action="append", default=[], metavar="FILE", help="fill its marked sections (repeatable)"
+        "--readme", type=Path, action="append", default=[], metavar="FILE", help="fill marked sections (repeatable)"
     )
 
 
@@ -102,7 +102,7 @@ def run(options: argparse.Namespace) -> int:
         for job, record in run_plan(plan, options.processes, interrupt.is_interrupted) if not options.no_run else ():
             lines(job.study, record)
     if interrupt.is_interrupted():
-        kept = f"{len(plan.done)} of {len(plan.jobs)} cases are kept in {options.out}"
+        kept = f"{len(plan.done)} of {len(plan.jobs)} cases are finished; {options.out} keeps their results"
         print_error(f"interrupted; {kept}")
         return EXIT_INTERRUPTED
     every = [record for own in records_of(plan).values() for record in own]
@@ -148,7 +148,7 @@ class Lines:
     def __enter__(self) -> Lines:
         total, done = len(self.plan.jobs), len(self.plan.done)
         if done:
-            print_note(f"{done} of {total} cases had finished before")
+            print_note(f"{done} of {total} cases had finished in earlier runs")
         if self.plan.missing and self.processes:
             minutes = self.plan.seconds(self.processes) / 60
             cost = f"{len(self.plan.missing)} cases, about {minutes:.0f} minutes on {self.processes} idle cores"

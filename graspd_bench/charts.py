@@ -175,7 +175,8 @@ _NAMED = 4
 class Point:
     """Point of one preset on a panel. `x` and `y` are (low, middle, high). `held` is True if any grasp held.
 
-    Low and high are quartiles over objects, or over grasps of a single object. For a share, they are its 95 % interval.
+    Low and high are quartiles over objects. For one object, they are quartiles over grasps. For a share, they are the
+    95 % interval.
     """
 
     name: str
@@ -188,7 +189,7 @@ class Point:
 def draw_charts(records: Sequence[Record], path: Path) -> dict[str, Path]:
     """Draw all charts for which the records have data: PATH, PATH_short, PATH_planned and PATH_ladder (.png, .svg).
 
-    `path` gives PATH. Return the PNGs' paths by name: "speed" (PATH), "short", "planned", "ladder", if drawn.
+    `path` gives PATH. Return the path of each drawn PNG by name: "speed" (PATH), "short", "planned", "ladder".
     """
     found = rows(records)
     swept = [row for row in found if is_sweep_value(row.name)]
@@ -224,7 +225,7 @@ def about_records(records: Sequence[Record], kind: str) -> str:
 
 
 def draw_planned(presets: dict[str, list[Row]], path: Path, about: str = "") -> Path | None:
-    """Draw CPU time per verified grasp against CPU time to the first. Return the PNG's path, or None without data."""
+    """Draw CPU time per verified grasp against CPU time to the first one. Return the PNG's path. None without data."""
     panel = Panel("cpu_per_verified", "CPU seconds per verified grasp, all included")
     points = points_of(presets, "first_cpu", panel)
     if not points:
@@ -260,7 +261,7 @@ def draw_speed(presets: dict[str, list[Row]], path: Path, about: str = "") -> Pa
 
 
 def points_of(presets: dict[str, list[Row]], time: str, panel: Panel) -> list[Point]:
-    """Return a point for each preset that has both values: `time`, and the panel's in the unit of its label."""
+    """Return a point for each preset with values of `time` and of the panel, in the unit of the panel's label."""
     points = []
     for name, group in presets.items():
         x, y = spread(group, time), spread(group, panel.figure)

@@ -150,7 +150,7 @@ def run_friction_mass(case: MapCase) -> tuple[MapCell, ...]:
 
 
 def run_size(case: MapCase) -> tuple[MapCell, ...]:
-    """Plan and try on a scaled shape of 0.1 kg. Its least width is `case.across` times the hand's span."""
+    """Plan and try on a shape of 0.1 kg, scaled to a least width of `case.across` times the hand's span."""
     config = settings(case.preset)
     width = float(case.across) * _span(case.hand, config.problem.fine_candidates)
     scale = width / least_width(make_shape(case.thing))
@@ -352,7 +352,7 @@ _CELL, _EDGE = 0.52, "#D55E00"
 
 
 def draw_map(drawn: Map, methods: Mapping[str, Shares], path: Path) -> Path:
-    """Draw a map with one panel per method. `methods` has the caption and `shares` of each. Return the PNG's path.
+    """Draw a map with one panel per method. `methods` maps captions to `shares`. Return the PNG's path.
 
     Cells without a record are white. Rows and columns without any record are left out.
     """

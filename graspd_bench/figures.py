@@ -76,9 +76,9 @@ class Row:
         given: number of grasps found.
         held: number of grasps that passed the standard hold trial.
         spent: CPU time [s] of optimiser and standard hold trials, or of the whole run if verified grasps are planned.
-        values: numbers by name, None if not measured: medians over grasps (`_grasp_figures`), shares of requested
-            grasps (`TRIAL_FIGURES`), times [s], memory, rounds. `cpu_per_grasp` is the optimiser's time per requested
-            grasp, `cpu_per_verified` is `spent` / `held`. `first_cpu` and `first_wall` end at the first verified grasp.
+        values: numbers by name, None if not measured. Medians over grasps (`_grasp_figures`), shares of requested
+            grasps (`TRIAL_FIGURES`), times [s], memory [MB], rounds. `cpu_per_grasp` is the optimiser's time per
+            requested grasp. `cpu_per_verified` is `spent` / `held`. `first_*`: time to the first verified grasp.
         quartiles: lower and upper quartile over the grasps, for each value that is a median over grasps.
     """
 
@@ -105,7 +105,7 @@ class Spread:
 
 
 def rows(records: Iterable[Record], kind: str = "raw") -> list[Row]:
-    """Return a row for every name and object of the records of `kind`, in record order. Leave out failed cells."""
+    """Return a row for every name and object of the records of `kind`, in record order. Leave out failed runs."""
     groups: dict[tuple[str, str], list[Record]] = {}
     # A record without grasps does not name its trials. They are taken to be the trials of the other records.
     ran = {TRIAL_FIGURES[0]}
@@ -143,7 +143,7 @@ def _row(group: Sequence[Record], ran: Collection[str]) -> Row:
 
 
 def spread(rows: Iterable[Row], figure: str) -> Spread | None:
-    """Return the spread of a value over the rows, None without values. For one row, take quartiles of its grasps."""
+    """Return the spread of a value over the rows, None without values. For one row, use its quartiles over grasps."""
     known = [row for row in rows if row.values.get(figure) is not None]
     values = [row.values[figure] or 0.0 for row in known]
     if not values:
@@ -200,7 +200,8 @@ def _inner(grasp: dict[str, Any], trial: str, figure: str) -> float | None:
 def pareto_front(points: Float[np.ndarray, "points axes"]) -> Bool[np.ndarray, "points"]:
     """Return which points are on the Pareto front, if less is better on every axis.
 
-    A point is not on it if another is no worse on every axis and better on one. Equal points do not exclude each other.
+    A point is not on the front if another is no worse on every axis and better on one. Equal points do not exclude each
+    other.
     """
     no_worse = (points[:, None] <= points[None]).all(-1)
     better = (points[:, None] < points[None]).any(-1)
@@ -233,7 +234,7 @@ class Move:
 
 
 def moves(old: Sequence[Record], new: Sequence[Record]) -> list[Move]:
-    """Return the changes between two runs: for each name, of means over shared objects ("all"), then of each object."""
+    """Return the changes between two runs. For each name: means over shared objects ("all"), then every object."""
     found: list[Move] = []
     for kind in ("raw", "verified"):
         before = {(row.name, row.object): row for row in rows(old, kind)}

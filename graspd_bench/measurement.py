@@ -186,7 +186,7 @@ def run_cell(cell: Cell) -> Record:
 
 
 def run_raw(cell: Cell) -> dict[str, Any]:
-    """Plan raw grasps, run their trials and compute their metrics. Return counts, times, and a result per grasp."""
+    """Plan raw grasps (not filtered by trials), try and measure them. Return counts, times, and a result per grasp."""
     stopwatch = Stopwatch()
     hand = load_hand(cell.hand, candidates=cell.settings.problem.fine_candidates)
     with stopwatch("scene"):
@@ -261,7 +261,7 @@ def _now() -> dict[str, float]:
 
 
 def run_pace(cell: Cell) -> dict[str, Any]:
-    """Time a batch of raw grasps. Return its CPU and wall time [s], and its number of optimiser steps, `grasp_steps`.
+    """Time a batch of raw grasps. Return CPU and wall time [s], and the number of optimiser steps, `grasp_steps`.
 
     Three batches are timed, after an untimed batch. The times are those of the fastest batch.
     """
@@ -287,7 +287,7 @@ def grasp_steps(cell: Cell) -> int | None:
 
 
 def run_start(cell: Cell) -> dict[str, Any]:
-    """Start a new process that plans a verified grasp. Return its CPU and wall time [s]. The disk cache is off."""
+    """Start a new process that plans a verified grasp. Return the CPU and wall time [s]. The disk cache is off."""
     environment = {**os.environ, "GRASPD_CACHE": "off", "OMP_NUM_THREADS": "1"}
     command = [sys.executable, "-c", _FRESH, cell.object, cell.hand, str(cell.seed)]
     began = time.perf_counter()

@@ -22,7 +22,7 @@ _COUNTED = ("baselines/*.py", "rendering/*.py", "trials.py")
 
 
 def case_key(study: str, case: Case) -> str:
-    """Return the SHA-256 of a study's name and all inputs of a case, as hexadecimal. It ignores the code version."""
+    """Return the SHA-256 of a study's name and all inputs of a case, except the code version, in hexadecimal."""
     return hashlib.sha256(json.dumps({"study": study, **case.inputs()}, sort_keys=True).encode()).hexdigest()
 
 
@@ -53,7 +53,7 @@ def write_record(folder: Path, study: str, case: Case, record: Record) -> None:
 
 
 def read_record(folder: Path, study: str, case: Case, code: str | None, *, failed: bool = False) -> Record | None:
-    """Return a case's record of code version `code` (None: any), or None. `failed` allows records of failed cases."""
+    """Return a case's record by code version `code` (None: any), or None. `failed` allows records of failed cases."""
     try:
         record = json.loads((folder / case_file(study, case)).read_text(encoding="utf-8"))
     except (OSError, ValueError):
@@ -95,5 +95,5 @@ def read_results(path: Path) -> list[Record]:
 
 
 def bench_version(sources: tuple[str, ...]) -> str:
-    """Return a study's code version: package version, and a hash of graspd_core and files `_COUNTED` and `sources`."""
+    """Return a study's code version: package version, and a hash of graspd_core and the files `_COUNTED`, `sources`."""
     return code_version(tuple(f"graspd_bench/{pattern}" for pattern in (*_COUNTED, *sources)))

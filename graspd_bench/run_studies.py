@@ -40,7 +40,7 @@ class Job:
         case: the case.
         run: function that runs the case.
         code: code version that the record will name.
-        alone: whether the case gets a new process of its own, without a first plan that loads libraries.
+        alone: whether the case gets a new process, in which no earlier plan has loaded the libraries.
         patience: seconds until the case counts as hung.
     """
 
@@ -190,7 +190,7 @@ ALL = "all"
 
 @dataclass(frozen=True)
 class Plan:
-    """All jobs of a command, the folder of their records, and the records of those jobs that are finished."""
+    """All jobs of a command, the folder of the records, and the records of finished jobs."""
 
     folder: Path
     jobs: tuple[Job, ...]
@@ -261,7 +261,7 @@ def records_of(plan: Plan) -> dict[str, list[Record]]:
 
 
 def report_of(plan: Plan, chart: Path | None) -> dict[str, Sequence[str | Picture]]:
-    """Return the page sections of all studies with records, by marker name. Draw charts too if `chart` is given."""
+    """Return the page sections of all studies with records, by the marker's name. If `chart` is given, draw charts."""
     sections: dict[str, Sequence[str | Picture]] = {}
     for name, records in records_of(plan).items():
         study = STUDIES[name]

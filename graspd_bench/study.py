@@ -40,7 +40,7 @@ Sections = Mapping[str, Sequence[str | Picture | None]]
 
 @dataclass(frozen=True)
 class Case:
-    """Base class of one run of a study. Files in `object`, `hand` and `preset` count by content, not by path."""
+    """Base class of one run of a study. Of files in `object`, `hand` and `preset`, the content counts, not the path."""
 
     @property
     def label(self) -> str:
@@ -81,7 +81,7 @@ class Request:
         joint_order: joint names in the order of the imported npy files.
         checkout: folder of DexGraspBench.
         python: Python program that runs DexGraspBench.
-        armature: whether to try grasps also with DexGraspBench's hand plus our joint armature.
+        armature: whether to try grasps a second time, with our joint armature in DexGraspBench's hand.
         grasps: file of our grasps, which DexGraspBench tries instead of newly planned ones.
     """
 
@@ -133,14 +133,14 @@ class Study:
     Attributes:
         about: what the study compares or measures, in one line.
         cases: returns the cases of a request. Raises GraspdError if the request has unknown names.
-        run: runs a case and returns its results. It must be a module-level function, because workers unpickle it.
-        sections: returns page sections from records and a path prefix for charts. If the prefix is None, draw none.
+        run: module-level function (workers unpickle it) that runs a case and returns the results.
+        sections: returns page sections from records and a path prefix for charts. None: no charts.
         sources: glob patterns of the files in graspd_bench that the study's results depend on.
         takes: names of the `Request` fields that the study uses.
         seconds: returns the estimated CPU time of a case [s].
         faults: returns the faults of a record, one line per fault.
         summary: returns the result in a record without faults, in a few words.
-        alone: whether every case gets a new process of its own, without a first plan that loads libraries.
+        alone: whether every case gets a new process, in which no earlier plan has loaded the libraries.
         patience: returns the seconds until a case counts as hung.
         usual: whether `graspd bench all` includes the study. False, for example, if it needs files of the user.
         failures: whether `sections` also needs the records of failed cases.
@@ -167,7 +167,7 @@ def all_shapes() -> tuple[str, ...]:
 
 
 def find_objects(sources: Sequence[str]) -> tuple[str, ...]:
-    """List `sources` with folders replaced by their meshes. Raises MeshError: unknown object, or two of one name."""
+    """List `sources` with folders replaced by their meshes. Raises MeshError: unknown object, or two with one name."""
     found = object_sources(sources)
     names = [object_name(source) for source in found]
     if twice := sorted({name for name in names if names.count(name) > 1}):
@@ -181,7 +181,7 @@ _NAME_COLUMNS, _MASS_COLUMNS = ("name", "mesh", "file"), ("mass_kg", "mass")
 
 
 def masses_of(meshes: Sequence[Path]) -> list[float]:
-    """Return the masses of the meshes of one folder from its csv files [kg].
+    """Return the masses of meshes in one folder, as the csv files in the folder give them [kg].
 
     Raises ConfigError: a csv file is unreadable, or its masses are not positive numbers, or a mesh has no mass.
     """
@@ -231,7 +231,7 @@ class ObjectCase(Case):
         return load_preset(self.preset)
 
     def load(self, friction: float = 0.6) -> tuple[HandModel, Scene]:
-        """Return the hand, and a scene with only the object, at 0.1 kg and the given Coulomb friction."""
+        """Return the hand, and a scene with only the object, with 0.1 kg and the given Coulomb friction."""
         hand = load_hand(self.hand, candidates=self.config.problem.fine_candidates)
         return hand, load_scene(self.object, mass=PROTOCOL_MASS, resolution=self.config.resolution, friction=friction)
 

@@ -1,4 +1,4 @@
-"""Suites of cells: all presets on all objects, sweeps of settings, and a comparison of hands."""
+"""Suites, lists of cells (runs): all presets on all objects, sweeps of settings, and a comparison of hands."""
 
 from __future__ import annotations
 
@@ -103,7 +103,7 @@ def sweep_suite(request: Request) -> tuple[Cell, ...]:
 
 
 def decades_suite(request: Request) -> tuple[Cell, ...]:
-    """Return `raw` cells that sweep contact settings over three decades. They show how exact a setting must be."""
+    """Return `raw` cells that sweep contact settings over three decades, which shows how exact a setting must be."""
     count, trials = request.count or HAND_COUNT, requested_trials(request, _SWEEP_TRIALS)
     return tuple(
         cell

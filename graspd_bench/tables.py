@@ -36,7 +36,7 @@ def sourced(command: str, records: Sequence[Record], sections: Sections) -> dict
 
 
 def written(parts: Sequence[str | Picture], document: Path | None = None) -> str:
-    """Return the parts of a section as Markdown. Pictures are links relative to `document`, or left out without it."""
+    """Return the parts of a section as Markdown. Pictures are links relative to `document`. None: no pictures."""
     texts = []
     for part in parts:
         if isinstance(part, str):
@@ -155,7 +155,7 @@ def planned_table(records: Sequence[Record]) -> str:
 
 
 def pace_table(records: Sequence[Record]) -> str:
-    """Return a table of computing times: per raw grasp of a batch, and of a new process until a verified grasp."""
+    """Return a table of computing times: of a raw grasp in a batch, and from a new process to a verified grasp."""
     body = []
     for r in records:
         if r["error"]:

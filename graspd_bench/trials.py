@@ -6,7 +6,7 @@ of Bullet's two coefficients, 3 times 3. Nothing bounces, as the hand's restitut
 
 `gravity_trial` measures how far gravity moves an object within 2 s while the hand squeezes the object. Hand, object and
 physics are those of the hold trial. The displacement trial of the papers differs: its hand is frozen, without motors
-and effort limits, and its 0.15 s are too short to show a slow slip.
+and effort limits, and it ends after 0.15 s, too soon to show a slow slip.
 
 `dropped` lets objects fall on a table and come to rest.
 """
@@ -69,7 +69,7 @@ class FrozenWorld:
 
 
 def build_frozen_world(hand: HandModel, target: ObjectModel, parts: Sequence[TriangleMesh]) -> FrozenWorld:
-    """Compile the world of one hand and one object. `parts` are the object's convex parts, object frame [m]."""
+    """Compile the MuJoCo model of one hand and object. `parts` are the object's convex parts, object frame [m]."""
     import mujoco
 
     spec = mujoco.MjSpec()
@@ -265,7 +265,7 @@ def _damp(model: Any, names: Sequence[str], slow: float, turn: float) -> None:
 
 
 def dropped(models: Sequence[ObjectModel], seed: int, wall: float, *, stays: bool = False) -> tuple[FreeBody, ...]:
-    """Drop objects into a square fence on the table z = 0, then remove it. Return the objects when they are at rest.
+    """Drop objects into a square fence on the table z = 0, then remove the fence. Return the objects when at rest.
 
     Args:
         models: the objects. They start above each other, with the first object lowest.

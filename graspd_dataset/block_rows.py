@@ -1,4 +1,4 @@
-"""Make one block, a file of grasps, in this process: prepare the object, plan its grasps, and build the rows."""
+"""Make one block (one call of the planner and its file) in this process: prepare the object, plan, build the rows."""
 
 from __future__ import annotations
 
@@ -107,7 +107,7 @@ def _one_thread() -> None:
 
 
 def _kept(key: str, pickled: bytes) -> Any:
-    """Return the unpickled value of a key. Keep recent instances for later calls, as worlds are cached by instance."""
+    """Return the unpickled value of a key. Keep recent values, as MuJoCo models are cached for one instance each."""
     if key not in _loaded:
         _loaded[key] = pickle.loads(pickled)
     _loaded.move_to_end(key)
@@ -172,7 +172,7 @@ def _object_file(target: ObjectModel) -> bytes:
 
 
 def dry_run(blocks: Sequence[Block], limits: Limits, workers: int | None) -> str:
-    """Make one block of each hand. From these, estimate grasps, CPU hours and megabytes of all blocks, as text.
+    """Make one block of each hand. Return as text the estimated grasps, CPU hours and megabytes of all blocks.
 
     Raises GraspdError: a block exceeds the limits, or its process died, or its object cannot be used.
     """

@@ -1,4 +1,4 @@
-"""Blocks, the parts of a data set. Each block has its own file, named by the key: a hash of the block's inputs."""
+"""Blocks of a data set. A block is one call of the planner and its file, named by a hash of the inputs: the key."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ _DIGITS = 32
 
 
 def content_key(inputs: Any) -> str:
-    """Return the key of values that JSON can hold: the first 128 bits of their SHA-256 in hexadecimal."""
+    """Return the key of JSON-ready values: the first 128 bits of the values' SHA-256, in hexadecimal."""
     return hashlib.sha256(json.dumps(inputs, sort_keys=True).encode()).hexdigest()[:_DIGITS]
 
 
@@ -121,7 +121,7 @@ class DatasetRequest:
         per_object: number of verified grasps wanted for every object, scale and hand.
         block: number of verified grasps wanted in one block.
         preset: name or file of the preset.
-        seed: random seed of the random scales, and of the first block of each object and hand. Later blocks add 1 each.
+        seed: random seed of the random scales, and of the first block of each object and hand. Each later block adds 1.
         scales: factors on every object's coordinates.
         random_scales: number of further random factors per object, then the least and the greatest factor. Their
             logarithms are drawn uniformly.

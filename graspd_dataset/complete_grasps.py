@@ -1,4 +1,4 @@
-"""Complete imported grasps: compute the postures that their files lack, as for planned grasps."""
+"""Complete imported grasps: compute the postures that a file lacks, in the same way as for planned grasps."""
 
 from __future__ import annotations
 
@@ -51,8 +51,8 @@ def complete_grasps(
 ) -> CompletedGrasps:
     """Close each hand whose file has no joint values. Compute each missing pregrasp and squeeze.
 
-    Postures from a file are kept exactly. A squeeze has joint targets, so it may exceed the joint limits. A grasp is
-    refused if its file marks it as failed, or if a joint is beyond its limits. A grasp whose file has no squeeze is
+    Postures from a file are kept exactly. Joint values of a squeeze are targets, so they may exceed the limits. A grasp
+    is refused if its file marks it as failed, or if a joint is beyond its limits. A grasp whose file has no squeeze is
     also refused if fewer than two links touch the object.
     """
     faults = [grasp.refused or beyond_limits(grasp, hand) for grasp in imported]
@@ -78,7 +78,7 @@ def complete_grasps(
 
 
 def frame_doubt(scene: Scene, hand: HandModel, postures: Sequence[Posture]) -> str:
-    """Warn if 80 % of the hands are over 5 mm inside the object, or 80 % over 5 mm away. "" if fewer than 5 hands."""
+    """Return a warning if 80 % of at least 5 hands are over 5 mm inside the object, or 80 % over 5 mm off. Else ""."""
     if len(postures) < _FEWEST:
         return ""
     points = [
@@ -112,7 +112,7 @@ def _poses(problem: Problem, postures: Sequence[Posture]) -> Poses:
 
 
 def _merged(theirs: ImportedGrasp, ours: Grasp) -> Grasp:
-    """Return the file's grasp `theirs`. Take what it lacks from `ours`, which graspd computed."""
+    """Return the grasp `theirs` of a file. Take the postures that the file lacks from `ours`, which graspd computed."""
     grasp = theirs.grasp
     if not theirs.closed:
         grasp = replace(grasp, joint_positions=ours.grasp.joint_positions)

@@ -47,7 +47,7 @@ def add_command(commands: Any) -> None:
     make.add_argument("--seed", type=int, default=0)
     make.add_argument("--scales", nargs="+", type=float, default=(1.0,), metavar="FACTOR", help="default 1")
     make.add_argument("--random-scales", nargs=3, type=float, default=(0, 1, 1), metavar=("N", "LOW", "HIGH"))
-    make.add_argument("--mass", type=float, default=None, metavar="KG", help="default: the heavy end for the volume")
+    make.add_argument("--mass", type=float, default=None, metavar="KG", help="default: a heavy object's mass")
     make.add_argument("--friction", type=float, default=0.6, metavar="MU", help="default 0.6")
     make.add_argument("--verify", default="standard", metavar="TRIALS")
     make.add_argument("--measure", default="verified", metavar="WHICH", help="verified (default), all, or none")
@@ -92,7 +92,7 @@ def _make(options: argparse.Namespace) -> int:
     limits = Limits(options.patience, options.memory)
     blocks = blocks_of(request)
     missing = missing_blocks(blocks, store, retry_failed=options.retry_failed)
-    there = f"{len(blocks) - len(missing)} of {len(blocks)} blocks exist or failed before"
+    there = f"{len(blocks) - len(missing)} of {len(blocks)} blocks are skipped: each has a file or a failure on record"
     print_note(there)
     if options.dry_run:
         from graspd_dataset.block_rows import dry_run
@@ -122,7 +122,7 @@ def _run_missing(
     record: RunRecord,
     interrupt: Interrupt,
 ) -> tuple[Lines, RunRecord]:
-    """Run the missing blocks. Write the run record every 30 s. Return the progress display and the updated record."""
+    """Make the missing blocks. Write the run record every 30 s. Return the progress display and the updated record."""
     from graspd_dataset.dataset_store import keys_below
     from graspd_dataset.ray_engine import RayEngine, ray_running
     from graspd_dataset.run_dataset import remove_failure, run_blocks, write_run
@@ -141,7 +141,7 @@ def _run_missing(
 
 
 def _finish(store: DatasetStore) -> None:
-    """Write the data card, the README.md of the data set, and print its counts. Do nothing if it has no blocks."""
+    """Write the data card (README.md of the data set), and print the counts. If there are no blocks, do nothing."""
     from graspd_dataset.inspect_dataset import stats_of, stats_table
     from graspd_dataset.run_dataset import data_card
 

@@ -30,7 +30,7 @@ _METADATA = b"graspd"
 
 
 def parquet_bytes(table: Any, metadata: Mapping[str, Any]) -> bytes:
-    """Return the content of a Parquet file with a pyarrow table. `metadata` has values that JSON can hold."""
+    """Convert a pyarrow table to the bytes of a Parquet file. The file also stores `metadata`, as JSON."""
     import pyarrow.parquet as pq
 
     text = json.dumps({"format": FORMAT, "version": SCHEMA_VERSION, **metadata}, sort_keys=True)
@@ -176,7 +176,7 @@ class DatasetStore:
             raise StorageError(f"{self.label}: {path}: {error.strerror or error}") from None
 
     def _tried(self, path: str, work: Callable[[], T]) -> T:
-        """Call `work`, a request to the server. Repeat it after growing pauses if it fails."""
+        """Call `work`, a request to the server. Repeat a failed request after growing pauses."""
         for number in range(_TRIES):
             try:
                 return work()

@@ -1,8 +1,8 @@
 """Export of a data set to isaac_grasp 1.0 (Isaac Sim, Isaac ROS), GraspGen's training JSON, and DexGraspBench.
 
 Poses are those of the hand's base link in the object frame, the frame of the exported mesh. Lengths are in metres.
-DexGraspBench reads one pickled dictionary per grasp and one folder per object. Its Allegro hand is the right hand of
-MuJoCo Menagerie, with our joint order. In the hand's root frame, our palm has the orientation (0, 1, 0, 1)/√2, wxyz.
+DexGraspBench reads one pickled dictionary per grasp and one folder per object. Its Allegro is MuJoCo Menagerie's right
+hand, with graspd's joint order. graspd's palm has the orientation (0, 1, 0, 1)/√2, wxyz, in the hand's root frame.
 """
 
 from __future__ import annotations
@@ -128,8 +128,8 @@ def write_dexgraspbench(
 ) -> None:
     """Write the grasps of one hand on one object. Also write the object: mesh, convex parts, mass and centre of mass.
 
-    The mass is the least in the trials of these grasps, because blocks may have tried one object at different masses.
-    Grasp files name the object folder by the path `objects`. DexGraspBench looks for this path in its code folder.
+    The written mass is the least in the trials of the grasps, because blocks may differ in the object's mass. Grasp
+    files name the object folder by the path `objects`. DexGraspBench looks for this path in its code folder.
     """
     name = rows[0]["object_sha256"]
     for number, row in enumerate(rows):

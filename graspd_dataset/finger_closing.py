@@ -1,8 +1,8 @@
 """Close a hand until contact: each finger closes until one of its links touches the object or another link.
 
-This is a solver for `optimize/loop.py`, without gradients. The base does not move. Each joint moves at its own rate
-towards the limit beyond its closed value. A step that would push a link into something is refused and halved. Below
-1/32 of a step, the joints that move that link stop. The finger's other joints continue.
+`Closing` is a solver for `optimize/loop.py`, without gradients. The base does not move. Each joint moves at its own
+rate towards the limit beyond its closed value. A step that would push a link into something is refused and halved.
+Below 1/32 of a step, the joints that move the blocked link stop. The finger's other joints continue.
 """
 
 from __future__ import annotations
@@ -38,10 +38,10 @@ class ClosingState:
 
     Attributes:
         poses: current poses of the hands, in the object frame.
-        floor: smallest allowed gap of each link, to the object and to other links [m]. A link that already overlaps
-            before closing may keep this overlap, so its value is negative.
+        floor: smallest allowed gap of each link, to the object and to other links [m]. Negative for a link that
+            overlaps before closing, because it may keep the overlap.
         stride: fraction of a full step that each joint tries next, equal for the joints of a finger.
-        blamed: links that would have gone below `floor` in the finger's last refused step.
+        blamed: links whose gap would have been below `floor` in the last refused step of their finger.
         stopped: joints that do not move any more, or never moved.
     """
 

@@ -1,4 +1,4 @@
-"""Read grasp files of other projects. Joint values get the hand's order, and poses become those of its base link.
+"""Read grasp files of other projects. Convert joint values to the hand's order, and poses to the hand's base link.
 
 DexGraspBench (.npy): one pickled dictionary per grasp. It holds three postures, each as position, quaternion wxyz and
 unnamed joint values. `runtime/inert_pickle` reads the pickle without running code from it.
@@ -48,7 +48,7 @@ class ImportedGrasp:
         grasp: the touching posture. If the format has no joint values, this is the open hand, still to be closed.
         pregrasp, squeeze: None if the format has no such posture.
         closed: whether the file gives the joint values of `grasp`.
-        squeeze_moved: distance between the base at the squeeze and at the grasp in the file [m]. graspd ignores it.
+        squeeze_moved: distance by which the file moves the base from grasp to squeeze [m]. graspd ignores this motion.
         refused: reason to refuse the grasp if its file marks it as failed. Otherwise empty.
     """
 
@@ -97,7 +97,7 @@ def quaternion_of(value: Any, where: str) -> Float[np.ndarray, "4"]:
 
 
 def joints_by_name(values: Any, hand: HandModel, where: str) -> Float[np.ndarray, "joints"]:
-    """Return the values of the actuated joints [rad] or [m] from a mapping. It may also contain coupled joints.
+    """Return the values of the actuated joints [rad] or [m] from a mapping, which may also contain coupled joints.
 
     Raises FormatError: a name is unknown, an actuated joint is missing, or a coupled joint's value does not fit.
     """
@@ -177,7 +177,7 @@ def read_dexgraspbench(
 
 
 def npy_dictionary(path: Path, content: bytes) -> dict[Any, Any]:
-    """Return the dictionary of an npy file. Its arrays are `Inert` objects, because no code of the pickle is run.
+    """Return the dictionary of an npy file. Arrays in it are `Inert` objects, because no code of the pickle is run.
 
     Raises FormatError: the file is not an npy file with one pickled dictionary.
     """
@@ -202,7 +202,7 @@ def npy_dictionary(path: Path, content: bytes) -> dict[Any, Any]:
 
 
 def plain_entry(values: dict[Any, Any], key: str, path: Path) -> Any:
-    """Return the text, number or array of numbers of a key. Raises FormatError: the key is missing, or another type."""
+    """Return the text, number or array of numbers of a key. Raises FormatError: no such key, or another type."""
     value = entry(values, key, f"{path}")
     if not isinstance(value, Inert):
         return value
@@ -233,7 +233,7 @@ def _posture(
     order: Sequence[str],
     path: Path,
 ) -> Posture:
-    """Return the hand's posture at `stage`, for example the pregrasp. Its pose is the base link's in the object frame.
+    """Return the hand's posture at `stage`, for example the pregrasp. The pose is that of the base link, object frame.
 
     `target` is the object's pose in the file's world frame: position, quaternion wxyz, no joint values.
     """
@@ -256,7 +256,7 @@ _ROTATION = 1e-3
 
 
 def read_isaac(path: Path, text: bytes, hand: HandModel, mesh: str | None) -> list[ImportedGrasp]:
-    """Read the grasps of one file. `mesh`, if given, replaces the file's mesh. Raises FormatError: malformed file."""
+    """Read the grasps of an isaac_grasp file. `mesh` replaces the mesh in it. Raises FormatError: malformed file."""
     try:
         _, document = parse_yaml(text.decode())
     except ValueError as error:
@@ -302,7 +302,7 @@ def _base_of(
 
 
 def read_graspgen(path: Path, text: bytes, hand: HandModel, mesh: str | None) -> list[ImportedGrasp]:
-    """Read the grasps of one file. `mesh`, if given, replaces the file's mesh. Raises FormatError: malformed file."""
+    """Read the grasps of a GraspGen file. `mesh` replaces the mesh in the file. Raises FormatError: malformed file."""
     try:
         document = json.loads(text)
     except (ValueError, RecursionError) as error:

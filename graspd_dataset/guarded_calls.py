@@ -134,7 +134,7 @@ def prepare_object(job: Job, content: bytes | None, store: DatasetStore, limits:
 
 
 def run_block(job: Job, hand: bytes, shared: bytes, store: DatasetStore, limits: Limits) -> Report:
-    """Make a block and write its file, or after a failure write a record of it. Return the report."""
+    """Make a block and write its file, or write a record of the failure. Return the report."""
     try:
         made = call_guarded(limits, block_of, job.pickled, hand, shared)
     except Exception as error:
@@ -179,7 +179,7 @@ def failed_report(store: DatasetStore, job: Job, error: BaseException) -> Report
 
 
 class _Child:
-    """The child process that does the work of this worker. The first `call` starts it."""
+    """The child process that does the work of this worker. The first `call` starts the child."""
 
     def __init__(self) -> None:
         self._process: WorkerProcess | None = None

@@ -34,7 +34,7 @@ def add_command(commands: Any) -> None:
     parser.add_argument("--object", default=None, metavar="MESH", help="replaces the mesh that the files name")
     parser.add_argument("--joint-order", default="", metavar="A,B,…", help="joint names of npy files, in their order")
     parser.add_argument("--preset", default="balanced", help="settings for pregrasps and squeezes that files lack")
-    parser.add_argument("--mass", type=float, default=None, metavar="KG", help="default: the heavy end for the volume")
+    parser.add_argument("--mass", type=float, default=None, metavar="KG", help="default: a heavy object's mass")
     parser.add_argument("--friction", type=float, default=0.6, metavar="MU", help="default 0.6")
     parser.add_argument("--verify", choices=VERIFICATIONS, default="none", help="trials of the grasps (default none)")
     parser.add_argument("--out", type=Path, required=True, metavar="DIR", help="folder, or .json file for one object")
@@ -101,7 +101,7 @@ def _result(scene: Scene, hand: HandModel, imported: Sequence[ImportedGrasp], co
         grasps,
         len(imported),
         method="imported",
-        message=f"{len(grasps)} of {len(imported)} imported grasps are kept, {good} are usable",
+        message=f"{len(grasps)} of {len(imported)} imported grasps accepted; {good} verified, or untried with contacts",
         warnings=tuple(warnings),
         refused=completed.refused,
     )

@@ -30,13 +30,13 @@ class HandCount:
 
 @dataclass
 class DatasetStats:
-    """Counts of a data set, the code that made it, and its failures.
+    """Counts and failures of a data set, and the code versions that made it.
 
     Attributes:
         hands: counts of each hand, by its name.
         reasons: number of failed grasps for each text of `kind_of_reason`.
         codes: versions of the code that made the rows.
-        failed: records of failed blocks and objects. Without those that succeeded later.
+        failed: records of failed blocks and objects, except those that succeeded later.
     """
 
     hands: dict[str, HandCount] = field(default_factory=dict)
@@ -162,7 +162,7 @@ def faults_of_dataset(store: DatasetStore) -> Iterator[str]:
 
 
 def recorded_hashes(store: DatasetStore) -> dict[str, set[str]]:
-    """Return the SHA-256 hashes of each file in the run records, by path. Raises FormatError: a record is damaged."""
+    """Return by path the SHA-256 hashes that run records hold of each file. Raises FormatError: a record is damaged."""
     known: dict[str, set[str]] = {}
     for record in (read_record(store, path) for path in store.list("runs")):
         for path, digest in record.get("files", {}).items():
@@ -176,7 +176,7 @@ def _changed(path: str, content: bytes, known: Mapping[str, set[str]]) -> Iterat
 
 
 def row_digests(table: Any) -> list[bytes]:
-    """Return for each row the SHA-256 of object, hand and grasp posture. It is equal for equal grasps in any block."""
+    """Return the SHA-256 of object, hand and grasp posture of each row. Equal grasps have equal hashes in any block."""
     names = ("object_sha256", "hand_sha256", "grasp_position", "grasp_quaternion_wxyz", "grasp_joint_positions")
     rows = zip(*(table[name].to_pylist() for name in names), strict=True)
     return [hashlib.sha256(repr(row).encode()).digest() for row in rows]

@@ -36,7 +36,7 @@ _FOLDER = "graspd-ray-"
 
 @contextmanager
 def ray_running(address: str | None, workers: int | None, folder: Path | None = None) -> Iterator[Any]:
-    """Connect to the cluster at `address`. If None, start a private Ray with `workers` CPUs. Yield the module `ray`.
+    """Connect to the cluster at `address`. None: start a private Ray with `workers` CPUs. Yield the module `ray`.
 
     A private Ray ends with this context. It has no dashboard and reports no usage. It accepts only connections with a
     random token. Its files are in `folder`, or in a temporary folder if `folder` is None.
@@ -77,7 +77,7 @@ def ray_running(address: str | None, workers: int | None, folder: Path | None = 
 
 @contextmanager
 def _own_handler() -> Iterator[None]:
-    """Keep this process's handler of SIGTERM. Ray's own handler ends the process before it writes the run record."""
+    """Keep this process's handler of SIGTERM. Ray's handler ends the process without a run record."""
     handler = signal.getsignal(signal.SIGTERM)
     try:
         yield
@@ -153,7 +153,7 @@ class RayEngine:
         return max(1, int(self._ray.cluster_resources().get("CPU", 1)))
 
     def submit_object(self, source: DatasetObject, config: PlanConfig) -> tuple[Any, Any]:
-        """Submit an object to prepare. Return two Ray handles: of its report, and of its `ReadyObject.shared`."""
+        """Submit an object to prepare. Return two Ray handles: of the report, and of `ReadyObject.shared`."""
         shape = source.source.startswith("shape:")
         content = Path(source.source).read_bytes() if self._ship and not shape else None
         return tuple(self._prepare.remote(object_job(source, config), content, self._store, self._limits))
@@ -169,7 +169,7 @@ class RayEngine:
         return self._ray.wait(list(handles), num_returns=1, timeout=seconds)[0]
 
     def report(self, handle: Any, key: str) -> Report:
-        """Return the report of a handle. Its kind of failure is `lost` if Ray lost the worker at every attempt.
+        """Return the report of a handle. If Ray lost the worker at every attempt, the failure is `lost`.
 
         Raises StorageError: the file could not be written.
         """

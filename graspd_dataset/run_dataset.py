@@ -59,7 +59,7 @@ class RunRecord:
 
 
 def command_of(request: DatasetRequest, out: str) -> str:
-    """Return the command line of a request, without options that have their default value."""
+    """Return the command line of a request, without options that have the default value."""
     usual, words = DatasetRequest(request.objects), ["graspd", "dataset", *request.objects]
     for item in fields(request):
         value = getattr(request, item.name)
@@ -71,7 +71,7 @@ def command_of(request: DatasetRequest, out: str) -> str:
 
 
 def _word(value: Any) -> str:
-    """Return a value as a word of a command line. Numbers are short, but give the same value again."""
+    """Return a value as a word of a command line. Numbers are shortened without loss."""
     short = f"{value:g}" if isinstance(value, float) else str(value)
     return short if not isinstance(value, float) or float(short) == value else repr(value)
 
@@ -104,7 +104,7 @@ def run_records(store: DatasetStore) -> list[RunRecord]:
 
 
 def with_unrecorded(store: DatasetStore, record: RunRecord) -> RunRecord:
-    """Return the record plus hashes of files that no record has. Killed sessions and earlier code leave such files."""
+    """Return the record plus hashes of unrecorded files. Killed sessions and earlier code leave such files."""
     known = recorded_hashes(store).keys() | record.files.keys()
     paths = [path for folder in ("grasps", "objects") for path in store.list(folder) if path not in known]
     return replace(record, files=record.files | {path: file_hash(store.read(path)) for path in paths})
@@ -174,14 +174,14 @@ _AHEAD = 2
 
 
 def missing_blocks(blocks: Sequence[Block], store: DatasetStore, *, retry_failed: bool = False) -> list[Block]:
-    """Return the blocks without a file. Skip those that failed, or whose object failed, unless `retry_failed`."""
+    """Return the blocks without a file. Skip failed blocks and blocks of failed objects, unless `retry_failed`."""
     there = keys_below(store, "grasps")
     failed = set() if retry_failed else keys_below(store, "failed")
     return [b for b in blocks if b.key not in there and not failed & {b.key, b.object.key}]
 
 
 def remove_failure(store: DatasetStore, report: Report, failed: Collection[str]) -> None:
-    """Remove the record of an earlier failure if the object or block has succeeded. `failed` are the recorded keys."""
+    """Remove the record of an earlier failure if the object or block has succeeded. `failed`: recorded keys."""
     if report.key in failed and not report.failed:
         store.remove(f"failed/{report.key}.json")
 
@@ -189,10 +189,10 @@ def remove_failure(store: DatasetStore, report: Report, failed: Collection[str])
 def run_blocks(
     blocks: Sequence[Block], engine: RayEngine, stop: Callable[[], bool] = lambda: False
 ) -> Iterator[tuple[Block | DatasetObject, Report]]:
-    """Prepare objects and make their blocks. Yield each object and each block, with its report, when its task ends.
+    """Prepare objects and make their blocks. Yield each object or block with its report when the task ends.
 
     The blocks of a failed object are skipped. The run ends when `stop` returns True.
-    Raises StorageError: a file could not be written. Files written before remain.
+    Raises StorageError: a file could not be written. Files that were written earlier remain.
     """
     waiting = deque(by_object(blocks))
     preparing: dict[Any, tuple[DatasetObject, list[Block], Any]] = {}

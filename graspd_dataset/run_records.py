@@ -107,7 +107,7 @@ def object_name(source: Any) -> str:
 
 
 def finite(value: Any) -> Any:
-    """Replace every NaN or infinity in nested values by None, because JSON cannot hold these."""
+    """Replace every NaN or infinity in nested values by None, because JSON has neither."""
     if isinstance(value, dict):
         return {str(key): finite(item) for key, item in value.items()}
     if isinstance(value, list | tuple):

@@ -1,4 +1,4 @@
-"""HTML page of a benchmark: charts of speed against accuracy. A click on a point lists its runs and their grasps.
+"""HTML page of a benchmark: charts of speed against accuracy. A click on a point lists the preset's runs and grasps.
 
 The page is one file that needs no network. A benchmark stores the metrics of grasps, but no postures. To show the
 grasps of a run, the server plans again with the run's settings and seed. The same code finds the same grasps.
@@ -51,7 +51,7 @@ _FIGURES = (
 
 
 def bench_page(folder: Path, *, served: bool = False) -> tuple[str, dict[str, Record]]:
-    """Return the HTML page of a benchmark's folder, and the records of its runs for raw candidates, by key.
+    """Return the HTML page of a benchmark's folder, and by key the records of runs that plan raw grasps.
 
     If `served`, the page has buttons that ask the server to show the grasps of a run.
     Raises FormatError: the folder has no readable results, or no raw grasps of a preset.
@@ -146,7 +146,7 @@ def serve_page(page: str, host: str, port: int, open_run: Callable[[str], int | 
     Args:
         page: the HTML text.
         host, port: the address to listen on.
-        open_run: function that shows the grasps of the run with a key. It returns the viewer's port, None if unknown.
+        open_run: shows the grasps of the run with a given key. Returns the viewer's port, None if the key is unknown.
 
     Raises:
         ConfigError: the address cannot be listened on.

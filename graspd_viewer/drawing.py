@@ -1,6 +1,6 @@
 """Make the meshes that the browser (`scene_nodes`) and the pictures of the docs (`benchmarks/pictures.py`) show.
 
-This module also computes the disturbance that a grasp resists least, and the hand's postures along its path.
+This module also computes the disturbance that a grasp resists least, and the hand's postures along a grasp's path.
 """
 
 from __future__ import annotations
@@ -57,7 +57,7 @@ def hand_parts(hand: HandModel) -> dict[int, Part]:
 
 
 def scene_parts(scene: Scene) -> list[Part]:
-    """Return meshes of object, support and obstacles. An object from clouds has two: seen and guessed surface."""
+    """Return meshes of object, support and obstacles. An object from clouds has two meshes: seen, guessed."""
     mesh, parts = scene.object.mesh, []
     if scene.confidence is None:
         parts.append(Part("object/known", mesh, OBJECT))
@@ -97,7 +97,7 @@ def force_parts(positions: Float[np.ndarray, "n 3"], forces: Float[np.ndarray, "
 
 
 def weakest_parts(push: Float[np.ndarray, "6"], target: ObjectModel) -> list[Part]:
-    """Return arrows for force and torque of the unit disturbance `push`. A norm of at most 0.05 gets no arrow."""
+    """Return arrows for force and torque of the unit disturbance `push`. A part with a norm up to 0.05 has no arrow."""
     center, parts = target.center_of_mass, []
     for name, part, colour in (("weakest/force", push[:3], WEAKEST), ("weakest/turn", push[3:], TURN)):
         share = float(np.linalg.norm(part))
@@ -169,7 +169,7 @@ def _square(support: Plane, mesh: TriangleMesh) -> TriangleMesh:
 def weakest_push(context: MetricsContext, grasp: Grasp) -> Float[np.ndarray, "6"] | None:
     """Return the unit disturbance that the contacts resist least: a force, and a torque over the object's radius.
 
-    None without force closure. Then the contacts do not resist some disturbances at all.
+    Return None without force closure. Then the contacts do not resist some disturbances at all.
     """
     return prepare_grasp(context, grasp.grasp).wrench_hull.weakest_push
 

@@ -1,4 +1,4 @@
-"""The tab Grasps: the list of grasps, a slider for the hand's path, what is drawn, and the trial of a grasp."""
+"""The tab Grasps: the list of grasps, a slider for the hand's path, choices of what is drawn, and a grasp's trial."""
 
 from __future__ import annotations
 
@@ -101,11 +101,11 @@ class GraspTab:
         self._draw_slice()
 
     def step(self, by: int) -> None:
-        """Select the grasp `by` places further in the list. Negative values go back. After the end comes the start."""
+        """Select the grasp `by` places further in the list. Negative values go back. The start follows the end."""
         self._jobs.submit("choose", lambda: self._choose_place(by))
 
     def draw_pose(self, at: float | None = None) -> None:
-        """Pose the hand at `at` on its path (`posture_at`), by default at the slider. Put the object back."""
+        """Draw the hand at `at` on its path (`posture_at`), by default at the slider's value. Put the object back."""
         self._at = float(self._stage.value) if at is None else at
         grasp = self._grasp()
         if self.trial.stop():

@@ -25,7 +25,7 @@ class LiveView:
     Args:
         jobs: queue of the drawing thread.
         nodes: the page's scene nodes, in which the hands are drawn.
-        show: function that shows a line of text, and the done fraction of the stage (0 to 1).
+        show: function that shows a line of text, and how much of the stage is done (0 to 1).
     """
 
     def __init__(self, jobs: LatestJobs, nodes: SceneNodes, show: Callable[[str, float], None]) -> None:

@@ -202,19 +202,19 @@ class PlanTab:
         self.begin(lambda _: self._plan_and_show(self._request()))
 
     def begin(self, work: Callable[[StopHook], None]) -> None:
-        """Start a thread that calls `work`. Its argument tells whether to stop. Do nothing if a run is in progress."""
+        """Start a thread that calls `work`. Its argument tells if `work` must stop. Do nothing during a run."""
         if self._busy.acquire(blocking=False):
             self._start(work)
 
     def replace(self, work: Callable[[StopHook], None]) -> None:
-        """Stop the run in progress. When it has ended, start a thread that calls `work`. The newest `work` counts."""
+        """Stop the run in progress. When it has ended, start a thread that calls `work`. Only the newest waits."""
         with self._waiting:
             self._next = work
         self._stop.set()
         self._start_next()
 
     def _start_next(self) -> None:
-        """Start the work that waits, if any. If a run is in progress, it calls this method at its end."""
+        """Start the work that waits, if any. A run in progress calls this method at its end."""
         while self._next is not None and self._busy.acquire(blocking=False):
             with self._waiting:
                 work, self._next = self._next, None
@@ -234,7 +234,7 @@ class PlanTab:
         self._thread.start()
 
     def close(self) -> None:
-        """Stop the run in progress, if any. Wait at most 10 s for its end. Drop the work that waits for its end."""
+        """Stop the run in progress, if any. Wait at most 10 s for its end. Drop the waiting work."""
         with self._waiting:
             self._next = None
         self._stop.set()

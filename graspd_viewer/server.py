@@ -1,8 +1,8 @@
 """A viser server with limits, and the drawing thread.
 
 By default viser listens on every network interface, lets any web page connect and accepts files of any size. It also
-opens a public tunnel if a visitor asks. This server does none of these. The drawing thread runs only the newest job of
-each kind. So a moved slider does not leave a queue of drawings.
+opens a public tunnel if a visitor asks. graspd's server does not. The drawing thread runs only the newest job of each
+kind. So a moved slider does not leave a queue of drawings.
 """
 
 from __future__ import annotations
@@ -160,7 +160,7 @@ def _refuse_tunnels(server: Any) -> None:
 
 
 def _limit_uploads(server: Any) -> None:
-    """Refuse files over 64 MB, and a visitor's third upload at a time. End uploads that exceed their stated size."""
+    """Refuse files over 64 MB, and a visitor's third simultaneous upload. End uploads that exceed the stated size."""
     from viser import _messages
 
     gui = server.gui
@@ -173,8 +173,8 @@ def _limit_uploads(server: Any) -> None:
             return
         visitor = server.get_clients().get(client)
         if visitor is not None:
-            limit = f"at most {LARGEST_UPLOAD // 2**20} MB, {_UPLOADS_AT_ONCE} at a time"
-            visitor.add_notification("Refused", f"{message.filename[:80]}: files of {limit}", color="red")
+            limit = f"the limit is {LARGEST_UPLOAD // 2**20} MB, and {_UPLOADS_AT_ONCE} files at a time"
+            visitor.add_notification("Refused", f"{message.filename[:80]}: {limit}", color="red")
 
     def part(client: int, message: Any) -> None:
         state = transfers.get(message.transfer_uuid)

@@ -1,4 +1,4 @@
-"""What the viewer shows, a session: grasps, their hand, and the object if it can be loaded."""
+"""Sessions. A session is what the viewer shows: grasps, their hand, and the object if it can be loaded."""
 
 from __future__ import annotations
 
@@ -78,7 +78,7 @@ def make_session(
     seen: Float[np.ndarray, "points 3"],
     notes: tuple[str, ...],
 ) -> Session:
-    """Make a session. Move a distant object to the origin, as a browser's float32 is too coarse far from it."""
+    """Make a session. Move a distant object to the origin, as a browser's float32 is coarse for large coordinates."""
     scene, far = planning_scene(scene, config.resolution)
     return Session(title, hand, tuple(moved_grasp(g, -far) for g in grasps), scene, seen - far, notes, far)
 
@@ -108,7 +108,7 @@ def _hand_of(document: dict[str, Any], path: Path, wanted: str | None) -> HandMo
 def _object_of(
     document: dict[str, Any], path: Path, wanted: str | None, config: PlanConfig
 ) -> tuple[Scene | None, Float[np.ndarray, "points 3"], tuple[str, ...]]:
-    """Return the scene of the file's or the wanted object, its camera points [m], and notes for visitors."""
+    """Return the scene of the object `wanted` (None: the file's), its camera points [m], and notes for visitors."""
     told = document.get("object")
     told = told if isinstance(told, dict) else {}
     source = wanted or _beside(str(told.get("source")), path)

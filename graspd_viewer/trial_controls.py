@@ -1,4 +1,4 @@
-"""Record a grasp's trial, and play it up to its end or failure.
+"""Record a grasp's trial, and play the recording up to the trial's end or failure.
 
 A recording contains the poses of hand and object in MuJoCo, and the contact forces. Recording changes neither the
 trial's steps nor its result.
@@ -114,7 +114,7 @@ class _Recorder:
 
 
 def _contact_forces(world: World, data: Any) -> tuple[Float[np.ndarray, "n 3"], Float[np.ndarray, "n 3"]]:
-    """Return where the hand touches the object [m], and its force on the object at each point [N], world frame."""
+    """Return the points where the hand touches the object [m], and the hand's force at each point [N], world frame."""
     import mujoco
 
     places, forces, wrench = [], [], np.zeros(6)
@@ -174,7 +174,7 @@ class TrialControls:
                 self._jobs.submit("frame", lambda: self._draw(int(self._time.value)))
 
     def show(self, session: Session, grasp: Grasp | None) -> None:
-        """Set the grasp whose trial can be played. Remove the recording. Select the trial that it failed, if any."""
+        """Set the grasp whose trial can be played. Remove the recording. Select the failed trial, if any."""
         if session is not self._session:
             self._session, self._contexts = session, {}
         self._grasp = grasp

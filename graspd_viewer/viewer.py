@@ -114,7 +114,7 @@ class Viewer:
             time.sleep(0.05)
 
     def do(self, kind: str, work: Callable[[], None]) -> None:
-        """Submit a job to the drawing thread. It replaces a waiting job of the same kind."""
+        """Submit a job to the drawing thread. The job replaces a waiting job of the same kind."""
         self._jobs.submit(kind, work)
 
     def run(self, work: Callable[[StopHook], None]) -> None:

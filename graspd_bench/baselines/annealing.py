@@ -122,8 +122,8 @@ def posture_space(hand: HandModel, dimensions: int, seed: int) -> PostureSpace:
 def inner_contacts(hand: HandModel, per_link: int) -> Int[np.ndarray, "contacts"]:
     """Choose up to `per_link` contact candidates on the inside of each rigid group of links. Return their indices.
 
-    Fixed joints connect the links of a group. The inside faces along the palm's normal or a finger's closing motion.
-    First choose the candidate nearest to the middle of the inside, then repeatedly the one farthest from all chosen.
+    Fixed joints connect the links of a group. The inside is the side towards the palm's normal or a finger's closing
+    motion. First choose the candidate nearest to the inside's middle, then repeatedly the one farthest from all chosen.
     """
     chosen: list[int] = []
     facing = _facing(hand)
@@ -148,7 +148,7 @@ def inner_contacts(hand: HandModel, per_link: int) -> Int[np.ndarray, "contacts"
 
 
 def _facing(hand: HandModel) -> Float[np.ndarray, "candidates"]:
-    """Return the cosine of each candidate's normal and closing motion. On the palm, the palm's normal is the motion."""
+    """Return the cosine between each contact candidate's normal and its motion. On the palm, use the palm's normal."""
     links = hand.candidate_link
     early, late = (
         link_poses(hand, hand.open_posture + share * (hand.closed_posture - hand.open_posture)) for share in (0.4, 0.6)
@@ -291,7 +291,7 @@ class Annealing:
 
     @torch.no_grad()
     def pierced(self, problem: Problem, x: Float[Tensor, "batch variables"]) -> Bool[Tensor, "batch"]:
-        """Return for each state whether the hand overlaps the object. Test all contact candidates and sharp points."""
+        """Return for each state whether the hand overlaps the object. Test candidates and the object's sharp points."""
         if len(x) == 0:
             return torch.zeros(0, dtype=torch.bool, device=x.device)
         return link_gaps(problem, self.poses(x), self.sphere_links)[:, 0].amin(-1) < 0.0
@@ -351,8 +351,8 @@ def sampled_epsilon(
 ) -> Float[Tensor, "batch"]:
     """Return Ferrari and Canny's ε of each grasp, for contact forces that sum to one.
 
-    Take for each direction the support: the most that any single contact contributes along it. ε is the least support
-    of all directions, and zero without force closure. Few directions are tested, so the result is an upper bound.
+    For each direction, take the support: the most that any contact contributes. ε is the least support of all
+    directions, and zero without force closure. Few directions are tested, so the result is an upper bound.
     """
     batch, slots = contact_set.active.shape
     support = wrench_support(

@@ -2,7 +2,7 @@
 
 The open hand faces the object's centre of mass from a uniformly random direction, with a random roll. It moves along
 the palm's normal until first contact. Then the fingers close (`finger_closing`). There is no optimisation and no
-ranking. The method returns the first hands that touch with enough links and keep clear of other objects.
+ranking. The method returns the first hands that touch the object with enough links, and nothing else.
 """
 
 from __future__ import annotations

@@ -44,7 +44,7 @@ def load_hand_urdf(client: int, hand: HandModel, armature: float) -> tuple[int, 
     Args:
         client: id of the PyBullet client.
         hand: a hand without coupled joints.
-        armature: rotor inertia of every joint [kg·m²]. Bullet has none, so it is added to the moved link.
+        armature: rotor inertia of every joint [kg·m²]. Bullet has no rotors, so the moved link gets this inertia.
 
     Raises:
         SimulatorError: the hand has coupled joints.
@@ -80,7 +80,7 @@ def load_hand_urdf(client: int, hand: HandModel, armature: float) -> tuple[int, 
 
 
 def hand_urdf(hand: HandModel, armature: float) -> str:
-    """Return the hand's URDF with names link<i>, joint<i>, hull<i>.obj. Add `armature` [kg·m²] to moved links."""
+    """Return the hand's URDF with names link<i>, joint<i>, hull<i>.obj. Moved links get inertia `armature` [kg·m²]."""
     robot = ET.Element("robot", name=hand.name)
     for link in range(hand.num_links):
         element = ET.SubElement(robot, "link", name=f"link{link}")

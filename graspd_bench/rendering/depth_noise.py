@@ -2,8 +2,8 @@
 
 The random error of stereo depth is z² / (f B) times the error of disparity (Khoshelham and Elberink 2012). Intel's
 tuning guide for the D400 series gives 0.08 pixels for a D415. With f = 616 pixels and a baseline of B = 55 mm, this is
-0.0024 z² [m]. DEFAULT was compared with real D415 frames of a table: they err by 0.9 mm at 0.5 m, 1.3 mm at 0.7 m.
-These errors correlate by 0.96 between neighbours and by 0.6 over eight pixels, as stereo matching averages many pixels.
+0.0024 z² [m]. DEFAULT was compared with real D415 frames of a table. The real errors are 0.9 mm at 0.5 m and 1.3 mm at
+0.7 m. They correlate by 0.96 between neighbours and 0.6 over eight pixels, as stereo matching averages many pixels.
 """
 
 from __future__ import annotations
@@ -38,7 +38,7 @@ class DepthNoise:
         flying: share of edge pixels with a depth between foreground and background.
         edge_loss: share of edge pixels without depth.
         loss: share of all pixels that lose depth. These pixels form patches.
-        grazing: angle between surface and line of sight below which pixels may lose depth [rad]. At angle 0, all do.
+        grazing: angle between surface and line of sight below which pixels may lose depth [rad]. At 0, all do so.
         baseline: distance between the two lenses of a stereo camera [m]. A point that one lens cannot see has no depth.
         step: depth is rounded to multiples of this unit [m].
         disparity_step: disparity (focal length x baseline / depth) is rounded to multiples of this unit [pixels].
@@ -142,7 +142,7 @@ CAMERAS = {
 def add_noise(depth: Depth, camera: PinholeCamera, noise: DepthNoise, seed: int) -> Depth:
     """Add camera noise to a true depth image [m]. The result is 0 at pixels without depth.
 
-    Flying pixels are made before the depth error is added, and holes last. The same seed gives the same image.
+    The order is flying pixels, depth error, holes. The same seed gives the same image.
     """
     rng = np.random.default_rng(seed)
     true = np.where(np.isfinite(depth) & (depth > 0), depth, 0.0)
@@ -226,7 +226,7 @@ def _field(shape: tuple[int, ...], blur: float, white: float, rng: np.random.Gen
 
 @lru_cache(maxsize=16)
 def _blurred_scale(shape: tuple[int, ...], blur: float) -> float:
-    """Return the standard deviation of blurred white noise. It is equal at all pixels, as the blur wraps around."""
+    """Return the standard deviation of blurred white noise. The blur wraps around, so all pixels are equal."""
     from scipy.ndimage import gaussian_filter
 
     impulse = np.zeros(shape)

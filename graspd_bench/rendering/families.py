@@ -2,7 +2,7 @@
 
 The mesh of an object is the zero level set of a signed distance grid, so it is one watertight body. The body consists
 of round cones, boxes and bodies of revolution, with smooth blends. The density is drawn from a typical range for such
-objects, full or hollow. The same family and seed give the same object.
+objects, full or hollow. A family is a kind of object. The same family and seed give the same object.
 """
 
 from __future__ import annotations
@@ -55,7 +55,7 @@ def draw_object(family: str, seed: int) -> RandomObject:
 
 
 def _surface(field: Field, half: Float[np.ndarray, "3"]) -> TriangleMesh:
-    """Return the zero level set of a field as a mesh, within a box of half edges `half` [m] around the origin."""
+    """Return the zero level set of a field as a mesh, within a box around the origin. `half`: half edge lengths [m]."""
     import igl
 
     half = half + 0.004

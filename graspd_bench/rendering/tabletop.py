@@ -54,7 +54,7 @@ class TabletopScene:
 
     @property
     def meshes(self) -> tuple[TriangleMesh, ...]:
-        """Return all meshes: the object, its neighbours, the table. The labels of `depth_views` are their indices."""
+        """Return all meshes: the object, its neighbours, the table. The labels of `depth_views` index this list."""
         return (self.truth, *self.obstacles, self.table)
 
 
@@ -67,8 +67,8 @@ def tabletop(
     """Put an object on the table. Return the scene.
 
     Args:
-        shape: name of a built-in shape, or a mesh. Meshes and the shapes of `LYING` (they would topple) get the pose of
-            `lowest_pose`. Other shapes keep their own orientation.
+        shape: name of a built-in shape, or a mesh. A mesh gets the pose of `lowest_pose`. So do the shapes in `LYING`,
+            which would topple. Other shapes keep their own orientation.
         yaw: rotation about the vertical [rad].
         obstacles: shape and position x, y [m] of each neighbour.
 

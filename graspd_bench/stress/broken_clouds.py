@@ -41,7 +41,7 @@ _SIDE = ring_poses(1, elevation=0.9, azimuth=-1.57)
 
 
 def cloud_cases() -> tuple[Case, ...]:
-    """Return all cases of faulty clouds. Their scenes are made by `scene_from_views`."""
+    """Return all cases of faulty clouds. `scene_from_views` makes the scenes."""
     return (*_measured(), *_refused(), *_special())
 
 
@@ -218,7 +218,7 @@ def _misplaced() -> Views:
 
 
 def _shiny() -> Views:
-    """Return views with a hole of 15 mm radius in the middle of the visible object, as a reflection leaves."""
+    """Return views with a hole of 15 mm radius in the middle of the visible object, as a reflection causes."""
 
     def burn(view: PointCloud) -> PointCloud:
         above = view.points[:, 2] > 0.01

@@ -1,7 +1,7 @@
 """Runs of stress cases. A run records how the case ended, the time and memory it took, and the message to the user.
 
-Every verified grasp must hold in a second trial. That trial reads the grasps from a saved grasps.json, loads the object
-again, and builds a new world.
+Every verified grasp must hold in a second trial. That trial reads the grasps from a saved grasps.json, reloads the
+object and builds a new MuJoCo model.
 """
 
 from __future__ import annotations
@@ -38,7 +38,7 @@ class Case:
         about: the fault, in one line.
         scene: makes the input in a given folder and loads it as a user would. It may raise a GraspdError.
         expect: valid endings: "grasp", names of `Outcome` ("TOO_FEW"), or classes of errors ("MeshError").
-        whole: whether the input has a graspable object. Summaries give the share of these cases with a verified grasp.
+        whole: whether the input has a graspable object. Summaries give the share with a verified grasp.
         hand: name or path of the hand.
         deadline: time limit of planning [s].
         loading: time limit of loading [s].
@@ -94,7 +94,7 @@ class StressEnding:
 
 
 def faults(case: Case, ending: StressEnding) -> tuple[str, ...]:
-    """Return how an ending breaks the expectations and limits of its case, one line per fault. Empty if it does not."""
+    """Return how an ending breaks the expectations and limits of its case, one line per fault. Empty without faults."""
     wrong = []
     if ending.ending not in case.expect:
         wrong.append(f"ended in {ending.ending}, not in {' or '.join(case.expect)}: {ending.message}")
@@ -154,7 +154,7 @@ def _printed(result: GraspResult, folder: str) -> str:
 
 
 def _hold_again(case: Case, result: GraspResult, scene: Scene, hand: Any, folder: Path, preset: str) -> int:
-    """Save the result, read it back, and load the object again. Return how many verified grasps hold again."""
+    """Save the result, read it back, and reload the object. Return how many verified grasps pass a second trial."""
     from graspd_core.io.grasps_json import grasps_of, load_document, save_result
     from graspd_core.optimize.plan_config import load_preset
     from graspd_core.runtime import disk_cache as cache
@@ -174,7 +174,7 @@ def _hold_truly(result: GraspResult, scene: Scene, hand: Any, truth: TriangleMes
 
 
 def _held(grasps: Sequence[Grasp], target: ObjectModel, hand: Any) -> int:
-    """Return how many verified grasps pass the hold trial on an object, in a new world."""
+    """Return how many verified grasps pass the hold trial on an object, in a new MuJoCo model."""
     from graspd_core.verify.hold_trial import hold_trial, out_of_place
     from graspd_core.verify.world import PROTOCOLS, at_friction, build_world
 

@@ -49,7 +49,7 @@ def run_stress(run: StressRun) -> Record:
 
 
 def stress_patience(run: StressRun) -> float:
-    """Return the seconds until a case counts as hung. They allow two loadings, because the second trial loads again."""
+    """Return the seconds until a case counts as hung. Allow two loadings, as the second trial reloads the object."""
     case = CASES[run.name]
     return 2 * case.loading + case.deadline + _PATIENCE
 

@@ -1,7 +1,7 @@
 """Study `reach`: inverse kinematics of the arms, and planning with and without the `Reach` restriction.
 
 `Reach` refuses grasps that the arm cannot reach. Objects stand or lie on a table. The arm's base is 40 to 80 cm away,
-in a random direction with a random yaw. After a plan without `Reach`, the study counts the verified grasps in reach.
+in a random direction with a random yaw. After a plan without `Reach`, verified grasps in reach are counted.
 """
 
 from __future__ import annotations
@@ -129,7 +129,7 @@ def _run_request(case: ReachCase) -> Record:
 
 
 class _Found:
-    """Progress hook. With each verified grasp it records the CPU time so far: total, and of the restriction [s]."""
+    """Progress hook. At each verified grasp it records the CPU time so far [s]: in total, and of the restriction."""
 
     def __init__(self, seconds: Sequence[float]) -> None:
         self.found: list[tuple[float, float, Grasp]] = []
@@ -168,11 +168,11 @@ def summary(record: Record) -> str:
     """Return the share of reached poses, or the numbers of grasps in reach, in a few words."""
     if "own" in record:
         return f"{record['own']['reached']:.1%} of the poses reached"
-    return f"{record['filtered']['verified']} verified in reach, without the filter {record['plain']['reached']}"
+    return f"verified in reach: {record['filtered']['verified']} with `Reach`, {record['plain']['reached']} without"
 
 
 def reach_sections(records: Sequence[Record], chart: Path | None) -> Sections:
-    """Return a section with the table of inverse kinematics, and one with the table and refusals of the requests."""
+    """Return a section on inverse kinematics, and a section on the requests with the reasons of refusals."""
     alone, filtered = ([r for r in records if key in r] for key in ("own", "filtered"))
     return {
         "inverse-kinematics": [_alone_table(alone)] if alone else [],

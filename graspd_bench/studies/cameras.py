@@ -1,8 +1,8 @@
 """Study `cameras`: single views by four kinds of cameras, of objects at rest, alone or crowded.
 
 An object is of a family of irregular shapes (`rendering/families.py`), a built-in shape of a random size, or a scan.
-Grasps verified on the view are tried on the true object, at 0.1 kg and at the object's own mass. Nothing was fitted to
-these views. `HeldShares` (`config/planning_config.py`) come from other objects: `CHOSEN_ON` and five scans.
+Grasps verified on the view are tried on the true object, at 0.1 kg and at the object's own mass. No setting was fitted
+to these views. `HeldShares` (`config/planning_config.py`) come from other objects: `CHOSEN_ON` and five scans.
 """
 
 from __future__ import annotations

@@ -2,7 +2,7 @@
 
     graspd bench dexgraspbench FOLDER --python ENVIRONMENT/bin/python
 
-FOLDER is the user's checkout of DexGraspBench with its submodule. ENVIRONMENT is a Python environment with
+FOLDER is the user's checkout of DexGraspBench with its git submodule. ENVIRONMENT is a Python environment with
 DexGraspBench's requirements. The checkout runs in a child process and is never imported. It reads our grasps, our
 objects and a changed Allegro (`--armature`) from a temporary folder. `inert_pickle` reads results without running code.
 """
@@ -71,7 +71,7 @@ class BenchCase(ObjectCase):
     Attributes:
         checkout: folder of DexGraspBench.
         python: Python program that runs DexGraspBench.
-        armature: whether to try the grasps also with DexGraspBench's Allegro plus our joint armature.
+        armature: whether to try the grasps a second time, with our joint armature in DexGraspBench's Allegro.
         grasps: file of our grasps. If empty, they are planned.
         content: hash of the checkout's code and of the file of grasps.
     """
@@ -250,7 +250,7 @@ def why_failed(there: Record) -> str:
 def bench_summary(record: Record) -> str:
     """Return a text: how many of our verified grasps hold in DexGraspBench."""
     pairs = [pair for pair in _pairs([record], AS_IS) if pair[0]]
-    return f"{sum(there['held'] for _, there in pairs)} of {len(pairs)} verified hold there"
+    return f"{sum(there['held'] for _, there in pairs)} of {len(pairs)} verified grasps hold in DexGraspBench"
 
 
 def _pairs(records: Sequence[Record], variant: str) -> list[tuple[bool, Record]]:
@@ -264,7 +264,7 @@ def _pairs(records: Sequence[Record], variant: str) -> list[tuple[bool, Record]]
 
 
 def bench_sections(records: Sequence[Record], chart: Path | None) -> Sections:
-    """Return a table by object and variant of the Allegro, why verified grasps failed there, and known differences."""
+    """Return a table by object and variant of the Allegro, the reasons of failures, and known differences."""
     headings = ["object", "its Allegro", "tried", "verified", "held by both", "by ours only", "by theirs only"]
     headings += ["by neither", "of the verified"]
     groups = [(object_name(record["object"]), [record]) for record in records]

@@ -1,4 +1,4 @@
-"""Study `early`: whether trials that stop early give the same verdict as trials of full length, and the time saved.
+"""Study `early`: whether trials that stop early give the verdict of full-length trials, and how much time they save.
 
 The study uses the first grasps of the method's own ranking. No trial filters them. Each grasp goes through the trials
 of `trials_of`, once with early stopping and once at full length.
@@ -37,7 +37,7 @@ Trial = Callable[[Grasp, bool, Any], Any]
 
 @dataclass(frozen=True)
 class EarlyEnds(ObjectCase):
-    """Grasps of an object. `factors` scale the object along x, y and z. If they are empty, it keeps its size."""
+    """Grasps of an object. `factors` scale the object along x, y and z. Without factors, the object keeps its size."""
 
     factors: tuple[float, ...] = ()
 
@@ -50,7 +50,7 @@ class EarlyEnds(ObjectCase):
 
 
 def early_cases(request: Request) -> tuple[EarlyEnds, ...]:
-    """Return cases with every built-in hand, each on a few shapes and thin objects, or on the requested ones."""
+    """Return a case for each hand and object. Default: all built-in hands, a few shapes, and thin objects."""
     things = [(thing, ()) for thing in find_objects(request.objects or SHAPES)]
     hands = (request.hand,) if request.hand else hand_names()
     cases = tuple(
@@ -82,7 +82,7 @@ def run_early(case: EarlyEnds) -> Record:
 
 
 def trials_of(hand: HandModel, scene: Scene) -> Mapping[str, Trial]:
-    """Return the trials by name. "noisy" is "displaced" with the shorter pulls of the robustness ranking."""
+    """Return the trials by name. "noisy" is "displaced" with shorter pulls, as in the ranking by noisy trials."""
     parts, center = object_parts(scene.object), scene.object.center_of_mass
     standard, hard = PROTOCOLS["standard"], PROTOCOLS["hard"]
     slippery, brief = at_friction(standard, 0.3), replace(standard, hold_time=RobustConfig().hold_time)

@@ -61,7 +61,7 @@ def frame_cases(request: Request) -> tuple[Frame, ...]:
 
 
 def run_frame(case: Frame) -> Record:
-    """Plan for the object at the view axis. If its IoU is at most 0.5, take the object at the reference's median."""
+    """Plan for the object on the view axis, or at the reference cloud's median if the first IoU is at most 0.5."""
     cloud, reference = read_frame(Path(case.folder))
     hand = load_hand(case.hand)
     target, found = None, {}

@@ -56,7 +56,7 @@ class SkinMetrics:
 
 
 def measure_skin(query: DistanceQuery, skin: TriangleMesh) -> SkinMetrics:
-    """Measure how a closed skin mesh touches an object, in the object frame [m]. `query` is of the object's mesh."""
+    """Measure how a closed skin mesh touches an object, object frame [m]. `query` gives distances to the object."""
     points, _ = surface_samples(skin, _SAMPLES, _SEED)
     distance = signed_distance(query, points, reach=2 * CONTACT_DISTANCES[-1])
     corners = skin.vertices[skin.faces]
@@ -160,7 +160,7 @@ def run_mano(case: HumanGrasps) -> Record:
 
 
 def mano_sections(records: Sequence[Record], chart: Path | None) -> Sections:
-    """Return a table: for each softness the objects and their mean, then the published results of the paper."""
+    """Return a table: for each softness the objects and the mean over objects, then the results of the paper."""
     body = []
     for softness in dict.fromkeys(r["softness"] for r in records):
         alike = [r for r in records if r["softness"] == softness]
@@ -173,7 +173,7 @@ def mano_sections(records: Sequence[Record], chart: Path | None) -> Sections:
 
 
 def _row(name: str, softness: float, records: Sequence[Record]) -> list[str]:
-    """Return a table row with means over the measured grasps. Its cells are empty if no grasp was measured."""
+    """Return a table row with means over the measured grasps. If no grasp was measured, the cells are empty."""
     name = f"{name}, {1e3 * softness:g} mm" if softness else f"{name}, rigid"
     held = f"{sum(r['held'] for r in records)}/{sum(r['count'] for r in records)}"
     if not any(r["contact_area_cm2"] for r in records):

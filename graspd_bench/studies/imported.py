@@ -2,8 +2,8 @@
 
     graspd bench --import FOLDER --hand NAME
 
-Grasps that the import refuses, such as those that their file marks as failed, count as failed. So do grasps that our
-planner does not find. Shares refer to all imported grasps of an object, or to the first `--count` of them.
+Grasps that the import refuses, such as those marked as failed in the file, count as failed. So do requested grasps that
+our planner does not find. Shares refer to all imported grasps of an object, or to the first `--count` of them.
 """
 
 from __future__ import annotations
@@ -49,7 +49,7 @@ class ImportedCase(ObjectCase):
     Attributes:
         scale: factor by which the object's coordinates are multiplied.
         files: paths of the grasp files.
-        mesh: mesh file to use instead of the mesh that the grasp files name. Empty to use theirs.
+        mesh: mesh file to use instead of the mesh that the grasp files name. Empty if none.
         order: joint names in the order of npy files.
         trials: names of the trials.
         content: hash of the grasp files.

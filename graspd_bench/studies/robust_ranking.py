@@ -1,6 +1,6 @@
 """Study `robust`: verified grasps ranked by score, the same grasps ranked by noisy trials, and the cost of both.
 
-Further noisy trials evaluate both rankings. No plan uses their pose errors. Their pulls last 2 s.
+A noisy trial has a random pose error. Further noisy trials, with pulls of 2 s and other errors, evaluate both rankings.
 """
 
 from __future__ import annotations
@@ -104,7 +104,7 @@ def orders(
 
 
 def correlation(rows: Sequence[Record], key: str) -> float:
-    """Return Spearman's correlation of `key` and the share held, mean over plans in which both vary, or NaN if none."""
+    """Return the mean Spearman correlation of `key` and the share held, over plans in which both vary. NaN if none."""
     from scipy.stats import rankdata
 
     found = [

@@ -142,7 +142,7 @@ def _true_scene(stage: TabletopScene, source: str) -> Scene:
 
 
 def _grasps(case: Seen, scene: Scene, stage: TabletopScene, hand: HandModel) -> Record:
-    """Time a plan for one grasp, then plan `count` grasps. Try verified and uncertain grasps on the true object."""
+    """Time a plan for one grasp, then plan `count`. Try verified grasps and those with a probability on the truth."""
     first = plan_grasps(scene, hand, count=1, seed=case.seed, preset=case.preset)
     many = plan_grasps(scene, hand, count=case.count, seed=case.seed, preset=case.preset)
     protocol, truth = PROTOCOLS["standard"], _true_scene(stage, case.object)

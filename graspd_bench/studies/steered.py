@@ -1,7 +1,7 @@
 """Study `steered`: requests with and without a steering constraint. Do grasps obey, and what does the constraint cost?
 
-Constraints are drawn at random from the case's seed, object and hand. Some cannot be met, such as an approach cone
-from a side where the object is too wide for the hand. Obedience is computed here from postures and contacts.
+Constraints are drawn at random from the case's seed, object and hand. Some cannot be met, such as an approach cone from
+a side where the object is too wide for the hand. This module computes obedience from postures and contacts.
 """
 
 from __future__ import annotations
@@ -73,9 +73,9 @@ def drawn_constraint(case: SteeredCase, scene: Scene) -> Steering:
 
 
 def _end_of(vertices: Float[np.ndarray, "n 3"], rng: np.random.Generator, share: float, beyond: float) -> Box:
-    """Draw a box around an end of the object. All its faces but the inner one lie `beyond` [m] outside the object.
+    """Draw a box around an end of the object. The box's faces, except the inner one, are `beyond` [m] off the object.
 
-    The end is `share` of the object's length on a random axis. For `beyond` under 3 cm, it is at least 5 cm long.
+    The end is `share` of the object's length on a random axis. For `beyond` under 3 cm, it is at least 5 cm.
     """
     low, high = vertices.min(0), vertices.max(0)
     axis, side = int(rng.integers(3)), int(rng.integers(2))

@@ -267,12 +267,12 @@ def test_a_killed_run_goes_on_where_it_was(tmp_path: Path):
     assert not (tmp_path / "results.json").exists()
     done = subprocess.run(command, capture_output=True, text=True, timeout=500)
     assert done.returncode == EXIT_OK, done.stderr
-    assert f"{len(before)} of 3 cases had finished before" in done.stderr
+    assert f"{len(before)} of 3 cases had finished in earlier runs" in done.stderr
     assert {name: finished(tmp_path)[name] for name in before} == before
     cells = read_results(tmp_path / "results.json")
     assert sorted(cell["seed"] for cell in cells) == [0, 1, 2]
     again = subprocess.run(command, capture_output=True, text=True, timeout=100)
-    assert "3 of 3 cases had finished before" in again.stderr
+    assert "3 of 3 cases had finished in earlier runs" in again.stderr
     assert again.stdout == done.stdout
 
 
@@ -287,4 +287,4 @@ def test_ctrl_c_keeps_finished_cells(tmp_path: Path):
     assert process.returncode == EXIT_INTERRUPTED, errors
     assert "Traceback" not in errors
     kept = len(finished(tmp_path))
-    assert f"interrupted; {kept} of 40 cases are kept" in errors
+    assert f"interrupted; {kept} of 40 cases are finished" in errors

@@ -243,4 +243,4 @@ def test_a_poisoned_object_is_written_down_and_stops_nothing(start: Start, many:
     process = start("-m", "graspd_core.cli", "dataset", *words)
     _, errors = process.communicate()
     assert process.returncode == 0, errors
-    assert "40 of 40 blocks exist or failed before" in errors
+    assert "40 of 40 blocks are skipped: each has a file or a failure on record" in errors

@@ -58,7 +58,7 @@ def test_a_point_leads_to_its_runs(folder, visit):
     page.text("box, seed 3: 0 of 1 held")
     page.tab.get_by_text("box, seed 3: 0 of 1 held").click()
     page.text("failed: the object moved 5.1 cm")
-    page.text("As many that hold are planned and shown by")
+    page.text("This command plans and shows as many grasps that hold:")
     page.text("graspd synthesize shape:box --hand allegro_right --preset fast --seed 3 -n 1 --view")
     page.tab.locator("#time").select_option("CPU seconds per verified grasp")
     assert page.tab.locator("circle").count() == 6  # two panels of three; nothing of `fast` held in the first
