@@ -261,7 +261,7 @@ def draw_speed(presets: dict[str, list[Row]], path: Path, about: str = "") -> Pa
 
 
 def points_of(presets: dict[str, list[Row]], time: str, panel: Panel) -> list[Point]:
-    """Return a point for each preset with values of `time` and of the panel, in the unit of the panel's label."""
+    """Return a point for each preset that has both values: `time` and the panel's, in the unit of the panel's label."""
     points = []
     for name, group in presets.items():
         x, y = spread(group, time), spread(group, panel.figure)

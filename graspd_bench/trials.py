@@ -134,7 +134,7 @@ def gravity_trial(world: World, grasp: Grasp, protocol: Protocol, *, stop: Calla
 
     The hand closes and squeezes as in the hold trial. Then gravity acts on the object along ±x, ±y, ±z in turn for 2 s.
     An object that moves 10 cm is lost and counts as 10 cm. If the hand fails to close, the result is also 10 cm.
-    A direction ends early if the displacement predicted for 2 s is constant within 0.1 mm. Then the prediction counts.
+    A direction ends early if predictions of the displacement at 2 s agree within 0.1 mm. Then the prediction counts.
     With `protocol.full_length` no direction ends early. If `stop` returns true, the displacement so far counts.
     """
     import mujoco

@@ -152,7 +152,7 @@ def posed_hand(hand: HandModel, posture: Posture) -> TriangleMesh:
 
 
 class ToldSource:
-    """Grasp source that passes every view and offer to a callback."""
+    """Grasp source that passes every view, and every answer of another source, to a callback."""
 
     def __init__(self, source: GraspSource, tell: Callable[[DepthView, Offer], None]) -> None:
         self._source, self._tell = source, tell

@@ -217,7 +217,7 @@ class Mover:
         shape: the arm.
         world: the obstacles.
         carried: collision balls of the hand and the held object, tip frame.
-        margin: distance that a motion keeps from obstacles [m]. It is smaller if an end of the motion is nearer.
+        margin: distance that a motion keeps from obstacles [m]. A start or goal nearer than this lowers the distance.
     """
 
     shape: ArmShape

@@ -36,7 +36,7 @@ _OTHER_FIGURES = {
 
 
 def standing(grasp: Grasp) -> str:
-    """Return the filter name of a grasp: its verdict, or `LESS_SURE` if it is unverified but was tried."""
+    """Return the name under which the list filters a grasp: its verdict, or `LESS_SURE` if tried but unverified."""
     return LESS_SURE if grasp.verdict is Verdict.UNVERIFIED and grasp.trials else str(grasp.verdict)
 
 

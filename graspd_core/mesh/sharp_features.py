@@ -109,8 +109,8 @@ def farthest_first(
         size: number of points.
         count: maximum number of indices to return. All of `chosen` are returned even if they are more.
         chosen: indices of the first points.
-        distances: function that returns the distances (or a growing function of them) from a chosen point to `mates`.
-        mates: function that returns the points to compare a chosen point with. Other points count as infinitely far.
+        distances: function that returns distances from a chosen point to its `mates`. Squared distances will do too.
+        mates: function that returns the points near a chosen point. Other points count as infinitely far from it.
     """
     picked, gap = [int(index) for index in chosen], np.full(size, np.inf)
     for number in range(max(min(count, size), len(picked))):

@@ -226,7 +226,7 @@ def _depth(obstacles: ObstacleTensors, base: SE3, links: SE3) -> Values:
 def _lowered(preference: Values, count: int, penalty: Callable[[Tensor], Values]) -> Values:
     """Return `preference` minus `penalty`. Rows that cannot be among the `count` greatest may get −inf.
 
-    A penalty is at least 0 and slow to compute, so it is computed by descending `preference` and only where needed.
+    A penalty is never negative, but slow to compute. So rows follow in descending order of `preference`, while needed.
     """
     lowered = torch.full_like(preference, -torch.inf)
     for rows in preference.argsort(descending=True).split(count):

@@ -199,7 +199,7 @@ def array_of(value: Inert) -> np.ndarray:
         raw = raw.arguments[0] if raw.arguments else None
     raw = raw.encode("latin1") if isinstance(raw, str) else raw
     if not isinstance(raw, bytes) or not is_shape(shape):
-        raise ValueError("its array has a shape or content that is not numeric")
+        raise ValueError("the shape or the content of its array is not numeric")
     flat = np.frombuffer(raw, dtype=kind)
     # `math.prod` uses Python's integers, which cannot overflow.
     if math.prod(shape) != len(flat):

@@ -148,7 +148,7 @@ def lighter(
 
 
 def payloads(context: VerificationContext, grasps: Sequence[Grasp], stop: StopHook) -> list[float]:
-    """Return each grasp's payload [kg], but 0 if it is not 10 % above the payloads of all preceding grasps."""
+    """Return each grasp's payload [kg], or 0 if it is less than 10 % above those of all preceding grasps."""
     trials, found = context.trials, list[float]()
     for grasp in grasps:
         least = FINENESS * max(found, default=LEAST_PAYLOAD)

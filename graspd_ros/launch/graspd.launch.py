@@ -42,7 +42,7 @@ def given(values: dict[str, str]) -> dict[str, str | bool]:
 
 def _argument(name: str) -> DeclareLaunchArgument:
     default, text = ARGUMENTS[name]
-    text += "; empty: the value of the parameter file" if name in PARAMETERS else ""
+    text += ". If empty, the parameter file sets it" if name in PARAMETERS else ""
     return DeclareLaunchArgument(name, default_value=default, description=text)
 
 

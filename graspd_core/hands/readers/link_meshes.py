@@ -49,7 +49,7 @@ def resolve_mesh(urdf: Path, shape: ET.Element, filename: str) -> Path:
         if os.path.isfile(folder / rest):
             return folder / rest
     where = "in any package path, nor " if scheme in ("package", "model") else ""
-    raise wrong(urdf, shape, f"mesh {filename!r} was not found {where}beside the file or above it")
+    raise wrong(urdf, shape, f"mesh {filename!r} was not found {where}in the file's folder or its parent folders")
 
 
 def _address(filename: str) -> tuple[str, str]:

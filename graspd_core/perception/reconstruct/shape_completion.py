@@ -115,9 +115,9 @@ def _mirrored(mirrors: list[Symmetry], seen: Surfels) -> Surfels:
 
 
 def guess_by(rule: str, seen: Surfels, free_space: FreeSpace, step: float) -> Surfels | None:
-    """Return the guess of one of `RULES` for the unseen side, even an unlikely one. None if the rule makes no guess.
+    """Return points that `rule`, one of `RULES`, guesses on the unseen side. None if the rule makes no guess.
 
-    The rule "" guesses no points, so the surface just closes over the seen part.
+    The guess may be unlikely. The rule "" gives an empty set: the surface then closes behind the seen points.
     """
     if rule == REVOLUTION:
         turned = find_revolution(seen, free_space, step)
