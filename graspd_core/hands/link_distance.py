@@ -171,7 +171,7 @@ def solid_distance(
 def solid_bound(
     solids: CollisionTensors, links: SE3, points: Float[Tensor, "batch points 3"]
 ) -> Float[Tensor, "batch points solids"]:
-    """Return a lower bound of `solid_distance` [m]: the greatest signed distance to the six planes of the solid's box."""
+    """Return a lower bound of `solid_distance` [m]: the greatest signed distance to a plane of the solid's box."""
     box = solids.core + solids.radius[:, None]
     return _in_parts(solids, links, points, lambda local: (local.abs() - box).amax(-1))
 

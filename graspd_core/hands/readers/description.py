@@ -142,7 +142,7 @@ def is_number(value: object) -> bool:
 def read_description(path: Path) -> HandDescription:
     """Read and check a hand description.
 
-    Raises HandError if the file is not YAML, lacks a key, or has an unknown key or a wrong value. It names line and key.
+    Raises HandError if the file is not YAML, lacks a key, or has an unknown key or a wrong value.
     """
     try:
         node, data = parse_yaml(path.read_text(encoding="utf-8"))
