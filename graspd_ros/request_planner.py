@@ -179,7 +179,9 @@ class RecentRuns:
         message = f"{min(count, len(left))} grasps of an earlier run, none similar to the {len(excluded)} excluded"
         warnings = runs[-1].planned.result.warnings
         result = GraspResult(outcome, tuple(left[:count]), Timing(), request.settings.seed, "", message, warnings)
-        return replace(runs[-1].planned, result=result, file="")
+        # A run may have tried its grasps at less than the assumed mass. Every grasp holds the least of these masses.
+        mass = min(run.planned.mass for run in runs if run.grasps)
+        return replace(runs[-1].planned, result=result, file="", mass=mass)
 
 
 def _terms(request: Request) -> tuple[str, str, bool]:

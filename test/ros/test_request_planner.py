@@ -14,7 +14,7 @@ from graspd_ros.convert import matrix_of_posture
 from graspd_ros.error_codes import RequestError
 from graspd_ros.parameters import Settings
 from graspd_ros.request import Request
-from graspd_ros.request_planner import Planner, unlike
+from graspd_ros.request_planner import Planner, RecentRuns, unlike
 
 SETTINGS = Settings(num_grasps=1, preset="fast", deadline=100.0)
 
@@ -170,6 +170,16 @@ def test_the_next_best_grasp_comes_at_once_from_the_candidates_of_the_same_run(h
             RequestError, match=f"exclude: no grasp '{unknown[:100]}.* in the last 16 runs; kept: first, "
         ):
             ask("sixth", unknown)
+
+
+def test_grasps_of_earlier_runs_have_the_least_mass_of_their_trials(hand):
+    asked = replace(request(lambda: load_scene("shape:sphere")), id="first", object_key="sphere")
+    planned, runs = planner(hand).plan(asked, never, lambda _: None), RecentRuns()
+    for name, mass in (("first", 0.3), ("second", 0.5)):
+        runs.keep(replace(asked, id=name), replace(planned, mass=mass), np.eye(4))
+    found = runs.next_best(asked, [])
+    assert found is not None
+    assert found.mass == 0.3
 
 
 @pytest.mark.parametrize(
