@@ -92,7 +92,7 @@ def test_a_mirrored_hull_is_wound_outwards(workspace: Path, scale: str) -> None:
     [
         ("", "", r"hand.urdf:1: link 'a': mesh '' was not found"),
         ("https://example.org/x.stl", "", "is not fetched from the network"),
-        ("x" * 5000, "", "was not found beside the file"),
+        ("x" * 5000, "", "was not found in the file"),
         ("meshes/wedge one.obj", "0 1 1", "a factor cannot be zero"),
         ("meshes/wedge one.obj", "1000 1000 1000", "is 30 m across: if it is in millimetres, scale it by 0.001"),
         ("meshes/wedge one.obj", "1 1", "expected 3 finite number"),
