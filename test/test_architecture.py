@@ -68,7 +68,7 @@ MAY_IMPORT = {
 MAX_PACKAGE_LINES = {
     "graspd_core": 27_796,
     "graspd_ros": 5_354,
-    "graspd_bench": 8_411,
+    "graspd_bench": 8_415,
     "graspd_dataset": 3_058,
     "graspd_viewer": 2_433,
     "graspd_cell": 3_800,

@@ -89,8 +89,8 @@ def stress_table(endings: Mapping[Case, StressEnding]) -> str:
 
 def summary(endings: Mapping[Case, StressEnding]) -> str:
     """Return a text: how many cases end in a verified grasp, how many grasps pass the second trial, and all faults."""
-    wrong = [f"* `{case.name}`: {fault}" for case, ending in endings.items() for fault in faults(case, ending)]
-    lines = [f"{len(endings)} cases, {len(wrong)} faults."]
+    wrong = [f"* `{c.name}`: {_shortened(fault)}" for c, e in endings.items() for fault in faults(c, e)]
+    lines = [f"Cases: {len(endings)}. Faults: {len(wrong)}."]
     for family in dict.fromkeys(case.family for case in endings):
         lines.append(_share(family, [(c, e) for c, e in endings.items() if c.family == family and c.whole]))
     verified, again = (sum(getattr(e, name) for e in endings.values()) for name in ("verified", "again"))
@@ -114,6 +114,10 @@ def _share(family: str, whole: Sequence[tuple[Case, StressEnding]]) -> str:
     return f"{family}: {share} with something to grasp end in a verified grasp."
 
 
+def _shortened(message: str) -> str:
+    return message if len(message) <= _MESSAGE else f"{message[:_MESSAGE].rstrip()} …"
+
+
 def _line(case: Case, ending: StressEnding) -> list[str]:
     good = ending.ending in case.expect
     # The column of the ending already shows success.
@@ -129,5 +133,5 @@ def _line(case: Case, ending: StressEnding) -> list[str]:
         f"{ending.verified}/{ending.tried}" if ending.tried else "–",
         str(ending.again) if ending.verified else "–",
         "–" if ending.true is None or not ending.verified else str(ending.true),
-        message if len(message) <= _MESSAGE else f"{message[:_MESSAGE].rstrip()} …",
+        _shortened(message),
     ]

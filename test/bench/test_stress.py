@@ -91,7 +91,7 @@ def test_cases_are_chosen_by_name_and_family():
 def test_the_table_shows_what_came_of_each_case_and_the_summary_every_fault():
     wrong = StressEnding("nan-vertices", GRASP, "", 0.1, 30.0, 300.0, 2, 1, 0)
     told = summary({BOX: GRASPED, NAN: wrong})
-    assert told.startswith("2 cases, 4 faults. mesh: 1 of 1 (100%) with something to grasp end in a verified grasp.")
+    assert told.startswith("Cases: 2. Faults: 4. mesh: 1 of 1 (100%) with something to grasp end in a verified grasp.")
     assert "2 of 3 verified grasps hold in a second trial." in told
     for fault in ("ended in grasp, not in MeshError", "planned 30.0 s at", "1 of 1 verified", "the message lacks"):
         assert f"* `nan-vertices`: {fault}" in told
@@ -112,8 +112,8 @@ def test_the_command_reports_kept_endings_and_fills_a_document(tmp_path: Path, c
     assert "none.md: has none of the sections stress-summary, stress" in capsys.readouterr().err
     assert "bygone" not in page.read_text(), "the other page is filled all the same"
     assert main([*command, "--readme", str(page)]) == EXIT_OK
-    assert "1 cases, 0 faults." in capsys.readouterr().out
-    assert "1 cases, 0 faults." in page.read_text()
+    assert "Cases: 1. Faults: 0." in capsys.readouterr().out
+    assert "Cases: 1. Faults: 0." in page.read_text()
     assert "by `graspd bench stress` at commit" in page.read_text()
     assert "open-box" in page.read_text()
     assert "bygone" not in page.read_text()
