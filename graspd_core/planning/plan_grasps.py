@@ -180,7 +180,8 @@ def _why_few(run: Run, scene: Scene, bound: BoundRestrictions, found: RoundsResu
     if found.good or found.context is None:
         return reason
     most = max(payloads(found.context, result.tried[:_WEIGHED], run.over), default=0.0)
-    return f"{reason}; the best of them would hold {most:.2g} kg" if most > LEAST_PAYLOAD else reason
+    best = f"the strongest grasp would hold {most:.2g} kg" if most > LEAST_PAYLOAD else ""
+    return "; ".join(filter(None, (reason, best)))
 
 
 def _less_sure(scene: Scene, far: Float[np.ndarray, "3"], result: GraspResult) -> GraspResult:

@@ -27,9 +27,9 @@ ASKED = {"preset": "fast", "measure": False, "seed": 0}
 
 @pytest.fixture(scope="module")
 def views() -> tuple[PointCloud, ...]:
-    """A box, and a flat one beside it, from one place above."""
+    """A box, and a bowl beside it, from one place above."""
     scene = tabletop("box", obstacles=[("bowl", 0.16, 0.05)])
-    return views_of(scene, CAMERA, ring_poses(1, elevation=np.deg2rad(55.0)), DEFAULT, 3)
+    return views_of(scene, CAMERA, ring_poses(1, elevation=np.deg2rad(55.0), distance=0.65), DEFAULT, 3)
 
 
 @pytest.fixture(scope="module")

@@ -80,7 +80,7 @@ def test_a_known_mass_that_the_hand_cannot_lift_is_never_lowered(scene):
     result = plan_grasps(scene, load_hand("parallel_gripper"), count=1, preset="fast")
     assert not any(grasp.usable for grasp in result.grasps)
     assert result.mass is None
-    assert "the best of them would hold" in result.message
+    assert "the strongest grasp would hold" in result.message
 
 
 def test_the_least_friction_is_measured_where_it_was_asked_for():
