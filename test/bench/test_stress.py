@@ -39,12 +39,13 @@ def test_cases_are_named_once_and_expect_endings_that_there_are():
     assert all(GRASP in case.expect for case in CASES.values() if case.whole)
 
 
-@pytest.mark.parametrize("name", ["nan-vertices", "no-object"])
-def test_what_shows_nothing_is_refused_in_one_line(name: str):
+@pytest.mark.parametrize("name", ["nan-vertices", "no-object", "half-out-of-view"])
+def test_what_shows_nothing_or_a_part_is_refused_in_one_line(name: str):
     # What it took is the study's to say: this process holds what other tests left, and is not alone on the machine.
     ending = replace(run_case(CASES[name], "fast"), loading=0.0, planning=0.0, memory=0.0)
     assert faults(CASES[name], ending) == ()
     assert "\n" not in ending.message
+    assert "; ;" not in ending.message
 
 
 def test_faults_are_named():
