@@ -5,6 +5,7 @@ import time
 from collections.abc import Sequence
 from dataclasses import replace
 from functools import cache, partial
+from itertools import pairwise
 
 import numpy as np
 import pytest
@@ -26,11 +27,12 @@ from graspd_core.config.planning_config import (
 from graspd_core.errors import ConfigError
 from graspd_core.hands.surface_points import with_candidates
 from graspd_core.mesh.convex_parts import convex_parts
+from graspd_core.optimize.plan_config import method_row
 from graspd_core.perception import scene as scene_module
 from graspd_core.perception.reconstruct.merge_views import Evidence
 from graspd_core.perception.scene import COARSE_CUTS, ObjectModel, Scene, moved_grasp, object_parts
 from graspd_core.planning.rounds import rounds_of, run_rounds
-from graspd_core.types import ROBUSTNESS, Grasp, GraspResult, Posture, StopHook, TrialResult, Verdict
+from graspd_core.types import ROBUSTNESS, Grasp, GraspResult, Posture, Stage, StopHook, TrialResult, Verdict
 from graspd_core.verify import robustness as hypotheses
 from graspd_core.verify import verification
 from graspd_core.verify.hold_trial import hold_trial
@@ -331,26 +333,40 @@ def test_a_grasp_is_as_sure_as_objects_are_lighter_than_its_own_payload():
     assert {grasp.verdict for grasp in tried} == {Verdict.VERIFIED, Verdict.UNVERIFIED}
 
 
-@pytest.mark.parametrize("times", [1.35, 10.0])
-def test_further_rounds_of_an_object_too_heavy_for_the_hand_look_for_grasps_that_lift_most_such_objects(times):
-    seen, config = seen_from(), load_preset("fast")
+def rounds_at(times, preset, *, assumed):
+    """What the rounds find of an object so many times as heavy as any planned grasp lifts, and their searches."""
+    seen, config = seen_from(), load_preset(preset)
     hand = with_candidates(load_hand("allegro_right"), config.problem.fine_candidates)
     worlds = build_worlds(seen, hand, object_parts(seen.object), PROTOCOLS["standard"])
     context = verification.VerificationContext(worlds, None)
     heavy = times * max(verification.payloads(context, planned().tried, lambda: False))
-    scene = replace(seen, object=replace(seen.object.at_mass(heavy), mass_assumed=True))
-    run = Run(time.perf_counter(), None, None, None)
+    scene = replace(seen, object=replace(seen.object.at_mass(heavy), mass_assumed=assumed))
+    steps = []
+    run = Run(time.perf_counter(), None, lambda at: steps.append(at.step) if at.stage is Stage.OPTIMISE else None, None)
     ahead = verification.prefetch(run, scene, hand, "standard", config.certainty)
     rounds = rounds_of(scene, config, "standard")
     found = run_rounds(run, scene, hand, rounds, ahead, count=1, seed=0, device="cpu", measure=False)
+    searches = 1 + sum(later <= earlier for earlier, later in pairwise(steps))
+    first_round = method_row(config.method).searches(config.settings)
+    return found, worlds, heavy, searches / first_round
+
+
+def test_further_rounds_of_an_object_too_heavy_for_the_hand_look_for_grasps_that_lift_most_such_objects():
+    found, worlds, heavy, _ = rounds_at(1.35, "fast", assumed=True)
     for grasp in found.grasps[: found.good]:
         assert payload(worlds.alone, grasp, worlds.protocol) > light_end(heavy) / 1.1
     assert found.context is not None
-    if times == 10.0:
-        # No grasp lifts that, so the last rounds still look for one.
-        assert (found.good, found.context.mass) == (0, pytest.approx(light_end(heavy)))
-        assert found.mass is not None
-        assert found.mass < light_end(heavy)
+
+
+# The first round of `fast` tries too few grasps to end planning.
+@pytest.mark.parametrize(("preset", "assumed", "most"), [("balanced", True, 1), ("fast", False, 2)])
+def test_rounds_end_if_no_grasp_lifts_most_such_objects(preset, assumed, most):
+    found, _, heavy, rounds = rounds_at(10.0, preset, assumed=assumed)
+    assert found.good == 0
+    assert rounds == most
+    # A given mass is never lowered.
+    assert (found.mass is not None) == assumed
+    assert (found.mass or 0.0) < light_end(heavy)
 
 
 def test_what_is_tried_at_less_mass_begins_with_the_strongest():
