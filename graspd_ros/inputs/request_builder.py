@@ -138,12 +138,15 @@ class RequestBuilder:
             to_frame = lambda target, source: lookup(target, source, stamp)  # noqa: E731
             return steering_of(message, request.to_object(message.header.frame_id, np.eye(4), to_frame))
 
-        steering, region_points = made(self.lookup, message.header.stamp), request.region_points
-        if region_points is None:
+        # Check fields and frames. The header's stamp is often newer than /tf, so check at the newest time.
+        steering, region_points = made(self.lookup, Time()), request.region_points
+        stamp = message.header.stamp
+        if region_points is not None:  # the camera may have moved since it saw the cloud
+            stamp = Time() if request.timeless else request.stamp
+        elif not nanoseconds(stamp):
             return lambda: steering
-        # The camera may have moved since. Its transforms at the cloud's time may still be on the way.
-        seen = lambda: made(self.lookup_in_time, Time() if request.timeless else request.stamp)  # noqa: E731
-        if not message.region_mask.height:
+        seen = lambda: made(self.lookup_in_time, stamp)  # noqa: E731  the transforms may still be on the way
+        if region_points is None or not message.region_mask.height:
             return seen
         return lambda: replace(seen(), region=NearPoints(region_points()))
 
@@ -463,10 +466,16 @@ def _from_views(given: SourceInput) -> Request:
     views, settings = given.builder.views, given.settings
     if not views.clouds:
         raise RequestError(ErrorCode.NO_CLOUD, "no view is stored; call ~/add_view while clouds arrive")
-    point = _target(given, views.frame, given.message.header.stamp, given.builder.lookup)
-    target = None if point is None else Target(point=point)
+    newest, stamp = _target(given, views.frame, Time(), given.builder.lookup), given.message.header.stamp
+
+    def load() -> Scene:
+        # The transforms at the header's stamp may still be on the way.
+        late = nanoseconds(stamp) > 0
+        point = _target(given, views.frame, stamp, given.builder.lookup_in_time) if late else newest
+        return seen.scene_of_views(views.clouds, settings, None if point is None else Target(point=point))
+
     more = {"views": lambda: (views.clouds, ())} if given.message.any_object else {}
-    return given.request(views.frame, views.stamp, lambda: seen.scene_of_views(views.clouds, settings, target), **more)
+    return given.request(views.frame, views.stamp, load, **more)
 
 
 SOURCES: dict[int, Source] = {
@@ -489,7 +498,7 @@ def source_of(message: GraspRequest) -> Source:
 def _of_frame(given: SourceInput, frame: SensorFrame) -> Request:
     message, place = given.message, place_of(given.settings, given.message)
     mask, lookup = message.target_mask if message.target_mask.height else None, given.builder.lookup_in_time
-    _target(given, frame.frame, message.header.stamp, given.builder.lookup)  # refuses frames that /tf does not connect
+    _target(given, frame.frame, Time(), given.builder.lookup)  # refuses frames that /tf does not connect
     # The camera may have moved since. Its transforms at the cloud's time may still be on the way.
     point = partial(_target, given, frame.frame, frame.stamp, lookup)
     load = frame_loader(frame, given.settings, place, lookup, point, mask)

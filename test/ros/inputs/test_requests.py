@@ -503,6 +503,34 @@ def test_point_and_wishes_are_placed_where_the_camera_stood_when_it_saw(make_clo
     assert np.allclose(np.asarray(region.center), [0, 0, 5])
 
 
+@pytest.mark.parametrize("source", [GraspRequest.CLOUD, GraspRequest.LATEST_CLOUD, GraspRequest.VIEWS])
+def test_a_request_may_have_the_present_time_though_tf_is_a_little_behind(make_cloud, monkeypatch, source):
+    def lookup(target: str, frame: str, stamp: Time) -> np.ndarray:
+        assert stamp != NOW, "the newest transform is older"
+        return np.eye(4)
+
+    def lookup_in_time(target: str, frame: str, stamp: Time) -> np.ndarray:
+        times.append(stamp)  # transforms at the present time have arrived meanwhile
+        return np.eye(4)
+
+    targets, times = [], list[Time]()
+    monkeypatch.setattr(sensor_frames, "scene_of_views", lambda views, settings, target, *_: targets.append(target))
+    builder = RequestBuilder(HAND, lambda: NOW, lookup, lookup_in_time)
+    cloud = make_cloud(np.ones((100, 3)))
+    cloud.header.stamp = SEEN
+    builder.newest = cloud_frame(cloud, 999 * 10**9)
+    builder.views = Views("camera", SEEN, (PointCloud(np.ones((100, 3)), np.zeros(3)),))
+    fields = {"use_target_point": True, "target_point": Point(x=0.5), "approach_direction": DOWN}
+    message = GraspRequest(header=Header(frame_id="map", stamp=NOW), source=source, cloud=cloud, **fields)
+    asked = builder.from_message("r", Settings(), message)
+    asked.load()
+    assert asked.steering is not None
+    asked.steering()
+    assert np.allclose(targets[0].point, [0.5, 0, 0])
+    # A cloud is seen at its own time. Views are in a fixed frame, so the header's time counts.
+    assert times == [NOW if source == GraspRequest.VIEWS else SEEN] * 2
+
+
 def test_a_box_may_be_the_region(tmp_path):
     steering = request(tmp_path, region=solid(BOX, 0.1, 0.1, 0.1)).steering
     assert steering is not None
