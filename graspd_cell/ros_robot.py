@@ -143,20 +143,20 @@ class RosRobot:
     def follow(self, motion: JointMotion, timeout: float, stop: Callable[[], bool] = never) -> JointReading:
         """Execute a motion and return the joint reading at its end. See `Robot`."""
         end, parts = self.joints().time + timeout, self._parts(motion)
-        sent: list[Any] = [self._send(client, part) for client, part in parts]
-        handles = []
+        sent: list[Any] = []
         try:
+            for client, part in parts:
+                sent.append(self._send(client, part))
             for goal in sent:
                 self._wait_for(goal, end, stop)
-                handles.append(goal.result())
-            refused = [handle for handle in handles if not handle.accepted]
-            if refused:
+            handles = [goal.result() for goal in sent]
+            if not all(handle.accepted for handle in handles):
                 raise MotionAborted("a controller rejected the motion; its log gives the reason")
             results = [self._begun(handle.get_result_async) for handle in handles]
             for result in results:
                 self._wait_for(result, end, stop, watched=results)
-        except MotionAborted:
-            self._cancel(handles)
+        except (MotionAborted, RobotSilentError):
+            self._cancel(sent)
             raise
         return self.joints()
 
@@ -209,11 +209,16 @@ class RosRobot:
         self._until(task.done, lambda: "the executor's turn to send a request to a controller")
         return task.result()
 
-    def _cancel(self, handles: list[Any]) -> None:
-        """Cancel the accepted goals and wait for the confirmations, at most `patience` seconds."""
-        waiting = [self._begun(handle.cancel_goal_async) for handle in handles if handle.accepted]
-        end = time.monotonic() + self._topics.patience
-        while not all(one.done() for one in waiting) and time.monotonic() < end:
+    def _cancel(self, sent: list[Any]) -> None:
+        """Cancel the goals and wait for the confirmations, at most `patience` seconds.
+
+        A controller may accept a goal late, so first wait for the answer to each goal.
+        """
+        end, left, waiting = time.monotonic() + self._topics.patience, list(sent), list[Any]()
+        while (left or not all(one.done() for one in waiting)) and time.monotonic() < end:
+            handles = [goal.result() for goal in left if goal.done()]
+            left = [goal for goal in left if not goal.done()]
+            waiting += [self._begun(handle.cancel_goal_async) for handle in handles if handle.accepted]
             time.sleep(_POLL)
 
     def _until(self, condition: Callable[[], bool], what: Callable[[], str], extra: float = 0.0) -> None:

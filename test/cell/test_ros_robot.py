@@ -5,13 +5,21 @@ from __future__ import annotations
 import os
 import subprocess
 import sys
-from collections.abc import Iterator
+import threading
+import time
+from collections.abc import Callable, Iterator
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 import rclpy
+from control_msgs.action import FollowJointTrajectory
+from rclpy.action.server import ActionServer, CancelResponse, GoalResponse
+from rclpy.callback_groups import ReentrantCallbackGroup
 from rclpy.context import Context
+from rclpy.executors import MultiThreadedExecutor
+from sensor_msgs.msg import JointState
 
 from graspd_cell.controller import JointLimits, Tolerances, TrajectoryController
 from graspd_cell.grasp_source import cloud_of
@@ -111,3 +119,104 @@ def test_a_silent_topic_is_named(domain: int):
     deaf.close()
     node.destroy_node()
     rclpy.shutdown(context=context)
+
+
+class Controllers:
+    """Controllers of an arm (joint a) and a hand (joint b), whose goals run until they are cancelled."""
+
+    def __init__(self, domain: int, *parts: str) -> None:
+        self.context = Context()
+        rclpy.init(context=self.context, domain_id=domain)
+        self.node = rclpy.create_node("controllers", context=self.context)
+        self.executor = MultiThreadedExecutor(4, context=self.context)
+        self.executor.add_node(self.node)
+        self.asked, self.may_accept, self.ended = threading.Event(), threading.Event(), threading.Event()
+        self.goals, self.cancelled, self.group = dict[str, Any](), set[str](), ReentrantCallbackGroup()
+        self.may_accept.set()
+        self.servers = [self.serve(part) for part in parts]
+        states = self.node.create_publisher(JointState, "/own/joint_states", 10)
+        self.node.create_timer(0.01, lambda: states.publish(self.state()), callback_group=self.group)
+        self.thread = threading.Thread(target=self.executor.spin, daemon=True)
+        self.thread.start()
+
+    def state(self) -> JointState:
+        state = JointState(name=["a", "b"], position=[0.0, 0.0])
+        state.header.stamp = self.node.get_clock().now().to_msg()
+        return state
+
+    def serve(self, part: str) -> ActionServer:
+        def accept(_: Any) -> GoalResponse:
+            self.asked.set()
+            self.may_accept.wait(PATIENCE)
+            return GoalResponse.ACCEPT
+
+        def execute(handle: Any) -> Any:
+            self.goals[part] = handle
+            while not handle.is_cancel_requested and not self.ended.wait(0.005):
+                pass
+            if handle.is_cancel_requested:
+                self.cancelled.add(part)
+                handle.canceled()
+            return FollowJointTrajectory.Result()
+
+        calls = {"goal_callback": accept, "cancel_callback": lambda _: CancelResponse.ACCEPT}
+        calls |= {"callback_group": self.group}
+        return ActionServer(self.node, FollowJointTrajectory, f"/own/{part}", execute, **calls)
+
+    def close(self) -> None:
+        self.ended.set()
+        self.may_accept.set()
+        self.executor.shutdown()
+        self.thread.join(PATIENCE)
+        self.node.destroy_node()
+        rclpy.shutdown(context=self.context)
+
+
+@pytest.fixture
+def driven(domain: int) -> Iterator[Callable[..., tuple[Controllers, RosRobot]]]:
+    """Makes controllers of some parts, and the robot that they drive."""
+    closed: list[Callable[[], None]] = []
+
+    def make(*parts: str) -> tuple[Controllers, RosRobot]:
+        own = Controllers(domain, *parts)
+        topics = RobotTopics("/own/joint_states", controllers=("/own/arm", "/own/hand"), patience=PATIENCE)
+        node = rclpy.create_node("driver", context=own.context)
+        robot = RosRobot(node, ("a",), ("b",), topics)
+        closed.extend((robot.close, node.destroy_node, own.close))
+        return own, robot
+
+    yield make
+    for close in closed:
+        close()
+
+
+BOTH = JointMotion(("a", "b"), np.array([1.0]), np.ones((1, 2)))
+
+
+def until(condition: Callable[[], bool]) -> None:
+    end = time.monotonic() + PATIENCE
+    while not condition():
+        assert time.monotonic() < end
+        time.sleep(0.005)
+
+
+def test_a_stop_before_the_controllers_accept_the_motion_cancels_it_too(driven):
+    own, robot = driven("arm", "hand")
+    own.may_accept.clear()
+
+    def stop() -> bool:
+        if own.asked.is_set():
+            own.may_accept.set()
+        return own.asked.is_set()
+
+    with pytest.raises(MotionAborted, match="stopped"):
+        robot.follow(BOTH, PATIENCE, stop)
+    until(lambda: own.cancelled == {"arm", "hand"})
+
+
+def test_the_arm_does_not_move_on_if_the_hand_has_no_controller(driven):
+    own, robot = driven("arm")
+    robot._clients[1].wait_for_server = lambda timeout_sec: False
+    with pytest.raises(RobotSilentError, match="no action server /own/hand"):
+        robot.follow(BOTH, PATIENCE)
+    until(lambda: own.cancelled == {"arm"})
