@@ -13,6 +13,7 @@ from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
+from action_msgs.msg import GoalStatus
 from control_msgs.action import FollowJointTrajectory
 from control_msgs.msg import JointTolerance
 from rclpy.action.client import ActionClient
@@ -192,6 +193,9 @@ class RosRobot:
             for result in (one.result() for one in watched if one.done()):
                 if result.result.error_code != _RESULT.SUCCESSFUL:
                     raise MotionAborted(result.result.error_string or f"error {result.result.error_code}")
+                # The result of a cancelled goal has no error code.
+                if result.status != GoalStatus.STATUS_SUCCEEDED:
+                    raise MotionAborted("a controller ended the motion early, because another client cancelled it")
             if future.done():
                 return
             if self._heard.joints_at > end:

@@ -14,6 +14,7 @@ from typing import Any
 import numpy as np
 import pytest
 import rclpy
+from action_msgs.srv import CancelGoal
 from control_msgs.action import FollowJointTrajectory
 from rclpy.action.server import ActionServer, CancelResponse, GoalResponse
 from rclpy.callback_groups import ReentrantCallbackGroup
@@ -198,6 +199,20 @@ def until(condition: Callable[[], bool]) -> None:
     while not condition():
         assert time.monotonic() < end
         time.sleep(0.005)
+
+
+def test_a_motion_that_another_client_cancels_has_not_reached_its_goal(driven):
+    own, robot = driven("arm", "hand")
+    client, asked = own.node.create_client(CancelGoal, "/own/arm/_action/cancel_goal"), []
+
+    def cancel_once() -> bool:
+        if len(own.goals) == 2 and client.service_is_ready() and not asked:
+            asked.append(client.call_async(CancelGoal.Request()))  # without an id it cancels every goal
+        return False
+
+    with pytest.raises(MotionAborted, match="another client cancelled"):
+        robot.follow(BOTH, PATIENCE, cancel_once)
+    until(lambda: own.cancelled == {"arm", "hand"})
 
 
 def test_a_stop_before_the_controllers_accept_the_motion_cancels_it_too(driven):
