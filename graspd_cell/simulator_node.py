@@ -291,7 +291,7 @@ class MotionServer:
                 handle.abort()
                 return result(error_code=result.INVALID_GOAL, error_string="a newer goal took its place")
             if handle.is_cancel_requested:
-                self._cell.hold(self._controller)
+                self._hold(number)
                 handle.canceled()
                 return result(error_string="cancelled")
             state, reason, targets, positions = self._cell.progress(self._controller)
@@ -299,7 +299,7 @@ class MotionServer:
                 handle.succeed()
                 return result(error_code=result.SUCCESSFUL)
             if state is not MotionState.RUNNING:
-                self._cell.hold(self._controller)
+                self._hold(number)
                 handle.abort()
                 left = state is MotionState.LEFT_PATH
                 code = result.PATH_TOLERANCE_VIOLATED if left else result.GOAL_TOLERANCE_VIOLATED
@@ -310,6 +310,12 @@ class MotionServer:
             time.sleep(_JOINTS)
         handle.abort()
         return result(error_code=result.INVALID_GOAL, error_string="the simulator is shutting down")
+
+    def _hold(self, number: int) -> None:
+        """Hold the joints unless a goal newer than goal `number` has begun."""
+        with self._lock:
+            if number == self._newest:
+                self._cell.hold(self._controller)
 
 
 def feedback_of(names: tuple[str, ...], targets: np.ndarray, positions: np.ndarray) -> Any:

@@ -71,8 +71,8 @@ MAX_PACKAGE_LINES = {
     "graspd_bench": 8_415,
     "graspd_dataset": 3_058,
     "graspd_viewer": 2_433,
-    "graspd_cell": 3_809,
-    "test": 34_235,
+    "graspd_cell": 3_815,
+    "test": 34_289,
 }
 # Lines that a program reaches through its imports, those inside functions too.
 # The layout aims at 22,000 of the node.

@@ -29,9 +29,10 @@ from std_msgs.msg import String
 from tf2_msgs.msg import TFMessage
 from trajectory_msgs.msg import JointTrajectory, JointTrajectoryPoint
 
+from graspd_cell.controller import JointLimits, MotionState, Tolerances, TrajectoryController
 from graspd_cell.layout import layout_of
 from graspd_cell.robot_description import CAMERA_FRAME, robot_description
-from graspd_cell.simulator_node import SimulatorNode
+from graspd_cell.simulator_node import MotionServer, SimulatorNode
 from graspd_core.arms.arm import load_arm, tip_hand
 from graspd_core.hands.library import load_hand
 from graspd_core.hands.readers.urdf import read_urdf
@@ -327,3 +328,56 @@ def test_a_simulation_that_cannot_keep_up_goes_on(speed: float, seconds: float):
     cell._publish = publish
     cell.simulate()
     assert rounds[1:] == pytest.approx([rounds[0] + 0.2 * k for k in (1, 2, 3)], abs=0.05)
+
+
+class BusyCell:
+    """A cell whose controller runs one motion, and whose first motion leaves its path if `fails`."""
+
+    def __init__(self, fails: bool) -> None:
+        self.node, self.stopped, self.begun, self.fails = None, False, list[Any](), fails
+        self.running = threading.Event()
+
+    def begin(self, controller: Any, motion: Any) -> None:
+        self.begun.append(motion)
+        self.running.set()
+
+    def hold(self, controller: Any) -> None:
+        self.running.clear()
+
+    def progress(self, controller: Any) -> tuple[MotionState, str, np.ndarray, np.ndarray]:
+        if self.fails and len(self.begun) == 1:
+            self.fails = False
+            self.between()
+            return MotionState.LEFT_PATH, "left its path", np.zeros(1), np.zeros(1)
+        return MotionState.RUNNING, "", np.zeros(1), np.zeros(1)
+
+    def between(self) -> None:
+        """What happens between the look at the first motion and its end."""
+
+
+@pytest.mark.parametrize("fails", [False, True])
+def test_the_end_of_an_older_goal_does_not_stop_a_newer_one(fails: bool):
+    limits = JointLimits(("joint",), np.zeros(1), np.ones(1), np.ones(1))
+    cell, server = BusyCell(fails), MotionServer.__new__(MotionServer)
+    server._cell, server._controller, server._newest = cell, TrajectoryController(limits, Tolerances(), np.zeros(1)), 0
+    server._lock, server._result = threading.Lock(), Result
+    done = {name: lambda *_: None for name in ("abort", "canceled", "succeed", "publish_feedback")}
+    goal = goal_of(("joint",), (1.0, [0.5]))
+    newer = SimpleNamespace(request=goal, is_cancel_requested=False, **done)
+    thread = threading.Thread(target=server._execute, args=(newer,))
+
+    def begin_newer() -> bool:
+        thread.start()
+        while len(cell.begun) < 2:
+            time.sleep(0.001)
+        return True
+
+    class Older(SimpleNamespace):
+        is_cancel_requested = property(lambda self: not fails and begin_newer())
+
+    cell.between = begin_newer
+    server._execute(Older(request=goal, **done))
+    # The newer motion still runs. Without it, its goal would be reported as reached.
+    assert cell.running.is_set()
+    cell.stopped = True
+    thread.join(PATIENCE)
