@@ -183,11 +183,13 @@ class ArmPath:
         joint_names: names of the arm's joints, base first.
         positions: joint values, one row per waypoint [rad] or [m].
         stages: row indices of the retreat, the pregrasp, the grasp and the lift (`ARM_STAGES`).
+        velocity: greatest speed of each joint that the arm allows [rad/s] or [m/s]. None if unknown, as from a file.
     """
 
     joint_names: tuple[str, ...]
     positions: Float[np.ndarray, "waypoints joints"]
     stages: tuple[int, int, int, int]
+    velocity: Float[np.ndarray, "joints"] | None = None
 
     def at(self, stage: str) -> Float[np.ndarray, "joints"]:
         """Return the arm's joint values at `stage`, one of `ARM_STAGES`."""

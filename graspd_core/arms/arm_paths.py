@@ -128,9 +128,9 @@ def _some_paths(task: ArmTask, grasps: Sequence[Grasp]) -> list[ArmPath | str]:
     joints = torch.as_tensor(np.stack([grasp.pregrasp.joint_positions for grasp in grasps]))[owner]
     followed = _followed(task, paths[owner], q, joints)
     best = _best_of_each(followed, owner, len(grasps))
-    reasons = _why_lost(task, paths, followed, best)
+    reasons, names, velocity = _why_lost(task, paths, followed, best), task.arm.joint_names, task.arm.chain.velocity
     return [
-        reasons[grasp] if grasp in reasons else ArmPath(task.arm.joint_names, followed.path[row].numpy(), STAGE_ROWS)
+        reasons[grasp] if grasp in reasons else ArmPath(names, followed.path[row].numpy(), STAGE_ROWS, velocity)
         for grasp, row in enumerate(best)
     ]
 

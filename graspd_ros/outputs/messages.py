@@ -361,21 +361,28 @@ def arm_trajectory(grasp: Grasp, path: ArmPath, pace: Pace) -> JointTrajectory:
     """Return all waypoints of the arm without velocities, so that controllers pass them without stopping.
 
     The first point is the retreat posture, at the time `pace.shortest` [s]. The arm must start in this posture. Points
-    of a stage are evenly spaced in time. Joints stay below `pace.joint_speed`, the hand below `pace.base_speed`.
+    of a stage are evenly spaced in time. Joints stay below `pace.joint_speed` and their own limits, the hand below
+    `pace.base_speed`.
     """
     from graspd_core.arms.arm_paths import LIFT
 
     approach = float(np.linalg.norm(grasp.grasp.position - grasp.pregrasp.position))
-    times = [pace.shortest]
+    times, speeds = [pace.shortest], _arm_speeds(path, pace)
     for first, last, travel in zip(path.stages, path.stages[1:], (RETREAT, approach, LIFT), strict=False):
-        fastest = float(np.abs(np.diff(path.positions[first : last + 1], axis=0)).max()) * (last - first)
-        seconds = max(pace.shortest, _PEAK * fastest / pace.joint_speed, _PEAK * travel / pace.base_speed)
+        longest = float((np.abs(np.diff(path.positions[first : last + 1], axis=0)) / speeds).max()) * (last - first)
+        seconds = max(pace.shortest, _PEAK * longest, _PEAK * travel / pace.base_speed)
         times += (times[-1] + seconds * np.arange(1, last - first + 1) / (last - first)).tolist()
     points = [
         JointTrajectoryPoint(positions=positions.tolist(), time_from_start=duration_of(at))
         for positions, at in zip(path.positions, times, strict=True)
     ]
     return JointTrajectory(joint_names=list(path.joint_names), points=points)
+
+
+def _arm_speeds(path: ArmPath, pace: Pace) -> np.ndarray:
+    """Return the greatest speed of each arm joint [rad/s] or [m/s]."""
+    own = np.inf if path.velocity is None else path.velocity
+    return np.minimum(np.full(len(path.joint_names), pace.joint_speed), own)
 
 
 def execution_message(
@@ -385,8 +392,7 @@ def execution_message(
     from graspd_core.arms.execution import GATES, ExecutionPace, execution_of
 
     own = ExecutionPace(pace.joint_speed, pace.base_speed, pace.base_speed, pace.shortest)
-    speeds = np.full(len(path.joint_names), pace.joint_speed)
-    made = execution_of(grasp, hand, arm_speeds=speeds, mass=mass, pace=own)
+    made = execution_of(grasp, hand, arm_speeds=_arm_speeds(path, pace), mass=mass, pace=own)
     times = [duration_of(at) for at in made.times.tolist()]
     arm = [
         JointTrajectoryPoint(positions=q, velocities=v, time_from_start=at)

@@ -80,6 +80,7 @@ def test_a_way_goes_where_the_hand_goes_within_limits_without_jump_or_hit(arm, h
             continue
         q = torch.as_tensor(path.positions)
         assert (path.joint_names, path.stages) == (arm.joint_names, STAGE_ROWS)
+        assert path.velocity is arm.chain.velocity
         assert (path.positions >= arm.lower).all()
         assert (path.positions <= arm.upper).all()
         assert np.abs(np.diff(path.positions, axis=0)).max() <= LARGEST_JUMP

@@ -229,6 +229,18 @@ def test_no_joint_and_no_hand_is_faster_than_asked(step: float):
     assert (stages >= np.maximum(0.2, np.array([0.1, 0.04, 0.1]) / 0.1) - 1e-6).all()
 
 
+def test_no_joint_of_the_arm_is_faster_than_the_arm_allows():
+    found, limits, hand = grasp_with(0.2), np.array([0.3, np.inf]), load_hand("barrett_like", candidates=50)
+    assert found.arm is not None
+    found = dataclasses.replace(found, arm=dataclasses.replace(found.arm, velocity=limits))
+    told = grasp_message(found, 0, "id", Header(), hand, Pace(joint_speed=50.0, base_speed=9.0, shortest=0.01))
+    for sent in (told.arm_trajectory, told.execution.arm):
+        speeds = np.diff(positions(sent), axis=0) / np.diff(seconds(sent))[:, None]
+        assert (np.abs(speeds) <= limits * (1 + 1e-6)).all()
+    # The execution looks at its speeds in 200 moments of a stage.
+    assert (np.abs([point.velocities for point in told.execution.arm.points]) <= 1.01 * limits).all()
+
+
 def test_the_message_of_a_grasp_has_it_only_where_there_is_an_arm():
     hand, grasp = load_hand("barrett_like", candidates=50), grasp_with(0.02)
     told = grasp_message(grasp, 0, "id", Header(frame_id="world"), hand, Pace())
