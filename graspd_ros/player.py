@@ -144,8 +144,8 @@ def _wait_for_delivery(publishers: dict[str, tuple[Any, type]]) -> None:
 def _shifted(data: bytes, kind: type, start: int, began: int, rate: float) -> Any:
     """Return the message with the stamps of its headers moved to the time of publication.
 
-    The stamp `start` [ns] becomes `began` [ns]. Time since `start` is divided by `rate`. Messages without headers do
-    not change.
+    The stamp `start` [ns] becomes `began` [ns]. Time since `start` is divided by `rate`. Messages without headers and
+    zero stamps do not change, because a zero stamp means that there is none.
     """
     from rclpy.serialization import deserialize_message
 
@@ -155,6 +155,8 @@ def _shifted(data: bytes, kind: type, start: int, began: int, rate: float) -> An
     for stamped in (message, *getattr(message, "transforms", ())):
         if hasattr(stamped, "header"):
             stamp = stamped.header.stamp
+            if not nanoseconds(stamp):
+                continue
             set_nanoseconds(stamp, max(0, began + round((nanoseconds(stamp) - start) / rate)))
     return message
 

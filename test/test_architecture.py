@@ -67,12 +67,12 @@ MAY_IMPORT = {
 # The layout aims at 22,000 of graspd_core, 4,500 of graspd_ros, 26,000 of test. Input checks added 1,700, 500, 3,300.
 MAX_PACKAGE_LINES = {
     "graspd_core": 27_819,
-    "graspd_ros": 5_369,
+    "graspd_ros": 5_371,
     "graspd_bench": 8_415,
     "graspd_dataset": 3_058,
     "graspd_viewer": 2_433,
     "graspd_cell": 3_815,
-    "test": 34_302,
+    "test": 34_311,
 }
 # Lines that a program reaches through its imports, those inside functions too.
 # The layout aims at 22,000 of the node.

@@ -11,14 +11,17 @@ from pathlib import Path
 import numpy as np
 import pytest
 from bag_writer import Record, camera_info_message, cloud_message, depth_message, transforms_message, write_bag
+from geometry_msgs.msg import TransformStamped
 from rclpy.qos import DurabilityPolicy, QoSProfile
+from rclpy.serialization import serialize_message
 from sensor_msgs.msg import CameraInfo, Image, PointCloud2
+from tf2_msgs.msg import TFMessage
 
 from graspd_core.errors import BagError
 from graspd_core.io.messages import cloud_from_depth_message, points_from_message
 from graspd_core.perception.cloud.camera import PinholeCamera
 from graspd_core.transforms import SECOND
-from graspd_ros.player import main, play
+from graspd_ros.player import _shifted, main, play
 
 CAMERA = PinholeCamera(32, 24, 30.0, 30.0, 15.5, 11.5, (0.1, -0.05))
 DEPTH = np.linspace(0.4, 0.8, 24 * 32).reshape(24, 32)
@@ -112,6 +115,12 @@ def test_stamps_can_be_those_of_now_at_the_rate_that_they_are_played(client, bag
     first, second = (m.header.stamp.sec * SECOND + m.header.stamp.nanosec for m in heard[PointCloud2])
     assert second - first == SECOND // 5 // rate
     assert abs(time.time_ns() - second) < TIMEOUT * SECOND
+
+
+def test_a_message_without_a_stamp_gets_none():
+    for message in (PointCloud2(), TFMessage(transforms=[TransformStamped()])):
+        shifted = _shifted(serialize_message(message), type(message), START, time.time_ns(), 1.0)
+        assert shifted == message
 
 
 def test_the_command_loops_under_other_names_until_a_signal(client, play_process, heard):
