@@ -146,6 +146,8 @@ _SECTIONS = ("compiler", "default", "asset", "worldbody", "tendon", "equality", 
 # Attributes whose values are names. They are not searched for nan and inf, because a name may contain these letters.
 _NAMES = {"name", "class", "childclass", "model", "mesh", "file"}
 _HEAVIEST, _MOST_CLASSES = 1e3, 300
+# MuJoCo's number for `inertiafromgeom="true"`. The geoms then give all masses, and <inertial> counts for nothing.
+_FROM_GEOMS = 1
 # Greatest number of files, the main file included.
 _MOST_FILES = 30
 
@@ -371,8 +373,11 @@ def _primitives(parts: _Parts, body: Any, name: str) -> tuple[Primitive, ...]:
 
 
 def _inertial(parts: _Parts, body: Any) -> tuple[float, Float[np.ndarray, "3"], Float[np.ndarray, "3 3"]]:
-    """Return mass [kg], centre of mass [m] and inertia about this centre [kg·m²]. Zero if there is no <inertial>."""
-    if not body.explicitinertial:
+    """Return mass [kg], centre of mass [m] and inertia about this centre [kg·m²]. Zero if there is no <inertial>.
+
+    Return zero too if the file says `inertiafromgeom="true"`. MuJoCo would weigh the spheres that replace the meshes.
+    """
+    if not body.explicitinertial or parts.spec.compiler.inertiafromgeom == _FROM_GEOMS:
         return 0.0, np.zeros(3), np.zeros((3, 3))
     model, number = parts.model, body.id
     rotation, com = pose(model.body_ipos[number], model.body_iquat[number])

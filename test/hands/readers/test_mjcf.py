@@ -346,3 +346,12 @@ def test_any_tree_is_given_a_palm_postures_and_candidates(folder: Path, data: st
         assert np.linalg.norm(direction) == pytest.approx(1.0)
     assert np.isfinite(hand.palm_center).all()
     assert len(hand.candidate_points) > 0
+
+
+def test_masses_that_geoms_give_instead_of_inertials_are_left_out(folder: Path) -> None:
+    """MuJoCo sees a small sphere instead of the mesh of `b2`. The mass of that sphere is not the link's."""
+    heavy = MJCF.replace('ref="5"/>', 'ref="5"/><inertial pos="0 0 0" mass="2" diaginertia="1 1 1"/>')
+    assert _read(folder, heavy).link_mass.max() == 2.0
+    by_geoms = _read(folder, heavy.replace("<compiler ", '<compiler inertiafromgeom="true" '))
+    assert not by_geoms.link_mass.any()
+    assert not by_geoms.link_inertia.any()
