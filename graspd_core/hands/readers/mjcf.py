@@ -30,7 +30,7 @@ from graspd_core.hands.readers.build_model import (
     refuse_crowds,
     resolved_couplings,
 )
-from graspd_core.hands.readers.link_meshes import LARGEST_SIZE, corners_each, mesh_hull
+from graspd_core.hands.readers.link_meshes import LARGEST_SIZE, SMALLEST_MESH, corners_each, mesh_hull
 from graspd_core.hands.readers.xml_io import DEEPEST, FARTHEST, Element, as_text, read_xml, wrong
 from graspd_core.mesh.convex_parts import limited_hull
 from graspd_core.se3 import axis_rotation, rotation_from_quaternion
@@ -133,9 +133,9 @@ def _asset_hull(path: Path, mesh: _MeshAsset, corners: int) -> TriangleMesh:
     if mesh.file:
         return mesh_hull(path, mesh.place, mesh.file, mesh.scale, corners)
     points = mesh.vertices * mesh.scale
-    if len(points) < 4 or np.abs(points).max() > LARGEST_SIZE:
-        text = f"{len(points)} points; expected four or more, within {LARGEST_SIZE:g} m"
-        raise wrong(path, mesh.place, f"<mesh vertex=...>: {text}")
+    if len(points) < 4 or np.abs(points).max() > LARGEST_SIZE or np.ptp(points, axis=0).max() < SMALLEST_MESH:
+        valid = f"four or more, {SMALLEST_MESH:g} m across or more, within {LARGEST_SIZE:g} m"
+        raise wrong(path, mesh.place, f"<mesh vertex=...>: {len(points)} points; expected {valid}")
     return limited_hull(points, corners)
 
 

@@ -240,6 +240,11 @@ def test_where_the_base_stands_in_its_file_is_kept(folder: Path) -> None:
             'vertex="0 0 0"',
             "mesh 't': <mesh vertex=...>: 1 points; expected four",
         ),
+        (
+            'scale="1 -1 1"',
+            'scale=".001 -.001 .001"',
+            "mesh 't': <mesh vertex=...>: 4 points; .*0.0003 m across or more",
+        ),
         ('file="wedge.obj"', 'file="lost.obj"', "mesh 'w': mesh 'lost.obj' was not found"),
         ('polycoef="0.1 .5 0 0 0"', 'polycoef="0.1 .5 2 0 0"', "not linear; valid: zeros"),
         ('joint2="j3"', 'joint2="j9"', "changed.xml:19: .*unknown element 'j9' in equality constraint"),
