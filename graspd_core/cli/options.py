@@ -229,6 +229,14 @@ def check_bag_options(options: argparse.Namespace) -> None:
             raise ConfigError(f"--{name}: {value} clouds; valid: 1 or more")
 
 
+def _refuse_bag_options(path: Path, options: argparse.Namespace) -> None:
+    given = {name: getattr(options, name) for name in ("topic", "camera_info", "frame", "sensor_frame", "limit")}
+    given["every"] = options.every if options.every > 1 else None
+    for name, value in given.items():
+        if value:
+            raise ConfigError(f"--{name.replace('_', '-')} {value}: given with {path}, a file; valid with recordings")
+
+
 def bag_views(path: Path, options: argparse.Namespace) -> Iterator[tuple[BagFrame, PointCloud | str]]:
     """Yield the recorded frames that the options choose, each with its cloud, or with the reason why it has none.
 
@@ -284,11 +292,16 @@ def merged_views(path: Path, options: argparse.Namespace) -> tuple[PointCloud, .
 
 
 def load_views(path: Path, options: argparse.Namespace) -> tuple[PointCloud, ...]:
-    """Return the views of a cloud file, or the chosen views of a bag. Without --limit, take a bag's first view."""
-    from graspd_core.perception.cloud import cloud_files
+    """Return the views of a cloud file or a depth image, or the chosen views of a bag. Without --limit, take the first.
+
+    Raises ConfigError: an option of bags is given with a file.
+    """
+    from graspd_core.perception.load_scene import scaled_views
 
     if not is_bag(path):
-        return cloud_files.load_views(path, None if options.view_point is None else np.array(options.view_point))
+        _refuse_bag_options(path, options)
+    if not is_bag(path) or options.camera is not None:
+        return tuple(scaled_views(path, options.camera, view_point=options.view_point))
     chosen = argparse.Namespace(**{**vars(options), "limit": options.limit or 1})
     return merged_views(path, chosen)
 

@@ -139,6 +139,25 @@ def test_a_cloud_is_reconstructed_to_a_mesh_file(tmp_path: Path, capsys: pytest.
     assert "none.npy" in the_line(capsys)
 
 
+@pytest.mark.parametrize(
+    ("options", "culprit"),
+    [
+        (["--frame", "base"], "--frame base: given with ball.npy, a file; valid with recordings"),
+        (["--camera-info", "/info"], "--camera-info /info: given with ball.npy, a file"),
+        (["--sensor-frame", "eye"], "--sensor-frame eye: given with ball.npy, a file"),
+        (["--every", "2"], "--every 2: given with ball.npy, a file"),
+        (["--camera", "camera.json", "--limit", "1"], "--limit 1: given with ball.npy, a file"),
+        (["--camera", "camera.json", "--view-point", "0", "0", "1"], "view_point: ball.npy is a depth image"),
+    ],
+)
+def test_an_option_that_a_file_to_reconstruct_does_not_take_is_refused(tmp_path, capsys, monkeypatch, options, culprit):
+    monkeypatch.chdir(tmp_path)
+    np.save("ball.npy", surface_samples(make_shape("sphere"), 4000, 0)[0])
+    assert main(["reconstruct", "ball.npy", *options, "--out", "ball.ply"]) == EXIT_BAD_INPUT
+    assert culprit in the_line(capsys)
+    assert not Path("ball.ply").exists()
+
+
 def test_a_scene_file_sets_the_reconstruction(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
     np.save(tmp_path / "ball.npy", surface_samples(make_shape("sphere"), 2000, 0)[0])
     scene = tmp_path / "scene.yaml"
