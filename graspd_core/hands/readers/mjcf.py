@@ -209,6 +209,17 @@ def read_mjcf(path: Path, root: ET.Element | None = None) -> HandModel:
     return replace(hand, base_place=((x, y, z), (w, i, j, k)))
 
 
+def included_files(path: Path) -> tuple[Path, ...]:
+    """Return the files that a hand's file includes, sorted by path. Only an MJCF file includes others.
+
+    Raises HandError: see `read_mjcf`.
+    """
+    root, seen = read_xml(path), {path.resolve()}
+    if root.tag == "mujoco":
+        _include(path, path, root, seen)
+    return tuple(sorted(seen - {path.resolve()}))
+
+
 def _include(path: Path, holder: Path, parent: ET.Element, seen: set[Path], depth: int = 0) -> None:
     """Replace each `<include>` below `parent` by the included elements, as in MuJoCo. `holder`: the file of `parent`.
 

@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 
 from graspd_core.errors import HandError
 from graspd_core.hands.kinematics import link_poses
-from graspd_core.hands.library import load_hand, read_hand_file
+from graspd_core.hands.library import hand_hash, load_hand, read_hand_file
 from graspd_core.hands.model import HandModel, all_joint_names, all_joint_positions
 
 WEDGE = np.array([[0.0, 0, 0], [0.02, 0, 0], [0, 0.02, 0], [0, 0, 0.03]])
@@ -201,6 +201,19 @@ def test_included_files_are_read_as_if_they_stood_there(folder: Path) -> None:
     (folder / "parts" / "finger.xml").write_text("<robot/>")
     with pytest.raises(HandError, match=r"<include file='finger.xml'>: the root element is <robot>"):
         _read(folder, f'{head}<include file="parts/middle.xml"/>{rest}')
+
+
+def test_an_included_file_that_changes_also_changes_the_hash_of_its_hand(folder: Path) -> None:
+    main, part = folder / "main.xml", folder / "limits.xml"
+    main.write_text(MJCF.replace("<default>", '<include file="limits.xml"/><default>', 1))
+    hashed = []
+    for upper in (50, 70, 50):
+        limit = f'<default><default class="g"><joint range="0 {upper}"/></default></default>'
+        part.write_text(f"<mujocoinclude>{limit}</mujocoinclude>")
+        hand_hash.cache_clear()
+        hashed.append(hand_hash(str(main)))
+    assert hashed[0] != hashed[1]
+    assert hashed[0] == hashed[2]
 
 
 def test_where_the_base_stands_in_its_file_is_kept(folder: Path) -> None:
