@@ -254,7 +254,7 @@ def bag_views(path: Path, options: argparse.Namespace) -> Iterator[tuple[BagFram
                 continue
             transforms = transforms or read_transforms(path)
             if name.removeprefix("/") not in transforms.frames():
-                known = ", ".join(transforms.frames())
+                known = ", ".join(transforms.frames()) + transforms.refused
                 raise BagError(f"{path}: no frame {name!r}; frames of its transforms: {known}")
         try:
             seen = frame.view(transforms, options.frame, place)
