@@ -240,7 +240,8 @@ def _refuse_bag_options(path: Path, options: argparse.Namespace) -> None:
 def bag_views(path: Path, options: argparse.Namespace) -> Iterator[tuple[BagFrame, PointCloud | str]]:
     """Yield the recorded frames that the options choose, each with its cloud, or with the reason why it has none.
 
-    Raises BagError: nothing can be read, or the requested frame is not in the bag.
+    Raises BagError: nothing can be read, or the requested frame is not in the bag. Raises ConfigError: an option is
+    given that messages of this kind do not use.
     """
     said = options.view_point and tuple(options.view_point)
     transforms, place = None, CameraPlace(said, options.sensor_frame)
@@ -249,6 +250,7 @@ def bag_views(path: Path, options: argparse.Namespace) -> Iterator[tuple[BagFram
         path, topic=options.topic, info_topic=options.camera_info, every=options.every, limit=options.limit
     )
     for frame in frames:
+        _refuse_unused(options, frame)
         for name in (options.frame, options.sensor_frame):
             if not name or name.removeprefix("/") == frame.frame.removeprefix("/"):
                 continue
@@ -264,6 +266,14 @@ def bag_views(path: Path, options: argparse.Namespace) -> Iterator[tuple[BagFram
             yield frame, seen
         except (CloudError, TransformError) as error:
             yield frame, str(error)
+
+
+def _refuse_unused(options: argparse.Namespace, frame: BagFrame) -> None:
+    cloud = frame.info is None
+    for name in ("camera_info",) if cloud else ("view_point", "sensor_frame"):
+        if getattr(options, name):
+            has, takes = ("clouds", "depth images") if cloud else ("depth images", "clouds")
+            raise ConfigError(f"--{name.replace('_', '-')}: {frame.topic} has {has}; valid with {takes}")
 
 
 def merged_views(path: Path, options: argparse.Namespace) -> tuple[PointCloud, ...]:

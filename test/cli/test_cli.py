@@ -412,6 +412,8 @@ def test_where_the_camera_of_a_cloud_stood_can_be_said_and_is_checked(tmp_path, 
     assert "refused: cloud: its camera did not stand at the origin of its frame" in capsys.readouterr().out
     assert main(["replay", str(tmp_path / "bag"), "--sensor-frame", "elbow", *to]) == EXIT_BAD_INPUT
     assert "no frame 'elbow'; frames of its transforms: " in the_line(capsys)
+    assert main(["replay", str(tmp_path / "bag"), "--camera-info", "/info", *to]) == EXIT_BAD_INPUT
+    assert "--camera-info: /points has clouds; valid with depth images" in the_line(capsys)
 
 
 def test_any_object_of_a_recording_is_told_with_all_seen(bags, capsys, quick):
@@ -455,6 +457,8 @@ def test_a_target_that_is_not_there_is_an_answer_and_no_bad_input(bags, capsys, 
         (["--limit", "0"], "--limit: 0 clouds; valid: 1 or more"),
         (["--out", "one.json"], "one.json: one file for several clouds; give a directory, --limit 1, or --fuse"),
         (["--target", "0", "0", "0", "--alone"], "not allowed with argument"),
+        (["--view-point", "0", "0", "1"], "--view-point: /depth/image_raw has depth images; valid with clouds"),
+        (["--sensor-frame", "world"], "--sensor-frame: /depth/image_raw has depth images; valid with clouds"),
     ],
 )
 def test_a_bad_option_of_replay_is_named_in_one_line(bags, capsys, monkeypatch, tmp_path, options, culprit):
