@@ -45,6 +45,8 @@ class TransformBuffer:
         self._history = history
         self._links: dict[str, _Link] = {}
         self._lock = threading.RLock()
+        # The child and the fault of the last transform that was refused.
+        self._refused = ("", "")
 
     def add(
         self, parent: str, child: str, T_parent_child: Float[np.ndarray, "4 4"], stamp: int = 0, static: bool = False
@@ -55,8 +57,14 @@ class TransformBuffer:
         Raises TransformError: a frame has no valid name, the frames form a loop, or the transform is not rigid.
         """
         parent, child = _name(parent), _name(child)
-        pose = _rigid(T_parent_child, parent, child)
+        try:
+            pose = _rigid(T_parent_child, parent, child)
+        except TransformError as error:
+            self._refused = (child, f"; refused: {error}")
+            raise
         with self._lock:
+            if child == self._refused[0]:
+                self._refused = ("", "")
             above = self._chain(parent)
             if child in above:
                 loop = " -> ".join([*reversed(above[: above.index(child) + 1]), child])
@@ -76,13 +84,14 @@ class TransformBuffer:
             known = self.frames()
             for name in (target, source):
                 if name not in known:
-                    raise TransformError(f"unknown frame {name!r}; known: {', '.join(known) or 'none'}")
+                    told = f"unknown frame {name!r}; known: {', '.join(known) or 'none'}"
+                    raise TransformError(told + self.refused)
             up_target, up_source = self._chain(target), self._chain(source)
             common = next((name for name in up_source if name in up_target), None)
             if common is None:
                 raise TransformError(
                     f"transform {source} -> {target}: not connected; the root of {source} is {up_source[-1]}, "
-                    f"that of {target} is {up_target[-1]}"
+                    f"that of {target} is {up_target[-1]}{self.refused}"
                 )
             below_source = up_source[: up_source.index(common)]
             below_target = up_target[: up_target.index(common)]
@@ -91,6 +100,11 @@ class TransformBuffer:
                 stamp = min((link.stamps[-1] for link in moving), default=0)
             what = f"transform {source} -> {target}"
             return _inverse(self._down(below_target, stamp, what)) @ self._down(below_source, stamp, what)
+
+    @property
+    def refused(self) -> str:
+        """The end of an error message about a missing frame: the last refused transform, or nothing."""
+        return self._refused[1]
 
     def frames(self) -> tuple[str, ...]:
         """Return the names of all known frames, in alphabetical order."""

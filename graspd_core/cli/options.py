@@ -229,10 +229,19 @@ def check_bag_options(options: argparse.Namespace) -> None:
             raise ConfigError(f"--{name}: {value} clouds; valid: 1 or more")
 
 
+def _refuse_bag_options(path: Path, options: argparse.Namespace) -> None:
+    given = {name: getattr(options, name) for name in ("topic", "camera_info", "frame", "sensor_frame", "limit")}
+    given["every"] = options.every if options.every > 1 else None
+    for name, value in given.items():
+        if value:
+            raise ConfigError(f"--{name.replace('_', '-')} {value}: given with {path}, a file; valid with recordings")
+
+
 def bag_views(path: Path, options: argparse.Namespace) -> Iterator[tuple[BagFrame, PointCloud | str]]:
     """Yield the recorded frames that the options choose, each with its cloud, or with the reason why it has none.
 
-    Raises BagError: nothing can be read, or the requested frame is not in the bag.
+    Raises BagError: nothing can be read, or the requested frame is not in the bag. Raises ConfigError: an option is
+    given that messages of this kind do not use.
     """
     said = options.view_point and tuple(options.view_point)
     transforms, place = None, CameraPlace(said, options.sensor_frame)
@@ -241,12 +250,13 @@ def bag_views(path: Path, options: argparse.Namespace) -> Iterator[tuple[BagFram
         path, topic=options.topic, info_topic=options.camera_info, every=options.every, limit=options.limit
     )
     for frame in frames:
+        _refuse_unused(options, frame)
         for name in (options.frame, options.sensor_frame):
             if not name or name.removeprefix("/") == frame.frame.removeprefix("/"):
                 continue
             transforms = transforms or read_transforms(path)
             if name.removeprefix("/") not in transforms.frames():
-                known = ", ".join(transforms.frames())
+                known = ", ".join(transforms.frames()) + transforms.refused
                 raise BagError(f"{path}: no frame {name!r}; frames of its transforms: {known}")
         try:
             seen = frame.view(transforms, options.frame, place)
@@ -256,6 +266,14 @@ def bag_views(path: Path, options: argparse.Namespace) -> Iterator[tuple[BagFram
             yield frame, seen
         except (CloudError, TransformError) as error:
             yield frame, str(error)
+
+
+def _refuse_unused(options: argparse.Namespace, frame: BagFrame) -> None:
+    cloud = frame.info is None
+    for name in ("camera_info",) if cloud else ("view_point", "sensor_frame"):
+        if getattr(options, name):
+            has, takes = ("clouds", "depth images") if cloud else ("depth images", "clouds")
+            raise ConfigError(f"--{name.replace('_', '-')}: {frame.topic} has {has}; valid with {takes}")
 
 
 def merged_views(path: Path, options: argparse.Namespace) -> tuple[PointCloud, ...]:
@@ -284,11 +302,16 @@ def merged_views(path: Path, options: argparse.Namespace) -> tuple[PointCloud, .
 
 
 def load_views(path: Path, options: argparse.Namespace) -> tuple[PointCloud, ...]:
-    """Return the views of a cloud file, or the chosen views of a bag. Without --limit, take a bag's first view."""
-    from graspd_core.perception.cloud import cloud_files
+    """Return the views of a cloud file or a depth image, or the chosen views of a bag. Without --limit, take the first.
+
+    Raises ConfigError: an option of bags is given with a file.
+    """
+    from graspd_core.perception.load_scene import scaled_views
 
     if not is_bag(path):
-        return cloud_files.load_views(path, None if options.view_point is None else np.array(options.view_point))
+        _refuse_bag_options(path, options)
+    if not is_bag(path) or options.camera is not None:
+        return tuple(scaled_views(path, options.camera, view_point=options.view_point))
     chosen = argparse.Namespace(**{**vars(options), "limit": options.limit or 1})
     return merged_views(path, chosen)
 

@@ -34,15 +34,12 @@ def run(options: argparse.Namespace) -> int:
     """Reconstruct a mesh and write it to `--out`. Return the exit status."""
     from graspd_core.io.grasps_json import check_writable
     from graspd_core.mesh.mesh_files import save_mesh
-    from graspd_core.perception.cloud.depth_files import is_depth_image
-    from graspd_core.perception.load_scene import scaled_views
     from graspd_core.perception.scene_from_views import reconstruct_object
 
     check_bag_options(options)
     check_writable(options.out)
     settings = scene_config_of(options)
-    depth = options.camera is not None or is_depth_image(options.cloud)
-    views = tuple(scaled_views(options.cloud, options.camera)) if depth else load_views(options.cloud, options)
+    views = load_views(options.cloud, options)
     with busy("reconstruct"):
         whole, _, _, warnings = reconstruct_object(views, target_of(options), options.alone, settings)
     mesh = whole.mesh

@@ -16,7 +16,7 @@ from graspd_core.hands.default_postures import default_palm, default_postures
 from graspd_core.hands.kinematics import link_poses
 from graspd_core.hands.model import HandModel
 from graspd_core.hands.readers.description import apply_description, read_description
-from graspd_core.hands.readers.mjcf import read_mjcf
+from graspd_core.hands.readers.mjcf import included_files, read_mjcf
 from graspd_core.hands.readers.urdf import EXPAND, below_link, read_urdf
 from graspd_core.hands.readers.xml_io import read_xml, wrong
 from graspd_core.hands.self_collision import adjacent_links
@@ -172,9 +172,10 @@ def _palms(hand: HandModel, translations: Float[np.ndarray, "links 3"]) -> tuple
 
 @lru_cache
 def hand_hash(name: str) -> str:
-    """Return the hash of a hand's file, description and meshes. Raises HandError: the hand is missing or unusable."""
+    """Return the hash of a hand's files, description and meshes. Raises HandError: the hand is missing or unusable."""
     hand = load_hand(name, candidates=1)
     boxed = config_dir() / "hands" / f"{name}.yaml"
     files = [Path(hand.urdf), boxed if boxed.is_file() else Path(name)]
+    files += included_files(files[0]) if files[0].suffix != ".pkl" else ()
     hulls = (shape.vertices.tobytes() for shape in hand.primitives)
     return hashlib.sha256(b"".join([*(file.read_bytes() for file in files), *hulls])).hexdigest()

@@ -18,6 +18,7 @@ from bag_writer import (
 )
 
 from graspd_bench.rendering.render import look_at, render_depth
+from graspd_core.cli import main
 from graspd_core.cli.options import bag_views
 from graspd_core.errors import BagError, CloudError, TransformError
 from graspd_core.io.bags import bag_topics, is_bag, read_frames, read_raw, read_transforms
@@ -279,6 +280,20 @@ def test_a_topic_that_is_missing_or_ambiguous_is_named(tmp_path, topics, options
         list(read_frames(path, **options))
     assert culprit in str(refused.value)
     assert "\n" not in str(refused.value)
+
+
+def test_a_frame_that_only_a_refused_transform_names_is_told_with_the_fault(tmp_path, capsys):
+    """Some drivers send a quaternion of four zeros."""
+    tree = transforms_message([("base", OPTICAL, np.eye(4)), ("elbow", "wrist", np.eye(4))], START)
+    tree.transforms[0].transform.rotation.w = 0.0
+    cloud = cloud_message(np.random.default_rng(0).random((60, 3)), OPTICAL, START)
+    write_bag(tmp_path / "bag", [Record("/tf_static", START, tree), Record("/points", START, cloud)])
+    said = f"refused: transform base -> {OPTICAL}: not rigid; valid: a rotation and a finite position"
+    (frame,) = read_frames(tmp_path / "bag")
+    with pytest.raises(TransformError, match=f"unknown frame 'base'; known: elbow, wrist; {said}"):
+        frame.view(read_transforms(tmp_path / "bag"), "base")
+    assert main(["reconstruct", str(tmp_path / "bag"), "--frame", "base", "--out", str(tmp_path / "m.ply")]) == 2
+    assert f"no frame 'base'; frames of its transforms: elbow, wrist; {said}" in capsys.readouterr().err
 
 
 def test_a_bag_without_transforms_says_so(tmp_path):

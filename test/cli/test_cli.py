@@ -139,6 +139,25 @@ def test_a_cloud_is_reconstructed_to_a_mesh_file(tmp_path: Path, capsys: pytest.
     assert "none.npy" in the_line(capsys)
 
 
+@pytest.mark.parametrize(
+    ("options", "culprit"),
+    [
+        (["--frame", "base"], "--frame base: given with ball.npy, a file; valid with recordings"),
+        (["--camera-info", "/info"], "--camera-info /info: given with ball.npy, a file"),
+        (["--sensor-frame", "eye"], "--sensor-frame eye: given with ball.npy, a file"),
+        (["--every", "2"], "--every 2: given with ball.npy, a file"),
+        (["--camera", "camera.json", "--limit", "1"], "--limit 1: given with ball.npy, a file"),
+        (["--camera", "camera.json", "--view-point", "0", "0", "1"], "view_point: ball.npy is a depth image"),
+    ],
+)
+def test_an_option_that_a_file_to_reconstruct_does_not_take_is_refused(tmp_path, capsys, monkeypatch, options, culprit):
+    monkeypatch.chdir(tmp_path)
+    np.save("ball.npy", surface_samples(make_shape("sphere"), 4000, 0)[0])
+    assert main(["reconstruct", "ball.npy", *options, "--out", "ball.ply"]) == EXIT_BAD_INPUT
+    assert culprit in the_line(capsys)
+    assert not Path("ball.ply").exists()
+
+
 def test_a_scene_file_sets_the_reconstruction(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
     np.save(tmp_path / "ball.npy", surface_samples(make_shape("sphere"), 2000, 0)[0])
     scene = tmp_path / "scene.yaml"
@@ -393,6 +412,8 @@ def test_where_the_camera_of_a_cloud_stood_can_be_said_and_is_checked(tmp_path, 
     assert "refused: cloud: its camera did not stand at the origin of its frame" in capsys.readouterr().out
     assert main(["replay", str(tmp_path / "bag"), "--sensor-frame", "elbow", *to]) == EXIT_BAD_INPUT
     assert "no frame 'elbow'; frames of its transforms: " in the_line(capsys)
+    assert main(["replay", str(tmp_path / "bag"), "--camera-info", "/info", *to]) == EXIT_BAD_INPUT
+    assert "--camera-info: /points has clouds; valid with depth images" in the_line(capsys)
 
 
 def test_any_object_of_a_recording_is_told_with_all_seen(bags, capsys, quick):
@@ -436,6 +457,8 @@ def test_a_target_that_is_not_there_is_an_answer_and_no_bad_input(bags, capsys, 
         (["--limit", "0"], "--limit: 0 clouds; valid: 1 or more"),
         (["--out", "one.json"], "one.json: one file for several clouds; give a directory, --limit 1, or --fuse"),
         (["--target", "0", "0", "0", "--alone"], "not allowed with argument"),
+        (["--view-point", "0", "0", "1"], "--view-point: /depth/image_raw has depth images; valid with clouds"),
+        (["--sensor-frame", "world"], "--sensor-frame: /depth/image_raw has depth images; valid with clouds"),
     ],
 )
 def test_a_bad_option_of_replay_is_named_in_one_line(bags, capsys, monkeypatch, tmp_path, options, culprit):

@@ -24,8 +24,9 @@ from graspd_core.types import TriangleMesh
 _CORNERS = 200
 # Greatest number of corners of all hulls of a hand together, and least number that every hull may have.
 _ALL_CORNERS, _FEWEST_CORNERS = 12_800, 48
-# Greatest valid size of a part of a hand [m].
-LARGEST_SIZE = 2.0
+# Greatest valid size of a part of a hand, and least valid size of a mesh [m]. A mesh in metres that a file scales by
+# 0.001 is smaller.
+LARGEST_SIZE, SMALLEST_MESH = 2.0, 3e-4
 
 
 def resolve_mesh(urdf: Path, shape: ET.Element, filename: str) -> Path:
@@ -79,7 +80,7 @@ def mesh_hull(
 ) -> TriangleMesh:
     """Return the convex hull [m] of a mesh file scaled along each axis, with at most `corners` corners.
 
-    A negative factor mirrors the mesh. Raises HandError: the file does not exist, is no mesh, or is too large.
+    A negative factor mirrors the mesh. Raises HandError: the file does not exist, is no mesh, or has a wrong size.
     """
     path = resolve_mesh(urdf, shape, filename)
     try:
@@ -91,6 +92,9 @@ def mesh_hull(
         raise wrong(
             urdf, shape, f"mesh {filename!r} is {extent:.3g} m across: if it is in millimetres, scale it by 0.001"
         )
+    if extent < SMALLEST_MESH:
+        told = f"mesh {filename!r} is {1e3 * extent:.3g} mm across; valid: {1e3 * SMALLEST_MESH:g} mm or more"
+        raise wrong(urdf, shape, f"{told}; if its file is in metres, scale it by 1")
     return hull
 
 

@@ -30,7 +30,7 @@ from graspd_core.hands.readers.build_model import (
     refuse_crowds,
     resolved_couplings,
 )
-from graspd_core.hands.readers.link_meshes import LARGEST_SIZE, corners_each, mesh_hull
+from graspd_core.hands.readers.link_meshes import LARGEST_SIZE, SMALLEST_MESH, corners_each, mesh_hull
 from graspd_core.hands.readers.xml_io import DEEPEST, FARTHEST, Element, as_text, read_xml, wrong
 from graspd_core.mesh.convex_parts import limited_hull
 from graspd_core.se3 import axis_rotation, rotation_from_quaternion
@@ -133,9 +133,9 @@ def _asset_hull(path: Path, mesh: _MeshAsset, corners: int) -> TriangleMesh:
     if mesh.file:
         return mesh_hull(path, mesh.place, mesh.file, mesh.scale, corners)
     points = mesh.vertices * mesh.scale
-    if len(points) < 4 or np.abs(points).max() > LARGEST_SIZE:
-        text = f"{len(points)} points; expected four or more, within {LARGEST_SIZE:g} m"
-        raise wrong(path, mesh.place, f"<mesh vertex=...>: {text}")
+    if len(points) < 4 or np.abs(points).max() > LARGEST_SIZE or np.ptp(points, axis=0).max() < SMALLEST_MESH:
+        valid = f"four or more, {SMALLEST_MESH:g} m across or more, within {LARGEST_SIZE:g} m"
+        raise wrong(path, mesh.place, f"<mesh vertex=...>: {len(points)} points; expected {valid}")
     return limited_hull(points, corners)
 
 
@@ -146,6 +146,8 @@ _SECTIONS = ("compiler", "default", "asset", "worldbody", "tendon", "equality", 
 # Attributes whose values are names. They are not searched for nan and inf, because a name may contain these letters.
 _NAMES = {"name", "class", "childclass", "model", "mesh", "file"}
 _HEAVIEST, _MOST_CLASSES = 1e3, 300
+# MuJoCo's number for `inertiafromgeom="true"`. The geoms then give all masses, and <inertial> counts for nothing.
+_FROM_GEOMS = 1
 # Greatest number of files, the main file included.
 _MOST_FILES = 30
 
@@ -205,6 +207,17 @@ def read_mjcf(path: Path, root: ET.Element | None = None) -> HandModel:
     x, y, z, *turn = (*parts.model.body_pos[number].tolist(), *parts.model.body_quat[number].tolist())
     w, i, j, k = turn
     return replace(hand, base_place=((x, y, z), (w, i, j, k)))
+
+
+def included_files(path: Path) -> tuple[Path, ...]:
+    """Return the files that a hand's file includes, sorted by path. Only an MJCF file includes others.
+
+    Raises HandError: see `read_mjcf`.
+    """
+    root, seen = read_xml(path), {path.resolve()}
+    if root.tag == "mujoco":
+        _include(path, path, root, seen)
+    return tuple(sorted(seen - {path.resolve()}))
 
 
 def _include(path: Path, holder: Path, parent: ET.Element, seen: set[Path], depth: int = 0) -> None:
@@ -371,8 +384,11 @@ def _primitives(parts: _Parts, body: Any, name: str) -> tuple[Primitive, ...]:
 
 
 def _inertial(parts: _Parts, body: Any) -> tuple[float, Float[np.ndarray, "3"], Float[np.ndarray, "3 3"]]:
-    """Return mass [kg], centre of mass [m] and inertia about this centre [kg·m²]. Zero if there is no <inertial>."""
-    if not body.explicitinertial:
+    """Return mass [kg], centre of mass [m] and inertia about this centre [kg·m²]. Zero if there is no <inertial>.
+
+    Return zero too if the file says `inertiafromgeom="true"`. MuJoCo would weigh the spheres that replace the meshes.
+    """
+    if not body.explicitinertial or parts.spec.compiler.inertiafromgeom == _FROM_GEOMS:
         return 0.0, np.zeros(3), np.zeros((3, 3))
     model, number = parts.model, body.id
     rotation, com = pose(model.body_ipos[number], model.body_iquat[number])

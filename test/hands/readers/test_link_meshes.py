@@ -95,6 +95,7 @@ def test_a_mirrored_hull_is_wound_outwards(workspace: Path, scale: str) -> None:
         ("x" * 5000, "", "was not found in the file"),
         ("meshes/wedge one.obj", "0 1 1", "a factor cannot be zero"),
         ("meshes/wedge one.obj", "1000 1000 1000", "is 30 m across: if it is in millimetres, scale it by 0.001"),
+        ("meshes/wedge one.obj", "0.001", r"is 0.03 mm across; valid: 0.3 mm or more; if its file is in metres"),
         ("meshes/wedge one.obj", "1 1", "expected 3 finite number"),
         ("broken.obj", "", "link 'a': mesh 'broken.obj' cannot be read"),
         ("../package.xml", "", "cannot be read as a collision mesh: .*unknown mesh ending"),

@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 
 from graspd_core.errors import HandError
 from graspd_core.hands.kinematics import link_poses
-from graspd_core.hands.library import load_hand, read_hand_file
+from graspd_core.hands.library import hand_hash, load_hand, read_hand_file
 from graspd_core.hands.model import HandModel, all_joint_names, all_joint_positions
 
 WEDGE = np.array([[0.0, 0, 0], [0.02, 0, 0], [0, 0.02, 0], [0, 0, 0.03]])
@@ -203,6 +203,19 @@ def test_included_files_are_read_as_if_they_stood_there(folder: Path) -> None:
         _read(folder, f'{head}<include file="parts/middle.xml"/>{rest}')
 
 
+def test_an_included_file_that_changes_also_changes_the_hash_of_its_hand(folder: Path) -> None:
+    main, part = folder / "main.xml", folder / "limits.xml"
+    main.write_text(MJCF.replace("<default>", '<include file="limits.xml"/><default>', 1))
+    hashed = []
+    for upper in (50, 70, 50):
+        limit = f'<default><default class="g"><joint range="0 {upper}"/></default></default>'
+        part.write_text(f"<mujocoinclude>{limit}</mujocoinclude>")
+        hand_hash.cache_clear()
+        hashed.append(hand_hash(str(main)))
+    assert hashed[0] != hashed[1]
+    assert hashed[0] == hashed[2]
+
+
 def test_where_the_base_stands_in_its_file_is_kept(folder: Path) -> None:
     """The base's frame stays the base body's own; grasps of others are poses of the file's world."""
     place, turn = _read(folder, MJCF).base_place
@@ -239,6 +252,11 @@ def test_where_the_base_stands_in_its_file_is_kept(folder: Path) -> None:
             'vertex="0 0 0 .02 0 0 0 .02 0 0 0 .03"',
             'vertex="0 0 0"',
             "mesh 't': <mesh vertex=...>: 1 points; expected four",
+        ),
+        (
+            'scale="1 -1 1"',
+            'scale=".001 -.001 .001"',
+            "mesh 't': <mesh vertex=...>: 4 points; .*0.0003 m across or more",
         ),
         ('file="wedge.obj"', 'file="lost.obj"', "mesh 'w': mesh 'lost.obj' was not found"),
         ('polycoef="0.1 .5 0 0 0"', 'polycoef="0.1 .5 2 0 0"', "not linear; valid: zeros"),
@@ -346,3 +364,12 @@ def test_any_tree_is_given_a_palm_postures_and_candidates(folder: Path, data: st
         assert np.linalg.norm(direction) == pytest.approx(1.0)
     assert np.isfinite(hand.palm_center).all()
     assert len(hand.candidate_points) > 0
+
+
+def test_masses_that_geoms_give_instead_of_inertials_are_left_out(folder: Path) -> None:
+    """MuJoCo sees a small sphere instead of the mesh of `b2`. The mass of that sphere is not the link's."""
+    heavy = MJCF.replace('ref="5"/>', 'ref="5"/><inertial pos="0 0 0" mass="2" diaginertia="1 1 1"/>')
+    assert _read(folder, heavy).link_mass.max() == 2.0
+    by_geoms = _read(folder, heavy.replace("<compiler ", '<compiler inertiafromgeom="true" '))
+    assert not by_geoms.link_mass.any()
+    assert not by_geoms.link_inertia.any()
