@@ -207,7 +207,10 @@ def known_grasps(
     for entry in entries:
         admitted, more = bound.admit(tuple(wanted(library.grasps(entry, hand))))
         refused.update(more)
-        for grasp, reason in _held(scene, hand, admitted, verify, stop or (lambda: False)):
+        # The object has the entry's mass in all trials, so that the result's `tried_mass` is true.
+        mass = entry.mass
+        about = scene if mass == scene.object.mass else replace(scene, object=scene.object.at_mass(mass))
+        for grasp, reason in _held(about, hand, admitted, verify, stop or (lambda: False)):
             if reason:
                 refused[reason] += 1
                 continue

@@ -49,7 +49,7 @@ from graspd_core.perception.scene import Obstacle
 from graspd_core.planning.steering import angle_of_approach
 from graspd_core.se3 import rotation_from_quaternion
 from graspd_core.types import Grasp, Plane, Verdict
-from graspd_core.verify.trial_registry import grasp_trials
+from graspd_core.verify.trial_registry import TrialContext, grasp_trials
 from graspd_core.verify.verification import trial_context
 
 
@@ -410,6 +410,24 @@ def test_of_an_unknown_mass_the_least_mass_in_the_trials_is_told(library, scene,
         assert (found.mass, found.tried_mass, len(found.grasps)) == (0.1, 0.1, 3)
         assert "tried at 0.1 kg" in found.message
     assert known_grasps(library, scene, hand).tried_mass == scene.object.mass
+
+
+def test_of_an_unknown_mass_trials_near_the_support_have_the_mass_of_the_entry(
+    library, hand, planned, monkeypatch: pytest.MonkeyPatch
+):
+    """Else a hand that lifts less than the assumed mass never gets its stored grasps back on a table."""
+    tried, real = list[float](), grasp_trials
+
+    def weighed(worlds: TrialContext, grasp: Grasp, stop):
+        tried.extend(float(w.model.body_mass[w.object_body]) for w in (worlds.alone, worlds.around) if w)
+        return real(worlds, grasp, stop)
+
+    monkeypatch.setattr(module, "grasp_trials", weighed)
+    about = at_height(load_scene("shape:sphere"), hand, planned, 0.01)
+    result = known_grasps(library, about, hand, count=4)
+    assert about.object.mass > 0.5
+    assert result.tried_mass == 0.1
+    assert set(tried) == {0.1}
 
 
 @pytest.mark.parametrize(
