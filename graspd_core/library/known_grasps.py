@@ -226,7 +226,7 @@ def known_grasps(
     lighter = f"tried at {tried['mass']:.2g} kg" if tried["mass"] else ""
     message = "; ".join(filter(None, (result.message, lighter, refusals)))
     warnings = (*scene.object.warnings, *hand.named_warnings)
-    return replace(result, message=message, refused=refused, warnings=warnings, **tried)
+    return replace(result, message=message, refused=refused, warnings=warnings, support=scene.support, **tried)
 
 
 def _least_mass(scene: Scene, masses: Sequence[float]) -> dict[str, float | None]:

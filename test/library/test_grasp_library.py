@@ -27,6 +27,7 @@ from graspd_core import (
 )
 from graspd_core.errors import ConfigError, FormatError, MeshError
 from graspd_core.hands.kinematics import hand_mesh
+from graspd_core.io.grasps_json import result_document
 from graspd_core.library import grasp_library
 from graspd_core.library import known_grasps as module
 from graspd_core.library.grasp_library import GraspLibrary, LibraryEntry, entry_of, hand_hash
@@ -358,6 +359,17 @@ def test_only_what_comes_near_something_is_tried_again(library, scene, hand, pla
         # What was tried again has the trial of the scene too.
         assert {len(grasp.trials) for grasp in result.grasps} <= {1, 2}
         assert sum(len(grasp.trials) == 2 for grasp in result.grasps) <= len(tried)
+
+
+def test_an_answer_on_a_table_tells_the_table(library, scene, hand, planned):
+    """Like the planner's answer. Without it, a file of the answer is shown and planned again without its table."""
+    about = at_height(scene, hand, planned, 0.25)
+    answers = (known_grasps(library, about, hand, count=4), known_or_planned(library, about, hand, count=4))
+    for result in answers:
+        assert len(result.grasps) == 4
+        assert result.support is about.support
+        document = result_document(result, about.object, hand, load_preset("fast"))
+        assert document["object"]["support"]["normal"] == [0.0, 0.0, 1.0]
 
 
 def test_what_would_rise_into_an_obstacle_is_tried_again(library, scene, hand, planned):
