@@ -108,13 +108,16 @@ def execution_of(
         pace: limits of speed and acceleration. None for the defaults.
 
     Raises:
-        ConfigError: the grasp has no arm path, or `arm_speeds` is not one positive number for each joint of the path.
+        ConfigError: the grasp has no arm path, or `arm_speeds` is not one positive number for each joint of the path,
+            or `mass` is below 0 or NaN.
     """
     if grasp.arm is None:
         raise ConfigError("execution: the grasp has no arm path; plan the grasp with the restriction Reach")
     if len(arm_speeds) != len(grasp.arm.joint_names) or not (np.asarray(arm_speeds) > 0).all():
         wanted = f"one positive number for each of {', '.join(grasp.arm.joint_names)}"
         raise ConfigError(f"arm_speeds: {np.asarray(arm_speeds).tolist()}; valid: {wanted}")
+    if mass is not None and not mass >= 0.0:
+        raise ConfigError(f"mass: {mass} kg; valid: a number from 0, or None")
     pace, path, (retreat, before, closed, lifted) = pace or ExecutionPace(), grasp.arm.positions, grasp.arm.stages
     fingers = np.minimum(np.where(hand.slides, pace.base_speed, pace.finger_speed), hand.velocity)
     limits = np.concatenate([arm_speeds, fingers])

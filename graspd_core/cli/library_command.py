@@ -76,7 +76,13 @@ def _add_object(options: argparse.Namespace, library: GraspLibrary, source: str,
         print_note(warning)
     entry = entry_of(scene.object, hand, options.verify)
     _refuse_name(library, entry)
-    has = len(library.grasps(entry, hand))
+
+    def stored() -> int:
+        # An object without a given mass may be stored at less than its assumed mass, if the hand cannot lift that.
+        same = library.of_mesh(entry, any_mass=scene.object.mass_assumed)
+        return sum(len(library.grasps(one, hand)) for one in same if one.verify == entry.verify)
+
+    has = stored()
     if has >= options.count:
         print(f"{entry.name}: the library has {has} grasps already")
         return has
@@ -84,7 +90,8 @@ def _add_object(options: argparse.Namespace, library: GraspLibrary, source: str,
     with Reporter() as reporter:
         hooks = {"progress": reporter, "stop": stop}
         result = plan_grasps(scene, hand, preset=config, deadline=options.deadline, **hooks, **missing)
-    has = add_planned(library, scene, hand, config, result, options.verify) or has
+    add_planned(library, scene, hand, config, result, options.verify)
+    has = stored()
     print(f"{entry.name}: {has} of {options.count} grasps, {result.timing.total:.1f} s", flush=True)
     return has
 

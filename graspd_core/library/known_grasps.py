@@ -207,7 +207,10 @@ def known_grasps(
     for entry in entries:
         admitted, more = bound.admit(tuple(wanted(library.grasps(entry, hand))))
         refused.update(more)
-        for grasp, reason in _held(scene, hand, admitted, verify, stop or (lambda: False)):
+        # The object has the entry's mass in all trials, so that the result's `tried_mass` is true.
+        mass = entry.mass
+        about = scene if mass == scene.object.mass else replace(scene, object=scene.object.at_mass(mass))
+        for grasp, reason in _held(about, hand, admitted, verify, stop or (lambda: False)):
             if reason:
                 refused[reason] += 1
                 continue
@@ -223,7 +226,7 @@ def known_grasps(
     lighter = f"tried at {tried['mass']:.2g} kg" if tried["mass"] else ""
     message = "; ".join(filter(None, (result.message, lighter, refusals)))
     warnings = (*scene.object.warnings, *hand.named_warnings)
-    return replace(result, message=message, refused=refused, warnings=warnings, **tried)
+    return replace(result, message=message, refused=refused, warnings=warnings, support=scene.support, **tried)
 
 
 def _least_mass(scene: Scene, masses: Sequence[float]) -> dict[str, float | None]:

@@ -117,7 +117,7 @@ def sample_sdf(
     distance and normal are continuous at the border.
     """
     half = sdf.half
-    unit = points / half - (sdf.origin / half + 1)
+    unit = points / half - (sdf.origin / half + 1).to(points)
     clamped = unit.clamp(-1.0, 1.0)
     # grid_sample takes x for the last axis of its input.
     field = sdf.field[None].permute(0, 1, 4, 3, 2)

@@ -19,11 +19,11 @@ from scipy.spatial import ConvexHull, KDTree, QhullError
 from graspd_core.config import ObstacleConfig, SceneConfig
 from graspd_core.mesh.convex_parts import hull_surface, limited_hull
 from graspd_core.mesh.mesh_files import surface_samples
-from graspd_core.mesh.sdf import build_sdf, sample_sdf
+from graspd_core.mesh.sdf import sample_sdf
 from graspd_core.mesh.surface_queries import winding_inside
 from graspd_core.mesh.topology import voxel_keys
 from graspd_core.perception.cloud.point_cloud import Points, Vector
-from graspd_core.perception.scene import Obstacle, Scene
+from graspd_core.perception.scene import Obstacle, Scene, make_obstacle
 from graspd_core.se3 import perpendicular, rotation_from_quaternion
 from graspd_core.types import Plane, Posture, TriangleMesh
 
@@ -78,7 +78,7 @@ def make_obstacles(
 
 def _obstacle(points: Points, support: Plane | None, padding: float) -> Obstacle:
     mesh = padded_hull(points, support, padding)
-    return Obstacle(mesh, build_sdf(mesh, resolution=GRID_RESOLUTION, padding=0.02))
+    return make_obstacle(mesh, resolution=GRID_RESOLUTION, padding=0.02)
 
 
 def _cells(points: Points, support: Plane | None, side: float) -> list[Float[np.ndarray, "_ 3"]]:

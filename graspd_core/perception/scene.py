@@ -35,9 +35,9 @@ from graspd_core.types import Contact, Grasp, Plane, Posture, TriangleMesh
 
 
 def moved_sdf(sdf: GridSDF, offset: Float[np.ndarray, "3"]) -> GridSDF:
-    """Return the SDF shifted by `offset` [m]."""
+    """Return the SDF shifted by `offset` [m]. Its origin is in float64, because float32 rounds map coordinates."""
     origin = sdf.origin.double() + torch.as_tensor(offset, device=sdf.origin.device)
-    return GridSDF(sdf.field, origin.to(sdf.origin), sdf.spacing, sdf.half)
+    return GridSDF(sdf.field, origin, sdf.spacing, sdf.half)
 
 
 def moved_grasp(grasp: Grasp, offset: Float[np.ndarray, "3"]) -> Grasp:
@@ -78,7 +78,7 @@ def sample_confidence(
     grid: Float[Tensor, "x y z"], sdf: GridSDF, points: Float[Tensor, "batch points 3"]
 ) -> Float[Tensor, "batch points"]:
     """Interpolate the confidence at points [m], linearly and differentiably. Outside the grid, use its border value."""
-    unit = points / sdf.half - (sdf.origin / sdf.half + 1)
+    unit = points / sdf.half - (sdf.origin / sdf.half + 1).to(points)
     # grid_sample takes x for the last axis of its input.
     field = grid.permute(2, 1, 0)[None, None]
     sampled = grid_sample(field, unit.reshape(1, 1, 1, -1, 3), align_corners=True, padding_mode="border")
@@ -314,6 +314,13 @@ def moved_object(model: ObjectModel, offset: Float[np.ndarray, "3"]) -> ObjectMo
         return model
     mesh = moved_mesh(model.mesh, offset)
     return replace(model, mesh=mesh, sha256=content_hash(mesh), center_of_mass=model.center_of_mass + offset)
+
+
+def make_obstacle(mesh: TriangleMesh, *, resolution: int, padding: float) -> Obstacle:
+    """Return the obstacle with this surface. A distant grid keeps its place in float64 (`moved_sdf`)."""
+    far = far_centre(mesh.vertices)
+    sdf = build_sdf(moved_mesh(mesh, -far), resolution=resolution, padding=padding)
+    return Obstacle(mesh, moved_sdf(sdf, far))
 
 
 def moved_obstacle(neighbour: Obstacle, offset: Float[np.ndarray, "3"]) -> Obstacle:

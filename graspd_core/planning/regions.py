@@ -15,9 +15,8 @@ from scipy.spatial import KDTree
 from graspd_core.errors import ConfigError, short_repr
 from graspd_core.hands.kinematics import RETREAT, forward, make_kinematics
 from graspd_core.hands.model import HandModel
-from graspd_core.mesh.sdf import build_sdf
 from graspd_core.optimize.obstacle_distance import extreme_points_of_solids, hand_reach
-from graspd_core.perception.scene import Obstacle, Scene
+from graspd_core.perception.scene import Obstacle, Scene, make_obstacle
 from graspd_core.se3 import SE3, rotation_from_quaternion
 from graspd_core.types import Posture, TriangleMesh
 
@@ -206,7 +205,7 @@ def boxes_in_reach(scene: Scene, hand: HandModel, boxes: Sequence[Box]) -> tuple
         low, high = np.maximum(-half - _PAD, middle - reach), np.minimum(half + _PAD, middle + reach)
         if (low < high).all():
             mesh = _box_mesh(box, low, high)
-            found.append(Obstacle(mesh, build_sdf(mesh, resolution=_GRID_RESOLUTION, padding=0.02)))
+            found.append(make_obstacle(mesh, resolution=_GRID_RESOLUTION, padding=0.02))
     return tuple(found)
 
 

@@ -239,6 +239,9 @@ def _tried_lighter(
     context = lighter(scene, prefetched, state.context, certainty, mass, most)
     strongest = sorted(range(len(best)), key=lambda place: -lifted[place])
     tried = run_trials(run, context, tuple(replace(best[place], trials=()) for place in strongest), count, 0)
+    if run.over() and all(grasp.verdict is Verdict.FAILED for grasp in tried.grasps):
+        # The run ended before a grasp held the lower mass. The grasps keep their trials at the assumed mass.
+        return state
     if context.checks is not None and context.checks.doubts:
         context = lighter(scene, prefetched, context, certainty, light_end(heavy), heavy)
     grasps = surest_first((*tried.grasps, *others))

@@ -32,7 +32,7 @@ from graspd_core.optimize.restrictions import (
     Roll,
     Turns,
 )
-from graspd_core.perception.scene import Obstacle, Scene
+from graspd_core.perception.scene import Obstacle, Scene, moved_sdf, near_scene, object_sdf
 from graspd_core.planning.regions import Box, NearPoints, Numbers, Region, Sphere, boxes_in_reach, entered, numbers
 from graspd_core.se3 import rotation_from_quaternion
 from graspd_core.types import Grasp
@@ -43,7 +43,10 @@ _BEGINS, _SKIN = 0.003, 0.004
 
 def untouched_part(scene: Scene, region: Region) -> Obstacle:
     """Return the part of the object outside `region` as an obstacle, on the nodes of the object's distance grid."""
-    sdf = scene.sdf
+    sdf, (near, far) = scene.sdf, near_scene(scene)
+    if far.any():
+        # Float32 has rounded the origin of a distant grid, so the grid is built again near the origin and moved.
+        sdf = moved_sdf(object_sdf(near.object).to(sdf.field.device, sdf.field.dtype), far)
     field, spacing = sdf.field.double().cpu().numpy(), float(sdf.spacing)
     axes = [float(x) + spacing * np.arange(n) for x, n in zip(sdf.origin, field.shape[1:], strict=True)]
     nodes = np.stack(np.meshgrid(*axes, indexing="ij"), -1)

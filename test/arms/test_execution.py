@@ -62,6 +62,14 @@ def test_speeds_that_no_motion_can_have_are_refused(speeds: list[float]):
         execution_of(reached_grasp(), HAND, arm_speeds=np.array(speeds))
 
 
+@pytest.mark.parametrize("mass", [float("nan"), -0.1])
+def test_a_mass_that_no_object_has_is_refused(mass: float):
+    """With NaN, all times of the lift would be NaN."""
+    grasp = replace(reached_grasp(), metrics=GraspMetrics({"payload": 1.0}))
+    with pytest.raises(ConfigError, match=f"mass: {mass} kg; valid: a number from 0, or None"):
+        execution_of(grasp, HAND, arm_speeds=SPEEDS, mass=mass)
+
+
 def test_joints_press_within_their_limits_and_only_once_the_hand_is_closed():
     made = execution_of(reached_grasp(), HAND, arm_speeds=SPEEDS)
     assert not made.efforts[: made.gates[1] + 1].any()

@@ -23,10 +23,13 @@ from graspd_core.cli import options as clouds
 from graspd_core.cli.options import summary
 from graspd_core.cli.running import EXIT_BAD_INPUT, EXIT_INTERRUPTED, EXIT_OK, EXIT_TOO_FEW, Interrupt
 from graspd_core.io.grasps_json import load_document, load_grasps
+from graspd_core.library.grasp_library import GraspLibrary
 from graspd_core.mesh.mesh_files import load_mesh, save_mesh, surface_samples
 from graspd_core.mesh.shapes import make_shape
 from graspd_core.optimize.plan_config import preset_names
+from graspd_core.paths import config_dir
 from graspd_core.perception.cloud.camera import PinholeCamera
+from graspd_core.perception.load_scene import load_scene
 from graspd_core.planning import plan_grasps as pipeline
 from graspd_core.transforms import SECOND
 from graspd_core.types import Grasp, GraspResult, Outcome, Posture, Timing, TrialResult, TriangleMesh
@@ -511,6 +514,24 @@ def test_a_library_is_built_gone_on_with_and_listed(tmp_path: Path, capsys: pyte
     told = capsys.readouterr()
     assert "capsule: 2 of 2 grasps" in told.out
     assert "bad.obj" in told.err
+
+
+def test_a_library_of_a_hand_that_cannot_lift_the_assumed_mass_is_gone_on_with(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+):
+    """The grasps are stored at the mass that the hand lifts. A second build plans none of them again."""
+    for name in ("parallel_gripper.yaml", "parallel_gripper.urdf"):
+        (tmp_path / name).write_text((config_dir() / "hands" / name).read_text())
+    with (tmp_path / "parallel_gripper.yaml").open("a") as description:
+        description.write("\neffort: 4.0\n")
+    words, out = ("shape:box", "--hand", str(tmp_path / "parallel_gripper.yaml")), tmp_path / "known.grasps"
+    assert build(out, *words) == 0
+    assert "box: 2 of 2 grasps" in capsys.readouterr().out
+    ((entry, count),) = GraspLibrary(out).entries()
+    assert entry.mass < load_scene("shape:box").object.mass
+    assert build(out, *words) == 0
+    assert "box: the library has 2 grasps already" in capsys.readouterr().out
+    assert GraspLibrary(out).entries() == [(entry, count)]
 
 
 def test_an_object_that_would_go_by_the_name_of_another_is_refused(tmp_path: Path, capsys):

@@ -27,6 +27,7 @@ from graspd_core import (
 )
 from graspd_core.errors import ConfigError, FormatError, MeshError
 from graspd_core.hands.kinematics import hand_mesh
+from graspd_core.io.grasps_json import result_document
 from graspd_core.library import grasp_library
 from graspd_core.library import known_grasps as module
 from graspd_core.library.grasp_library import GraspLibrary, LibraryEntry, entry_of, hand_hash
@@ -49,7 +50,7 @@ from graspd_core.perception.scene import Obstacle
 from graspd_core.planning.steering import angle_of_approach
 from graspd_core.se3 import rotation_from_quaternion
 from graspd_core.types import Grasp, Plane, Verdict
-from graspd_core.verify.trial_registry import grasp_trials
+from graspd_core.verify.trial_registry import TrialContext, grasp_trials
 from graspd_core.verify.verification import trial_context
 
 
@@ -360,6 +361,17 @@ def test_only_what_comes_near_something_is_tried_again(library, scene, hand, pla
         assert sum(len(grasp.trials) == 2 for grasp in result.grasps) <= len(tried)
 
 
+def test_an_answer_on_a_table_tells_the_table(library, scene, hand, planned):
+    """Like the planner's answer. Without it, a file of the answer is shown and planned again without its table."""
+    about = at_height(scene, hand, planned, 0.25)
+    answers = (known_grasps(library, about, hand, count=4), known_or_planned(library, about, hand, count=4))
+    for result in answers:
+        assert len(result.grasps) == 4
+        assert result.support is about.support
+        document = result_document(result, about.object, hand, load_preset("fast"))
+        assert document["object"]["support"]["normal"] == [0.0, 0.0, 1.0]
+
+
 def test_what_would_rise_into_an_obstacle_is_tried_again(library, scene, hand, planned):
     """A ceiling clear of the hand at the grasp, and within the lift."""
     grasps = planned.tried[:4]
@@ -410,6 +422,24 @@ def test_of_an_unknown_mass_the_least_mass_in_the_trials_is_told(library, scene,
         assert (found.mass, found.tried_mass, len(found.grasps)) == (0.1, 0.1, 3)
         assert "tried at 0.1 kg" in found.message
     assert known_grasps(library, scene, hand).tried_mass == scene.object.mass
+
+
+def test_of_an_unknown_mass_trials_near_the_support_have_the_mass_of_the_entry(
+    library, hand, planned, monkeypatch: pytest.MonkeyPatch
+):
+    """Else a hand that lifts less than the assumed mass never gets its stored grasps back on a table."""
+    tried, real = list[float](), grasp_trials
+
+    def weighed(worlds: TrialContext, grasp: Grasp, stop):
+        tried.extend(float(w.model.body_mass[w.object_body]) for w in (worlds.alone, worlds.around) if w)
+        return real(worlds, grasp, stop)
+
+    monkeypatch.setattr(module, "grasp_trials", weighed)
+    about = at_height(load_scene("shape:sphere"), hand, planned, 0.01)
+    result = known_grasps(library, about, hand, count=4)
+    assert about.object.mass > 0.5
+    assert result.tried_mass == 0.1
+    assert set(tried) == {0.1}
 
 
 @pytest.mark.parametrize(

@@ -83,6 +83,28 @@ def test_a_cancel_is_noticed_while_grasps_are_weighed_for_a_lower_mass(scene, mo
 POSTURE = Posture(np.zeros(3), np.array([1.0, 0.0, 0.0, 0.0]), np.zeros(1))
 
 
+def test_a_run_that_ends_in_the_trials_at_a_lower_mass_keeps_the_grasps_it_tried(monkeypatch):
+    """They failed at the assumed mass, and the result says so."""
+    gripper, scene, cancelled, lighter = (
+        load_hand("parallel_gripper"),
+        load_scene("shape:box"),
+        [],
+        planning_rounds.lighter,
+    )
+
+    def cancelling(*given):
+        cancelled.append(True)
+        return lighter(*given)
+
+    monkeypatch.setattr(planning_rounds, "lighter", cancelling)
+    weak = replace(gripper, effort=np.full(gripper.num_joints, 4.0))
+    result = plan_grasps(scene, weak, count=4, preset="fast", stop=lambda: bool(cancelled))
+    assert result.outcome is Outcome.CANCELLED
+    assert len(result.failed) > 0
+    assert all(grasp.reason for grasp in result.failed)
+    assert (result.mass, result.tried_mass) == (None, scene.object.mass)
+
+
 def order(shares: dict[float, float | None]) -> list[float]:
     """Scores of grasps in the order that the given shares bring about."""
     measured = [GraspMetrics({"robustness": share}) for share in shares.values()]

@@ -15,6 +15,7 @@ from graspd_core.hands.kinematics import link_poses
 from graspd_core.mesh.sdf import sample_sdf
 from graspd_core.mesh.topology import moved_mesh
 from graspd_core.optimize.restrictions import BoundRestrictions, Refusal, Roll
+from graspd_core.perception.scene import near_scene
 from graspd_core.planning.regions import Box, NearPoints, Sphere, boxes_in_reach, entered
 from graspd_core.planning.steering import (
     CONTACT_TOLERANCE,
@@ -207,6 +208,22 @@ def test_steering_is_in_the_frame_of_the_scene_far_from_the_origin_too(hand):
     assert found.tried[0].verdict is Verdict.VERIFIED
     assert max(outside_region(top, grasp) for grasp in found.tried) <= CONTACT_TOLERANCE
     assert np.linalg.norm(found.tried[0].grasp.position - away) < 0.5
+
+
+def test_the_search_sees_region_and_boxes_in_place_in_map_coordinates_too(hand):
+    """At 5000 km, float32 rounds to half a metre. The obstacles of the search must not move by that."""
+    away = np.array([4999123.457, 123456.789, 0.0])
+    points = torch.as_tensor(np.random.default_rng(0).uniform(-0.1, 0.1, (500, 3)), dtype=torch.float32)
+
+    def seen(origin: np.ndarray) -> list[torch.Tensor]:
+        scene = load_scene(moved_mesh(make_shape("hammer"), origin), mass=0.2)
+        head = Box(origin + np.array([0.0, 0.0, 0.065]), (0.15, 0.08, 0.07))
+        steering = Steering(region=Sphere(origin, 0.06), avoid=[head])
+        searched = BoundRestrictions((steering.bind(scene, hand),), origin).searched(near_scene(scene)[0])
+        return [sample_sdf(obstacle.sdf, points)[0] for obstacle in searched.obstacles]
+
+    for near, far in zip(seen(np.zeros(3)), seen(away), strict=True):
+        assert float((near - far).abs().max()) < 1e-3
 
 
 QUARTER = (np.sqrt(0.5), 0.0, 0.0, np.sqrt(0.5))
