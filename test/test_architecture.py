@@ -72,7 +72,7 @@ MAX_PACKAGE_LINES = {
     "graspd_dataset": 3_058,
     "graspd_viewer": 2_433,
     "graspd_cell": 3_815,
-    "test": 34_475,
+    "test": 34_476,
 }
 # Lines that a program reaches through its imports, those inside functions too.
 # The layout aims at 22,000 of the node.

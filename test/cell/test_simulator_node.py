@@ -358,7 +358,8 @@ class BusyCell:
 @pytest.mark.parametrize("fails", [False, True])
 def test_the_end_of_an_older_goal_does_not_stop_a_newer_one(fails: bool):
     limits = JointLimits(("joint",), np.zeros(1), np.ones(1), np.ones(1))
-    cell, server = BusyCell(fails), MotionServer.__new__(MotionServer)
+    cell: Any = BusyCell(fails)
+    server: Any = MotionServer.__new__(MotionServer)
     server._cell, server._controller, server._newest = cell, TrajectoryController(limits, Tolerances(), np.zeros(1)), 0
     server._lock, server._result = threading.Lock(), Result
     done = {name: lambda *_: None for name in ("abort", "canceled", "succeed", "publish_feedback")}
