@@ -121,6 +121,7 @@ class RecentRuns:
         """
         about = request.object_key, request.frame_out, T_out_object, _terms(request)
         self._runs[request.id] = _Run(*about, planned)
+        self._runs.move_to_end(request.id)
         while len(self._runs) > MOST_RUNS:
             self._runs.popitem(last=False)
 

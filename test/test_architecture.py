@@ -67,16 +67,16 @@ MAY_IMPORT = {
 # The layout aims at 22,000 of graspd_core, 4,500 of graspd_ros, 26,000 of test. Input checks added 1,700, 500, 3,300.
 MAX_PACKAGE_LINES = {
     "graspd_core": 27_899,
-    "graspd_ros": 5_371,
+    "graspd_ros": 5_372,
     "graspd_bench": 8_415,
     "graspd_dataset": 3_058,
     "graspd_viewer": 2_433,
     "graspd_cell": 3_815,
-    "test": 34_476,
+    "test": 34_484,
 }
 # Lines that a program reaches through its imports, those inside functions too.
 # The layout aims at 22,000 of the node.
-MAX_REACH = {"graspd_core.cli.synthesize_command": 22_852, "graspd_ros.node": 26_770}
+MAX_REACH = {"graspd_core.cli.synthesize_command": 22_852, "graspd_ros.node": 26_771}
 
 # The launch file imports this one where ROS runs it, perhaps without any library of graspd.
 SHORT = ("graspd_core/paths.py",)

@@ -14,7 +14,7 @@ from graspd_ros.convert import matrix_of_posture
 from graspd_ros.error_codes import RequestError
 from graspd_ros.parameters import Settings
 from graspd_ros.request import Request
-from graspd_ros.request_planner import Planner, RecentRuns, unlike
+from graspd_ros.request_planner import MOST_RUNS, Planner, RecentRuns, unlike
 
 SETTINGS = Settings(num_grasps=1, preset="fast", deadline=100.0)
 
@@ -180,6 +180,14 @@ def test_grasps_of_earlier_runs_have_the_least_mass_of_their_trials(hand):
     found = runs.next_best(asked, [])
     assert found is not None
     assert found.mass == 0.3
+
+
+def test_a_run_whose_id_was_used_before_is_the_newest(hand):
+    asked = replace(request(lambda: load_scene("shape:sphere")), id="again", object_key="sphere")
+    planned, runs = planner(hand).plan(asked, never, lambda _: None), RecentRuns()
+    for name in ("again", *(f"other {number}" for number in range(MOST_RUNS - 1)), "again", "last"):
+        runs.keep(replace(asked, id=name), planned, np.eye(4))
+    assert len(runs.excluded(replace(asked, exclude=("again/0", "last/0")), lambda *_: np.eye(4))) == 2
 
 
 @pytest.mark.parametrize(
