@@ -178,7 +178,8 @@ def run_rounds(
             before = state
             if scene.object.mass_assumed:
                 state = _tried_lighter(run, scene, prefetched, state, batch.config.certainty, count)
-            if state.good >= count or _too_weak(run, scene, before, state.lowered) or run.over():
+            last = batch.ends_round == len(rounds)
+            if state.good >= count or last or _too_weak(run, scene, before, state.lowered) or run.over():
                 break
     return state
 
@@ -251,11 +252,11 @@ def _tried_lighter(
 def _too_weak(run: Run, scene: Scene, state: RoundsResult, lowered: float | None) -> bool:
     """Return True if no grasp lifts `light_end` of the object's mass. Then no later round is likely to verify a grasp.
 
-    Return False if too few grasps were tried, or if no camera saw the object: then no robustness check needs a margin.
+    Return False if too few grasps were tried, if no robustness check needs a margin, or if no grasp can be verified.
     `lowered` is the lower mass that the strongest grasp lifts, if `_tried_lighter` weighed the grasps [kg].
     """
     context, least = state.context, light_end(scene.object.mass)
-    if context is None or context.checks is None or len(state.grasps) < _ENOUGH:
+    if context is None or context.checks is None or context.checks.doubts or len(state.grasps) < _ENOUGH:
         return False
     if scene.object.mass_assumed:
         return lowered is not None and lowered < _LIFTED * least
