@@ -68,11 +68,11 @@ MAY_IMPORT = {
 MAX_PACKAGE_LINES = {
     "graspd_core": 27_899,
     "graspd_ros": 5_372,
-    "graspd_bench": 8_415,
+    "graspd_bench": 8_424,
     "graspd_dataset": 3_060,
-    "graspd_viewer": 2_433,
+    "graspd_viewer": 2_436,
     "graspd_cell": 3_815,
-    "test": 34_493,
+    "test": 34_515,
 }
 # Lines that a program reaches through its imports, those inside functions too.
 # The layout aims at 22,000 of the node.
