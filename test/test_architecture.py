@@ -70,9 +70,9 @@ MAX_PACKAGE_LINES = {
     "graspd_ros": 5_372,
     "graspd_bench": 8_424,
     "graspd_dataset": 3_060,
-    "graspd_viewer": 2_438,
+    "graspd_viewer": 2_442,
     "graspd_cell": 3_815,
-    "test": 34_518,
+    "test": 34_521,
 }
 # Lines that a program reaches through its imports, those inside functions too.
 # The layout aims at 22,000 of the node.
