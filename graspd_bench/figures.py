@@ -74,7 +74,7 @@ class Row:
     Attributes:
         count: number of requested grasps.
         given: number of grasps found.
-        held: number of grasps that passed the standard hold trial.
+        held: number of grasps that passed the standard hold trial. 0 without this trial.
         spent: CPU time [s] of optimiser and standard hold trials, or of the whole run if verified grasps are planned.
         values: numbers by name, None if not measured. Medians over grasps (`_grasp_figures`), shares of requested
             grasps (`TRIAL_FIGURES`), times [s], memory [MB], rounds. `cpu_per_grasp` is the optimiser's time per
@@ -117,7 +117,8 @@ def rows(records: Iterable[Record], kind: str = "raw") -> list[Row]:
 
 
 def _row(group: Sequence[Record], ran: Collection[str]) -> Row:
-    count, held = sum(r["count"] for r in group), sum(r["held"] for r in group)
+    # A record of a run without the standard trial has no key "held".
+    count, held = sum(r["count"] for r in group), sum(r.get("held", 0) for r in group)
     grasps = [grasp for r in group for grasp in r["grasps"]]
     figures = [_grasp_figures(grasp) for grasp in grasps]
     names = _grasp_figures({})

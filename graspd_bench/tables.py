@@ -103,9 +103,12 @@ def summary_table(records: Sequence[Record]) -> str:
 def hands_table(records: Sequence[Record]) -> str:
     """Return a table with a row per hand: means over objects, and the object with the smallest share of held grasps."""
     found = by_name(row for row in rows(records) if is_hand(row.name))
-    worst = [min(group, key=lambda row: row.held / row.count) for group in found.values()]
+    # Without the standard trial, no cell of the last column is known.
+    tried = _known(found, "standard")
+    worst = [min(group, key=lambda row: row.held / row.count) for group in found.values()] if tried else []
     hands = {name.removeprefix("hand:"): group for name, group in found.items()}
-    return _summary("hand", hands, ("fewest held", [f"{row.object} {row.held}/{row.count}" for row in worst]))
+    last = ("fewest held", [f"{row.object} {row.held}/{row.count}" for row in worst])
+    return _summary("hand", hands, last if tried else None)
 
 
 def _summary(kind: str, found: Mapping[str, Sequence[Row]], last: tuple[str, list[str]] | None = None) -> str:
@@ -195,7 +198,9 @@ def decades_sections(records: Sequence[Record], chart: Path | None) -> Sections:
     for title, _, setting, values in DECADES:
         scale = 1e3 if "[mm]" in title else 1.0
         found = [groups.get(f"{setting}={value:g}", []) for value in values]
-        share = [f"{sum(r.held for r in group)}/{sum(r.count for r in group)}" if group else "–" for group in found]
+        known = [_known({setting: group}, "standard") for group in found]
+        held = [f"{sum(r.held for r in group)}/{sum(r.count for r in group)}" for group in found]
+        share = [text if tried else "–" for text, tried in zip(held, known, strict=True)]
         blocks.append(markdown_table([title, *(f"{v * scale:g}" for v in values)], [[f"`{setting}`", *share]]))
     return {"decades": blocks}
 

@@ -20,6 +20,8 @@ from graspd_core.mesh.mesh_files import MESH_ENDINGS
 
 # Parts of graspd_core on which no recorded result depends.
 _BESIDE = ("cli", "io", "doctor.py")
+# Endings of hands (`load_hand`) and presets.
+_HAND_ENDINGS = ("yaml", "yml", "urdf", "xml", "pkl")
 _STATUS, _CLEAR = Path("/proc/self/status"), Path("/proc/self/clear_refs")
 
 
@@ -103,7 +105,7 @@ def object_name(source: Any) -> str:
     """Return a short name of an object, hand or other value: without `shape:`, or a file's name without its ending."""
     text = f"{source:g}" if isinstance(source, float) else str(source)
     path = Path(text)
-    return path.stem if path.suffix[1:].lower() in (*MESH_ENDINGS, "yaml", "yml") else text.removeprefix("shape:")
+    return path.stem if path.suffix[1:].lower() in (*MESH_ENDINGS, *_HAND_ENDINGS) else text.removeprefix("shape:")
 
 
 def finite(value: Any) -> Any:

@@ -95,7 +95,7 @@ def _run(record: Record) -> dict[str, Any]:
     words = ["graspd", "synthesize", _source(record), "--hand", record["hand"], "--preset", record["name"]]
     words += ["--seed", str(record["seed"]), "-n", str(record["count"]), "--view"]
     return {
-        **{name: record[name] for name in ("name", "key", "object", "seed", "count", "held")},
+        **{name: record[name] for name in ("name", "key", "object", "seed", "count")}, "held": record.get("held"),
         "command": shlex.join(words), "grasps": [_grasp(grasp) for grasp in record["grasps"]],
     }  # fmt: skip
 
@@ -109,7 +109,8 @@ def _grasp(grasp: dict[str, Any]) -> dict[str, Any]:
     measured, tried = grasp.get("metrics") or {}, grasp.get("standard") or {}
     values = [(name, measured.get(key), scale, digits) for name, key, scale, digits in _FIGURES]
     figures = {name: f"{value * scale:.{digits}f}" for name, value, scale, digits in values if value is not None}
-    return {"held": bool(tried.get("passed")), "reason": str(tried.get("reason", "")), "figures": figures}
+    # None: the run had no standard trial.
+    return {"held": tried.get("passed"), "reason": str(tried.get("reason", "")), "figures": figures}
 
 
 def plan_again(record: Record, show: Callable[[Session], None], report: ShowProgress, stop: StopHook) -> None:
@@ -134,7 +135,9 @@ def plan_again(record: Record, show: Callable[[Session], None], report: ShowProg
         trials = grasp_trials(worlds, grasp, stop)
         grasps.append(replace(grasp, trials=trials, metrics=measure(context, grasp.grasp)))
     held = sum(grasp.verdict is Verdict.VERIFIED for grasp in grasps)
-    line = f"{held} of {count} held; {record['held']} held in the benchmark, by graspd {record.get('code')}"
+    line = f"{held} of {count} held"
+    if "held" in record:
+        line += f"; {record['held']} held in the benchmark, by graspd {record.get('code')}"
     show(make_session(title, hand, tuple(grasps), scene, config, session.seen, (line,)))
     report(line, 1.0)
 

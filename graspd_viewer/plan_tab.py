@@ -13,7 +13,7 @@ import tempfile
 import threading
 import traceback
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -138,9 +138,11 @@ def load_object(request: PlanRequest) -> tuple[Scene, Any]:
         scale = UNITS[request.units]
         try:
             scene = run_isolated(load_scene, str(path), friction=request.friction, scale=scale, alone=request.alone)
-            return scene, run_isolated(seen_points, str(path), scale)
+            seen = run_isolated(seen_points, str(path), scale)
         except GraspdError as error:
             raise type(error)(str(error).replace(str(path), request.upload.name[:80])) from None
+    # The folder is gone. A saved grasps.json names the visitor's file, which `graspd view` finds beside it.
+    return replace(scene, object=replace(scene.object, source=request.upload.name)), seen
 
 
 _FILE = "the file sent"

@@ -55,7 +55,7 @@ def open_grasps(path: Path, *, object_source: str | None = None, hand: str | Non
         hand: name or path of a hand. If None, the hand that the file names.
 
     Raises:
-        FormatError: the file cannot be read, or its joints are not those of the hand.
+        FormatError: the file cannot be read, or its joints or its base link are not those of the hand.
         HandError: the hand cannot be read.
         GraspdError: `object_source` cannot be read.
     """
@@ -102,6 +102,10 @@ def _hand_of(document: dict[str, Any], path: Path, wanted: str | None) -> HandMo
     hand = load_hand(source)
     if list(all_joint_names(hand)) != named.get("joint_names"):
         raise FormatError(f"{path}: its joints are not those of {source}; name the hand with --hand")
+    # The file names a hand's URDF, not its description, which may begin the hand at a later link (`root`).
+    if (base := named.get("base_link", hand.base_link)) != hand.base_link:
+        told = f"{path}: its poses are those of link {short_repr(base)}"
+        raise FormatError(f"{told}, but {source} begins at {hand.base_link!r}; name the hand with --hand")
     return hand
 
 

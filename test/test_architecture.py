@@ -68,11 +68,11 @@ MAY_IMPORT = {
 MAX_PACKAGE_LINES = {
     "graspd_core": 27_900,
     "graspd_ros": 5_372,
-    "graspd_bench": 8_415,
-    "graspd_dataset": 3_058,
-    "graspd_viewer": 2_433,
+    "graspd_bench": 8_424,
+    "graspd_dataset": 3_060,
+    "graspd_viewer": 2_442,
     "graspd_cell": 3_815,
-    "test": 34_484,
+    "test": 34_521,
 }
 # Lines that a program reaches through its imports, those inside functions too.
 # The layout aims at 22,000 of the node.

@@ -114,8 +114,9 @@ def run_imported(case: ImportedCase) -> Record:
         "planned": tuple(grasp for grasp in planned if grasp.verdict is Verdict.VERIFIED)[: case.count],
     }
     figures = {name: tried(scene, hand, some, case.trials) for name, some in grasps.items()}
-    held = sum(bool(r.get("standard", {}).get("passed")) for r in figures["imported"])
-    return {"held": held, "refused": completed.refused, "frame_doubt": completed.frame_doubt, "grasps": figures}
+    held = {"held": sum(bool(r.get("standard", {}).get("passed")) for r in figures["imported"])}
+    held = held if "standard" in case.trials else {}
+    return {**held, "refused": completed.refused, "frame_doubt": completed.frame_doubt, "grasps": figures}
 
 
 def _theirs(case: ImportedCase, hand: HandModel) -> tuple[ImportedGrasp, ...]:

@@ -23,6 +23,7 @@ from graspd_bench.figures import (
     short_name,
     spread,
 )
+from graspd_bench.suites import DECADES
 from graspd_core.errors import ConfigError
 from graspd_core.verify.metrics import METRICS, Metric
 
@@ -89,6 +90,15 @@ def test_without_the_standard_trial_nothing_is_said_of_it(record):
     objects = tables.object_tables([record(count=2, given=2, held=0, grasps=hard)])
     assert "| object | held, hard | CPU s per grasp |" in objects
     assert "| box | 50% | 1 |" in objects
+    untried = record("hand:leap_right", count=2, given=2, grasps=hard)
+    del untried["held"]
+    assert (
+        tables.hands_table([untried])
+        == "| hand | held, hard | CPU s per grasp |\n|---|---|---|\n| `leap_right` | 50% | 1 |"
+    )
+    setting, values = DECADES[0][2:]
+    table = tables.decades_sections([{**untried, "name": f"{setting}={values[0]:g}"}], None)["decades"][0]
+    assert f"| `{setting}` |{' – |' * len(values)}" in str(table)
 
 
 def test_what_the_means_leave_out_is_said(record):

@@ -14,11 +14,12 @@ import graspd_core
 from graspd_bench import result_store as store
 from graspd_bench.measurement import Cell, run_cell
 from graspd_bench.run_studies import ENVIRONMENT, Job, run_cases, run_job
-from graspd_bench.study import Case, find_objects
+from graspd_bench.study import Case, find_objects, held_of
 from graspd_core import TriangleMesh, make_shape, save_mesh
 from graspd_core.errors import GraspdError, MeshError
 from graspd_core.optimize.plan_config import METHODS, PlanConfig, load_preset, override, to_mapping
 from graspd_dataset import run_records
+from graspd_viewer.bench_page import page_data
 
 CELL = Cell("raw", "balanced", PlanConfig(), "shape:box", "allegro_right", 0, 4, ("standard", "hard"))
 
@@ -175,6 +176,17 @@ def test_a_death_and_a_hang_cost_their_case_only(tmp_path: Path, job):
     assert told["odd"] is None, "JSON knows no infinity"
     kept = [store.read_record(tmp_path / "out", "errands", wanted.case, "1+a", failed=True) for wanted in jobs]
     assert kept == [died, hung, told]
+
+
+def test_a_run_without_the_standard_trial_does_not_say_that_nothing_held():
+    cell = replace(CELL, settings=load_preset("fast"), object="shape:sphere", count=1, trials=("gravity",))
+    record = run_job(Job("main", cell, run_cell, "1+a"))
+    assert record["grasps"][0]["gravity"]["displacement_cm"] >= 0.0
+    assert "held" not in record
+    assert held_of(record) == "measured"
+    (run,) = page_data([record])["runs"]
+    assert run["held"] is None
+    assert [grasp["held"] for grasp in run["grasps"]] == [None]
 
 
 def test_nothing_is_begun_once_stopped(tmp_path: Path, job):

@@ -9,6 +9,7 @@ import pytest
 from graspd_core import METRICS, load_hand, load_scene, plan_grasps
 from graspd_core.errors import ConfigError, FormatError, MeshError
 from graspd_core.hands.model import all_joint_names, all_joint_positions
+from graspd_core.paths import config_dir
 from graspd_core.runtime.worker_process import WorkerProcess
 from graspd_dataset import block_rows
 from graspd_dataset.blocks import Block, DatasetRequest, blocks_of, by_object
@@ -106,6 +107,14 @@ def test_keys_go_by_content():
         assert not {b.key for b in blocks_of(replace(request, **changes))} & {b.key for b in blocks}
     # What an object is called does not count.
     assert replace(blocks[0], object=replace(blocks[0].object, source="other")).key == blocks[0].key
+
+
+@pytest.mark.parametrize("hand", ["parallel_gripper", "hands/parallel_gripper.yaml", "hands/parallel_gripper.urdf"])
+def test_a_hand_given_as_a_file_is_named_without_folder_and_ending(hand: str):
+    given = str(config_dir() / hand) if "/" in hand else hand
+    (block,) = blocks_of(DatasetRequest(("shape:sphere",), (given,), 1))
+    # The name is one folder of the data set, and of an export.
+    assert block.hand_name == "parallel_gripper"
 
 
 def test_random_scales_are_drawn_by_content_and_seed():

@@ -154,7 +154,10 @@ def test_a_file_is_called_by_its_visitors_name_and_read_from_nowhere_else(monkey
     box = b"v 0 0 0\nv .1 0 0\nv 0 .1 0\nv 0 0 .1\nf 1 3 2\nf 1 2 4\nf 2 3 4\nf 1 4 3\n"
     sent = PlanRequest(**{**vars(GOOD), "upload": Upload("../../my thing.obj", box)})
     check(sent)
-    assert load_object(sent)[0].object.volume == pytest.approx(0.1**3 / 6, rel=0.01)
+    loaded = load_object(sent)[0].object
+    assert loaded.volume == pytest.approx(0.1**3 / 6, rel=0.01)
+    # A saved grasps.json names the visitor's file.
+    assert loaded.source == "../../my thing.obj"
     broken = PlanRequest(**{**vars(GOOD), "upload": Upload("mine.stl", b"solid")})
     with pytest.raises(GraspdError, match=r"mine\.stl") as caught:
         load_object(broken)

@@ -60,6 +60,9 @@ def test_an_object_that_is_gone_or_another_is_said(grasps_file, tmp_path):
 def test_a_hand_that_does_not_fit_is_refused(grasps_file, tmp_path):
     with pytest.raises(FormatError, match="its joints are not those of allegro_right"):
         open_grasps(grasps_file, hand="allegro_right")
+    # A hand description with `root` begins the hand at a later link than its URDF.
+    with pytest.raises(FormatError, match="poses are those of link 'palm', but parallel_gripper begins at 'base_link'"):
+        open_grasps(changed(grasps_file, tmp_path, hand={"base_link": "palm"}))
     strange = {"name": "mine", "urdf": "gone.urdf"}
     with pytest.raises(HandError, match=r"gone\.urdf"):
         open_grasps(changed(grasps_file, tmp_path, hand=strange))
