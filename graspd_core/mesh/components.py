@@ -56,6 +56,25 @@ def face_components(mesh: TriangleMesh) -> Int[np.ndarray, "faces"]:
     return np.unique(label[a], return_inverse=True)[1].reshape(-1)
 
 
+def keep_cavities(mesh: TriangleMesh, outward: Int[np.ndarray, "faces 3"]) -> Int[np.ndarray, "faces 3"]:
+    """Turn the walls of cavities inwards again, after all faces of `mesh` were turned to `outward`.
+
+    A piece is the wall of a cavity if it lies within other pieces, and most of its area had the opposite winding.
+    """
+    piece = face_components(mesh)
+    given, turned = (scaled_normals(mesh.vertices, faces) for faces in (mesh.faces, outward))
+    area = np.linalg.norm(given, axis=1)
+    agree = np.bincount(piece, weights=np.where((given * turned).sum(1) < 0, -area, area))
+    # The piece with the most area shows the winding of the whole mesh, which may be inside out.
+    opposite = agree * agree[np.abs(agree).argmax()] < 0
+    if not opposite.any():
+        return outward
+    others = TriangleMesh(mesh.vertices, outward[~opposite[piece]])
+    _, first = np.unique(piece, return_index=True)
+    cavity = opposite & winding_inside(others, mesh.vertices[outward[first, 0]])
+    return np.where(cavity[piece][:, None], outward[:, ::-1], outward)
+
+
 def _extents(corners: Float[np.ndarray, "faces 3 3"], piece: Int[np.ndarray, "faces"]) -> Float[np.ndarray, "pieces"]:
     order = np.argsort(piece, kind="stable")
     starts = np.flatnonzero(np.diff(piece[order], prepend=-1))

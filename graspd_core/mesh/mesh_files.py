@@ -22,7 +22,7 @@ from torch.quasirandom import SobolEngine
 from graspd_core.errors import MeshError
 from graspd_core.mesh import topology
 from graspd_core.mesh.collada import read_dae
-from graspd_core.mesh.components import drop_small_components, face_components
+from graspd_core.mesh.components import drop_small_components, face_components, keep_cavities
 from graspd_core.mesh.surface_queries import winding_inside
 from graspd_core.types import TriangleMesh
 
@@ -238,7 +238,7 @@ def check_mesh(
             warnings.append(f"{source}: dropped {small} tiny pieces that touch nothing else")
     faces = mesh.faces
     if not topology.is_oriented(faces):
-        faces = topology.orient(mesh.vertices, faces)
+        faces = keep_cavities(mesh, topology.orient(mesh.vertices, faces))
         warnings.append(f"{source}: neighbouring faces had opposite winding; all faces now agree")
     used, compact = np.unique(faces, return_inverse=True)
     clean = TriangleMesh(mesh.vertices[used], compact.reshape(-1, 3))

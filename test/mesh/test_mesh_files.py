@@ -194,6 +194,19 @@ def test_mixed_winding_is_made_consistent(seed):
     assert mass_properties(mesh)[0] == pytest.approx(mass_properties(bowl)[0], rel=1e-9)
 
 
+@pytest.mark.parametrize("inside_out", [False, True])
+def test_one_flipped_face_does_not_fill_a_cavity(inside_out):
+    outer, inner = box_of(0.03), box_of(0.02)
+    count = len(outer.vertices)
+    vertices = np.concatenate([outer.vertices, inner.vertices])
+    faces = np.concatenate([outer.faces, inner.faces[:, ::-1] + count])
+    faces[0] = faces[0, ::-1]
+    mesh, warnings = check_mesh(TriangleMesh(vertices, faces[:, ::-1] if inside_out else faces), "hollow")
+    assert any("winding" in w for w in warnings)
+    # The volume comes from sample points, with errors of about 1 %.
+    assert mass_properties(mesh)[0] == pytest.approx(0.06**3 - 0.04**3, rel=0.02)
+
+
 def test_mass_properties_of_a_box_are_the_closed_form():
     volume, center, inertia = mass_properties(make_shape("box"))
     squares = (2 * np.array(BOX_HALF)) ** 2

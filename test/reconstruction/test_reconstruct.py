@@ -320,3 +320,16 @@ def test_an_all_round_cloud_keeps_the_thin_walls_of_what_is_hollow(name, noise):
     tall = mesh.vertices[:, 2]
     cavity = np.array([[0.0, 0.0, tall.min() + share * np.ptp(tall)] for share in (0.5, 0.8)])
     assert not winding_inside(whole.mesh, cavity).any()
+
+
+def test_a_camera_that_turned_forgets_no_occluder():
+    scene, (view,) = seen("box")
+    sight = view.points.mean(0) - view.viewpoint
+    aside = 0.05 * np.cross(sight, np.eye(3)[2]) / np.linalg.norm(sight[:2])
+    # A body of the object's outline, 5 cm beside the object in the image and nearer to the camera.
+    occluder = view.viewpoint + 0.6 * (view.points + aside - view.viewpoint)
+    first = PointCloud(np.concatenate([view.points, occluder]), view.viewpoint)
+    whole = reconstruct([view, view], scene.support, whole=[first, view])
+    for view_depth in whole.evidence.free_space.view_depths:
+        # Cells that an occluder covers have an infinite depth.
+        assert np.isinf(view_depth.depth).any()

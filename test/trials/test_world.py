@@ -51,6 +51,16 @@ def test_the_object_weighs_what_it_should(world, cube):
     assert np.array_equal(world.model.opt.gravity, np.zeros(3))
 
 
+@pytest.mark.parametrize(("radius", "length"), [(0.0015, 0.2), (0.0002, 0.1), (0.01, 0.1)])
+def test_mujoco_accepts_rods_however_thin(radius, length, gripper, cube):
+    # A cylinder about its axis z: m r² / 2, and across: m (3 r² + l²) / 12.
+    across = cube.mass * (3 * radius**2 + length**2) / 12
+    rod = replace(cube, inertia=np.diag([across, across, cube.mass * radius**2 / 2]))
+    world = build_world(gripper, rod, (cube.mesh,), STANDARD)
+    # A thousandth of the inertia is traded for a valid one.
+    assert world.model.body_inertia[world.object_body][:2] == pytest.approx(across, rel=2e-3)
+
+
 def test_joints_stay_within_their_limits_however_far_the_target(world, gripper):
     data = start(world, -1.0, 0.02)
     worst = 0.0

@@ -99,7 +99,7 @@ def reconstruct(
     views = _clean(views, settings)
     rotation, origin = _frame(views, support)
     local = [_in_frame(view, rotation, origin) for view in views]
-    by_eye = {tuple(view.viewpoint.astype(float)): view for view in whole}
+    by_eye = _by_eye(whole)
     around = [_in_frame(by_eye[tuple(view.viewpoint)], rotation, origin) for view in views] if whole else ()
     step = point_step(local)
     standing = support is not None
@@ -126,6 +126,16 @@ def reconstruct(
     evidence = Evidence(seen, free_space, step, rotation, origin, guess.method, settings, hidden)
     mesh = TriangleMesh(mesh.vertices @ rotation.T + origin, mesh.faces)
     return Reconstruction(mesh, confidence, warnings, evidence)
+
+
+def _by_eye(whole: Sequence[PointCloud]) -> dict[tuple[float, ...], PointCloud]:
+    """Return what was seen from each camera position. Several clouds of a camera that only turned become one cloud."""
+    places = [tuple(view.viewpoint.astype(float)) for view in whole]
+    found = {place: [view for view, at in zip(whole, places, strict=True) if at == place] for place in places}
+    return {
+        place: views[0] if len(views) == 1 else replace(views[0], points=np.concatenate([v.points for v in views]))
+        for place, views in found.items()
+    }
 
 
 def _in_frame(view: PointCloud, rotation: Float[np.ndarray, "3 3"], origin: Vector) -> PointCloud:
