@@ -367,6 +367,9 @@ def test_rounds_end_if_no_grasp_lifts_most_such_objects(preset, assumed, most):
     # A given mass is never lowered.
     assert (found.mass is not None) == assumed
     assert (found.mass or 0.0) < light_end(heavy)
+    assert found.context is not None
+    # A further round would try grasps at the least mass that counts.
+    assert found.context.mass == pytest.approx(light_end(heavy) if assumed else heavy)
 
 
 def test_what_is_tried_at_less_mass_begins_with_the_strongest():
