@@ -178,7 +178,8 @@ def _links(hand: HandTensors, arrays: Arrays) -> structs.Hand:
 def _candidates(points: PointSet, arrays: Arrays) -> structs.Points:
     """Return the contact candidates sorted by candidate group (`PointSet.groups`), then by link."""
     at, links = (values.numpy() for values in placed_points(points.matrix))
-    group = np.zeros(len(at), dtype=int)
+    # A candidate on links without coarse candidates is in no group, and comes last.
+    group = np.full(len(at), len(points.groups))
     for index, members in enumerate(points.groups.numpy()):
         group[members] = index
     order = np.lexsort((links, group))

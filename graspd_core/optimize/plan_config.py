@@ -79,6 +79,23 @@ METHODS: dict[str, Method] = {
 
 _DEFAULT_METHOD, _GROUP, _PLUGINS = "closed_form", "graspd.methods", "GRASPD_PLUGINS"
 
+# Greatest value of a setting. The sum of three numbers of steps fits into the kernel's 32 bits.
+_MOST = 500_000_000
+# Settings with less as greatest value, because their time or memory grows fast.
+_LESS = {
+    **dict.fromkeys(("candidates", "fine_candidates"), 5000),
+    **dict.fromkeys(("features", "starts_per_grasp"), 20_000),
+    **dict.fromkeys(("directions", "drops"), 1000),
+    **dict.fromkeys(("most", "first_budget", "growth"), 100),
+}
+# Settings that must not be zero: the least value of those that are no integers, and all names.
+_TINY = 1e-9
+_NOT_ZERO = {
+    *("candidates", "fine_candidates", "directions", "friction", "stiffness", "slide_stiffness"),
+    *("most", "first_budget", "trials", "hold_time", "searches", "rounds", "steps", "close_steps"),
+    *("delta_start", "delta_end", "stopping_force", "time_step", "speed"),
+}
+
 
 @cache
 def _registered() -> dict[str, EntryPoint]:
@@ -123,7 +140,7 @@ class PlanConfig:
         certainty: required certainty of a grasp if part of the object's surface is a guess.
 
     Raises:
-        ConfigError: the method is unknown, or the settings belong to another method.
+        ConfigError: the method is unknown, the settings belong to another method, or a number is out of range.
     """
 
     resolution: int = 48
@@ -141,6 +158,11 @@ class PlanConfig:
             object.__setattr__(self, "settings", config())
         elif not isinstance(self.settings, config):
             raise ConfigError(f"settings of {self.method}: {type(self.settings).__name__}; valid: {config.__name__}")
+        values = to_mapping(self)
+        # A plugin knows the range of its own settings.
+        if not config.__module__.startswith("graspd_"):
+            del values[self.method]
+        _refuse_values(values)
 
     def at_budget(self, budget: float) -> PlanConfig:
         """Return the settings with the method's effort scaled by `budget`. A budget of 1 changes nothing."""
@@ -149,6 +171,18 @@ class PlanConfig:
     def with_method(self, method: str) -> PlanConfig:
         """Return the settings with `method` at its defaults. Return them unchanged if they already have this method."""
         return self if method == self.method else dataclasses.replace(self, method=method, settings=None)
+
+
+def _refuse_values(values: Mapping[str, Any], prefix: str = "") -> None:
+    for key, value in values.items():
+        name = prefix + key
+        if isinstance(value, Mapping):
+            _refuse_values(value, f"{name}.")
+        elif isinstance(value, int | float) and not isinstance(value, bool):
+            least = (1 if isinstance(value, int) else _TINY) if key in _NOT_ZERO else 0
+            most = _LESS.get(key, _MOST)
+            if not least <= value <= most:
+                raise ConfigError(f"{name}: {value!r}; valid: {least} to {most}")
 
 
 def to_mapping(config: PlanConfig) -> dict[str, Any]:
@@ -160,7 +194,7 @@ def to_mapping(config: PlanConfig) -> dict[str, Any]:
 def plan_config(values: Any, where: str = "config") -> PlanConfig:
     """Build the settings of a run from a preset's nested mappings.
 
-    Raises ConfigError: unknown key or wrong type. The message has the dotted name and the valid choices.
+    Raises ConfigError: unknown key, wrong type or value. The message has the dotted name and the valid choices.
     """
     named = values.get("method", _DEFAULT_METHOD) if isinstance(values, Mapping) else _DEFAULT_METHOD
     row = method_row(named, where)
@@ -171,14 +205,17 @@ def plan_config(values: Any, where: str = "config") -> PlanConfig:
     if others := sorted(name for name in unknown if name in method_names()):
         raise ConfigError(f"{where}.{others[0]}: not used with method: {named}; remove it, or set method: {others[0]}")
     found = coerced(hints, values, where)
-    return PlanConfig(**{("settings" if key == named else key): value for key, value in found.items()})
+    try:
+        return PlanConfig(**{("settings" if key == named else key): value for key, value in found.items()})
+    except ConfigError as error:
+        raise ConfigError(f"{where}.{error}") from None
 
 
 def override(config: PlanConfig, changes: Mapping[str, Any]) -> PlanConfig:
     """Return the settings with the values in `changes`, which maps dotted names of a preset file to new values.
 
     Raises:
-        ConfigError: a name is unknown, or a value has the wrong type.
+        ConfigError: a name is unknown, or a value has the wrong type or is out of range.
     """
     if "method" in changes:
         config = config.with_method(changes["method"])

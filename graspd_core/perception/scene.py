@@ -362,7 +362,8 @@ def refuse_numbers(source: str, *, mass: float | None, friction: float, resoluti
         raise MeshError(f"{source}: scale {scale!r} must be a positive number")
     if mass is not None and not (np.isfinite(mass) and mass > 0):
         raise MeshError(f"{source}: mass {mass!r} kg must be a positive number")
-    if not (np.isfinite(friction) and friction > 0):
-        raise MeshError(f"{source}: friction {friction!r} must be a positive number")
+    # More is a percentage or an angle in degrees. Rubber has about 1.
+    if not 0 < friction <= 5:
+        raise MeshError(f"{source}: friction {friction!r}; valid: above 0, up to 5")
     if not 8 <= resolution <= 256:
         raise MeshError(f"{source}: resolution {resolution!r} must be between 8 and 256 nodes")

@@ -3,6 +3,7 @@
 import ctypes
 
 import pytest
+import torch
 
 from graspd_core.errors import ConfigError
 from graspd_core.optimize.kernel import builds
@@ -26,6 +27,8 @@ def test_a_build_is_chosen_by_name_or_path(monkeypatch, tmp_path):
     monkeypatch.setenv("GRASPD_KERNEL", str(other))
     assert builds.kernel().library is None
     assert "other.so" in builds.kernel().reason
+    monkeypatch.setenv("GRASPD_KERNEL", torch._C.__file__)
+    assert builds.kernel().reason == "built from other sources: install graspd again"
 
 
 def test_a_build_that_does_not_exist_is_refused(monkeypatch):

@@ -1,6 +1,8 @@
 """Every setting of a preset reaches `plan_grasps`: changed alone, it changes a very short run."""
 
 import dataclasses
+import math
+import re
 from functools import cache, partial
 from typing import Any, Literal, get_args, get_origin, get_type_hints
 
@@ -14,7 +16,7 @@ from graspd_core import GraspdError, HandModel, load_hand, make_shape, scene_fro
 from graspd_core.config import GraspStagesConfig, ProblemConfig, RoundsConfig
 from graspd_core.optimize.closed_form.closed_form_config import ClosedFormConfig
 from graspd_core.optimize.graspd2022.graspd2022_config import Graspd2022Config, InitialPosesConfig, LevelSetConfig
-from graspd_core.optimize.plan_config import PlanConfig, method_names, method_row
+from graspd_core.optimize.plan_config import METHODS, Method, PlanConfig, method_names, method_row, override
 from graspd_core.perception.scene import Scene, build_scene
 from graspd_core.planning.plan_grasps import plan_grasps, planning_scene
 from graspd_core.types import Grasp, Plane, Posture, Progress, Stage
@@ -111,7 +113,14 @@ CASES = {
     "graspd2022.simulation.stopping_force": Case(base=(("graspd2022.simulation.scaling", "object"),)),
     "graspd2022.contact.friction_stiffness": Case(1e-3),
     "graspd2022.contact.leak": Case(1.0),
-    "graspd2022.level_set.clearance": Case(-0.02, base=(("graspd2022.level_set.schedule", "code"),)),
+    "graspd2022.level_set.clearance": Case(
+        0.0,
+        (
+            ("graspd2022.level_set.schedule", "code"),
+            ("graspd2022.level_set.coarse_steps", 4),
+            ("graspd2022.pose_rate", 0.1),
+        ),
+    ),
     "graspd2022.pose_steps.within_limits": Case(base=(("graspd2022.pose_rate", 1.0),)),
     "graspd2022.constraints.limit_bound": Case(base=(("graspd2022.pose_rate", 1.0),)),
     "graspd2022.weights.inter": Case(base=(("graspd2022.pose_rate", 1.0),)),
@@ -259,6 +268,34 @@ def test_confidence_goes_along_to_another_grid():
 def test_a_setting_out_of_range_is_named(nodes: int):
     with pytest.raises(GraspdError, match=f"resolution: {nodes} nodes; valid: 8 to 256"):
         plan_grasps(scene("box"), hand("barrett_like"), preset=changed(SHORT, "resolution", nodes))
+
+
+@pytest.mark.parametrize(
+    ("name", "value"),
+    [
+        *(("problem.candidates", 0), ("problem.directions", 0), ("problem.friction", 0.0), ("rounds.most", 0)),
+        *(("problem.fine_candidates", 20_000), ("grasp_stages.stiffness", 0.0), ("grasp_stages.open_steps", 2**32)),
+        *(("grasp_stages.grip_force", 1e300), ("closed_form.delta_end", math.nan), ("closed_form.searches", 0)),
+        *(("graspd2022.simulation.stopping_force", 0.0), ("annealing.directions", 0)),
+    ],
+)
+def test_a_number_out_of_range_is_named(name: str, value: float):
+    method = name.split(".")[0]
+    config = changed(SHORT, "method", method) if method in method_names() else SHORT
+    with pytest.raises(GraspdError, match=f"^{name}: {re.escape(repr(value))}; valid: "):
+        changed(config, name, value)
+    with pytest.raises(GraspdError, match=rf"^settings\.{name}: "):
+        override(config, {name: value})
+
+
+def test_the_settings_of_a_plugin_may_have_any_value(monkeypatch: pytest.MonkeyPatch):
+    @dataclasses.dataclass(frozen=True)
+    class OwnConfig:
+        steps: int = 0
+        speed: float = -1.0
+
+    monkeypatch.setitem(METHODS, "own", Method("own", OwnConfig, "own", "#123456", "*", 1))
+    assert PlanConfig(method="own", settings=OwnConfig(speed=-2.0)).settings.speed == -2.0
 
 
 def test_only_settings_have_cases():

@@ -67,7 +67,9 @@ def test_a_mass_that_was_given_is_exact_and_nothing_is_told():
     assert thing.at_mass(0.246).inertia == pytest.approx(2 * thing.inertia)
 
 
-@pytest.mark.parametrize("setting", [{"mass": 0.0}, {"mass": float("nan")}, {"friction": -1.0}, {"resolution": 2}])
+@pytest.mark.parametrize(
+    "setting", [{"mass": 0.0}, {"mass": float("nan")}, {"friction": -1.0}, {"friction": 60.0}, {"resolution": 2}]
+)
 def test_numbers_out_of_range_are_named(setting):
     with pytest.raises(MeshError, match=next(iter(setting))):
         load_scene("shape:box", **setting)

@@ -89,10 +89,9 @@ def _load(path: Path, name: str) -> Kernel:
     except OSError as error:
         return Kernel("", None, str(error))
     sizes = (ctypes.c_int32 * 64)()
-    count = library.graspd_sizes(sizes)
+    known = all(hasattr(library, function) for function in ("graspd_sizes", *_ARGUMENTS))
+    count = library.graspd_sizes(sizes) if known else 0
     if list(sizes[:count]) != [ctypes.sizeof(structure) for structure in STRUCTURES]:
-        return Kernel("", None, "built from other sources: install graspd again")
-    if not all(hasattr(library, function) for function in _ARGUMENTS):
         return Kernel("", None, "built from other sources: install graspd again")
     for function, arguments in _ARGUMENTS.items():
         getattr(library, function).argtypes = arguments
