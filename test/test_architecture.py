@@ -72,7 +72,7 @@ MAX_PACKAGE_LINES = {
     "graspd_dataset": 3_060,
     "graspd_viewer": 2_442,
     "graspd_cell": 3_815,
-    "test": 34_611,
+    "test": 34_616,
 }
 # Lines that a program reaches through its imports, those inside functions too.
 # The layout aims at 22,000 of the node.

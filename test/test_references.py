@@ -11,7 +11,7 @@ import tokenize
 from collections import defaultdict
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
-from functools import lru_cache
+from functools import cache, lru_cache
 from itertools import product
 from pathlib import Path
 
@@ -113,16 +113,22 @@ def members_of(body: Iterable[ast.AST]) -> Iterator[tuple[str, set[str]]]:
             yield from members_of([*node.body, *node.orelse])
 
 
-def docstrings(module: ast.Module) -> list[ast.Constant]:
-    nodes = [n for n in ast.walk(module) if isinstance(n, ast.Expr) and isinstance(n.value, ast.Constant)]
+@cache
+def nodes_of(source: str) -> tuple[ast.AST, ...]:
+    """Return the nodes of a module's syntax tree, the module first."""
+    return tuple(ast.walk(ast.parse(source)))
+
+
+def docstrings(source: str) -> list[ast.Constant]:
+    nodes = [n for n in nodes_of(source) if isinstance(n, ast.Expr) and isinstance(n.value, ast.Constant)]
     return [node.value for node in nodes if isinstance(node.value, ast.Constant) and isinstance(node.value.value, str)]
 
 
-def words_of(module: ast.Module) -> set[str]:
+def words_of(source: str) -> set[str]:
     """Return every word of the code, those in strings too, but none of a docstring."""
-    prose = set(map(id, docstrings(module)))
+    prose = set(map(id, docstrings(source)))
     words: set[str] = set()
-    for node in ast.walk(module):
+    for node in nodes_of(source):
         values = [value for value in vars(node).values() if isinstance(value, str)] if id(node) not in prose else []
         words.update(word for value in values for word in (value, *re.findall(r"\w+", value)))
     return words
@@ -140,13 +146,12 @@ def read_tree(sources: dict[str, str]) -> Tree:
         if not path.endswith(".py"):
             words.update(re.findall(r"\w+", text) if not path.endswith(".md") else ())
             continue
-        module = ast.parse(text)
-        words |= words_of(module)
+        words |= words_of(text)
         dotted = Path(path).with_suffix("").parts
         dotted = dotted[:-1] if dotted[-1] == "__init__" else dotted
         for name in suffixes(dotted, "."):
-            scopes[name].update(members_of(module.body))
-        for node in ast.walk(module):
+            scopes[name].update(members_of(ast.iter_child_nodes(nodes_of(text)[0])))
+        for node in nodes_of(text):
             if isinstance(node, ast.ClassDef):
                 members = {**dict(members_of(node.body)), "<bases>": {ast.unparse(base) for base in node.bases}}
                 attributes = [n.attr for n in ast.walk(node) if isinstance(n, ast.Attribute)]
@@ -184,7 +189,8 @@ def unknown(text: str, tree: Tree, word: re.Pattern[str] = WORD) -> list[str]:
     spans = [re.sub(r"\(.*\)$", "", span) for span in SPAN.findall(text)]
     named = [span for span in spans if (PATH.fullmatch(span) or DOTTED.fullmatch(span)) and not FOREIGN.fullmatch(span)]
     words = [span for span in spans if word.fullmatch(span) and not FOREIGN.fullmatch(span)]
-    return [span for span in named if not exists(span, tree)] + [w for w in words if w not in tree.words | tree.paths]
+    strange = [word for word in words if word not in tree.words and word not in tree.paths]
+    return [span for span in named if not exists(span, tree)] + strange
 
 
 def unknown_settings(page: str, tree: Tree) -> list[str]:
@@ -202,7 +208,7 @@ def prose_of(source: str) -> str:
     """Return the docstrings and comments of a module."""
     tokens = tokenize.generate_tokens(io.StringIO(source).readline)
     comments = [token.string for token in tokens if token.type == tokenize.COMMENT]
-    return "\n".join([str(node.value) for node in docstrings(ast.parse(source))] + comments)
+    return "\n".join([str(node.value) for node in docstrings(source)] + comments)
 
 
 def text_of(node: ast.Constant | ast.JoinedStr) -> str:
@@ -243,10 +249,9 @@ def is_trouble(node: ast.AST) -> bool:
 
 def messages_of(source: str) -> set[str]:
     """Return the errors and warnings of a module: texts of three words or more."""
-    module = ast.parse(source)
-    prose = set(map(id, docstrings(module)))
-    marked = {id(text) for node in ast.walk(module) if is_trouble(node) for text in texts_in(node)}
-    texts = [text for text in texts_in(module) if id(text) not in prose]
+    prose = set(map(id, docstrings(source)))
+    marked = {id(text) for node in nodes_of(source) if is_trouble(node) for text in texts_in(node)}
+    texts = [text for text in texts_in(nodes_of(source)[0]) if id(text) not in prose]
     kept = [text_of(text) for text in texts if id(text) in marked or TROUBLE_WORDS.search(text_of(text))]
     return {" ".join(text.split()) for text in kept if len(text.split()) >= 3}
 
