@@ -322,7 +322,7 @@ def posture_times(grasp: Grasp, hand: HandModel, pace: Pace) -> tuple[float, flo
 
     The first time is enough for every joint to cross its whole range. At this time, the base must be at the pregrasp.
     """
-    speed = _greatest_speeds(hand, pace)
+    speed = hand.joint_speeds(pace.joint_speed, pace.base_speed)
     first = max(pace.shortest, _PEAK * float(np.max((hand.upper - hand.lower) / speed, initial=0.0)))
     closing = _move_time(grasp.pregrasp, grasp.grasp, speed, pace)
     return first, first + closing, first + closing + _move_time(grasp.grasp, grasp.squeeze, speed, pace)
@@ -335,15 +335,6 @@ def _move_time(start: Posture, end: Posture, speed: np.ndarray, pace: Pace) -> f
     cosine = min(abs(float(start.quaternion_wxyz @ end.quaternion_wxyz)), 1.0)
     turn = 2 * math.acos(cosine) / pace.base_turn
     return max(pace.shortest, _PEAK * max(joints, travel, turn))
-
-
-def _greatest_speeds(hand: HandModel, pace: Pace) -> np.ndarray:
-    """Return the speed limit of each actuated joint [rad/s] or [m/s] that keeps coupled joints within their limits."""
-    speed = np.minimum(np.where(hand.slides, pace.base_speed, pace.joint_speed), hand.velocity)
-    for mimic in hand.mimics:
-        own = pace.base_speed if hand.joint_kind[mimic.link] == "prismatic" else pace.joint_speed
-        speed[mimic.joint] = min(speed[mimic.joint], own / max(abs(mimic.multiplier), 1e-9))
-    return speed
 
 
 def _postures(grasp: Grasp) -> tuple[Posture, Posture, Posture]:
