@@ -352,8 +352,8 @@ def arm_trajectory(grasp: Grasp, path: ArmPath, pace: Pace) -> JointTrajectory:
     """Return all waypoints of the arm without velocities, so that controllers pass them without stopping.
 
     The first point is the retreat posture, at the time `pace.shortest` [s]. The arm must start in this posture. Points
-    of a stage are evenly spaced in time. Joints stay below `pace.joint_speed` and their own limits, the hand below
-    `pace.base_speed`.
+    of a stage are evenly spaced in time. Joints stay below `pace.joint_speed` and their own limits, the hand and
+    prismatic joints below `pace.base_speed`.
     """
     from graspd_core.arms.arm_paths import LIFT
 
@@ -373,7 +373,8 @@ def arm_trajectory(grasp: Grasp, path: ArmPath, pace: Pace) -> JointTrajectory:
 def _arm_speeds(path: ArmPath, pace: Pace) -> np.ndarray:
     """Return the greatest speed of each arm joint [rad/s] or [m/s]."""
     own = np.inf if path.velocity is None else path.velocity
-    return np.minimum(np.full(len(path.joint_names), pace.joint_speed), own)
+    slides = np.zeros(len(path.joint_names), dtype=bool) if path.slides is None else path.slides
+    return np.minimum(np.where(slides, pace.base_speed, pace.joint_speed), own)
 
 
 def execution_message(
