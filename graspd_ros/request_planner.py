@@ -120,7 +120,9 @@ class RecentRuns:
         `T_out_object` [m] places the grasps in the answer's frame, because a camera's frame may move later.
         """
         about = request.object_key, request.frame_out, T_out_object, _terms(request)
-        self._runs[request.id] = _Run(*about, planned)
+        # Only requests without an arm reuse a run. The arm may be elsewhere or switched off by then.
+        tried = tuple(replace(grasp, arm=None) if grasp.arm else grasp for grasp in planned.result.tried)
+        self._runs[request.id] = _Run(*about, replace(planned, result=replace(planned.result, tried=tried)))
         self._runs.move_to_end(request.id)
         while len(self._runs) > MOST_RUNS:
             self._runs.popitem(last=False)
