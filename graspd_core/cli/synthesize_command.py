@@ -84,7 +84,7 @@ def run(options: argparse.Namespace) -> int:
                 target=target_of(options),
                 alone=options.alone,
                 view_point=options.view_point,
-                settings=scene_config_of(options),
+                settings=scene_config_of(options) if options.scene else None,
                 camera=options.camera,
             )
             hand = load_hand(options.hand)
