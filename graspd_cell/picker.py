@@ -377,7 +377,7 @@ class Picker:
     def _move_hand(self, goal: np.ndarray) -> None:
         """Move all fingers to joint values [rad] or [m], so that they arrive together."""
         hand, now = self._hand, self._hand_now()
-        speed = np.minimum(np.where(hand.slides, 0.1, 1.5), 0.6 * hand.velocity)
+        speed = np.minimum(hand.joint_speeds(1.5, 0.1), 0.6 * hand.velocity)
         way = np.maximum(np.abs(goal - now), np.abs(goal - self._sent))
         seconds = max(0.3, 1.5 * float((way / speed).max()))
         if np.abs(goal - now).max() > 1e-3:

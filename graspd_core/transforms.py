@@ -53,7 +53,8 @@ class TransformBuffer:
     ) -> None:
         """Add the pose of `child` in `parent` at `stamp` [ns]. A static transform is valid at all times.
 
-        If a child gets a new parent, or changes between static and moving, the child's earlier poses are dropped.
+        If a child gets a new parent, changes between static and moving, or its stamps jump back by more than the
+        history, as when a recording restarts, the child's earlier poses are dropped.
         Raises TransformError: a frame has no valid name, the frames form a loop, or the transform is not rigid.
         """
         parent, child = _name(parent), _name(child)
@@ -70,7 +71,8 @@ class TransformBuffer:
                 loop = " -> ".join([*reversed(above[: above.index(child) + 1]), child])
                 raise TransformError(f"transform {parent} -> {child}: closes the loop {loop}")
             link = self._links.get(child)
-            if link is None or link.parent != parent or static or link.static:
+            restarted = link and link.stamps and self._history is not None and stamp < link.stamps[-1] - self._history
+            if link is None or link.parent != parent or static or link.static or restarted:
                 link = self._links[child] = _Link(parent, static)
             self._insert(link, stamp, pose)
 

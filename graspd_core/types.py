@@ -12,7 +12,7 @@ from dataclasses import dataclass, field
 from enum import Enum, StrEnum
 
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 
 from graspd_core.errors import ConfigError, short_repr
 
@@ -184,12 +184,14 @@ class ArmPath:
         positions: joint values, one row per waypoint [rad] or [m].
         stages: row indices of the retreat, the pregrasp, the grasp and the lift (`ARM_STAGES`).
         velocity: greatest speed of each joint that the arm allows [rad/s] or [m/s]. None if unknown, as from a file.
+        slides: True for each joint that is prismatic. None if unknown.
     """
 
     joint_names: tuple[str, ...]
     positions: Float[np.ndarray, "waypoints joints"]
     stages: tuple[int, int, int, int]
     velocity: Float[np.ndarray, "joints"] | None = None
+    slides: Bool[np.ndarray, "joints"] | None = None
 
     def at(self, stage: str) -> Float[np.ndarray, "joints"]:
         """Return the arm's joint values at `stage`, one of `ARM_STAGES`."""

@@ -17,6 +17,7 @@ from typing import Any
 
 import graspd_core
 from graspd_core.mesh.mesh_files import MESH_ENDINGS
+from graspd_core.optimize.plan_config import plugin_files
 
 # Parts of graspd_core on which no recorded result depends.
 _BESIDE = ("cli", "io", "doctor.py")
@@ -73,8 +74,8 @@ def failure(error: BaseException, kind: str = "raised") -> dict[str, Any]:
 def code_version(sources: tuple[str, ...] = ()) -> str:
     """Return the package's version and a hash of the sources that results depend on.
 
-    The hash is of all Python and C++ files of graspd_core, except those in `_BESIDE`. `sources` are glob patterns of
-    further files, relative to the parent folder of graspd_core.
+    The hash is of the plugins and of all Python and C++ files of graspd_core, except those in `_BESIDE`. `sources` are
+    glob patterns of further files, relative to the parent folder of graspd_core.
     """
     root = Path(graspd_core.__file__).parent
     files = {path for pattern in ("*.py", "*.cpp", "*.h", "*.hpp") for path in root.rglob(pattern)}
@@ -83,6 +84,8 @@ def code_version(sources: tuple[str, ...] = ()) -> str:
     digest = hashlib.sha256()
     for path in sorted(counted):
         digest.update(f"{path.relative_to(root.parent).as_posix()}\n".encode() + path.read_bytes())
+    for path in map(Path, plugin_files()):
+        digest.update(f"{path.name}\n".encode() + path.read_bytes())
     try:
         released = version("graspd")
     except PackageNotFoundError:

@@ -48,7 +48,7 @@ from graspd_ros.inputs.sensor_frames import (
 )
 from graspd_ros.inputs.sensor_topics import SensorTopic
 from graspd_ros.inputs.solids import SceneObject, updated_objects
-from graspd_ros.inputs.tf_listener import TransformListener, heard_robot
+from graspd_ros.inputs.tf_listener import TransformListener, check_arm, heard_robot
 from graspd_ros.outputs.responses import RECEIVED, Responses, health_message, resident_memory
 from graspd_ros.parameters import LiveSettings, Settings
 from graspd_ros.request import Listener, Request
@@ -92,7 +92,9 @@ class GraspNode(Node):
             lambda target, source, at: self._listener.lookup_in_time(target, source, at, self._worker.stopping),
         )
         self._responses = Responses(self, self._hand)
-        self._planner = Planner(self._hand, self._listener.lookup_in_time, heard_robot(self, settings.arm))
+        robot = heard_robot(self, settings.arm)
+        self.add_on_set_parameters_callback(lambda changed: check_arm(changed, robot))
+        self._planner = Planner(self._hand, self._listener.lookup_in_time, robot)
         self._worker: Worker[Request, Planned] = Worker(
             work=self._work, finish=self._responses.finished, prepare=self._prepare, queue_size=settings.queue_size
         )

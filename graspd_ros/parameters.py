@@ -19,7 +19,7 @@ from rclpy.validate_topic_name import validate_topic_name
 
 from graspd_core import load_preset
 from graspd_core.config import VERIFICATIONS, load_scene_config
-from graspd_core.errors import ConfigError, FormatError
+from graspd_core.errors import ConfigError, GraspdError
 from graspd_ros.outputs.messages import GEOMETRIES, PARTS, USUAL_PARTS
 from graspd_ros.worker import BusyPolicy
 
@@ -78,10 +78,7 @@ def _check_library(path: str) -> None:
     if path:
         from graspd_core.library.grasp_library import GraspLibrary
 
-        try:
-            GraspLibrary(Path(path)).checked()
-        except FormatError as error:
-            raise ConfigError(str(error)) from None
+        GraspLibrary(Path(path)).checked()
 
 
 def _check_topic(name: str) -> None:
@@ -332,7 +329,7 @@ def _check_value(name: str, value: Any) -> None:
     if check is not None:
         try:
             check(value)
-        except ConfigError as error:
+        except GraspdError as error:
             raise ConfigError(f"parameter {name}: {error}") from None
 
 

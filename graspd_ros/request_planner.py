@@ -78,7 +78,7 @@ class Planned:
         file: path of the result file. Empty if none was written.
         worked_on: False if the deadline passed while the request waited in the queue.
         mass: object's mass for planning and trials [kg]. 0 if unknown.
-        mass_assumed: True if the request gave no mass.
+        mass_assumed: True if neither the request nor the library's entry of a named object gave a mass.
         objects: if the request allows any object: each object's position [m], and why it has no verified grasp. The
             grasps belong to the first object.
         surface: the object's mesh in its own frame [m]. None if it was not loaded.
@@ -120,7 +120,9 @@ class RecentRuns:
         `T_out_object` [m] places the grasps in the answer's frame, because a camera's frame may move later.
         """
         about = request.object_key, request.frame_out, T_out_object, _terms(request)
-        self._runs[request.id] = _Run(*about, planned)
+        # Only requests without an arm reuse a run. The arm may be elsewhere or switched off by then.
+        tried = tuple(replace(grasp, arm=None) if grasp.arm else grasp for grasp in planned.result.tried)
+        self._runs[request.id] = _Run(*about, replace(planned, result=replace(planned.result, tried=tried)))
         self._runs.move_to_end(request.id)
         while len(self._runs) > MOST_RUNS:
             self._runs.popitem(last=False)
@@ -332,7 +334,9 @@ class Planner:
             result = replace(result, tried=tuple(map(arrived, result.tried)))
         if excluded:
             result = without(result, excluded, settings.num_grasps)
-        mass, assumed = result.mass or 0.0, False
+        # The mass of an object that the request names is the library's. Of a mesh it is assumed, as without library.
+        named = request.known is not None and request.known.name
+        mass, assumed = result.mass or 0.0, not (settings.mass or named)
         if scene is not None:
             mass, assumed = result.mass or scene.object.mass, scene.object.mass_assumed
         planned = Planned(result, mass=mass, mass_assumed=assumed, objects=objects, surface=scene and scene.object.mesh)

@@ -145,6 +145,15 @@ def test_what_is_no_transform_is_refused(T, parent, culprit):
     assert buffer.frames() == ()
 
 
+def test_a_recording_that_restarts_is_heard_again():
+    buffer = TransformBuffer()
+    for second in (*range(20), 0, 1):
+        buffer.add("map", "base", pose((second, 0, 0)), second * SECOND)
+    assert buffer.lookup("map", "base", SECOND)[0, 3] == pytest.approx(1)
+    with pytest.raises(TransformError, match="is known from 0"):
+        buffer.lookup("map", "base", 19 * SECOND)
+
+
 def test_history_is_bounded():
     buffer = TransformBuffer()
     for second in range(31):

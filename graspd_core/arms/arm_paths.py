@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
 import torch
@@ -128,11 +129,9 @@ def _some_paths(task: ArmTask, grasps: Sequence[Grasp]) -> list[ArmPath | str]:
     joints = torch.as_tensor(np.stack([grasp.pregrasp.joint_positions for grasp in grasps]))[owner]
     followed = _followed(task, paths[owner], q, joints)
     best = _best_of_each(followed, owner, len(grasps))
-    reasons, names, velocity = _why_lost(task, paths, followed, best), task.arm.joint_names, task.arm.chain.velocity
-    return [
-        reasons[grasp] if grasp in reasons else ArmPath(names, followed.path[row].numpy(), STAGE_ROWS, velocity)
-        for grasp, row in enumerate(best)
-    ]
+    reasons, names, chain = _why_lost(task, paths, followed, best), task.arm.joint_names, task.arm.chain
+    made = partial(ArmPath, names, stages=STAGE_ROWS, velocity=chain.velocity, slides=chain.slides)
+    return [reasons[grasp] if grasp in reasons else made(followed.path[row].numpy()) for grasp, row in enumerate(best)]
 
 
 def _best_of_each(followed: _Followed, owner: Int[Tensor, "postures"], count: int) -> list[int]:

@@ -119,8 +119,7 @@ def execution_of(
     if mass is not None and not mass >= 0.0:
         raise ConfigError(f"mass: {mass} kg; valid: a number from 0, or None")
     pace, path, (retreat, before, closed, lifted) = pace or ExecutionPace(), grasp.arm.positions, grasp.arm.stages
-    fingers = np.minimum(np.where(hand.slides, pace.base_speed, pace.finger_speed), hand.velocity)
-    limits = np.concatenate([arm_speeds, fingers])
+    limits = np.concatenate([arm_speeds, hand.joint_speeds(pace.finger_speed, pace.base_speed)])
     low, high = hand.lower, hand.upper
     open_, touch, press = (np.clip(p.joint_positions, low, high) for p in (grasp.pregrasp, grasp.grasp, grasp.squeeze))
     shares = np.linspace(0.0, 1.0, closed - before + 1)[:, None]
@@ -178,6 +177,7 @@ def _from_rest_to_rest(
     time = 0.5 - np.sin(np.arcsin(1.0 - 2.0 * share) / 3.0)
     speed = np.gradient(rows, share, axis=0) * (6.0 * time * (1.0 - time))[:, None]
     # A controller's cubic may be faster between the rows than at the rows.
-    fastest = np.abs(CubicHermiteSpline(time, rows, speed)(np.linspace(0.0, 1.0, _SAMPLES), 1)).max(0)
+    checked = np.concatenate([time, np.linspace(0.0, 1.0, _SAMPLES)])
+    fastest = np.abs(CubicHermiteSpline(time, rows, speed)(checked, 1)).max(0)
     span = max(shortest, least, float((fastest / limits).max()))
     return span * time, speed / span

@@ -47,7 +47,7 @@ def add_command(commands: Any) -> None:
     add_object_options(parser, any_object=True)
     add_restriction_options(parser)
     sizes = parser.add_mutually_exclusive_group()
-    sizes.add_argument("--scale", type=float, default=1.0, metavar="S", help="metres per unit of file or depth")
+    sizes.add_argument("--scale", type=float, default=None, metavar="S", help="metres per unit of file or depth")
     sizes.add_argument("--units", choices=tuple(_UNITS), default=None, help="unit of the file's coordinates")
     parser.add_argument("--out", type=Path, default=None, metavar="grasps.json", help="grasps file (docs/format.md)")
     parser.add_argument("--html", type=Path, default=None, metavar="view.html", help="write a page with the grasps")
@@ -80,11 +80,11 @@ def run(options: argparse.Namespace) -> int:
                 options.object,
                 mass=options.mass,
                 friction=options.friction,
-                scale=_UNITS[options.units] if options.units else options.scale,
+                scale=_scale_of(options),
                 target=target_of(options),
                 alone=options.alone,
                 view_point=options.view_point,
-                settings=scene_config_of(options),
+                settings=scene_config_of(options) if options.scene else None,
                 camera=options.camera,
             )
             hand = load_hand(options.hand)
@@ -111,6 +111,22 @@ def run(options: argparse.Namespace) -> int:
     return exit_status(result)
 
 
+def _scale_of(options: argparse.Namespace) -> float:
+    """Return metres per unit of the file. Raises ConfigError: the options say metres, but the camera's file does not.
+
+    `load_scene` takes a scale of 1 as the unit of the camera's file.
+    """
+    from graspd_core.perception.cloud.depth_files import load_depth_camera
+
+    scale = _UNITS[options.units] if options.units else options.scale
+    if scale == 1.0 and options.camera:
+        told = load_depth_camera(options.camera)[2]
+        if told not in (None, 1.0):
+            given = f"--units {options.units}" if options.units else "--scale 1"
+            raise ConfigError(f"{given}: {options.camera} has depth_unit {told:g} m; remove one of them")
+    return 1.0 if scale is None else scale
+
+
 def _any_object(options: argparse.Namespace, config: PlanConfig, request: dict[str, Any], deadline: Deadline) -> int:
     """Plan for any object of a cloud. Return the exit status. Raises ConfigError: no cloud, or `--view` is given."""
     from graspd_core.hands.library import load_hand
@@ -122,8 +138,7 @@ def _any_object(options: argparse.Namespace, config: PlanConfig, request: dict[s
         raise ConfigError("--any: --view is given too; remove one of them")
     if not (options.camera or is_depth_image(options.object) or is_cloud_file(options.object)):
         raise ConfigError(f"--any: given with {options.object}; valid with clouds and depth images of several objects")
-    scale = _UNITS[options.units] if options.units else options.scale
-    views = scaled_views(options.object, options.camera, scale, options.view_point)
+    views = scaled_views(options.object, options.camera, _scale_of(options), options.view_point)
     hand = load_hand(options.hand)
     with Reporter() as reporter, Interrupt() as interrupt:
         hooks = {"progress": reporter, "stop": interrupt.is_interrupted}

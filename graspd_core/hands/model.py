@@ -230,6 +230,19 @@ class HandModel:
         """The travel of each joint that counts as one radian: 1 rad if revolute, a length [m] if prismatic."""
         return np.where(self.slides, METRES_PER_RADIAN, 1.0)
 
+    def joint_speeds(self, turning: float, sliding: float) -> Float[np.ndarray, "joints"]:
+        """Return the greatest speed of each actuated joint [rad/s] or [m/s], within the joints' own limits.
+
+        No revolute joint is faster than `turning` [rad/s], no prismatic joint than `sliding` [m/s], coupled joints too.
+        """
+        speeds = self.velocity.copy()
+        for joint, kind, ratio in zip(self.link_joint, self.joint_kind, self.link_multiplier, strict=True):
+            if joint >= 0:
+                speeds[joint] = min(
+                    speeds[joint], (sliding if kind == "prismatic" else turning) / max(abs(ratio), 1e-9)
+                )
+        return speeds
+
 
 def all_joint_names(hand: HandModel) -> tuple[str, ...]:
     """Return the names of all actuated and coupled joints, depth-first, as in output files and ROS messages."""

@@ -1,9 +1,9 @@
 """Reader of the surfaces in COLLADA (.dae) files, without a COLLADA library.
 
-The reader takes the triangles, strips, fans, polylists and polygons of the visual scene, or of all geometries if there
-is no scene. It applies the node transforms, and converts lengths to metres by `<unit>`. Polygons become
-triangle fans, which is exact if they are convex. The up axis is ignored, as in ROS viewers. Format: COLLADA 1.4.1,
-Khronos Group, 2008.
+The reader takes the triangles, strips, fans, polylists and polygons of the visual scene that `<scene>` names, or of the
+only visual scene, or of all geometries if there is no scene. It applies the node transforms, and converts lengths to
+metres by `<unit>`. Polygons become triangle fans, which is exact if they are convex. The up axis is ignored, as in ROS
+viewers. Format: COLLADA 1.4.1, Khronos Group, 2008.
 """
 
 from __future__ import annotations
@@ -57,8 +57,13 @@ def _joined(root: ET.Element) -> TriangleMesh:
     named = {f"#{element.get('id')}": element for element in root.iter() if element.get("id")}
     unit = root.find("asset/unit")
     scale = float(unit.get("meter", "1")) if unit is not None else 1.0
-    if root.find("library_visual_scenes/visual_scene") is not None:
-        placed = _instances(root.findall("library_visual_scenes/visual_scene/node"), named)
+    scenes, shown = root.findall("library_visual_scenes/visual_scene"), root.find("scene/instance_visual_scene")
+    if shown is not None:
+        scenes = [_target(named, shown.get("url"))]
+    if len(scenes) > 1:
+        raise ValueError(f"the file has {len(scenes)} visual scenes, and no <scene> names one of them")
+    if scenes:
+        placed = _instances(scenes[0].findall("node"), named)
     else:
         placed = [(np.eye(4), geometry) for geometry in root.findall("library_geometries/geometry")]
     surfaces: dict[ET.Element, tuple[np.ndarray, np.ndarray]] = {}
@@ -130,6 +135,8 @@ def _surface(
     for element in geometry.iterfind("mesh/*"):
         if element.tag not in _FACES:
             continue
+        if element.find("ph") is not None:
+            raise ValueError(f"<{element.tag}> has a polygon with holes (<ph>); export the mesh as triangles")
         inputs = element.findall("input")
         stride = 1 + max((int(entry.get("offset", "0")) for entry in inputs), default=0)
         corner = next((entry for entry in inputs if entry.get("semantic") == "VERTEX"), None)

@@ -84,7 +84,9 @@ def make_obstacle_tensors(
     samples = surface_samples(scene.object.mesh, _SURFACE, 0)[0]
     surface = torch.as_tensor(np.concatenate([scene.object.mesh.vertices, samples]))
     gaps = [float(sample_sdf(solid.sdf, surface.to(solid.sdf.field))[0].min()) for solid in scene.obstacles]
-    reached = [solid for solid, gap in zip(scene.obstacles, gaps, strict=True) if gap < hand_reach(hand) + RETREAT]
+    # Fingertips may touch the object while the palm is between them and the farthest part of the hand.
+    reach = 2 * hand_reach(hand) + RETREAT
+    reached = [solid for solid, gap in zip(scene.obstacles, gaps, strict=True) if gap < reach]
     if scene.support is None and not reached:
         return None
 

@@ -105,7 +105,7 @@ def _registered() -> dict[str, EntryPoint]:
 @cache
 def _run_plugins() -> None:
     """Load the parent process's plugins. Do so after the import of this module, because plugins import this module."""
-    for path in filter(None, os.environ.get(_PLUGINS, "").split(os.pathsep)):
+    for path in plugin_files():
         load_plugin(path)
 
 
@@ -268,6 +268,10 @@ def load_plugin(path: str) -> str:
         raise ConfigError(f"plugin {path}: {type(error).__name__}: {error}") from error
     if module.__file__ is None or Path(module.__file__).resolve() != file:
         raise ConfigError(f"plugin {path}: a module called {file.stem} exists; give the file another name")
-    named = os.environ.get(_PLUGINS, "").split(os.pathsep)
-    os.environ[_PLUGINS] = os.pathsep.join(filter(None, dict.fromkeys((*named, str(file)))))
+    os.environ[_PLUGINS] = os.pathsep.join(dict.fromkeys((*plugin_files(), str(file))))
     return str(file)
+
+
+def plugin_files() -> tuple[str, ...]:
+    """Return the paths of the plugins of this process and of its parent."""
+    return tuple(filter(None, os.environ.get(_PLUGINS, "").split(os.pathsep)))

@@ -61,7 +61,7 @@ def load_scene(
             in metres per unit of depth, and 1 means the unit that the camera's file gives.
 
     Raises:
-        MeshError: the mesh cannot be read or used, comes with `target` or `view_point`, or a number is out of range.
+        MeshError: the mesh cannot be read or used, comes with an argument of clouds, or a number is out of range.
         CloudError: the cloud cannot be read or shows no object.
     """
     started = time.perf_counter()
@@ -85,8 +85,8 @@ def load_scene(
         about = {"target": target, "alone": alone, "settings": settings, "source": given, "device": device}
         scene = scene_from_views(views, **about, **numbers)
         scene = replace(scene, object=replace(scene.object, warnings=warnings + scene.object.warnings))
-    elif target is not None:
-        raise MeshError(f"target: given with {given}, a mesh; valid with clouds of several objects")
+    elif target is not None or settings is not None:
+        raise MeshError(f"target or scene settings: given with {given}, a mesh; valid with clouds of several objects")
     else:
         about = {"source": given, "scale": scale, "device": device, "started": started, "warnings": warnings}
         scene = build_scene(mesh, **about, **numbers)

@@ -110,7 +110,7 @@ def reconstruct_object(
     views = [replace(view, points=_single(view.points)) for view in views]
     alone = alone or _is_whole_object(views)
     if alone:
-        seen = Segmentation(tuple(views), None, (), ())
+        seen = Segmentation(tuple(views), tuple(range(len(views))), None, (), ())
     else:
         seen = segment(views, target=target, settings=settings.segmentation)
     doubts = ()
@@ -147,10 +147,9 @@ def _unit_doubts(seen: Segmentation, views: Sequence[PointCloud], farthest: floa
 
 
 def _camera_doubts(seen: Segmentation, views: Sequence[PointCloud]) -> tuple[str, ...]:
-    by_eye = {tuple(view.viewpoint.astype(float)): view for view in views}
     up = None if seen.support is None else np.asarray(seen.support.normal, dtype=float)
     try:
-        told = [check_viewpoint(thing, by_eye[tuple(thing.viewpoint.astype(float))], up) for thing in seen.views]
+        told = [check_viewpoint(thing, views[k], up) for k, thing in zip(seen.numbers, seen.views, strict=True)]
     except CloudError:
         if _needs_no_camera(seen.views):
             return ()

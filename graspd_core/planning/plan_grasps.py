@@ -5,6 +5,7 @@ from __future__ import annotations
 import time
 from collections.abc import Sequence
 from dataclasses import replace
+from numbers import Integral
 from typing import Any
 
 import numpy as np
@@ -218,9 +219,9 @@ def _timing(run: Run, scene: Scene, found: RoundsResult) -> Timing:
 
 def check_request(*, count: int, seed: int, verify: str, deadline: float | None, device: str) -> None:
     """Check those arguments of `plan_grasps` that need no scene. Raises ConfigError: a value is not valid."""
-    if not 1 <= count <= MOST_GRASPS:
+    if not (isinstance(count, Integral) and 1 <= count <= MOST_GRASPS):
         raise ConfigError(f"count: {count} grasps; valid: 1 to {MOST_GRASPS}")
-    if not 0 <= seed < SEEDS:
+    if not (isinstance(seed, Integral) and 0 <= seed < SEEDS):
         raise ConfigError(f"seed: {seed}; valid: 0 to 2^63 - 1")
     if verify not in VERIFICATIONS:
         raise ConfigError(f"verify: {verify!r}; valid: {', '.join(VERIFICATIONS)}")

@@ -35,6 +35,15 @@ def numbers(name: str, given: Any, count: int) -> tuple[float, ...]:
     return tuple(values.tolist())
 
 
+def unit_vector(name: str, given: Any, count: int = 3) -> tuple[float, ...]:
+    """Return `given` with length 1, else raise ConfigError: all numbers are 0, or see `numbers`."""
+    values = np.array(numbers(name, given, count))
+    if not values.any():
+        raise ConfigError(f"{name}: {short_repr(given)}; valid: {count} numbers, not all 0")
+    values = values / np.abs(values).max()  # the square of a very large or small number is not finite or 0
+    return tuple((values / np.linalg.norm(values)).tolist())
+
+
 @dataclass(frozen=True)
 class Box:
     """An oriented box.
@@ -53,12 +62,11 @@ class Box:
     quaternion_wxyz: Numbers = (1.0, 0.0, 0.0, 0.0)
 
     def __post_init__(self) -> None:
-        for name, count in (("center", 3), ("size", 3), ("quaternion_wxyz", 4)):
-            object.__setattr__(self, name, numbers(f"box {name}", getattr(self, name), count))
+        for name in ("center", "size"):
+            object.__setattr__(self, name, numbers(f"box {name}", getattr(self, name), 3))
+        object.__setattr__(self, "quaternion_wxyz", unit_vector("box quaternion_wxyz", self.quaternion_wxyz, 4))
         if min(self.size) <= 0:
             raise ConfigError(f"box size: {short_repr(self.size)}; valid: three lengths above 0, in metres")
-        if not any(self.quaternion_wxyz):
-            raise ConfigError("box quaternion_wxyz: all 0; valid: w, x, y, z, not all 0")
 
     @cached_property
     def rotation(self) -> Float[np.ndarray, "3 3"]:

@@ -33,7 +33,7 @@ from graspd_core.optimize.restrictions import (
     Turns,
 )
 from graspd_core.perception.scene import Obstacle, Scene, moved_sdf, near_scene, object_sdf
-from graspd_core.planning.regions import Box, NearPoints, Numbers, Region, Sphere, boxes_in_reach, entered, numbers
+from graspd_core.planning.regions import Box, NearPoints, Numbers, Region, Sphere, boxes_in_reach, entered, unit_vector
 from graspd_core.se3 import rotation_from_quaternion
 from graspd_core.types import Grasp
 
@@ -85,13 +85,15 @@ class Steering:
     point along the approach, as in a gripper, the side is the closing direction.
 
     Attributes:
-        approach_direction: wanted approach direction, a vector of any non-zero length. (0, 0, -1) is from above.
+        approach_direction: wanted approach direction, of any non-zero length, kept with length 1. (0, 0, -1) is from
+            above.
         approach_angle: greatest angle between `approach_direction` and a grasp's approach, above 0, at most π [rad].
         region: a `Box`, a `Sphere` or `NearPoints`. Every contact lies in the region, or at most 5 mm outside.
         avoid: boxes that no link enters at pregrasp, grasp and squeeze.
         roll: wanted right-handed rotation of the side [rad]. It needs `approach_direction`, and `approach_angle` below
             π/2. At 0 the side points along z, or along x for an approach within 18° of vertical.
-        roll_zero: direction of the side at roll 0, projected normal to the approach. None for z or x, as in `roll`.
+        roll_zero: direction of the side at roll 0, projected normal to the approach, also kept with length 1. None for
+            z or x, as in `roll`.
         roll_tolerance: greatest deviation from `roll` in either direction, above 0, at most π [rad].
 
     Raises:
@@ -107,10 +109,9 @@ class Steering:
     roll_zero: Numbers | None = None
 
     def __post_init__(self) -> None:
-        if self.approach_direction is not None:
-            values = numbers("approach_direction", self.approach_direction, 3)
-            if not np.linalg.norm(values) > 0:
-                raise ConfigError("approach_direction: (0, 0, 0) is no direction; valid: x, y, z, not all 0")
+        for name in ("approach_direction", "roll_zero"):
+            if getattr(self, name) is not None:
+                object.__setattr__(self, name, unit_vector(name, getattr(self, name)))
         for name in ("approach_angle", "roll_tolerance"):
             if not 0 < getattr(self, name) <= np.pi:
                 raise ConfigError(f"{name}: {getattr(self, name):.4g} rad; valid: above 0, at most pi (180 degrees)")
@@ -127,11 +128,10 @@ class Steering:
             raise ConfigError("roll: no approach_direction is given; give the direction about which the hand rolls")
         if self.approach_angle >= np.pi / 2:
             raise ConfigError(f"roll: approach_angle is {self.approach_angle:.4g} rad; valid: below pi/2 (90 degrees)")
-        if self.roll_zero is not None:
-            zero, along = numbers("roll_zero", self.roll_zero, 3), np.array(self.approach_direction, dtype=float)
-            if not np.linalg.norm(np.cross(zero, along)) > _PARALLEL * np.linalg.norm(zero) * np.linalg.norm(along):
-                given = short_repr(zero)
-                raise ConfigError(f"roll_zero: {given}; valid: a direction that is not along approach_direction")
+        zero, along = self.roll_zero, self.approach_direction
+        if zero is not None and not np.linalg.norm(np.cross(zero, along)) > _PARALLEL:
+            given = short_repr(zero)
+            raise ConfigError(f"roll_zero: {given}; valid: a direction that is not along approach_direction")
 
     def bind(self, scene: Scene, hand: HandModel) -> BoundSteering:
         """Bind the steering to this hand in this scene.
@@ -140,8 +140,6 @@ class Steering:
             ConfigError: no part of the object lies in the region, or an avoided box covers that part.
         """
         direction = None if self.approach_direction is None else np.array(self.approach_direction, dtype=float)
-        if direction is not None:
-            direction = direction / np.linalg.norm(direction)
         roll = None
         if direction is not None and self.roll is not None:
             zero = zero_of_roll(direction) if self.roll_zero is None else np.array(self.roll_zero, dtype=float)

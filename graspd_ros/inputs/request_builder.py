@@ -29,6 +29,7 @@ from graspd_core import Box, NearPoints, PointCloud, Scene, Sphere, Steering, Ta
 from graspd_core.errors import MeshError
 from graspd_core.io.messages import CameraPlace
 from graspd_core.perception.cloud.viewpoint_check import check_scene
+from graspd_core.planning.regions import unit_vector
 from graspd_core.planning.steering import zero_of_roll
 from graspd_core.runtime.worker_process import run_isolated
 from graspd_ros.convert import Matrix, moved_points, nanoseconds, near, pose_matrix, wxyz_of_matrix
@@ -270,14 +271,15 @@ def steering_of(message: GraspRequest, T_object_header: Matrix) -> Steering:
     """
     _check(message)
     rotation = T_object_header[:3, :3]
-    region, direction = _region(message, T_object_header), _direction(message)
+    region, given = _region(message, T_object_header), _direction(message)
     boxes = zip(message.avoid, message.avoid_poses, strict=True)
     avoid = [_box("avoid", solid, pose, T_object_header) for solid, pose in boxes]
+    direction = np.array(unit_vector("approach_direction", given)) if given else None
     zero = None
-    if message.use_roll and np.isfinite(direction).all() and direction:
-        zero = tuple((rotation @ zero_of_roll(np.array(direction) / np.linalg.norm(direction))).tolist())
+    if message.use_roll and direction is not None:
+        zero = rotation @ zero_of_roll(direction)
     return Steering(
-        approach_direction=tuple((rotation @ direction).tolist()) if direction else None,
+        approach_direction=None if direction is None else rotation @ direction,
         approach_angle=message.approach_angle or _DEFAULTS.approach_angle,
         region=region,
         avoid=avoid,

@@ -11,14 +11,16 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from builtin_interfaces.msg import Time
+from rcl_interfaces.msg import SetParametersResult
 from rclpy.clock import JumpThreshold, TimeJump
 from rclpy.duration import Duration
 from rclpy.executors import SingleThreadedExecutor
 from rclpy.node import Node
+from rclpy.parameter import Parameter
 from rclpy.qos import DurabilityPolicy, QoSProfile
 from std_msgs.msg import String
 
-from graspd_core.errors import ConfigError, TransformError
+from graspd_core.errors import ConfigError, GraspdError, TransformError
 from graspd_core.transforms import TransformBuffer
 from graspd_core.types import StopHook
 from graspd_ros.convert import Matrix, matrix_of_transform, nanoseconds, wxyz_of_matrix
@@ -145,3 +147,18 @@ def heard_robot(node: Node, arm: str) -> str:
     robot = str(heard[-1].data)
     _arm(arm, robot)
     return robot
+
+
+def check_arm(changed: list[Parameter], robot: str) -> SetParametersResult:
+    """Refuse an arm that cannot be used. `robot` is the URDF that the node heard at its start, or ""."""
+    from graspd_core.arms.arm import ROBOT_DESCRIPTION, from_robot_description, read_arm_file
+
+    try:
+        for name in (parameter.value for parameter in changed if parameter.name == "arm" and parameter.value):
+            if not robot and from_robot_description(read_arm_file(name)[1]):
+                told = f"{name} needs a URDF from {ROBOT_DESCRIPTION}, which the node reads only at its start"
+                raise ConfigError(f"{told}; start the node with this arm, or give a URDF file as urdf")
+            _arm(name, robot)
+    except GraspdError as error:
+        return SetParametersResult(successful=False, reason=f"parameter arm: {error}")
+    return SetParametersResult(successful=True)

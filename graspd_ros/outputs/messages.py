@@ -322,7 +322,7 @@ def posture_times(grasp: Grasp, hand: HandModel, pace: Pace) -> tuple[float, flo
 
     The first time is enough for every joint to cross its whole range. At this time, the base must be at the pregrasp.
     """
-    speed = _greatest_speeds(hand, pace)
+    speed = hand.joint_speeds(pace.joint_speed, pace.base_speed)
     first = max(pace.shortest, _PEAK * float(np.max((hand.upper - hand.lower) / speed, initial=0.0)))
     closing = _move_time(grasp.pregrasp, grasp.grasp, speed, pace)
     return first, first + closing, first + closing + _move_time(grasp.grasp, grasp.squeeze, speed, pace)
@@ -335,15 +335,6 @@ def _move_time(start: Posture, end: Posture, speed: np.ndarray, pace: Pace) -> f
     cosine = min(abs(float(start.quaternion_wxyz @ end.quaternion_wxyz)), 1.0)
     turn = 2 * math.acos(cosine) / pace.base_turn
     return max(pace.shortest, _PEAK * max(joints, travel, turn))
-
-
-def _greatest_speeds(hand: HandModel, pace: Pace) -> np.ndarray:
-    """Return the speed limit of each actuated joint [rad/s] or [m/s] that keeps coupled joints within their limits."""
-    speed = np.minimum(np.where(hand.slides, pace.base_speed, pace.joint_speed), hand.velocity)
-    for mimic in hand.mimics:
-        own = pace.base_speed if hand.joint_kind[mimic.link] == "prismatic" else pace.joint_speed
-        speed[mimic.joint] = min(speed[mimic.joint], own / max(abs(mimic.multiplier), 1e-9))
-    return speed
 
 
 def _postures(grasp: Grasp) -> tuple[Posture, Posture, Posture]:
@@ -361,8 +352,8 @@ def arm_trajectory(grasp: Grasp, path: ArmPath, pace: Pace) -> JointTrajectory:
     """Return all waypoints of the arm without velocities, so that controllers pass them without stopping.
 
     The first point is the retreat posture, at the time `pace.shortest` [s]. The arm must start in this posture. Points
-    of a stage are evenly spaced in time. Joints stay below `pace.joint_speed` and their own limits, the hand below
-    `pace.base_speed`.
+    of a stage are evenly spaced in time. Joints stay below `pace.joint_speed` and their own limits, the hand and
+    prismatic joints below `pace.base_speed`.
     """
     from graspd_core.arms.arm_paths import LIFT
 
@@ -382,7 +373,8 @@ def arm_trajectory(grasp: Grasp, path: ArmPath, pace: Pace) -> JointTrajectory:
 def _arm_speeds(path: ArmPath, pace: Pace) -> np.ndarray:
     """Return the greatest speed of each arm joint [rad/s] or [m/s]."""
     own = np.inf if path.velocity is None else path.velocity
-    return np.minimum(np.full(len(path.joint_names), pace.joint_speed), own)
+    slides = np.zeros(len(path.joint_names), dtype=bool) if path.slides is None else path.slides
+    return np.minimum(np.where(slides, pace.base_speed, pace.joint_speed), own)
 
 
 def execution_message(

@@ -10,6 +10,7 @@ from graspd_core.arms.arm_paths import LIFT, STAGE_ROWS
 from graspd_core.arms.execution import GATES, PEAK_ACCELERATION, ExecutionPace, execution_of, lift_time
 from graspd_core.errors import ConfigError
 from graspd_core.hands.library import load_hand
+from graspd_core.hands.model import Mimic
 from graspd_core.types import ArmPath, Grasp, GraspMetrics, Posture
 
 HAND = load_hand("allegro_right", candidates=50)
@@ -41,6 +42,16 @@ def test_no_joint_is_faster_than_its_limit_and_all_rest_at_every_gate(seed: int)
         # It is looked at in other moments than by the code.
         assert (np.abs(between).max(0) <= 1.01 * limits).all()
     assert (np.abs(made.arm_speed) <= SPEEDS + 1e-9).all()
+
+
+def test_coupled_joints_keep_the_limit_too():
+    joint = HAND.num_joints - 1
+    link = HAND.link_joint.tolist().index(joint)
+    coupled = replace(HAND, mimics=(Mimic("tip", link, joint, 2.0, 0.0),))
+    made = execution_of(reached_grasp(), coupled, arm_speeds=10 * SPEEDS, pace=ExecutionPace(shortest=0.01))
+    # The coupled joint is twice as fast.
+    assert np.abs(made.hand_speed[:, joint]).max() <= 0.5 + 1e-9
+    assert coupled.joint_speeds(1.0, 0.1)[joint] == 0.5
 
 
 def test_rows_follow_the_arms_path_and_the_three_postures_in_the_order_of_the_gates():

@@ -130,6 +130,10 @@ def test_the_code_is_of_the_package_the_kernel_and_what_a_study_names(monkeypatc
     assert fresh() == before
     (root / "optimize" / "kernel" / "src" / "step.cpp").write_text("2")
     assert fresh() != before
+    plugin = tmp_path / "mine.py"
+    monkeypatch.setenv("GRASPD_PLUGINS", str(plugin))
+    versions = [fresh() for text in ("1", "2", "1") if plugin.write_text(text)]
+    assert versions[0] == versions[2] != versions[1]
 
 
 def test_a_finished_case_is_found_again_only_under_its_code(tmp_path: Path):

@@ -168,6 +168,8 @@ def test_a_scene_file_sets_the_reconstruction(tmp_path: Path, capsys: pytest.Cap
     command = ["reconstruct", str(tmp_path / "ball.npy"), "--out", str(tmp_path / "ball.ply"), "--scene", str(scene)]
     assert main(command) == EXIT_OK
     assert int(capsys.readouterr().out.split(": ")[1].split()[0]) <= 300
+    assert main(["synthesize", "shape:sphere", "--scene", str(scene)]) == EXIT_BAD_INPUT
+    assert "scene settings: given with shape:sphere, a mesh; valid with clouds" in the_line(capsys)
     scene.write_text("reconstruction: {most_faces: 300}")
     for bad in (command, ["synthesize", str(tmp_path / "ball.npy"), "--scene", str(scene)]):
         assert main(bad) == EXIT_BAD_INPUT

@@ -439,6 +439,14 @@ def test_nodes_units_and_polygons(tmp_path: Path) -> None:
     np.testing.assert_allclose(load_mesh(tmp_path / "part.dae").vertices, mesh.vertices)
 
 
+def test_only_the_scene_that_is_shown_counts(tmp_path: Path) -> None:
+    other = '<visual_scene id="t"><node><instance_geometry url="#g"/></node></visual_scene></library_visual_scenes>'
+    text = FILE.replace("</library_visual_scenes>", other + '<scene><instance_visual_scene url="#t"/></scene>')
+    vertices = read_dae(_write(tmp_path, text)).vertices
+    np.testing.assert_allclose(vertices.max(0), [0.02, 0.02, 0.03])
+    assert len(vertices) == 5
+
+
 def test_all_kinds_of_faces_say_the_same(tmp_path: Path) -> None:
     start, end = FILE.index("<vcount>"), FILE.index("</polylist>")
     polygons = FILE[:start] + "<p>0 9 1 9 2 9 3 9</p><p>0 9 1 9 4 9</p>" + FILE[end:]
@@ -479,6 +487,9 @@ def test_what_is_no_surface_may_be_broken(tmp_path: Path, before: str, beside: s
         ("<vcount>4 3", "<vcount>1 2", "holds no triangles"),
         ('semantic="VERTEX"', 'semantic="COLOR"', "has no VERTEX input"),
         ("<node><translate>", '<node id="n"><instance_node url="#n"/><translate>', "a node contains itself"),
+        ("</polylist>", "</polylist><polygons><ph><p>0</p><h>1</h></ph></polygons>", "a polygon with holes"),
+        ("<visual_scene", "<visual_scene/><visual_scene", "the file has 2 visual scenes"),
+        ("</COLLADA>", '<scene><instance_visual_scene url="#t"/></scene></COLLADA>', "refers to '#t'"),
     ],
 )
 def test_a_broken_file_is_refused(tmp_path: Path, old: str, new: str, message: str) -> None:

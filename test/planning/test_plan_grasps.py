@@ -1,5 +1,6 @@
 """`plan_grasps`, end to end on a cylinder: verdicts, limits, reproducibility, and every way for a run to end early."""
 
+import inspect
 import threading
 import time
 from dataclasses import replace
@@ -9,6 +10,7 @@ import pytest
 
 from graspd_core import load_preset, load_scene, override, plan_grasps
 from graspd_core.errors import ConfigError
+from graspd_core.planning.plan_grasps import check_request
 from graspd_core.runtime import disk_cache as cache
 from graspd_core.types import Grasp, GraspResult, Outcome, Plane, Progress, Stage, Verdict
 from graspd_core.verify import verification
@@ -229,6 +231,13 @@ def test_a_wrong_request_is_refused(scene, hand, wrong: dict, culprit: str):
     with pytest.raises(ConfigError) as caught:
         plan_grasps(scene, hand, **wrong)
     assert culprit in str(caught.value)
+
+
+@pytest.mark.parametrize("wrong", [{"count": 1.5}, {"seed": 0.5}])
+def test_a_number_that_is_not_whole_is_refused(wrong: dict):
+    unchecked = inspect.unwrap(check_request)  # the tests check types before the function is called
+    with pytest.raises(ConfigError, match=f"{next(iter(wrong))}: .*; valid"):
+        unchecked(**{"count": 1, "seed": 0, "verify": "none", "deadline": None, "device": "cpu"} | wrong)
 
 
 def test_a_candidate_that_touches_nothing_is_no_grasp_where_no_trial_is_asked_for(scene, hand):

@@ -159,3 +159,15 @@ def test_it_is_an_object_by_library_and_command_line(depth, camera: Path, tmp_pa
         assert main([command[0], str(image), *command[1:]]) == 2
         told = "depth.png: a depth image needs the camera that took it: --camera camera.json"
         assert told in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("given", [["--units", "m"], ["--scale", "1"]])
+@pytest.mark.parametrize("any_object", [[], ["--any"]])
+def test_metres_beside_another_unit_of_the_camera_are_refused(depth, tmp_path: Path, capsys, given, any_object):
+    image, camera = (
+        saved(tmp_path / "depth.png", np.round(depth * 1000).astype("u2")),
+        written(tmp_path, depth_unit="mm"),
+    )
+    assert main(["synthesize", str(image), "--camera", str(camera), *given, *any_object]) == 2
+    told = f"{' '.join(given)}: {camera} has depth_unit 0.001 m; remove one of them"
+    assert told in capsys.readouterr().err

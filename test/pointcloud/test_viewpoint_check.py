@@ -69,6 +69,15 @@ def test_the_true_place_is_taken_and_the_places_of_robots_are_refused(shape, ele
         assert is_refused(PointCloud(thing, np.array(base)), replace(cloud, viewpoint=np.array(base)))
 
 
+def test_another_cloud_from_the_same_place_does_not_hide_that_the_camera_was_elsewhere():
+    _, points, _ = seen("box", 0.8)
+    rest = points[np.linalg.norm(points[:, :2], axis=1) > 0.2]
+    views = [PointCloud(part, np.array(BASES["above"])) for part in (points, rest)]
+    for given in (views, views[::-1]):
+        with pytest.raises(CloudError, match="around the object are hidden from there"):
+            scene_from_views(given, target=Target(point=np.array([0.0, 0.0, 0.05])))
+
+
 def test_an_object_alone_from_all_round_needs_no_camera():
     ball = surface_samples(make_shape("sphere"), 3000, seed=0)[0] + [0.0, 0.0, 0.5]
     cloud = PointCloud(ball, np.zeros(3))

@@ -102,6 +102,9 @@ def test_a_known_object_is_answered_where_it_stands_without_its_mesh_being_read(
     assert len(planned.result.grasps) == 2
     assert all(abs(grasp.grasp.position[0] - 5.0) < 0.3 for grasp in planned.result.grasps)
     assert "2 grasps of the library known.grasps" in planned.result.message
+    assert planned.mass == 0.1
+    assert planned.mass_assumed == ("mesh_uri" in fields)
+    assert not Node(hand, mass=0.1).answer(**fields).mass_assumed
 
 
 def test_a_mesh_named_by_its_path_alone_is_known_too(folder: Path, hand: HandModel, unread: None):

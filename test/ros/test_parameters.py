@@ -14,6 +14,7 @@ from rclpy.parameter import Parameter
 from graspd_core import PointCloud
 from graspd_core.paths import config_dir
 from graspd_ros.inputs.sensor_frames import scene_of_views
+from graspd_ros.inputs.tf_listener import check_arm
 from graspd_ros.parameters import LiveSettings, Settings, check_parameters
 
 
@@ -60,6 +61,25 @@ def test_what_is_no_choice_is_refused_by_name(name, value, culprit):
 )
 def test_choices_are_taken(name, value):
     assert check_parameters([Parameter(name, value=value)]).successful
+
+
+def test_an_arm_is_refused_if_its_urdf_is_broken_or_was_not_heard(tmp_path: Path):
+    path = tmp_path / "arm.yaml"
+    path.write_text("urdf: arm.urdf\ntip: tip\n")
+    (tmp_path / "arm.urdf").write_text("<robot")
+    changed = [Parameter("arm", value=str(path))]
+    for answer in (check_parameters(changed), check_arm(changed, "")):
+        assert not answer.successful
+        assert answer.reason.startswith(f"parameter arm: {tmp_path / 'arm.urdf'}: not well-formed XML")
+    path.write_text("urdf: robot_description\ntip: tip\n")
+    assert check_parameters(changed).successful  # at the start, when the topic is still to be heard
+    assert "which the node reads only at its start" in check_arm(changed, "").reason
+    robot = (config_dir() / "arms" / "panda_like.urdf").read_text()
+    assert "tip" in check_arm(changed, robot).reason
+    path.write_text(
+        (config_dir() / "arms" / "panda_like.yaml").read_text().replace("panda_like.urdf", "robot_description")
+    )
+    assert check_arm(changed, robot).successful
 
 
 def test_a_scene_file_sets_the_reconstruction_and_is_refused_by_its_key(tmp_path: Path):

@@ -9,7 +9,7 @@ from builtin_interfaces.msg import Time
 
 from graspd_core import Steering, load_scene
 from graspd_core.errors import MeshError, TransformError
-from graspd_core.types import GraspResult, Outcome, Progress, Stage, Verdict
+from graspd_core.types import ArmPath, GraspResult, Outcome, Progress, Stage, Verdict
 from graspd_ros.convert import matrix_of_posture
 from graspd_ros.error_codes import RequestError
 from graspd_ros.parameters import Settings
@@ -180,6 +180,16 @@ def test_grasps_of_earlier_runs_have_the_least_mass_of_their_trials(hand):
     found = runs.next_best(asked, [])
     assert found is not None
     assert found.mass == 0.3
+
+
+def test_grasps_of_an_earlier_run_have_no_path_of_an_arm_that_is_switched_off(hand):
+    asked = replace(request(lambda: load_scene("shape:sphere")), id="first", object_key="sphere")
+    planned, runs = planner(hand).plan(asked, never, lambda _: None), RecentRuns()
+    reached = replace(planned.result.tried[0], arm=ArmPath(("a",), np.zeros((13, 1)), (0, 5, 7, 12)))
+    runs.keep(asked, replace(planned, result=replace(planned.result, tried=(reached,))), np.eye(4))
+    found = runs.next_best(asked, [])
+    assert found is not None
+    assert found.result.tried[0].arm is None
 
 
 def test_a_run_whose_id_was_used_before_is_the_newest(hand):

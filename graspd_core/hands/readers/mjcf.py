@@ -296,7 +296,12 @@ def _compiled(path: Path, root: ET.Element) -> _Parts:
                 meshes.append((geom, assets.get(name)))
         for mesh in list(spec.meshes):
             spec.delete(mesh)
-        return _Parts(path, spec, spec.compile(), {geom.id: mesh for geom, mesh in meshes if mesh})
+        # The compiler warns that its own `settotalmass` is deprecated.
+        total, spec.compiler.settotalmass = spec.compiler.settotalmass, -1
+        model = spec.compile()
+        if total > 0:
+            mujoco.mj_setTotalmass(model, total)
+        return _Parts(path, spec, model, {geom.id: mesh for geom, mesh in meshes if mesh})
     except (ValueError, mujoco.FatalError) as error:
         raise _refusal(path, root, " ".join(str(error).split())) from error
 

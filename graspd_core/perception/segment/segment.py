@@ -50,6 +50,7 @@ class Segmentation:
 
     Attributes:
         views: the object's points in each view, at full density. Views that do not show the object are left out.
+        numbers: index of each of `views` among the segmented clouds.
         support: support plane of the object. None if none was seen.
         obstacles: downsampled points of each other object or surface nearby [m].
         warnings: warnings for the user.
@@ -58,6 +59,7 @@ class Segmentation:
     """
 
     views: tuple[PointCloud, ...]
+    numbers: tuple[int, ...]
     support: Plane | None
     obstacles: tuple[Float[np.ndarray, "_ 3"], ...]
     warnings: tuple[str, ...]
@@ -95,7 +97,7 @@ def segment(
     if not free and not marked and extent(scene.mean[chosen]) > settings.largest_object:
         raise NoObjectError(_nothing(parted))
     found = _cut_out(views, scene, chosen, ground)
-    total = sum(len(view.points) for view in found)
+    total = sum(len(view.points) for view in found.values())
     if total < MIN_POINTS:
         raise CloudError(f"cloud: only {total} points show the object; at least {MIN_POINTS} are needed")
     obstacles = _obstacles(parted, chosen)
@@ -106,7 +108,8 @@ def segment(
     if parted.settings.piled and target.point is not None and touching:
         # In a pile, a part need not stand on the support, so the seam may also lie within one object.
         touching, beside = (), "a seam divides the target from its neighbour, and both may be one object"
-    return Segmentation(found, support, obstacles, (*warnings, *touching), _cut(parted, chosen), beside)
+    told = (*warnings, *touching)
+    return Segmentation(tuple(found.values()), tuple(found), support, obstacles, told, _cut(parted, chosen), beside)
 
 
 def find_things(
@@ -194,19 +197,19 @@ def _candidates(parted: _Parted) -> list[int]:
     return standing or fits
 
 
-def _cut_out(views: Sequence[PointCloud], scene: VoxelScene, chosen: Mask, ground: Ground) -> tuple[PointCloud, ...]:
-    """Return the object's points in every view that shows the object."""
+def _cut_out(views: Sequence[PointCloud], scene: VoxelScene, chosen: Mask, ground: Ground) -> dict[int, PointCloud]:
+    """Return the object's points in every view that shows the object, by the index of the view."""
     wanted = chosen[scene.voxel]
     if ground.support is not None:
         rows = np.flatnonzero(wanted)
         height = ground.support.height(scene.points[rows])
         wanted[rows] = height > ground.support.tolerance(scene.distance[rows])
-    found = []
+    found = {}
     for k, view in enumerate(views):
         part = scene.of_view(k)
         if wanted[part].any():
-            found.append(replace(view, points=scene.points[part][wanted[part]]))
-    return tuple(found)
+            found[k] = replace(view, points=scene.points[part][wanted[part]])
+    return found
 
 
 def _obstacles(parted: _Parted, chosen: Mask) -> tuple[Float[np.ndarray, "_ 3"], ...]:

@@ -373,3 +373,13 @@ def test_masses_that_geoms_give_instead_of_inertials_are_left_out(folder: Path) 
     by_geoms = _read(folder, heavy.replace("<compiler ", '<compiler inertiafromgeom="true" '))
     assert not by_geoms.link_mass.any()
     assert not by_geoms.link_inertia.any()
+
+
+def test_a_total_mass_scales_all_masses_without_a_warning(tmp_path: Path) -> None:
+    bodies = """<body name="palm"><inertial pos="0 0 0" mass=".3" diaginertia="1e-4 1e-4 1e-4"/>
+    <body name="tip"><inertial pos="0 0 0" mass=".1" diaginertia="1e-5 1e-5 1e-5"/>
+    <joint name="j" range="0 1"/><geom size=".01"/></body></body>"""
+    text = f'<mujoco><compiler settotalmass="2" angle="radian"/><worldbody>{bodies}</worldbody></mujoco>'
+    hand = _read(tmp_path, text)
+    np.testing.assert_allclose(hand.link_mass, [1.5, 0.5])
+    np.testing.assert_allclose(np.diag(hand.link_inertia[1]), 5e-5)

@@ -148,6 +148,15 @@ def test_what_cannot_be_met_says_which_wish_refused_the_rest(bottle, hand):
     assert "with a contact outside the region" in found.message
 
 
+@pytest.mark.parametrize("length", [1e-200, 1e200, 1e308])
+def test_the_length_of_a_direction_and_of_a_quaternion_is_free(length: float):
+    steering = Steering((length, 0, length), roll=0.1, roll_zero=(0, length, 0))
+    assert np.allclose(np.array(steering.approach_direction), np.sqrt([0.5, 0, 0.5]))
+    assert steering.roll_zero == (0, 1, 0)
+    turned = Box((0, 0, 0), (1, 1, 1), (length, 0, 0, length)).rotation
+    assert np.allclose(turned, axis_rotation(np.array([0.0, 0.0, 1.0]), np.pi / 2))
+
+
 @pytest.mark.parametrize(
     ("make", "said"),
     [
@@ -165,7 +174,8 @@ def test_what_cannot_be_met_says_which_wish_refused_the_rest(bottle, hand):
         (partial(Box, (0, 0), (1, 1, 1)), "box center: .*3 finite numbers"),
         (partial(Box, (0, 0, np.nan), (1, 1, 1)), "box center"),
         (partial(Box, (0, 0, 0), (1, 0, 1)), "box size: .*above 0"),
-        (partial(Box, (0, 0, 0), (1, 1, 1), (0, 0, 0, 0)), "quaternion_wxyz: all 0"),
+        (partial(Box, (0, 0, 0), (1, 1, 1), (0, 0, 0, 0)), "quaternion_wxyz: .*not all 0"),
+        (partial(Steering, (0, 0, 1), roll_zero=(0, 0, 0)), "roll_zero: .*not all 0"),
         (partial(Sphere, (0, 0, 0), 0.0), "sphere radius: 0.0 m"),
         (partial(Sphere, (0, 0, 0), np.nan), "sphere radius"),
         (partial(NearPoints, np.full((2, 3), np.nan)), "no finite row"),

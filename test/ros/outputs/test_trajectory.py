@@ -229,11 +229,17 @@ def test_no_joint_and_no_hand_is_faster_than_asked(step: float):
     assert (stages >= np.maximum(0.2, np.array([0.1, 0.04, 0.1]) / 0.1) - 1e-6).all()
 
 
-def test_no_joint_of_the_arm_is_faster_than_the_arm_allows():
-    found, limits, hand = grasp_with(0.2), np.array([0.3, np.inf]), load_hand("barrett_like", candidates=50)
+LIMITS = np.array([0.3, np.inf])
+
+
+@pytest.mark.parametrize(
+    ("about", "base_speed"), [({"velocity": LIMITS}, 9.0), ({"slides": np.array([True, False])}, LIMITS[0])]
+)
+def test_no_joint_of_the_arm_is_faster_than_the_arm_allows_or_slides_faster_than_the_base(about, base_speed):
+    found, limits, hand = grasp_with(0.2), LIMITS, load_hand("barrett_like", candidates=50)
     assert found.arm is not None
-    found = dataclasses.replace(found, arm=dataclasses.replace(found.arm, velocity=limits))
-    told = grasp_message(found, 0, "id", Header(), hand, Pace(joint_speed=50.0, base_speed=9.0, shortest=0.01))
+    found = dataclasses.replace(found, arm=dataclasses.replace(found.arm, **about))
+    told = grasp_message(found, 0, "id", Header(), hand, Pace(joint_speed=50.0, base_speed=base_speed, shortest=0.01))
     for sent in (told.arm_trajectory, told.execution.arm):
         speeds = np.diff(positions(sent), axis=0) / np.diff(seconds(sent))[:, None]
         assert (np.abs(speeds) <= limits * (1 + 1e-6)).all()
