@@ -5,8 +5,9 @@ or an axis the gradient is zero (see `se3.safe_norm`). There are two approximati
 greatest depth in a single primitive, which may be too small. For a hull, the result is the greatest distance to its
 face planes. It is exact inside the hull, and may be too small outside near edges and corners.
 
-`CollisionTensors` holds all primitives of a hand except hulls, to compute the distance of object points to every link.
-For hulls, the hand's contact candidates are tested instead.
+`CollisionTensors` holds the primitives of a hand, to compute the distance of object points to every link. Hulls are
+left out, or replaced by a box with round edges that fills the hull as well as possible. Between this box and the hull's
+surface, only the hand's contact candidates are tested. A thin wall passes between candidates, but not through the box.
 """
 
 from __future__ import annotations
@@ -22,12 +23,15 @@ from torch import Tensor
 
 from graspd_core.hands.model import HandModel, Primitive
 from graspd_core.mesh.topology import scaled_normals
+from graspd_core.runtime import disk_cache as cache
 from graspd_core.se3 import SE3, safe_norm
 
 # Points and their distances [m].
 _Places, _Distances = Float[Tensor, "*batch 3"], Float[Tensor, "*batch"]
 # Planes and bounds of this many primitives are cached. No hand may have more primitives.
 _MOST = 2048
+# Linear programs that fit a box into a hull.
+_FILLS = 4
 
 
 def primitive_sdf(primitive: Primitive, points: _Places) -> _Distances:
@@ -107,6 +111,38 @@ def hull_planes(primitive: Primitive) -> tuple[Float[np.ndarray, "planes 3"], Fl
     return planes[:, :3], planes[:, 3]
 
 
+def box_inside(hull: Primitive) -> Float[np.ndarray, "16"]:
+    """Return a large box with round edges inside a hull, in the link frame.
+
+    The box is along the principal axes of the corners. Linear programs first find the largest ball (radius only). Then
+    they increase the product of the three widths. The numbers are the rotation (9) and translation (3) of `T_link_box`,
+    the half extents of the core (3), and the radius (1) [m].
+    """
+    from scipy.optimize import linprog
+
+    normals, offsets = hull_planes(hull)
+    axes = np.linalg.svd(hull.vertices - hull.vertices.mean(0))[2].T
+    axes = axes * [1.0, 1.0, np.linalg.det(axes)]
+    # For a box with centre c, core e and radius r, the farthest point along a normal n is n·c + |n·axes|·e + r.
+    farthest = np.hstack([normals, np.abs(normals @ axes), np.ones((len(normals), 1))])
+    slope, best = np.eye(7)[6], np.zeros(7)
+    for _ in range(_FILLS):
+        found = linprog(-slope, A_ub=farthest, b_ub=offsets, bounds=[(None, None)] * 3 + [(0, None)] * 4).x
+        mixed = best + np.linspace(0.0, 1.0, 33)[:, None] * (found - best) if best.any() else found[None]
+        best = mixed[(mixed[:, 3:6] + mixed[:, 6:]).prod(1).argmax()]
+        gain = 1.0 / (best[3:6] + best[6])
+        slope = np.array([0.0, 0.0, 0.0, *gain, gain.sum()])
+    return np.array([*(hull.rotation @ axes).flat, *(hull.rotation @ best[:3] + hull.translation), *best[3:]])
+
+
+def _boxes_inside(hulls: Sequence[Primitive]) -> Float[np.ndarray, "hulls 16"]:
+    """Return `box_inside` of each hull, cached on disk. A hull takes milliseconds, and a hand may have hundreds."""
+    shape = (len(hulls), 16)
+    build = lambda: {"boxes": np.reshape([box_inside(hull) for hull in hulls], shape)}  # noqa: E731
+    valid = lambda found: [array.shape for array in found.values()] == [shape]  # noqa: E731
+    return cache.remember(f"boxes-{cache.digest(hulls)}", build, valid)["boxes"]
+
+
 def corner_sdf(past: Float[Tensor, "*batch n"]) -> _Distances:
     """Return the signed distance [m] to a corner where `n` orthogonal faces meet. `past`: distance to each face [m]."""
     return safe_norm(past.clamp_min(0.0)) + past.amax(-1).clamp_max(0.0)
@@ -137,26 +173,32 @@ class CollisionTensors:
     link: Int[Tensor, "solids"]
 
 
-def make_collision_tensors(hand: HandModel, device: torch.device | str, dtype: torch.dtype) -> CollisionTensors:
-    """Return the hand's primitives except hulls as tensors. The most recent results are cached."""
-    return _make_collision_tensors(hand, torch.device(device), dtype)
+def make_collision_tensors(
+    hand: HandModel, device: torch.device | str, dtype: torch.dtype, *, filled: bool = False
+) -> CollisionTensors:
+    """Return the hand's primitives as tensors: without hulls, or `filled`, each hull as a box inside it.
+
+    The most recent results are cached.
+    """
+    return _make_collision_tensors(hand, torch.device(device), dtype, filled)
 
 
 @lru_cache(maxsize=8)
-def _make_collision_tensors(hand: HandModel, device: torch.device, dtype: torch.dtype) -> CollisionTensors:
-    solids = [p for p in hand.primitives if p.kind != "hull"]
-    cores = [core_of(p) for p in solids]
-
-    def tensor(values: object, shape: tuple[int, ...]) -> Tensor:
-        return torch.as_tensor(np.asarray(values, dtype=float).reshape(shape), device=device, dtype=dtype)
-
-    n = len(solids)
+def _make_collision_tensors(
+    hand: HandModel, device: torch.device, dtype: torch.dtype, filled: bool
+) -> CollisionTensors:
+    solids = [p for p in hand.primitives if filled or p.kind != "hull"]
+    n, hull = len(solids), [p.kind == "hull" for p in solids]
+    rows = np.reshape([[*p.rotation.flat, *p.translation, *core_of(p)[0], core_of(p)[1]] for p in solids], (n, 16))
+    if any(hull):
+        rows[hull] = _boxes_inside([p for p in solids if p.kind == "hull"])
+    values = torch.as_tensor(rows, device=device, dtype=dtype)
     return CollisionTensors(
-        rotation=tensor([p.rotation for p in solids], (n, 3, 3)),
-        translation=tensor([p.translation for p in solids], (n, 3)),
-        core=tensor([core for core, _ in cores], (n, 3)),
-        radius=tensor([radius for _, radius in cores], (n,)),
-        is_round=tensor([p.kind == "cylinder" for p in solids], (n,)),
+        rotation=values[:, :9].reshape(n, 3, 3),
+        translation=values[:, 9:12].contiguous(),
+        core=values[:, 12:15].contiguous(),
+        radius=values[:, 15].contiguous(),
+        is_round=torch.as_tensor([p.kind == "cylinder" for p in solids], device=device, dtype=dtype),
         link=torch.as_tensor([p.link for p in solids], device=device, dtype=torch.long),
     )
 

@@ -182,8 +182,8 @@ _RATHER_FACES = 1e-6
 
 
 def solid_pairs(hand: HandModel) -> Int[np.ndarray, "pairs 2"]:
-    """Return the index pairs of primitives whose links are not adjacent. Indices count all primitives except hulls."""
-    link = np.array([p.link for p in hand.primitives if p.kind != "hull"], dtype=np.int64)
+    """Return the index pairs of primitives whose links are not adjacent."""
+    link = np.array([p.link for p in hand.primitives], dtype=np.int64)
     return np.argwhere(np.triu(~hand.adjacent[np.ix_(link, link)], 1))
 
 

@@ -93,7 +93,7 @@ class HandTensors:
         coarse: the first contact candidates, evenly spread. Used in most steps.
         fine: all contact candidates. Used in the last steps.
         reach: attraction range of each group of candidates [m].
-        solids: collision primitives, without hulls.
+        solids: collision primitives. A hull counts as a box inside it.
         group_of_solid: first candidate group on the rigid group of each primitive. If none, the number of groups.
         solid_pairs: pairs of `solids` whose links are not adjacent.
         spheres: spheres for self-collision.
@@ -118,8 +118,8 @@ class HandTensors:
 
     @property
     def has_hulls(self) -> bool:
-        """True if the hand has convex hulls. Overlap of hulls is detected only by spheres and contact candidates."""
-        return len(self.solids.link) < len(self.model.primitives)
+        """True if the hand has convex hulls. Near their surface, only contact candidates and spheres detect overlap."""
+        return any(primitive.kind == "hull" for primitive in self.model.primitives)
 
 
 @dataclass(frozen=True, eq=False)
@@ -175,7 +175,7 @@ def make_hand_tensors(
         return PointSet(placement(hand.num_links, points, index(links)), index(links), index(members))
 
     far = np.linalg.norm(hand.palm_center) > _PALM_RADIUS
-    solids = make_collision_tensors(hand, device, dtype)
+    solids = make_collision_tensors(hand, device, dtype, filled=True)
     same = hand.link_group[solids.link.cpu().numpy()][:, None] == of_link[first]
     place = np.where(same.any(1), same.argmax(1), len(present))
     return HandTensors(

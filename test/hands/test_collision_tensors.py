@@ -10,6 +10,7 @@ import pytest
 import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from scipy.spatial.transform import Rotation
 from torch import Tensor
 from torch.autograd import gradcheck
 
@@ -31,6 +32,7 @@ from graspd_core.hands.link_distance import (
 )
 from graspd_core.hands.model import HandModel, Primitive, PrimitiveKind
 from graspd_core.hands.readers.urdf import read_urdf
+from graspd_core.mesh.convex_parts import hull_surface
 from graspd_core.se3 import SE3
 
 
@@ -94,6 +96,23 @@ def test_capsules_are_swept_segments_and_hulls_are_left_out(hand):
     local = links[:, 1].apply_inverse(points)
     together = solid_distance(found, links, points)[..., 0]
     assert together.numpy() == pytest.approx(primitive_sdf(capsule, local).numpy(), abs=1e-12)
+
+
+def test_a_filled_hull_of_a_box_is_that_box(hand):
+    # The corners are those of a box of 4 by 2 by 1 cm, turned and off the origin.
+    corners = np.stack(np.meshgrid([-0.02, 0.02], [-0.01, 0.01], [-0.005, 0.005]), -1).reshape(-1, 3)
+    turn = Rotation.from_rotvec([0.3, -0.2, 0.5]).as_matrix()
+    shape = hull_surface(corners @ turn.T + [0.01, 0.02, 0.03])
+    hull = Primitive(1, "hull", turn, np.array([0.0, 0.01, 0.0]), (), shape.vertices, shape.faces)
+    found = make_collision_tensors(replace(hand, primitives=(hull,)), "cpu", torch.float64, filled=True)
+    _, points = drawn(hand, 0, postures=1, points=40)
+    links = SE3(torch.eye(3, dtype=torch.float64).repeat(1, 2, 1, 1), torch.zeros(1, 2, 3, dtype=torch.float64))
+    inside = solid_distance(found, links, points)[..., 0] < 0
+    box = Primitive(1, "box", turn @ turn, turn @ [0.01, 0.02, 0.03] + [0.0, 0.01, 0.0], (0.02, 0.01, 0.005))
+    middle = torch.as_tensor(box.translation)[None, None]
+    # All corners of the filled box are inside the true box, and its middle is as deep.
+    assert solid_distance(found, links, middle).item() == pytest.approx(-0.005, abs=1e-7)
+    assert (primitive_sdf(box, points)[inside] < 1e-7).all()
 
 
 def test_gradients_against_finite_differences(hand, solids, kinematics):

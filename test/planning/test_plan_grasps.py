@@ -10,6 +10,9 @@ import pytest
 
 from graspd_core import load_preset, load_scene, override, plan_grasps
 from graspd_core.errors import ConfigError
+from graspd_core.hands.model import Primitive
+from graspd_core.hands.surface_points import surface_points
+from graspd_core.mesh.convex_parts import hull_surface
 from graspd_core.planning.plan_grasps import check_request
 from graspd_core.runtime import disk_cache as cache
 from graspd_core.types import Grasp, GraspResult, Outcome, Plane, Progress, Stage, Verdict
@@ -251,3 +254,13 @@ def test_a_candidate_that_touches_nothing_is_no_grasp_where_no_trial_is_asked_fo
     assert all(grasp.usable for grasp in result.tried if grasp.contacts)
     told = f"{len(off)} of {len(result.tried)} untried candidates do not touch the object"
     assert (result.outcome, result.message) == (Outcome.TOO_FEW, told)
+
+
+def test_a_hand_of_meshes_does_not_grasp_through_the_wall_of_a_mug(hand):
+    def hull(solid: Primitive) -> Primitive:
+        shape = hull_surface(surface_points(solid, 200, np.random.default_rng(0))[0])
+        return Primitive(solid.link, "hull", np.eye(3), np.zeros(3), (), shape.vertices, shape.faces)
+
+    meshes = replace(hand, primitives=tuple(hull(solid) for solid in hand.primitives))
+    result = plan_grasps(load_scene("shape:mug"), meshes, count=2, preset="fast", measure=False)
+    assert result.outcome is Outcome.SUCCEEDED
