@@ -6,8 +6,8 @@ hand has too many, the spheres that extend farthest beyond the others are kept.
 
 The overlap of two primitives is found by the separating axis test. A separating axis of two boxes is a face normal or
 a cross product of two edges. Two boxes have fifteen such directions, and the least overlap along them is the exact
-depth. Round primitives need three more directions. If an edge meets a rim, the depth is slightly too large. Hulls are
-excluded. Gradients are exact if a single direction has the least overlap.
+depth. Round primitives need three more directions. If an edge meets a rim, the depth is slightly too large. A hull
+counts as the box inside it. Gradients are exact if a single direction has the least overlap.
 """
 
 from __future__ import annotations

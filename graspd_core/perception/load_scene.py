@@ -86,7 +86,8 @@ def load_scene(
         scene = scene_from_views(views, **about, **numbers)
         scene = replace(scene, object=replace(scene.object, warnings=warnings + scene.object.warnings))
     elif target is not None or settings is not None:
-        raise MeshError(f"target or scene settings: given with {given}, a mesh; valid with clouds of several objects")
+        what = "scene settings" if target is None else "target"
+        raise MeshError(f"{what}: given with {given}, a mesh; valid with clouds of several objects")
     else:
         about = {"source": given, "scale": scale, "device": device, "started": started, "warnings": warnings}
         scene = build_scene(mesh, **about, **numbers)

@@ -151,10 +151,11 @@ def heard_robot(node: Node, arm: str) -> str:
 
 def check_arm(changed: list[Parameter], robot: str) -> SetParametersResult:
     """Refuse an arm that cannot be used. `robot` is the URDF that the node heard at its start, or ""."""
-    from graspd_core.arms.arm import ROBOT_DESCRIPTION, from_robot_description, read_arm_file
-
     try:
         for name in (parameter.value for parameter in changed if parameter.name == "arm" and parameter.value):
+            # Imported here, because a node without an arm needs nothing of it.
+            from graspd_core.arms.arm import ROBOT_DESCRIPTION, from_robot_description, read_arm_file
+
             if not robot and from_robot_description(read_arm_file(name)[1]):
                 told = f"{name} needs a URDF from {ROBOT_DESCRIPTION}, which the node reads only at its start"
                 raise ConfigError(f"{told}; start the node with this arm, or give a URDF file as urdf")
