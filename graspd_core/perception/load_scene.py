@@ -75,7 +75,7 @@ def load_scene(
         mesh, warnings = _read_mesh(source, scale)
         view = view_in_mesh(mesh, given)
         if view_point is not None:
-            raise MeshError(f"view_point: {given} is a mesh; only a cloud has a camera")
+            raise _clouds_only("view_point", given)
         if view is not None:
             views, warnings = (view,), (f"{given}: shows one camera's view, so its points are used as a cloud",)
     if views or mesh is None:
@@ -86,12 +86,15 @@ def load_scene(
         scene = scene_from_views(views, **about, **numbers)
         scene = replace(scene, object=replace(scene.object, warnings=warnings + scene.object.warnings))
     elif target is not None or settings is not None:
-        what = "scene settings" if target is None else "target"
-        raise MeshError(f"{what}: given with {given}, a mesh; valid with clouds of several objects")
+        raise _clouds_only("scene settings" if target is None else "target", given)
     else:
         about = {"source": given, "scale": scale, "device": device, "started": started, "warnings": warnings}
         scene = build_scene(mesh, **about, **numbers)
     return replace(scene, object=replace(scene.object, scale=scale, file_state=state))
+
+
+def _clouds_only(argument: str, source: str) -> MeshError:
+    return MeshError(f"{argument}: given with {source}, a mesh; valid with clouds")
 
 
 def scaled_views(

@@ -22,7 +22,7 @@ def test_a_sheet_of_pixels_is_a_view_however_it_is_wound(turn):
 
 
 def test_the_camera_of_a_sheet_has_no_other_place():
-    with pytest.raises(MeshError, match="view_point: mesh is a mesh; only a cloud has a camera"):
+    with pytest.raises(MeshError, match="view_point: given with mesh, a mesh; valid with clouds"):
         load_scene(sheet(), view_point=(0.0, 0.0, 1.0))
 
 
