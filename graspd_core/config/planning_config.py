@@ -18,8 +18,8 @@ class ProblemConfig:
         fine_candidates: number of contact candidates in the last optimiser steps (polishing).
         patch_size: number of contact candidates in a patch. The optimiser pulls each patch to the surface separately,
             so that the whole hand touches. With zero, it pulls only the nearest candidate of each rigid group of links.
-        softness: depth to which the hand's surface yields, as flesh does [m]. Planning makes the object thinner by this
-            depth and ignores the object's sharp points. Trials do not model softness.
+        softness: depth to which the hand's surface yields, as flesh does [m]. Planning makes object and hand thinner by
+            this depth, for contact candidates and for sharp points. Trials do not model softness.
         features: number of sharp object points that polishing uses. Objects with large thin walls get more points.
         directions: number of disturbance wrenches that a grasp should resist.
         friction: friction coefficient for planning, below the object's friction, so that contacts keep a margin.

@@ -217,7 +217,6 @@ def make_object_tensors(scene: Scene, settings: ProblemConfig, device: str, dtyp
     surface = np.concatenate([sharp, *samples])
     surface = surface[neighbours_together(surface)]
     if settings.softness:
-        sharp, thin, surface = sharp[:0], False, sharp[:0]
         sdf = replace(sdf, field=torch.cat([sdf.field[:1] + settings.softness, sdf.field[1:]]))
     # Each sharp point was chosen farthest from all earlier points, so the first half is spread over the object too.
     coarse = max(settings.features, len(sharp) // 2) if thin else 0
@@ -326,8 +325,12 @@ def build_problem(
 
     The disturbances are the 12 signed axes of wrench space, then random directions drawn with `seed`.
     """
+    tensors = make_hand_tensors(hand, settings.candidates, settings.patch_size, device, dtype)
+    if settings.softness:
+        yielding = replace(tensors.solids, radius=tensors.solids.radius - settings.softness)
+        tensors = replace(tensors, solids=yielding)
     return Problem(
-        hand=make_hand_tensors(hand, settings.candidates, settings.patch_size, device, dtype),
+        hand=tensors,
         object=make_object_tensors(scene, settings, device, dtype),
         directions=disturbance_directions(settings.directions, seed).to(device=device, dtype=dtype),
         friction=min(settings.friction, scene.object.friction),
