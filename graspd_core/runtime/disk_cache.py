@@ -25,7 +25,7 @@ import numpy as np
 Arrays = dict[str, np.ndarray]
 
 # Part of every file name. Increase `VERSION` if the arrays that are computed from one mesh or hand change.
-VERSION = 8
+VERSION = 9
 CAPACITY = 24
 # Greatest size of all files together [bytes]. The size is checked after every `LOOK_EVERY` written files.
 MOST_BYTES, LOOK_EVERY = 512 * 2**20, 16

@@ -8,7 +8,7 @@ import torch
 
 from graspd_core.hands import surface_points as sampling
 from graspd_core.hands.kinematics import link_poses
-from graspd_core.hands.library import hand_names, load_hand
+from graspd_core.hands.library import hand_names, load_hand, read_hand_file
 from graspd_core.hands.link_distance import primitive_sdf
 from graspd_core.hands.model import HandModel, Primitive
 from graspd_core.hands.self_collision import adjacent_links, collision_spheres
@@ -198,3 +198,23 @@ def test_an_alien_file_is_sampled_again(alien, own_cache):
         np.savez(file, **alien)
     cache.forget()
     assert adjacent_links(bare).tolist() == hand.adjacent.tolist()
+
+
+@pytest.mark.parametrize(("first", "adjacent"), [(0.01, True), (0.055, False)])
+def test_a_link_that_is_in_the_palm_in_most_postures_is_so_in_the_model_only(tmp_path, first, adjacent):
+    """A finger that turns down from upright, beside a palm whose solid begins `first` [m] from it."""
+
+    def link(name: str, solid: str, at: str) -> str:
+        return f'<link name="{name}"><collision><origin xyz="{at}"/><geometry>{solid}</geometry></collision></link>'
+
+    def joint(parent: str, child: str, at: str) -> str:
+        ends = f'<parent link="{parent}"/><child link="{child}"/><origin xyz="{at}"/><axis xyz="-1 0 0"/>'
+        return f'<joint name="to_{child}" type="revolute">{ends}<limit lower="0" upper="0.7" effort="1"/></joint>'
+
+    made = link("palm", '<box size="0.1 0.1 0.04"/>', f"0 {first + 0.05} 0.05")
+    made += link("knuckle", '<sphere radius="0.005"/>', "0 0 0") + joint("palm", "knuckle", "0 0 0")
+    made += link("finger", '<box size="0.01 0.01 0.06"/>', "0 0 0.04") + joint("knuckle", "finger", "0 0 0.01")
+    (tmp_path / "hand.urdf").write_text(f'<robot name="a">{made}</robot>')
+    hand = replace(read_hand_file(tmp_path / "hand.urdf"), open_posture=np.zeros(2))
+    found = adjacent_links(hand)
+    assert found[hand.link_index["palm"], hand.link_index["finger"]] == adjacent

@@ -126,6 +126,8 @@ def test_reasons_are_told_without_numbers_the_most_frequent_first(hand, card_on_
     free = scene_of(make_shape("sphere"))
     assert why_trials_failed(free, [held, *failed]) == told + "the object moved while closing (1)"
     assert why_trials_failed(free, [held]) == ""
+    own = TrialResult("hold", False, 0.0, 0.0, "the pregrasp puts finger3_link2 2.4 mm into palm_1")
+    assert "puts finger3_link2 into palm_1 (1)" in why_trials_failed(free, [replace(held, trials=(own,))])
     # Only what is low and pressed from above is called so.
     aside = [replace(one, contacts=(Contact("tip", (0.0, 0.0, 0.0), (1.0, 0.0, 0.0)),)) for one in failed]
     assert "support" not in why_trials_failed(card_on_table, aside)
