@@ -405,7 +405,7 @@ def test_where_the_camera_of_a_cloud_stood_can_be_said_and_is_checked(tmp_path, 
             assert main([*command, *wrong, *rest]) == EXIT_BAD_INPUT
             assert "its camera did not stand at" in the_line(capsys)
     assert main(["synthesize", "shape:mug", "--view-point", "0", "0", "1", *quick]) == EXIT_BAD_INPUT
-    assert "view_point: shape:mug is a mesh" in the_line(capsys)
+    assert "view_point: given with shape:mug, a mesh" in the_line(capsys)
     stamped = [
         Record("/tf", START, transforms_message([("base", OPTICAL, pose)], START)),
         Record("/points", START, cloud_message(points, "base", START)),
