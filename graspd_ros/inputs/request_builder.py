@@ -397,9 +397,7 @@ def frame_loader(
         cloud = seen.seen_by_camera(frame, place, lookup)
         warnings = frame.warnings(cloud)
         points, marks = seen.masked_points(frame, mask)
-        marked = replace(cloud, points=points)
-        inside = seen.within(marked, settings)
-        marked = replace(marked, points=points[inside])
+        marked, inside = seen.cropped(replace(cloud, points=points), settings)
         return seen.scene_of_views((marked,), settings, Target(mask=marks[inside]), warnings)
 
     return load

@@ -32,7 +32,7 @@ from graspd_core.io.messages import (
     pixels_from_message,
 )
 from graspd_core.perception.cloud.camera import camera_rays
-from graspd_core.perception.cloud.point_cloud import transform_cloud
+from graspd_core.perception.cloud.point_cloud import crop, transform_cloud
 from graspd_core.perception.cloud.voxel_downsample import unit_hint
 from graspd_core.runtime.disk_cache import digest
 from graspd_core.verify.robustness import begin_other_shapes
@@ -296,16 +296,16 @@ def scene_of_views(
 
 def trimmed(cloud: PointCloud, settings: Settings) -> PointCloud:
     """Return the points inside the workspace, downsampled to one per voxel if `voxel_size` is set."""
-    inside = replace(cloud, points=cloud.points[within(cloud, settings)])
+    inside, _ = cropped(cloud, settings)
     return inside.thinned(settings.voxel_size) if settings.voxel_size > 0 else inside
 
 
-def within(cloud: PointCloud, settings: Settings) -> Bool[np.ndarray, "n"]:
-    """Return whether each point is inside the workspace. NaN is outside. Raises RequestError if no point is inside."""
-    points, low, high = cloud.points, np.array(settings.roi_min), np.array(settings.roi_max)
-    inside = np.asarray(((points >= low) & (points <= high)).all(1))
-    if inside.any():
-        return inside
+def cropped(cloud: PointCloud, settings: Settings) -> tuple[PointCloud, Bool[np.ndarray, "n"]]:
+    """Return the points inside the workspace, and which these are. Raises RequestError if no point is inside."""
+    kept, inside = crop(cloud, settings.roi_min, settings.roi_max)
+    if len(kept.points):
+        return kept, inside
+    points = cloud.points
     seen = points[np.isfinite(points).all(1)]
     span = f"; they lie from {seen.min(0).round(3).tolist()} to {seen.max(0).round(3).tolist()}" if len(seen) else ""
     fault = (

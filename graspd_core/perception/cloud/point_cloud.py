@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
 from jaxtyping import Bool, Float
+from scipy.spatial import KDTree
 
 from graspd_core.errors import CloudError, Extra
 from graspd_core.mesh.topology import voxel_keys
@@ -21,6 +23,9 @@ MIN_POINTS = 50
 MAX_DISTANCE_IN_SIZES = 1e3
 # Points nearer to the camera than this [m] are not measurements. Some drivers send such points for missing depth.
 CAMERA_PLACE_TOLERANCE_M = 1e-5
+# Cropping cuts a surface where points this near to a side [m] continue outside, in steps of this length [m], each at
+# most this far aside [m], to a distance in this range [m]. Nearer points may show the wall of a bin.
+_AT_SIDE, _STEP, _ASIDE, _BEYOND = 0.005, 0.01, 0.008, (0.02, 0.04)
 # Greatest error of a rotation matrix times its transpose, as in a `TransformBuffer`.
 RIGID = 1e-3
 
@@ -34,12 +39,15 @@ class PointCloud:
         viewpoint: position of the camera, in the same frame [m].
         forward: unit direction of the camera's optical axis, in the same frame, None if unknown.
         posed: True if the viewpoint is certain and needs no check, for example for the pixels of a depth image.
+        ends: points where `crop` cut a seen surface, each with a point of the same surface beyond the cut [m]. The
+            same point may occur several times.
     """
 
     points: Float[np.ndarray, "points 3"]
     viewpoint: Vector
     forward: Vector | None = None
     posed: bool = False
+    ends: Float[np.ndarray, "ends 2 3"] = field(default_factory=lambda: np.empty((0, 2, 3)))
 
     def thinned(self, size: float) -> PointCloud:
         """Keep the first point in every voxel of side `size` [m]."""
@@ -67,7 +75,42 @@ def transform_cloud(cloud: PointCloud, T_a_b: Float[np.ndarray, "4 4"]) -> Point
     points = cloud.points @ rotation.T
     points += position
     forward = None if cloud.forward is None else rotation @ cloud.forward
-    return replace(cloud, points=points, viewpoint=rotation @ cloud.viewpoint + position, forward=forward)
+    moved = {"points": points, "viewpoint": rotation @ cloud.viewpoint + position, "forward": forward}
+    return replace(cloud, **moved, ends=cloud.ends @ rotation.T + position)
+
+
+def crop(cloud: PointCloud, low: Sequence[float], high: Sequence[float]) -> tuple[PointCloud, Bool[np.ndarray, "n"]]:
+    """Return the points between two corners of a box [m], and which points these are. NaN is outside."""
+    inside = near = np.ones(len(cloud.points), dtype=bool)
+    for column, least, most in zip(cloud.points.T, low, high, strict=True):
+        near = near & (column > least - _BEYOND[1]) & (column < most + _BEYOND[1])
+        inside = inside & (column >= least) & (column <= most)
+    kept, left, found = cloud.points[inside], cloud.points[near & ~inside], [cloud.ends]
+    for way, corner in ((-1.0, low), (1.0, high)) if len(left) else ():
+        for axis, side in enumerate(corner):
+            at_side = kept[way * (kept[:, axis] - side) > -_AT_SIDE]
+            found.append(_continued(at_side, left, way * (left[:, axis] - side), axis))
+    return replace(cloud, points=kept, ends=np.concatenate(found)), inside
+
+
+def _continued(
+    at_side: Points, left: Float[np.ndarray, "left 3"], beyond: Float[np.ndarray, "left"], axis: int
+) -> Float[np.ndarray, "ends 2 3"]:
+    """Follow surfaces from points at a side through the points `left` outside. Return the points found with origin."""
+    origin = front = at_side
+    found = [np.empty((0, 2, 3))]
+    for begin in np.arange(0.0, _BEYOND[1], _STEP):
+        more = left[(beyond > begin) & (beyond <= begin + _STEP)]
+        if len(front) == 0 or len(more) == 0:
+            break
+        across = [np.delete(points, axis, axis=1) for points in (front, more)]
+        apart, nearest = (
+            np.asarray(values) for values in KDTree(across[0]).query(across[1], distance_upper_bound=_ASIDE)
+        )
+        origin, front = origin[nearest[apart < np.inf]], more[apart < np.inf]
+        if begin >= _BEYOND[0]:
+            found.append(np.stack([origin, front], 1))
+    return np.concatenate(found)
 
 
 def measured(points: Points, viewpoint: Vector) -> Bool[np.ndarray, "n"]:

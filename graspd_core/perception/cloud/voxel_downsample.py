@@ -6,7 +6,7 @@ Segmentation labels the mean points only. Every original point then gets the lab
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
@@ -14,7 +14,7 @@ from jaxtyping import Bool, Float, Int
 from graspd_core.config import SegmentationConfig
 from graspd_core.errors import CloudError
 from graspd_core.mesh.topology import packed_rows
-from graspd_core.perception.cloud.point_cloud import MIN_POINTS, PointCloud, Points, longest_side, measured
+from graspd_core.perception.cloud.point_cloud import MIN_POINTS, PointCloud, Points, crop, longest_side, measured
 
 # Mask: which voxels of a scene are chosen. Labels: the object of each voxel, 0 for the largest, -1 for no object.
 Mask = Bool[np.ndarray, "voxels"]
@@ -39,6 +39,7 @@ class VoxelScene:
         mean_distance: mean distance of each voxel's points from their cameras [m].
         count: number of points in each voxel.
         size: side of a voxel [m].
+        ends: points where the workspace cuts seen surfaces, and points beyond, as in a `PointCloud`.
     """
 
     points: Float[np.ndarray, "points 3"]
@@ -49,6 +50,7 @@ class VoxelScene:
     mean_distance: Float[np.ndarray, "voxels"]
     count: Int[np.ndarray, "voxels"]
     size: float
+    ends: Float[np.ndarray, "ends 2 3"]
 
     @property
     def weight(self) -> Float[np.ndarray, "voxels"]:
@@ -71,13 +73,12 @@ def voxel_downsample(views: Sequence[PointCloud], settings: SegmentationConfig) 
         raise CloudError("cloud: empty, no points at all" if len(views) else "cloud: no view at all")
     stride = -(-given // MAX_SCENE_POINTS)
     kept = [_inside(view, stride, settings) for view in views]
-    finite = sum(number for _, _, _, number in kept)
+    finite = sum(number for *_, number in kept)
     if finite == 0:
         raise CloudError(_unmeasured(views, given))
-    rows = tuple(row for row, _, _, _ in kept)
+    rows = tuple(row for row, *_ in kept)
     _refuse_far_apart(views, rows, settings.max_range)
-    points = np.concatenate([point for _, point, _, _ in kept])
-    distance = np.concatenate([reach for _, _, reach, _ in kept])
+    points, distance, ends = (np.concatenate([part[k] for part in kept]) for k in (1, 2, 3))
     if len(points) < MIN_POINTS:
         few = f"only {len(points)} finite points of {given}"
         if len(points) < finite:
@@ -91,22 +92,25 @@ def voxel_downsample(views: Sequence[PointCloud], settings: SegmentationConfig) 
         within = longest_side(points)
         unit = f", within {1e3 * within:.2g} mm: are they in metres?" if within else "; no surface is seen"
         raise CloudError(f"cloud: all {len(points)} points are in one place{unit}")
-    return VoxelScene(points, distance, rows, voxel, mean, np.bincount(voxel, distance) / count, count, size)
+    return VoxelScene(points, distance, rows, voxel, mean, np.bincount(voxel, distance) / count, count, size, ends)
 
 
 def _inside(
     view: PointCloud, stride: int, settings: SegmentationConfig
-) -> tuple[Int[np.ndarray, "kept"], Float[np.ndarray, "kept 3"], Float[np.ndarray, "kept"], int]:
-    """Take every `stride`-th point. Return rows, points and distances in the workspace, and how many were measured."""
+) -> tuple[
+    Int[np.ndarray, "kept"], Float[np.ndarray, "kept 3"], Float[np.ndarray, "kept"], Float[np.ndarray, "ends 2 3"], int
+]:
+    """Take every `stride`-th point. Return rows, points and distances in the workspace, where it cuts surfaces, and
+    how many points were measured.
+    """
     rows = stride * np.flatnonzero(measured(view.points[::stride], view.viewpoint))
     points = view.points[rows].astype(float)
     distance = np.linalg.norm(points - view.viewpoint, axis=1)
-    inside: Bool[np.ndarray, "finite"] = distance <= settings.max_range
-    if settings.roi_low is not None:
-        inside &= (points >= np.asarray(settings.roi_low, dtype=float)).all(1)
-    if settings.roi_high is not None:
-        inside &= (points <= np.asarray(settings.roi_high, dtype=float)).all(1)
-    return rows[inside], points[inside], distance[inside], len(rows)
+    cropped, inside = crop(
+        replace(view, points=points), settings.roi_low or (-np.inf,) * 3, settings.roi_high or (np.inf,) * 3
+    )
+    inside &= distance <= settings.max_range
+    return rows[inside], points[inside], distance[inside], cropped.ends, len(rows)
 
 
 def _refuse_far_apart(views: Sequence[PointCloud], rows: Sequence[Int[np.ndarray, "_"]], farthest: float) -> None:

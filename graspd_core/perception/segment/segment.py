@@ -9,10 +9,11 @@ from hashlib import blake2b
 
 import numpy as np
 from jaxtyping import Float
+from scipy.spatial import KDTree
 
 from graspd_core.config import SegmentationConfig
 from graspd_core.errors import CloudError, NoObjectError
-from graspd_core.perception.cloud.camera import reaches_image_border
+from graspd_core.perception.cloud.camera import MIN_BORDER_POINTS, reaches_image_border
 from graspd_core.perception.cloud.point_cloud import MIN_POINTS, Eyes, PointCloud, Vector
 from graspd_core.perception.cloud.voxel_downsample import Labels, Mask, VoxelScene, voxel_downsample
 from graspd_core.perception.segment.clusters import (
@@ -242,7 +243,7 @@ def _warnings(parted: _Parted, crowded: bool) -> tuple[str, ...]:
 def _cut(parted: _Parted, chosen: Mask) -> str:
     """Return why the object may extend beyond what the views show, or ""."""
     scene, ground, settings = parted.scene, parted.ground, parted.settings
-    if _cut_off(scene, chosen, settings):
+    if _cut_off(parted, chosen):
         return "the object reaches the border of the workspace; the rest of it is not seen"
     # Without surroundings, the object's own outline is the outline of the view.
     if ground.support is None and not ground.background:
@@ -308,14 +309,15 @@ def _beside(parted: _Parted, chosen: Mask, point: Vector) -> str:
     return f"the target is {aside:.0f} mm from the middle of the segment: two touching objects may be taken for one"
 
 
-def _cut_off(scene: VoxelScene, chosen: Mask, settings: SegmentationConfig) -> bool:
-    mine = scene.mean[chosen]
-    cut = bool((scene.mean_distance[chosen] > settings.max_range - 2 * scene.size).any())
-    if settings.roi_low is not None:
-        cut |= bool((mine < np.asarray(settings.roi_low, dtype=float) + scene.size).any())
-    if settings.roi_high is not None:
-        cut |= bool((mine > np.asarray(settings.roi_high, dtype=float) - scene.size).any())
-    return cut
+def _cut_off(parted: _Parted, chosen: Mask) -> bool:
+    """Return True if the object reaches `max_range`, or is seen beyond the workspace too."""
+    scene, support, ends = parted.scene, parted.ground.support, parted.scene.ends
+    if (scene.mean_distance[chosen] > parted.settings.max_range - 2 * scene.size).any():
+        return True
+    if support is not None:
+        ends = ends[support.height(ends[:, 1]) > scene.size]
+    near, _ = KDTree(scene.mean[chosen]).query(ends[:, 0], distance_upper_bound=2 * scene.size)
+    return bool(np.isfinite(near).sum() >= MIN_BORDER_POINTS)
 
 
 def _nothing(parted: _Parted) -> str:

@@ -256,6 +256,20 @@ def test_a_workspace_without_a_point_says_where_they_are_and_names_the_unit(scen
         taker.from_message("r", behind, asked).load()
 
 
+@pytest.mark.parametrize(("frame", "axis"), [(BASE, 1), (OPTICAL, 0)])
+def test_an_object_that_the_workspace_cuts_is_doubted(scene, frame, axis):
+    grid, _, T = scene
+    points = grid if frame == OPTICAL else in_base(grid, T)
+    middle = points[len(points) // 2, points.shape[1] // 2]
+    asked = GraspRequest(cloud=message(points, frame, frame == OPTICAL), sensor_frame=OPTICAL)
+    for beside, cut in ((0.0, True), (0.3, False)):
+        corner = np.full(3, 10.0)
+        corner[axis] = middle[axis] + beside
+        settings = Settings(cloud_max_age=0.0, roi_max=corner.tolist())
+        found = builder(T).from_message("r", settings, asked).load()
+        assert ("reaches the border of the" in str(found.evidence)) is cut
+
+
 @pytest.fixture(scope="module")
 def scene():
     """A bottle and a box on a table; what a camera sees, and its pose in base_link, half a metre beside the bottle."""
