@@ -50,10 +50,16 @@ def drop_small_components(mesh: TriangleMesh) -> tuple[TriangleMesh, int]:
 def face_components(mesh: TriangleMesh) -> Int[np.ndarray, "faces"]:
     """Return the index of the connected piece of each face. Pieces share no vertex."""
     a, b, c = mesh.faces.T
-    rows, columns = np.concatenate([a, b]), np.concatenate([b, c])
-    shared = coo_matrix((np.ones(len(rows), dtype=bool), (rows, columns)), shape=(len(mesh.vertices),) * 2)
-    _, label = connected_components(shared, directed=False)
+    label = connected_parts(len(mesh.vertices), np.concatenate([a, b]), np.concatenate([b, c]))
     return np.unique(label[a], return_inverse=True)[1].reshape(-1)
+
+
+def connected_parts(
+    count: int, one: Int[np.ndarray, "edges"], other: Int[np.ndarray, "edges"]
+) -> Int[np.ndarray, "count"]:
+    """Return the index of the connected part of each of `count` nodes. Each edge joins a node `one` to an `other`."""
+    graph = coo_matrix((np.ones(len(one), dtype=bool), (one, other)), shape=(count, count))
+    return connected_components(graph, directed=False)[1]
 
 
 def keep_cavities(mesh: TriangleMesh, outward: Int[np.ndarray, "faces 3"]) -> Int[np.ndarray, "faces 3"]:

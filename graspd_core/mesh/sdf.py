@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 import torch
 from jaxtyping import Bool, Float
+from scipy.ndimage import label
 from torch import Tensor
 from torch.nn.functional import grid_sample
 
@@ -184,8 +185,6 @@ def _inside(mesh: TriangleMesh, nodes: _Vectors, distance: _Lengths, spacing: fl
     nodes that are both over half a cell from the surface, there is no surface. So one query answers for a region.
     Around an open surface, the winding number changes in free space too, so every node is queried.
     """
-    from scipy.ndimage import label
-
     if not is_closed(mesh):
         return winding_inside(mesh, nodes.reshape(3, -1).T).reshape(distance.shape)
     labelled: Any = label(distance > 0.51 * spacing)

@@ -8,16 +8,15 @@ free space. A neighbour that surrounds the target is split into parts.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from contextlib import suppress
 from dataclasses import replace
 
 import numpy as np
 import torch
 from jaxtyping import Float
-from scipy.spatial import ConvexHull, KDTree, QhullError
+from scipy.spatial import KDTree
 
 from graspd_core.config import ObstacleConfig, SceneConfig
-from graspd_core.mesh.convex_parts import hull_surface, limited_hull
+from graspd_core.mesh.convex_parts import convex_hull, hull_surface, limited_hull
 from graspd_core.mesh.mesh_files import surface_samples
 from graspd_core.mesh.sdf import sample_sdf
 from graspd_core.mesh.surface_queries import winding_inside
@@ -100,8 +99,8 @@ def padded_hull(points: Points, support: Plane | None, padding: float) -> Triang
         height = points @ support.normal - support.offset
         corners = np.vstack([points, points - height[:, None] * support.normal])
     # Without a support, the points of a flat face have no hull. The padding below makes them thicker.
-    with suppress(QhullError):
-        corners = corners[ConvexHull(corners).vertices]
+    if (hull := convex_hull(corners)) is not None:
+        corners = corners[hull.vertices]
     skin = padding * np.vstack([np.eye(3), -np.eye(3)])
     return hull_surface((corners[:, None] + skin).reshape(-1, 3))
 
@@ -148,15 +147,14 @@ def with_neighbours(
 
 def _overlap(a: Float[np.ndarray, "_ 3"], b: Float[np.ndarray, "_ 3"]) -> float:
     """Return the intersection over union of the convex hulls of two sets of points, 0 if a hull is flat."""
-    try:
-        hulls = [ConvexHull(_hull_corners(a)), ConvexHull(_hull_corners(b))]
-    except QhullError:
+    one, other = (convex_hull(_hull_corners(points)) for points in (a, b))
+    if one is None or other is None:
         return 0.0
     low, high = b.min(0), b.max(0)
     points = low + (high - low) * np.random.default_rng(0).random((_OVERLAP_SAMPLES, 3))
-    inside = [(points @ hull.equations[:, :3].T + hull.equations[:, 3] <= 0).all(1) for hull in hulls]
-    shared = float((inside[0] & inside[1]).mean() * np.prod(high - low))
-    return shared / (hulls[0].volume + hulls[1].volume - shared)
+    equations = np.vstack([one.equations, other.equations])
+    shared = float((points @ equations[:, :3].T + equations[:, 3] <= 0).all(1).mean() * np.prod(high - low))
+    return shared / (one.volume + other.volume - shared)
 
 
 def _hull_corners(points: Float[np.ndarray, "_ 3"]) -> Float[np.ndarray, "_ 3"]:

@@ -15,8 +15,9 @@ import numpy as np
 from jaxtyping import Bool, Float, UInt16
 
 from graspd_core.errors import CloudError
+from graspd_core.mesh.convex_parts import convex_hull
 from graspd_core.perception.cloud.free_space import view_frame
-from graspd_core.perception.cloud.point_cloud import PointCloud, Vector, convex_hull, longest_side, transform_cloud
+from graspd_core.perception.cloud.point_cloud import PointCloud, Vector, longest_side, transform_cloud
 
 DISTORTION_MODELS = {"plumb_bob": 5, "rational_polynomial": 8}
 

@@ -10,6 +10,7 @@ import numpy as np
 from jaxtyping import Float
 
 from graspd_core.errors import MeshError
+from graspd_core.mesh.components import connected_parts
 from graspd_core.mesh.topology import edge_counts, scaled_normals
 from graspd_core.perception.cloud.point_cloud import PointCloud, Points, Vector
 from graspd_core.types import TriangleMesh
@@ -105,16 +106,9 @@ def _is_open(mesh: TriangleMesh) -> bool:
 
 def _borders(mesh: TriangleMesh) -> int:
     """Return the number of border loops of the surface."""
-    from scipy.sparse import coo_matrix
-    from scipy.sparse.csgraph import connected_components
-
     edges, count = edge_counts(mesh.faces)
     used, compact = np.unique(edges[count == 1], return_inverse=True)
-    if not len(used):
-        return 0
-    one, other = compact.reshape(-1, 2).T
-    graph = coo_matrix((np.ones(len(one), dtype=bool), (one, other)), shape=(len(used), len(used)))
-    return int(connected_components(graph, directed=False)[0])
+    return 1 + int(connected_parts(len(used), *compact.reshape(-1, 2).T).max(initial=-1))
 
 
 def _is_grid(mesh: TriangleMesh) -> bool:

@@ -15,6 +15,7 @@ from functools import lru_cache
 
 import numpy as np
 from jaxtyping import Float
+from scipy.spatial import KDTree
 
 from graspd_core.config import ReconstructionConfig
 from graspd_core.errors import CloudError
@@ -99,8 +100,6 @@ def merge_views(
 
 def orient_view(view: PointCloud, step: float, settings: ReconstructionConfig) -> Surfels:
     """Return the surface points of one view, about `step` [m] apart, with normals towards its camera."""
-    from scipy.spatial import KDTree
-
     points = _thin_by_sight(view, step)
     if len(points) <= settings.neighbours:
         return nothing()
@@ -164,8 +163,6 @@ def is_unposed(view: PointCloud, axis_known: bool = False) -> bool:
         view: the object's points.
         axis_known: whether the camera's direction is known.
     """
-    from scipy.spatial import KDTree
-
     points = clean_cloud(view.points)
     if (view.viewpoint > points.min(0)).all() and (view.viewpoint < points.max(0)).all() and is_all_round(view):
         return True
@@ -210,8 +207,6 @@ def orient_unposed(view: PointCloud, step: float) -> Surfels:
     View the cloud from many directions. In each image cell, the nearest point is taken to face the viewer. So the two
     sides of a thin wall stay apart. Orientation by neighbours would mix the two sides.
     """
-    from scipy.spatial import KDTree
-
     points = view.thinned(step * UNPOSED_THINNING).points
     seen_from, place, many = _seen_from(points), KDTree(points), min(NORMAL_NEIGHBOURS, len(points))
     near = np.asarray(place.query(points, k=many)[1])
@@ -234,8 +229,6 @@ def _least_axes_of(groups: Float[np.ndarray, "n k 3"]) -> Points:
 
 def _seen_from(points: Points) -> Points:
     """Return for each point the sum of the directions from which it is the nearest point in its image cell."""
-    from scipy.spatial import KDTree
-
     width = 2 * float(np.median(KDTree(points).query(points, k=5)[0][:, -1]))
     rng, total = np.random.default_rng(0), np.zeros_like(points)
     turn = np.arange(UNPOSED_DIRECTIONS) + 0.5

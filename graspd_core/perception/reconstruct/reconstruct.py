@@ -14,6 +14,7 @@ from functools import partial
 
 import numpy as np
 from jaxtyping import Float
+from scipy.spatial import KDTree
 
 from graspd_core.config import ReconstructionConfig
 from graspd_core.errors import CloudError, MeshError
@@ -192,8 +193,6 @@ def closed_mesh(
 
 def _clean(views: Sequence[PointCloud], settings: ReconstructionConfig) -> list[PointCloud]:
     """Drop points that are not finite or far from the others, and views with too few points for a surface."""
-    from scipy.spatial import KDTree
-
     if len(views) == 0:
         raise CloudError("cloud: no view at all; at least one is needed")
     for view in views:
@@ -274,8 +273,6 @@ def _fewer(mesh: TriangleMesh, most: int) -> TriangleMesh:
 
 
 def _confidence(mesh: TriangleMesh, seen: Points, settings: ReconstructionConfig) -> Float[np.ndarray, "vertices"]:
-    from scipy.spatial import KDTree
-
     far = settings.guessed_distance
     distance, _ = KDTree(seen).query(mesh.vertices, distance_upper_bound=far)
     return np.clip((far - distance) / (far - settings.seen_distance), 0.0, 1.0)
@@ -306,8 +303,6 @@ def _unseen_share(mesh: TriangleMesh, seen: Surfels, standing: bool, reach: floa
     Args:
         reach: largest distance that counts as near [m]. Normals 60° apart count like a distance of `reach`.
     """
-    from scipy.spatial import KDTree
-
     area, normals = _open_area(mesh, standing)
     place = np.hstack([mesh.vertices[mesh.faces].mean(1), reach * normals])
     far = KDTree(np.hstack([seen.points, reach * seen.normals])).query(place)[0] > reach

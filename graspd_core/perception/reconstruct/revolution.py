@@ -11,6 +11,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
+from scipy.spatial import KDTree
 
 from graspd_core.mesh.topology import packed_rows
 from graspd_core.perception.cloud.free_space import FreeSpace, weigh
@@ -198,8 +199,6 @@ def find_revolution(surfels: Surfels, free_space: FreeSpace, step: float) -> Rev
 
 def revolve(surfels: Surfels, free_space: FreeSpace, axis: Axis, step: float) -> Revolution | None:
     """Revolve the seen profile about the axis, without rings that the cameras contradict. Return None if few remain."""
-    from scipy.spatial import KDTree
-
     _, rows = half_plane(surfels, axis)
     fits = turned(rows, step)
     if fits.sum() < MIN_AXIS_POINTS:
