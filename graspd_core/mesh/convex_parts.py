@@ -14,10 +14,9 @@ import numpy as np
 import torch
 from jaxtyping import Float, Int
 from scipy.spatial import ConvexHull, QhullError
-from torch.nn.functional import grid_sample
 
 from graspd_core.mesh.mesh_files import surface_samples
-from graspd_core.mesh.sdf import GridSDF
+from graspd_core.mesh.sdf import GridSDF, interpolate
 from graspd_core.types import TriangleMesh
 
 SURFACE_POINTS = 6000
@@ -225,9 +224,7 @@ def _hull_samples(hull: ConvexHull) -> Float[np.ndarray, "_ 3"]:
 
 def _outside(sdf: GridSDF, points: Points) -> Float[np.ndarray, "_"]:
     unit = (torch.as_tensor(points, dtype=sdf.field.dtype) - sdf.origin) / sdf.half - 1
-    field = sdf.field[None, :1].permute(0, 1, 4, 3, 2)
-    sampled = grid_sample(field, unit[None, None, None], align_corners=True, padding_mode="border")
-    return sampled.flatten().clamp_min(0.0).numpy()
+    return interpolate(sdf.field[:1], unit)[0].clamp_min(0.0).numpy()
 
 
 def _thin(points: Points, most: int) -> Points:

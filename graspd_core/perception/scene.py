@@ -19,13 +19,12 @@ from jaxtyping import Float
 from scipy.ndimage import distance_transform_edt
 from scipy.spatial import KDTree
 from torch import Tensor
-from torch.nn.functional import grid_sample
 
 from graspd_core.errors import MeshError
 from graspd_core.mesh.components import bodies_apart
 from graspd_core.mesh.convex_parts import convex_parts
 from graspd_core.mesh.mesh_files import check_mesh, content_hash, mass_properties
-from graspd_core.mesh.sdf import GridSDF, build_sdf, grid_layout, is_solid
+from graspd_core.mesh.sdf import GridSDF, build_sdf, grid_layout, interpolate, is_solid
 from graspd_core.mesh.sharp_features import sharp_points
 from graspd_core.mesh.topology import far_centre, moved_mesh
 from graspd_core.perception.reconstruct.merge_views import Evidence
@@ -79,10 +78,7 @@ def sample_confidence(
 ) -> Float[Tensor, "batch points"]:
     """Interpolate the confidence at points [m], linearly and differentiably. Outside the grid, use its border value."""
     unit = points / sdf.half - (sdf.origin / sdf.half + 1).to(points)
-    # grid_sample takes x for the last axis of its input.
-    field = grid.permute(2, 1, 0)[None, None]
-    sampled = grid_sample(field, unit.reshape(1, 1, 1, -1, 3), align_corners=True, padding_mode="border")
-    return sampled.reshape(points.shape[:-1])
+    return interpolate(grid[None], unit.reshape(-1, 3)).reshape(points.shape[:-1])
 
 
 # Meshes are simplified to this number of faces. More faces would be slow, and smaller than the cells of a 48³ grid.

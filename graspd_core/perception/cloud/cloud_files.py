@@ -8,9 +8,8 @@ Cloud Library).
 from __future__ import annotations
 
 import re
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
-from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -217,21 +216,21 @@ def load_views(path: str | Path, viewpoint: Vector | None = None, scale: float =
         raise CloudError(f"{path}: {recording_told(path)}")
     if ending not in CLOUD_ENDINGS:
         raise CloudError(f"{path}: unknown cloud ending {path.suffix!r}; valid endings: {', '.join(CLOUD_ENDINGS)}")
+    said = None if viewpoint is None else np.asarray(viewpoint, dtype=float) / scale
     if ending not in ("npy", "npz"):
-        return (_scaled(partial(_read_points, path, ending), viewpoint, scale),)
+        return (_scaled(_read_points(path, ending, said), scale),)
     arrays = read_numpy(path)
     try:
         if "depth" in arrays or "depths" in arrays:
             if viewpoint is not None:
                 raise CloudError("view_point: given with depth, which has its own camera pose; valid with points")
             return _depth_views(arrays, scale)
-        return (_scaled(partial(_points_view, arrays), viewpoint, scale),)
+        return (_scaled(_points_view(arrays, said), scale),)
     except CloudError as error:
         raise CloudError(f"{path}: {error}") from None
 
 
-def _scaled(read: Callable[[Vector | None], PointCloud], viewpoint: Vector | None, scale: float) -> PointCloud:
-    view = read(None if viewpoint is None else np.asarray(viewpoint, dtype=float) / scale)
+def _scaled(view: PointCloud, scale: float) -> PointCloud:
     return replace(view, points=view.points * scale, viewpoint=view.viewpoint * scale)
 
 
