@@ -20,13 +20,12 @@ from graspd_core.mesh.convex_parts import convex_hull, hull_surface, limited_hul
 from graspd_core.mesh.mesh_files import surface_samples
 from graspd_core.mesh.sdf import sample_sdf
 from graspd_core.mesh.surface_queries import winding_inside
-from graspd_core.mesh.topology import voxel_keys
+from graspd_core.mesh.topology import scaled_normals, voxel_keys
 from graspd_core.perception.cloud.point_cloud import Points, Vector
 from graspd_core.perception.scene import Obstacle, Scene, make_obstacle
 from graspd_core.se3 import perpendicular, rotation_from_quaternion
 from graspd_core.types import Plane, Posture, TriangleMesh
 
-GRID_RESOLUTION = 32
 # A neighbour whose hull would overlap the target is split into at most this many parts along each axis.
 MAX_PARTS_ACROSS = 8
 _TARGET_SAMPLES = 2000  # surface points of the target, to measure its distance from neighbours
@@ -64,20 +63,15 @@ def make_obstacles(
         seen = seen[np.isfinite(seen).all(1)]
         if len(seen) < settings.min_points or near.query(seen)[0].min() > reach:
             continue
-        whole = _obstacle(seen, support, settings.padding)
+        whole = make_obstacle(padded_hull(seen, support, settings.padding))
         at = torch.as_tensor(near.data).to(whole.sdf.field)
         if not (sample_sdf(whole.sdf, at)[0] < -2 * settings.padding).any():
             found.append(whole)
             continue
         # The neighbour surrounds the target, like a tray, a box or a ring. One hull would fill the target's own place.
         parts = [part for part in _cells(seen, support, settings.part_size) if near.query(part)[0].min() <= reach]
-        found += [_obstacle(part, support, settings.padding) for part in parts]
+        found += [make_obstacle(padded_hull(part, support, settings.padding)) for part in parts]
     return tuple(found)
-
-
-def _obstacle(points: Points, support: Plane | None, padding: float) -> Obstacle:
-    mesh = padded_hull(points, support, padding)
-    return make_obstacle(mesh, resolution=GRID_RESOLUTION, padding=0.02)
 
 
 def _cells(points: Points, support: Plane | None, side: float) -> list[Float[np.ndarray, "_ 3"]]:
@@ -175,8 +169,7 @@ def _points_within(shape: TriangleMesh, low: Vector, high: Vector) -> Float[np.n
     corners = corners[((corners >= shape.vertices.min(0)) & (corners <= shape.vertices.max(0))).all(1)]
     points = [corners[winding_inside(shape, corners)]] if len(corners) else []
     if len(faces):
-        sides = np.diff(vertices[faces], axis=1)
-        area = 0.5 * float(np.linalg.norm(np.cross(sides[:, 0], sides[:, 1]), axis=1).sum())
+        area = 0.5 * float(np.linalg.norm(scaled_normals(vertices, faces), axis=1).sum())
         count = int(np.clip(area / _AREA_OF_A_SAMPLE, _FEWEST, _MOST))
         surface = TriangleMesh(vertices, faces.astype(np.int64))
         points += [_hull_corners(vertices[np.unique(faces)]), surface_samples(surface, count, 0)[0]]

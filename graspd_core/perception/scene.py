@@ -30,7 +30,7 @@ from graspd_core.mesh.topology import far_centre, moved_mesh
 from graspd_core.perception.reconstruct.merge_views import Evidence
 from graspd_core.runtime import disk_cache as cache
 from graspd_core.runtime.worker_process import run_isolated
-from graspd_core.types import Contact, Grasp, Plane, Posture, TriangleMesh
+from graspd_core.types import Grasp, Plane, TriangleMesh
 
 
 def moved_sdf(sdf: GridSDF, offset: Float[np.ndarray, "3"]) -> GridSDF:
@@ -43,16 +43,10 @@ def moved_grasp(grasp: Grasp, offset: Float[np.ndarray, "3"]) -> Grasp:
     """Return the grasp shifted by `offset` [m], or the grasp itself if the offset is zero."""
     if not offset.any():
         return grasp
-
-    def posture(given: Posture) -> Posture:
-        return replace(given, position=given.position + offset)
-
-    def contact(given: Contact) -> Contact:
-        x, y, z = (np.array(given.position) + offset).tolist()
-        return replace(given, position=(x, y, z))
-
-    postures = {name: posture(getattr(grasp, name)) for name in ("pregrasp", "grasp", "squeeze")}
-    return replace(grasp, **postures, contacts=tuple(map(contact, grasp.contacts)))
+    postures = {name: getattr(grasp, name) for name in ("pregrasp", "grasp", "squeeze", "arrival")}
+    moved = {name: replace(one, position=one.position + offset) for name, one in postures.items() if one is not None}
+    contacts = (replace(one, position=tuple(np.add(one.position, offset).tolist())) for one in grasp.contacts)
+    return replace(grasp, **moved, contacts=tuple(contacts))
 
 
 # Nodes within this many cells of the surface take the confidence of their nearest vertex. Every surface has such nodes.
@@ -91,6 +85,8 @@ HEAVY_LITRE, HEAVY_GROWTH = 1.35, 0.5
 
 # Settings for cutting reconstructed or guessed surfaces into convex parts. They are accurate to millimetres only.
 COARSE_CUTS: dict[str, Any] = {"tolerance": 0.003, "max_parts": 32, "surface_points": 2000}
+# Nodes per side of an obstacle's distance grid, and free space around the obstacle that the grid covers [m].
+_OBSTACLE_RESOLUTION, _OBSTACLE_PADDING = 32, 0.02
 # Number of surface points of a reconstructed object that are searched for sharp points.
 _COARSE_POOL = 2000
 
@@ -312,10 +308,10 @@ def moved_object(model: ObjectModel, offset: Float[np.ndarray, "3"]) -> ObjectMo
     return replace(model, mesh=mesh, sha256=content_hash(mesh), center_of_mass=model.center_of_mass + offset)
 
 
-def make_obstacle(mesh: TriangleMesh, *, resolution: int, padding: float) -> Obstacle:
+def make_obstacle(mesh: TriangleMesh) -> Obstacle:
     """Return the obstacle with this surface. A distant grid keeps its place in float64 (`moved_sdf`)."""
     far = far_centre(mesh.vertices)
-    sdf = build_sdf(moved_mesh(mesh, -far), resolution=resolution, padding=padding)
+    sdf = build_sdf(moved_mesh(mesh, -far), resolution=_OBSTACLE_RESOLUTION, padding=_OBSTACLE_PADDING)
     return Obstacle(mesh, moved_sdf(sdf, far))
 
 
