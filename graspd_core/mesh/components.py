@@ -12,7 +12,7 @@ from scipy.sparse.csgraph import connected_components
 from scipy.spatial import KDTree
 
 from graspd_core.mesh.surface_queries import make_surface, surface_distance, winding_inside
-from graspd_core.mesh.topology import scaled_normals
+from graspd_core.mesh.topology import drop_strays, scaled_normals
 from graspd_core.types import TriangleMesh
 
 # A piece is tiny if its extent is below this fraction of the extent of the piece with the most area. If the other
@@ -31,20 +31,17 @@ def drop_small_components(mesh: TriangleMesh) -> tuple[TriangleMesh, int]:
     if count == 1:
         return mesh, 0
     corners = mesh.vertices[mesh.faces]
-    area = np.linalg.norm(scaled_normals(mesh.vertices, mesh.faces), axis=1)
-    area = np.bincount(piece, weights=area)
+    area = np.bincount(piece, weights=np.linalg.norm(scaled_normals(mesh.vertices, mesh.faces), axis=1))
     extent = _extents(corners, piece)
     tiny = extent < TINY * extent[area.argmax()]
     if not tiny.any() or area[~tiny].sum() < STAYS * area.sum():
         return mesh, 0
     gap = np.full(count, np.inf)
     rest = make_surface(TriangleMesh(mesh.vertices, mesh.faces[~tiny[piece]]))
-    queried = tiny[piece]
-    distance = surface_distance(rest, corners[queried].reshape(-1, 3)).reshape(-1, 3).min(1)
-    np.minimum.at(gap, piece[queried], distance)
+    distance = surface_distance(rest, corners[tiny[piece]].reshape(-1, 3)).reshape(-1, 3).min(1)
+    np.minimum.at(gap, piece[tiny[piece]], distance)
     small = tiny & (gap > extent)
-    used, compact = np.unique(mesh.faces[~small[piece]], return_inverse=True)
-    return TriangleMesh(mesh.vertices[used], compact.reshape(-1, 3)), int(small.sum())
+    return drop_strays(TriangleMesh(mesh.vertices, mesh.faces[~small[piece]]))[0], int(small.sum())
 
 
 def face_components(mesh: TriangleMesh) -> Int[np.ndarray, "faces"]:

@@ -17,6 +17,7 @@ from scipy.spatial import ConvexHull, QhullError
 
 from graspd_core.mesh.mesh_files import surface_samples
 from graspd_core.mesh.sdf import GridSDF, interpolate
+from graspd_core.mesh.topology import drop_strays, scaled_normals
 from graspd_core.types import TriangleMesh
 
 SURFACE_POINTS = 6000
@@ -289,8 +290,6 @@ def convex_hull(points: Float[np.ndarray, "n k"]) -> ConvexHull | None:
 def hull_surface(corners: Points) -> TriangleMesh:
     """Return the convex hull of points as a mesh whose faces wind outwards."""
     hull = ConvexHull(corners)
-    a, b, c = corners[hull.simplices].transpose(1, 0, 2)
-    inward = (np.cross(b - a, c - a) * hull.equations[:, :3]).sum(1) < 0
+    inward = (scaled_normals(corners, hull.simplices) * hull.equations[:, :3]).sum(1) < 0
     faces = np.where(inward[:, None], hull.simplices[:, ::-1], hull.simplices).astype(np.int64)
-    used, compact = np.unique(faces, return_inverse=True)
-    return TriangleMesh(corners[used], compact.reshape(-1, 3))
+    return drop_strays(TriangleMesh(corners, faces))[0]
