@@ -19,6 +19,7 @@ from scipy.spatial import KDTree
 
 from graspd_core.config import ReconstructionConfig
 from graspd_core.errors import CloudError
+from graspd_core.mesh.convex_parts import even_directions
 from graspd_core.mesh.topology import packed_rows, voxel_keys
 from graspd_core.perception.cloud.free_space import FreeSpace, view_frame
 from graspd_core.perception.cloud.point_cloud import (
@@ -231,10 +232,7 @@ def _seen_from(points: Points) -> Points:
     """Return for each point the sum of the directions from which it is the nearest point in its image cell."""
     width = 2 * float(np.median(KDTree(points).query(points, k=5)[0][:, -1]))
     rng, total = np.random.default_rng(0), np.zeros_like(points)
-    turn = np.arange(UNPOSED_DIRECTIONS) + 0.5
-    height, angle = 1 - 2 * turn / UNPOSED_DIRECTIONS, np.pi * (1 + 5**0.5) * turn
-    flat = np.sqrt(1 - height**2)
-    for way in np.column_stack([flat * np.cos(angle), flat * np.sin(angle), height]):
+    for way in even_directions(UNPOSED_DIRECTIONS).T:
         right = perpendicular(way)
         image = np.column_stack([points @ right, points @ np.cross(way, right)]) + rng.uniform(0, width, 2)
         order = np.argsort(-(points @ way))

@@ -15,6 +15,7 @@ from itertools import product
 from typing import Any
 
 import numpy as np
+import scipy.fft
 from jaxtyping import Bool, Float
 from scipy.ndimage import binary_dilation, gaussian_filter, label
 from scipy.sparse import csr_array
@@ -116,10 +117,8 @@ def close_surface(surfels: Surfels, field: Field, free_space: FreeSpace, cell: f
     nodes = np.stack(np.meshgrid(*axes, indexing="ij"), -1)
     value = field(surfels, nodes, cell)
     inner = value < BAND_CELLS * cell
-    beyond = (
-        np.maximum(empty_depth(free_space, nodes[inner]), _outside_hull(known, nodes[inner], cell)) - free_space.slack
-    )
-    value[inner] = np.maximum(value[inner], beyond)
+    beyond = np.maximum(empty_depth(free_space, nodes[inner]), _outside_hull(known, nodes[inner], cell))
+    value[inner] = np.maximum(value[inner], beyond - free_space.slack)
     value = gaussian_filter(value, 0.5)
     if free_space.standing:
         value = np.maximum(value, -nodes[..., 2])
@@ -215,8 +214,6 @@ def grid_poisson_field(surfels: Surfels, nodes: Nodes, cell: float) -> Grid:
     Raises:
         CloudError: the points and normals do not fit one surface.
     """
-    import scipy.fft
-
     counts = nodes.shape[:3]
     fft: Any = scipy.fft  # typed as Any, because SciPy declares only the dispatch types
     shape = tuple(int(fft.next_fast_len(count + _MARGIN, real=True)) for count in counts)
