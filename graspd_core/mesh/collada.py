@@ -15,7 +15,7 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from graspd_core.se3 import axis_rotation
-from graspd_core.types import TriangleMesh
+from graspd_core.types import TriangleMesh, joined
 
 # Greatest numbers of nodes and of faces. A few nodes can instance the same geometry very many times.
 _MOST_NODES = 4000
@@ -66,22 +66,19 @@ def _joined(root: ET.Element) -> TriangleMesh:
         placed = _instances(scenes[0].findall("node"), named)
     else:
         placed = [(np.eye(4), geometry) for geometry in root.findall("library_geometries/geometry")]
-    surfaces: dict[ET.Element, tuple[np.ndarray, np.ndarray]] = {}
+    surfaces: dict[ET.Element, TriangleMesh] = {}
     parts, count = [], 0
     for pose, geometry in placed:
         if geometry not in surfaces:
             surfaces[geometry] = _surface(geometry, named)
-        count += max(map(len, surfaces[geometry]))
+        count += max(len(surfaces[geometry].vertices), len(surfaces[geometry].faces))
         if count > _MOST_FACES:
             raise ValueError(f"the file has more than {_MOST_FACES} faces or vertices")
-        parts.append(_placed(*surfaces[geometry], pose))
-    vertices = np.concatenate([np.zeros((0, 3)), *(corners for corners, _ in parts)]) * scale
-    starts = np.cumsum([0, *(len(corners) for corners, _ in parts)])
-    faces = [part + start for (_, part), start in zip(parts, starts, strict=False)]
-    joined = np.concatenate([np.zeros((0, 3), dtype=np.int64), *faces])
-    if len(joined) == 0:
+        parts.append(_placed(surfaces[geometry], pose))
+    if not any(len(part.faces) for part in parts):
         raise ValueError("the file holds no triangles")
-    return TriangleMesh(vertices, joined)
+    whole = joined(*parts)
+    return TriangleMesh(whole.vertices * scale, whole.faces)
 
 
 def _instances(roots: list[ET.Element], named: dict[str, ET.Element]) -> list[tuple[np.ndarray, ET.Element]]:
@@ -126,10 +123,8 @@ def _pose(node: ET.Element) -> Float[np.ndarray, "4 4"]:
     return pose
 
 
-def _surface(
-    geometry: ET.Element, named: dict[str, ET.Element]
-) -> tuple[Float[np.ndarray, "vertices 3"], Int[np.ndarray, "faces 3"]]:
-    """Return the vertices and faces of a geometry in its own frame. `named` maps "#id" to elements."""
+def _surface(geometry: ET.Element, named: dict[str, ET.Element]) -> TriangleMesh:
+    """Return the surface of a geometry in its own frame. `named` maps "#id" to elements."""
     vertices, faces, count = [np.zeros((0, 3))], [np.zeros((0, 3), dtype=np.int64)], 0
     known: dict[ET.Element, tuple[int, int]] = {}
     for element in geometry.iterfind("mesh/*"):
@@ -164,14 +159,12 @@ def _surface(
         if not few or (len(indices) and not 0 <= indices.min() <= indices.max() < available):
             raise ValueError(f"<{element.tag}> names vertices that the file does not hold")
         faces.append(_fans(indices, sides) + start)
-    return np.concatenate(vertices), np.concatenate(faces)
+    return TriangleMesh(np.concatenate(vertices), np.concatenate(faces))
 
 
-def _placed(
-    vertices: Float[np.ndarray, "vertices 3"], faces: Int[np.ndarray, "faces 3"], pose: Float[np.ndarray, "4 4"]
-) -> tuple[Float[np.ndarray, "vertices 3"], Int[np.ndarray, "faces 3"]]:
-    corners = vertices @ pose[:3, :3].T + pose[:3, 3]
-    return corners, faces[:, ::-1] if np.linalg.det(pose[:3, :3]) < 0 else faces
+def _placed(mesh: TriangleMesh, pose: Float[np.ndarray, "4 4"]) -> TriangleMesh:
+    faces = mesh.faces[:, ::-1] if np.linalg.det(pose[:3, :3]) < 0 else mesh.faces
+    return TriangleMesh(mesh.vertices @ pose[:3, :3].T + pose[:3, 3], faces)
 
 
 def _positions(vertices: ET.Element, named: dict[str, ET.Element]) -> Float[np.ndarray, "vertices 3"]:

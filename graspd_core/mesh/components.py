@@ -12,7 +12,7 @@ from scipy.sparse.csgraph import connected_components
 from scipy.spatial import KDTree
 
 from graspd_core.mesh.surface_queries import make_surface, surface_distance, winding_inside
-from graspd_core.mesh.topology import scaled_normals
+from graspd_core.mesh.topology import drop_strays, scaled_normals
 from graspd_core.types import TriangleMesh
 
 # A piece is tiny if its extent is below this fraction of the extent of the piece with the most area. If the other
@@ -31,29 +31,32 @@ def drop_small_components(mesh: TriangleMesh) -> tuple[TriangleMesh, int]:
     if count == 1:
         return mesh, 0
     corners = mesh.vertices[mesh.faces]
-    area = np.linalg.norm(scaled_normals(mesh.vertices, mesh.faces), axis=1)
-    area = np.bincount(piece, weights=area)
+    area = np.bincount(piece, weights=np.linalg.norm(scaled_normals(mesh.vertices, mesh.faces), axis=1))
     extent = _extents(corners, piece)
     tiny = extent < TINY * extent[area.argmax()]
     if not tiny.any() or area[~tiny].sum() < STAYS * area.sum():
         return mesh, 0
     gap = np.full(count, np.inf)
     rest = make_surface(TriangleMesh(mesh.vertices, mesh.faces[~tiny[piece]]))
-    queried = tiny[piece]
-    distance = surface_distance(rest, corners[queried].reshape(-1, 3)).reshape(-1, 3).min(1)
-    np.minimum.at(gap, piece[queried], distance)
+    distance = surface_distance(rest, corners[tiny[piece]].reshape(-1, 3)).reshape(-1, 3).min(1)
+    np.minimum.at(gap, piece[tiny[piece]], distance)
     small = tiny & (gap > extent)
-    used, compact = np.unique(mesh.faces[~small[piece]], return_inverse=True)
-    return TriangleMesh(mesh.vertices[used], compact.reshape(-1, 3)), int(small.sum())
+    return drop_strays(TriangleMesh(mesh.vertices, mesh.faces[~small[piece]]))[0], int(small.sum())
 
 
 def face_components(mesh: TriangleMesh) -> Int[np.ndarray, "faces"]:
     """Return the index of the connected piece of each face. Pieces share no vertex."""
     a, b, c = mesh.faces.T
-    rows, columns = np.concatenate([a, b]), np.concatenate([b, c])
-    shared = coo_matrix((np.ones(len(rows), dtype=bool), (rows, columns)), shape=(len(mesh.vertices),) * 2)
-    _, label = connected_components(shared, directed=False)
+    label = connected_parts(len(mesh.vertices), np.concatenate([a, b]), np.concatenate([b, c]))
     return np.unique(label[a], return_inverse=True)[1].reshape(-1)
+
+
+def connected_parts(
+    count: int, one: Int[np.ndarray, "edges"], other: Int[np.ndarray, "edges"]
+) -> Int[np.ndarray, "count"]:
+    """Return the index of the connected part of each of `count` nodes. Each edge joins a node `one` to an `other`."""
+    graph = coo_matrix((np.ones(len(one), dtype=bool), (one, other)), shape=(count, count))
+    return connected_components(graph, directed=False)[1]
 
 
 def keep_cavities(mesh: TriangleMesh, outward: Int[np.ndarray, "faces 3"]) -> Int[np.ndarray, "faces 3"]:

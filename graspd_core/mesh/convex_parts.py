@@ -14,10 +14,10 @@ import numpy as np
 import torch
 from jaxtyping import Float, Int
 from scipy.spatial import ConvexHull, QhullError
-from torch.nn.functional import grid_sample
 
 from graspd_core.mesh.mesh_files import surface_samples
-from graspd_core.mesh.sdf import GridSDF
+from graspd_core.mesh.sdf import GridSDF, interpolate
+from graspd_core.mesh.topology import drop_strays, scaled_normals
 from graspd_core.types import TriangleMesh
 
 SURFACE_POINTS = 6000
@@ -69,7 +69,7 @@ def convex_parts(
     """
     points = np.vstack([_thin(mesh.vertices[np.unique(mesh.faces)], surface_points // 2),
                         surface_samples(mesh, surface_points, 0)[0]])  # fmt: skip
-    if _hull(points) is None:
+    if convex_hull(points) is None:
         return (_slab(points),)
     clusters = _join(sdf, _cut_up(sdf, points, tolerance, round(SURPLUS * max_parts)), tolerance, max_parts)
     corners = int(np.clip(ALL_VERTICES // len(clusters), FEWEST_VERTICES, MOST_VERTICES))
@@ -152,7 +152,7 @@ def _sums_below(
 def _bulge_left(sdf: GridSDF, points: Points, cut: _Cut) -> float:
     direction, offset = cut
     below = points @ direction <= offset
-    hulls = [hull for hull in (_hull(points[below]), _hull(points[~below])) if hull is not None]
+    hulls = [hull for hull in (convex_hull(points[below]), convex_hull(points[~below])) if hull is not None]
     return float(sum(hull.area * _outside(sdf, _hull_samples(hull)).mean() for hull in hulls))
 
 
@@ -200,7 +200,7 @@ def _bulges_between(sdf: GridSDF, one: Points, others: list[Points]) -> Float[np
 
 
 def _bulge(sdf: GridSDF, cluster: Points) -> float:
-    hull = _hull(cluster)
+    hull = convex_hull(cluster)
     return 0.0 if hull is None else _quantile(_outside(sdf, _hull_samples(hull)), 0.98)
 
 
@@ -211,15 +211,6 @@ def _blur(sdf: GridSDF, cluster: Points) -> float:
 def _quantile(values: Float[np.ndarray, "_"], share: float) -> float:
     rank = min(int(share * len(values)), len(values) - 1)
     return float(np.partition(values, rank)[rank])
-
-
-def _hull(points: Points) -> ConvexHull | None:
-    if len(points) < 4:
-        return None
-    try:
-        return ConvexHull(points)
-    except QhullError:
-        return None
 
 
 def _hull_samples(hull: ConvexHull) -> Float[np.ndarray, "_ 3"]:
@@ -234,9 +225,7 @@ def _hull_samples(hull: ConvexHull) -> Float[np.ndarray, "_ 3"]:
 
 def _outside(sdf: GridSDF, points: Points) -> Float[np.ndarray, "_"]:
     unit = (torch.as_tensor(points, dtype=sdf.field.dtype) - sdf.origin) / sdf.half - 1
-    field = sdf.field[None, :1].permute(0, 1, 4, 3, 2)
-    sampled = grid_sample(field, unit[None, None, None], align_corners=True, padding_mode="border")
-    return sampled.flatten().clamp_min(0.0).numpy()
+    return interpolate(sdf.field[:1], unit)[0].clamp_min(0.0).numpy()
 
 
 def _thin(points: Points, most: int) -> Points:
@@ -256,7 +245,7 @@ def even_directions(count: int) -> Float[np.ndarray, "3 count"]:
 
 def limited_hull(points: Points, most: int) -> TriangleMesh:
     """Return the hull of at most `most` points, which approximates the hull of all. For flat points, return a plate."""
-    hull = _hull(points)
+    hull = convex_hull(points)
     if hull is None:
         return _slab(points)
     corners = points[hull.vertices]
@@ -264,7 +253,7 @@ def limited_hull(points: Points, most: int) -> TriangleMesh:
         corners = _thin(corners, CHOICE * most)
         chosen = set((corners @ even_directions(most // 2)).argmax(0).tolist())
         while len(chosen) < most:
-            found = _hull(corners[sorted(chosen)])
+            found = convex_hull(corners[sorted(chosen)])
             if found is None:
                 # The extremes lie in one plane, on a line or in a point. Add the extremes along the principal axes.
                 along = corners @ np.linalg.eigh(np.cov(corners.T))[1]
@@ -282,7 +271,7 @@ def _slab(points: Points) -> TriangleMesh:
     _, principal = np.linalg.eigh(np.cov(points.T))
     lift = principal[:, 0] * OVERLAP
     spread = np.vstack([points - lift, points + lift])
-    hull = _hull(spread)
+    hull = convex_hull(spread)
     if hull is not None:
         return hull_surface(spread[hull.vertices])
     # The points lie on a line or coincide, so a small box is put around them.
@@ -290,11 +279,17 @@ def _slab(points: Points) -> TriangleMesh:
     return hull_surface(np.vstack([points.min(0) + corners, points.max(0) + corners]))
 
 
+def convex_hull(points: Float[np.ndarray, "n k"]) -> ConvexHull | None:
+    """Return SciPy's convex hull of points, or None if the points are too few, flat, or not finite."""
+    try:
+        return ConvexHull(points)
+    except (QhullError, ValueError):
+        return None
+
+
 def hull_surface(corners: Points) -> TriangleMesh:
     """Return the convex hull of points as a mesh whose faces wind outwards."""
     hull = ConvexHull(corners)
-    a, b, c = corners[hull.simplices].transpose(1, 0, 2)
-    inward = (np.cross(b - a, c - a) * hull.equations[:, :3]).sum(1) < 0
+    inward = (scaled_normals(corners, hull.simplices) * hull.equations[:, :3]).sum(1) < 0
     faces = np.where(inward[:, None], hull.simplices[:, ::-1], hull.simplices).astype(np.int64)
-    used, compact = np.unique(faces, return_inverse=True)
-    return TriangleMesh(corners[used], compact.reshape(-1, 3))
+    return drop_strays(TriangleMesh(corners, faces))[0]

@@ -7,9 +7,9 @@ The guess is never applied.
 from __future__ import annotations
 
 import hashlib
-import os
 import re
 import warnings
+from collections.abc import Sequence
 from math import ceil, log, log10
 from pathlib import Path
 from typing import cast
@@ -19,7 +19,7 @@ import torch
 from jaxtyping import Float
 from torch.quasirandom import SobolEngine
 
-from graspd_core.errors import MeshError
+from graspd_core.errors import GraspdError, MeshError
 from graspd_core.mesh import topology
 from graspd_core.mesh.collada import read_dae
 from graspd_core.mesh.components import drop_small_components, face_components, keep_cavities
@@ -88,19 +88,16 @@ _HEADER, _TRIANGLE, _MOST_TRIANGLES = 84, 50, 10**8
 
 def refuse_broken(path: Path) -> None:
     """Raise MeshError if a file is empty, is another kind of file, or is an STL, OBJ, PLY or OFF that is cut off."""
-    with path.open("rb") as file:
-        head = file.read(_LOOK)
-        size = file.seek(0, os.SEEK_END)
-        file.seek(max(0, size - _LOOK))
-        tail = file.read()
-    if size == 0:
+    data = path.read_bytes()
+    head, tail = data[:_LOOK], data[-_LOOK:]
+    if not data:
         raise MeshError(f"{path}: the file is empty")
     for begins, what in _OTHERS:
         if head.lstrip()[: len(begins)].lower() == begins.lower():
             raise MeshError(f"{path}: {what}")
     ending = path.suffix.lower()
-    cut = _cut_stl(head, tail, size) if ending == ".stl" else _cut_obj(tail) if ending == ".obj" else ""
-    cut = _cut_rows(path.read_bytes(), ending == ".ply") if ending in (".ply", ".off") else cut
+    cut = _cut_stl(head, tail, len(data)) if ending == ".stl" else _cut_obj(tail) if ending == ".obj" else ""
+    cut = _cut_rows(data, ending == ".ply") if ending in (".ply", ".off") else cut
     if cut:
         raise MeshError(f"{path}: cut off: {cut}")
 
@@ -167,7 +164,7 @@ def load_mesh(path: str | Path, *, scale: float = 1.0) -> TriangleMesh:
 def read_mesh(path: str | Path, *, scale: float = 1.0) -> tuple[TriangleMesh, tuple[str, ...]]:
     """Read a mesh file like `load_mesh`. Return the mesh and warnings about its defects, one sentence each."""
     path = Path(path)
-    _refuse_path(path)
+    refuse_path(path, "mesh", MESH_ENDINGS, MeshError)
     if not (np.isfinite(scale) and scale > 0):
         raise MeshError(f"scale {scale!r} for {path}: must be a positive number")
     vertices, faces = _read(path)
@@ -240,8 +237,7 @@ def check_mesh(
     if not topology.is_oriented(faces):
         faces = keep_cavities(mesh, topology.orient(mesh.vertices, faces))
         warnings.append(f"{source}: neighbouring faces had opposite winding; all faces now agree")
-    used, compact = np.unique(faces, return_inverse=True)
-    clean = TriangleMesh(mesh.vertices[used], compact.reshape(-1, 3))
+    clean, _ = topology.drop_strays(TriangleMesh(mesh.vertices, faces))
     # Simplifying can tear a surface. That is no defect of the input, and the winding number tolerates it.
     if not topology.is_closed(clean) and not topology.is_closed(given):
         warnings.append(f"{source}: the surface is not closed; the winding number decides what is inside")
@@ -256,8 +252,7 @@ def simplify(mesh: TriangleMesh, faces: int, *, aggressiveness: int = 7) -> Tria
         return mesh
     centre = mesh.vertices.mean(0)
     points, triangles = (mesh.vertices - centre).astype(np.float32), mesh.faces.astype(np.int32)
-    fewer = fast_simplification.simplify(points, triangles, target_count=int(faces), agg=aggressiveness)
-    vertices, triangles = fewer[:2]
+    vertices, triangles, *_ = fast_simplification.simplify(points, triangles, target_count=faces, agg=aggressiveness)
     return TriangleMesh(vertices.astype(float) + centre, triangles.astype(np.int64))
 
 
@@ -290,8 +285,11 @@ def mass_properties(mesh: TriangleMesh) -> tuple[float, Float[np.ndarray, "3"], 
     spread = SobolEngine(3, scramble=True, seed=0).draw(SPREAD_POINTS, dtype=torch.float64).numpy()
     points = (spread - 0.5) * size + (low + high) / 2
     inside = winding_inside(mesh, points)
-    share = inside.mean() or 1.0
-    return _moments(points[inside] if inside.any() else points, float(share * size.prod()))
+    volume = float((inside.mean() or 1.0) * size.prod())
+    points = points[inside] if inside.any() else points
+    centre = points.mean(0)
+    second = (points - centre).T @ (points - centre) * (volume / len(points))
+    return volume, centre, np.trace(second) * np.eye(3) - second
 
 
 def surface_samples(
@@ -333,14 +331,14 @@ def _read(path: Path):
     return np.array(mesh.vertices, dtype=float).reshape(-1, 3), np.array(mesh.faces, dtype=np.int64).reshape(-1, 3)
 
 
-def _refuse_path(path: Path) -> None:
-    endings = ", ".join(MESH_ENDINGS)
+def refuse_path(path: Path, kind: str, endings: Sequence[str], error: type[GraspdError]) -> None:
+    """Raise `error` if there is no file, or its ending is not in `endings`. `kind` is a word for the file's content."""
     if path.is_dir():
-        raise MeshError(f"{path}: is a directory; give a mesh file ({endings})")
+        raise error(f"{path}: is a directory; give a {kind} file ({', '.join(endings)})")
     if not path.exists():
-        raise MeshError(f"{path}: no such mesh file")
-    if path.suffix.lower().lstrip(".") not in MESH_ENDINGS:
-        raise MeshError(f"{path}: unknown mesh ending {path.suffix!r}; valid endings: {endings}")
+        raise error(f"{path}: no such {kind} file")
+    if path.suffix.lower().lstrip(".") not in endings:
+        raise error(f"{path}: unknown {kind} ending {path.suffix!r}; valid endings: {', '.join(endings)}")
 
 
 def _without_strays(mesh: TriangleMesh, source: str) -> tuple[TriangleMesh, tuple[str, ...]]:
@@ -396,11 +394,3 @@ def _solid_moments(mesh: TriangleMesh) -> tuple[float, Float[np.ndarray, "3"], F
     spread[np.abs(spread) < 1e-9 * np.trace(spread)] = 0.0
     centre[np.abs(centre) < 1e-12 * np.abs(corners).max()] = 0.0
     return float(abs(total) / 6), centre, np.trace(spread) * np.eye(3) - spread
-
-
-def _moments(
-    points: Float[np.ndarray, "points 3"], volume: float
-) -> tuple[float, Float[np.ndarray, "3"], Float[np.ndarray, "3 3"]]:
-    centre = points.mean(0)
-    second = (points - centre).T @ (points - centre) * (volume / len(points))
-    return volume, centre, np.trace(second) * np.eye(3) - second

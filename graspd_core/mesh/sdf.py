@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 import torch
 from jaxtyping import Bool, Float
+from scipy.ndimage import label
 from torch import Tensor
 from torch.nn.functional import grid_sample
 
@@ -119,10 +120,7 @@ def sample_sdf(
     half = sdf.half
     unit = points / half - (sdf.origin / half + 1).to(points)
     clamped = unit.clamp(-1.0, 1.0)
-    # grid_sample takes x for the last axis of its input.
-    field = sdf.field[None].permute(0, 1, 4, 3, 2)
-    sampled = grid_sample(field, clamped.reshape(1, 1, 1, -1, 3), align_corners=True, padding_mode="border")
-    channels = sampled.reshape(4, -1)
+    channels = interpolate(sdf.field, clamped.reshape(-1, 3))
     phi, gradient = channels[0].reshape(points.shape[:-1]), channels[1:].T.reshape(points.shape)
     # Inside the grid `from_surface` is the gradient times a positive number, so the two lengths cancel exactly
     # and no branch is needed. If φ is not positive, any positive `reach` works. 1 mm keeps float32 clear of zero.
@@ -130,6 +128,15 @@ def sample_sdf(
     from_surface = (unit - clamped) * half + reach[..., None] * gradient
     length = safe_norm(from_surface)
     return phi + length - reach * safe_norm(gradient), from_surface / length.clamp_min(EPSILON)[..., None]
+
+
+def interpolate(
+    field: Float[Tensor, "channels x y z"], places: Float[Tensor, "points 3"]
+) -> Float[Tensor, "channels points"]:
+    """Interpolate node values linearly at places from -1 to 1 along each axis. Beyond, use the value at the border."""
+    # grid_sample takes x for the last axis of its input.
+    swapped = field[None].permute(0, 1, 4, 3, 2)
+    return grid_sample(swapped, places[None, None, None], align_corners=True, padding_mode="border")[0, :, 0, 0]
 
 
 def is_solid(sdf: GridSDF) -> bool:
@@ -184,8 +191,6 @@ def _inside(mesh: TriangleMesh, nodes: _Vectors, distance: _Lengths, spacing: fl
     nodes that are both over half a cell from the surface, there is no surface. So one query answers for a region.
     Around an open surface, the winding number changes in free space too, so every node is queried.
     """
-    from scipy.ndimage import label
-
     if not is_closed(mesh):
         return winding_inside(mesh, nodes.reshape(3, -1).T).reshape(distance.shape)
     labelled: Any = label(distance > 0.51 * spacing)

@@ -30,7 +30,7 @@ THIN_WALLED = 0.6
 _AREA_OF_POINT, _MOST = 5e-5, 16
 
 
-def sharp_points(mesh: TriangleMesh, count: int, seed: int = 0, *, pool: int = _POOL) -> tuple[Points, float]:
+def sharp_points(mesh: TriangleMesh, count: int, *, pool: int = _POOL) -> tuple[Points, float]:
     """Return evenly spread points [m] on edges, corners and thin walls, where little material lies below the surface.
 
     A probe point is placed 3 mm below each candidate. Under a flat surface, the probe is 3 mm from the surface. Under
@@ -45,9 +45,9 @@ def sharp_points(mesh: TriangleMesh, count: int, seed: int = 0, *, pool: int = _
         for cups and sheets.
     """
     query = make_distance_query(mesh)
-    points, normals = _pool(mesh, seed, pool)
+    points, normals = _pool(mesh, pool)
     sharp = points[_is_thin(query, points, normals, _PROBE)]
-    samples, sample_normals = surface_samples(mesh, pool // 6, seed)
+    samples, sample_normals = surface_samples(mesh, pool // 6, 0)
     share = float(_is_thin(query, samples, sample_normals, 2 * _PROBE).mean())
     if share > THIN_WALLED:
         walls = share * 0.5 * float(np.linalg.norm(scaled_normals(mesh.vertices, mesh.faces), axis=1).sum())
@@ -135,14 +135,14 @@ def neighbours_together(points: Points) -> Int[np.ndarray, "n"]:
     return np.concatenate([first[neighbours_together(points[first])], rest[neighbours_together(points[rest])]])
 
 
-def _pool(mesh: TriangleMesh, seed: int, size: int) -> tuple[Points, Points]:
+def _pool(mesh: TriangleMesh, size: int) -> tuple[Points, Points]:
     """Return positions and unit normals of up to `size` vertices, `size` edge points and `size // 2` face points."""
     scaled = scaled_normals(mesh.vertices, mesh.faces)
     vertex_normals = np.zeros_like(mesh.vertices)
     for corner in range(3):
         np.add.at(vertex_normals, mesh.faces[:, corner], scaled)
     vertex_normals /= np.maximum(np.linalg.norm(vertex_normals, axis=-1, keepdims=True), 1e-20)
-    rng = np.random.default_rng(seed)
+    rng = np.random.default_rng(0)
     edges, _ = edge_counts(mesh.faces)
     lengths = np.linalg.norm(mesh.vertices[edges[:, 0]] - mesh.vertices[edges[:, 1]], axis=-1)
     along = rng.choice(len(edges), size=size, p=lengths / lengths.sum())
@@ -153,7 +153,7 @@ def _pool(mesh: TriangleMesh, seed: int, size: int) -> tuple[Points, Points]:
     edge_normals = (1 - a) * vertex_normals[start] + a * vertex_normals[end]
     edge_normals /= np.maximum(np.linalg.norm(edge_normals, axis=-1, keepdims=True), 1e-20)
     vertices = rng.permutation(len(mesh.vertices))[:size]
-    samples, sample_normals = surface_samples(mesh, size // 2, seed)
+    samples, sample_normals = surface_samples(mesh, size // 2, 0)
     return (
         np.concatenate([mesh.vertices[vertices], on_edges, samples]),
         np.concatenate([vertex_normals[vertices], edge_normals, sample_normals]),

@@ -8,6 +8,7 @@ second. Planning on a mesh casts no rays.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from itertools import product
 from typing import Any
 
 import numpy as np
@@ -154,10 +155,8 @@ _ABOUT = 3e-4
 # Maximum number of rounds that adjust the weights of these faces. They end if no weight changes by more than this.
 _SWEEPS, _SETTLED = 100, 1e-7
 # Directions in which these faces are searched: towards the corners and face centres of a cube.
-_AROUND = np.array(
-    [[x, y, z] for x in (-1, 0, 1) for y in (-1, 0, 1) for z in (-1, 0, 1) if abs(x) + abs(y) + abs(z) != 2]
-)
-_AROUND = _AROUND[np.abs(_AROUND).any(1)] / np.linalg.norm(_AROUND[np.abs(_AROUND).any(1)], axis=1, keepdims=True)
+_AROUND = np.array([way for way in product((-1, 0, 1), repeat=3) if np.abs(way).sum() in (1, 3)])
+_AROUND = _AROUND / np.linalg.norm(_AROUND, axis=1, keepdims=True)
 
 
 def pressed_points(
@@ -193,10 +192,10 @@ def first_hits(
 
     # Embree uses float32. Centring the mesh keeps the precision of a mesh far from the origin.
     centre = 0.5 * (mesh.vertices.min(0) + mesh.vertices.max(0))
-    scene = o3d.t.geometry.RaycastingScene()
-    scene.add_triangles(_tensor(mesh.vertices - centre, np.float32), _tensor(mesh.faces, np.uint32))
+    scene: Any = o3d.t.geometry.RaycastingScene()
+    scene.add_triangles((mesh.vertices - centre).astype(np.float32), mesh.faces.astype(np.uint32))
     origins = np.broadcast_to(-centre, directions.shape)
-    hits = scene.cast_rays(_tensor(np.concatenate([origins, directions], -1), np.float32))
+    hits = scene.cast_rays(np.concatenate([origins, directions], -1).astype(np.float32))
     normals = hits["primitive_normals"].numpy().astype(float)
     return hits["t_hit"].numpy().astype(float), hits["primitive_ids"].numpy(), normals
 
@@ -213,9 +212,3 @@ def _nearest(
     squared, face, closest = (np.concatenate(part) for part in zip(*parts, strict=True))
     # libigl returns long long, which NumPy treats as another type than int64.
     return squared, face.astype(np.int64), closest
-
-
-def _tensor(array: np.ndarray, dtype: type):
-    import open3d as o3d
-
-    return o3d.core.Tensor.from_numpy(np.ascontiguousarray(array, dtype=dtype))

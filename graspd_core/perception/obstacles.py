@@ -8,26 +8,24 @@ free space. A neighbour that surrounds the target is split into parts.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from contextlib import suppress
 from dataclasses import replace
 
 import numpy as np
 import torch
 from jaxtyping import Float
-from scipy.spatial import ConvexHull, KDTree, QhullError
+from scipy.spatial import KDTree
 
 from graspd_core.config import ObstacleConfig, SceneConfig
-from graspd_core.mesh.convex_parts import hull_surface, limited_hull
+from graspd_core.mesh.convex_parts import convex_hull, hull_surface, limited_hull
 from graspd_core.mesh.mesh_files import surface_samples
 from graspd_core.mesh.sdf import sample_sdf
 from graspd_core.mesh.surface_queries import winding_inside
-from graspd_core.mesh.topology import voxel_keys
+from graspd_core.mesh.topology import scaled_normals, voxel_keys
 from graspd_core.perception.cloud.point_cloud import Points, Vector
 from graspd_core.perception.scene import Obstacle, Scene, make_obstacle
 from graspd_core.se3 import perpendicular, rotation_from_quaternion
 from graspd_core.types import Plane, Posture, TriangleMesh
 
-GRID_RESOLUTION = 32
 # A neighbour whose hull would overlap the target is split into at most this many parts along each axis.
 MAX_PARTS_ACROSS = 8
 _TARGET_SAMPLES = 2000  # surface points of the target, to measure its distance from neighbours
@@ -65,20 +63,15 @@ def make_obstacles(
         seen = seen[np.isfinite(seen).all(1)]
         if len(seen) < settings.min_points or near.query(seen)[0].min() > reach:
             continue
-        whole = _obstacle(seen, support, settings.padding)
+        whole = make_obstacle(padded_hull(seen, support, settings.padding))
         at = torch.as_tensor(near.data).to(whole.sdf.field)
         if not (sample_sdf(whole.sdf, at)[0] < -2 * settings.padding).any():
             found.append(whole)
             continue
         # The neighbour surrounds the target, like a tray, a box or a ring. One hull would fill the target's own place.
         parts = [part for part in _cells(seen, support, settings.part_size) if near.query(part)[0].min() <= reach]
-        found += [_obstacle(part, support, settings.padding) for part in parts]
+        found += [make_obstacle(padded_hull(part, support, settings.padding)) for part in parts]
     return tuple(found)
-
-
-def _obstacle(points: Points, support: Plane | None, padding: float) -> Obstacle:
-    mesh = padded_hull(points, support, padding)
-    return make_obstacle(mesh, resolution=GRID_RESOLUTION, padding=0.02)
 
 
 def _cells(points: Points, support: Plane | None, side: float) -> list[Float[np.ndarray, "_ 3"]]:
@@ -100,8 +93,8 @@ def padded_hull(points: Points, support: Plane | None, padding: float) -> Triang
         height = points @ support.normal - support.offset
         corners = np.vstack([points, points - height[:, None] * support.normal])
     # Without a support, the points of a flat face have no hull. The padding below makes them thicker.
-    with suppress(QhullError):
-        corners = corners[ConvexHull(corners).vertices]
+    if (hull := convex_hull(corners)) is not None:
+        corners = corners[hull.vertices]
     skin = padding * np.vstack([np.eye(3), -np.eye(3)])
     return hull_surface((corners[:, None] + skin).reshape(-1, 3))
 
@@ -148,15 +141,14 @@ def with_neighbours(
 
 def _overlap(a: Float[np.ndarray, "_ 3"], b: Float[np.ndarray, "_ 3"]) -> float:
     """Return the intersection over union of the convex hulls of two sets of points, 0 if a hull is flat."""
-    try:
-        hulls = [ConvexHull(_hull_corners(a)), ConvexHull(_hull_corners(b))]
-    except QhullError:
+    one, other = (convex_hull(_hull_corners(points)) for points in (a, b))
+    if one is None or other is None:
         return 0.0
     low, high = b.min(0), b.max(0)
     points = low + (high - low) * np.random.default_rng(0).random((_OVERLAP_SAMPLES, 3))
-    inside = [(points @ hull.equations[:, :3].T + hull.equations[:, 3] <= 0).all(1) for hull in hulls]
-    shared = float((inside[0] & inside[1]).mean() * np.prod(high - low))
-    return shared / (hulls[0].volume + hulls[1].volume - shared)
+    equations = np.vstack([one.equations, other.equations])
+    shared = float((points @ equations[:, :3].T + equations[:, 3] <= 0).all(1).mean() * np.prod(high - low))
+    return shared / (one.volume + other.volume - shared)
 
 
 def _hull_corners(points: Float[np.ndarray, "_ 3"]) -> Float[np.ndarray, "_ 3"]:
@@ -177,8 +169,7 @@ def _points_within(shape: TriangleMesh, low: Vector, high: Vector) -> Float[np.n
     corners = corners[((corners >= shape.vertices.min(0)) & (corners <= shape.vertices.max(0))).all(1)]
     points = [corners[winding_inside(shape, corners)]] if len(corners) else []
     if len(faces):
-        sides = np.diff(vertices[faces], axis=1)
-        area = 0.5 * float(np.linalg.norm(np.cross(sides[:, 0], sides[:, 1]), axis=1).sum())
+        area = 0.5 * float(np.linalg.norm(scaled_normals(vertices, faces), axis=1).sum())
         count = int(np.clip(area / _AREA_OF_A_SAMPLE, _FEWEST, _MOST))
         surface = TriangleMesh(vertices, faces.astype(np.int64))
         points += [_hull_corners(vertices[np.unique(faces)]), surface_samples(surface, count, 0)[0]]

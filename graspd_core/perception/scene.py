@@ -19,19 +19,18 @@ from jaxtyping import Float
 from scipy.ndimage import distance_transform_edt
 from scipy.spatial import KDTree
 from torch import Tensor
-from torch.nn.functional import grid_sample
 
 from graspd_core.errors import MeshError
 from graspd_core.mesh.components import bodies_apart
 from graspd_core.mesh.convex_parts import convex_parts
 from graspd_core.mesh.mesh_files import check_mesh, content_hash, mass_properties
-from graspd_core.mesh.sdf import GridSDF, build_sdf, grid_layout, is_solid
+from graspd_core.mesh.sdf import GridSDF, build_sdf, grid_layout, interpolate, is_solid
 from graspd_core.mesh.sharp_features import sharp_points
 from graspd_core.mesh.topology import far_centre, moved_mesh
 from graspd_core.perception.reconstruct.merge_views import Evidence
 from graspd_core.runtime import disk_cache as cache
 from graspd_core.runtime.worker_process import run_isolated
-from graspd_core.types import Contact, Grasp, Plane, Posture, TriangleMesh
+from graspd_core.types import Grasp, Plane, TriangleMesh
 
 
 def moved_sdf(sdf: GridSDF, offset: Float[np.ndarray, "3"]) -> GridSDF:
@@ -44,16 +43,10 @@ def moved_grasp(grasp: Grasp, offset: Float[np.ndarray, "3"]) -> Grasp:
     """Return the grasp shifted by `offset` [m], or the grasp itself if the offset is zero."""
     if not offset.any():
         return grasp
-
-    def posture(given: Posture) -> Posture:
-        return replace(given, position=given.position + offset)
-
-    def contact(given: Contact) -> Contact:
-        x, y, z = (np.array(given.position) + offset).tolist()
-        return replace(given, position=(x, y, z))
-
-    postures = {name: posture(getattr(grasp, name)) for name in ("pregrasp", "grasp", "squeeze")}
-    return replace(grasp, **postures, contacts=tuple(map(contact, grasp.contacts)))
+    postures = {name: getattr(grasp, name) for name in ("pregrasp", "grasp", "squeeze", "arrival")}
+    moved = {name: replace(one, position=one.position + offset) for name, one in postures.items() if one is not None}
+    contacts = (replace(one, position=tuple(np.add(one.position, offset).tolist())) for one in grasp.contacts)
+    return replace(grasp, **moved, contacts=tuple(contacts))
 
 
 # Nodes within this many cells of the surface take the confidence of their nearest vertex. Every surface has such nodes.
@@ -79,10 +72,7 @@ def sample_confidence(
 ) -> Float[Tensor, "batch points"]:
     """Interpolate the confidence at points [m], linearly and differentiably. Outside the grid, use its border value."""
     unit = points / sdf.half - (sdf.origin / sdf.half + 1).to(points)
-    # grid_sample takes x for the last axis of its input.
-    field = grid.permute(2, 1, 0)[None, None]
-    sampled = grid_sample(field, unit.reshape(1, 1, 1, -1, 3), align_corners=True, padding_mode="border")
-    return sampled.reshape(points.shape[:-1])
+    return interpolate(grid[None], unit.reshape(-1, 3)).reshape(points.shape[:-1])
 
 
 # Meshes are simplified to this number of faces. More faces would be slow, and smaller than the cells of a 48³ grid.
@@ -95,6 +85,8 @@ HEAVY_LITRE, HEAVY_GROWTH = 1.35, 0.5
 
 # Settings for cutting reconstructed or guessed surfaces into convex parts. They are accurate to millimetres only.
 COARSE_CUTS: dict[str, Any] = {"tolerance": 0.003, "max_parts": 32, "surface_points": 2000}
+# Nodes per side of an obstacle's distance grid, and free space around the obstacle that the grid covers [m].
+_OBSTACLE_RESOLUTION, _OBSTACLE_PADDING = 32, 0.02
 # Number of surface points of a reconstructed object that are searched for sharp points.
 _COARSE_POOL = 2000
 
@@ -316,10 +308,10 @@ def moved_object(model: ObjectModel, offset: Float[np.ndarray, "3"]) -> ObjectMo
     return replace(model, mesh=mesh, sha256=content_hash(mesh), center_of_mass=model.center_of_mass + offset)
 
 
-def make_obstacle(mesh: TriangleMesh, *, resolution: int, padding: float) -> Obstacle:
+def make_obstacle(mesh: TriangleMesh) -> Obstacle:
     """Return the obstacle with this surface. A distant grid keeps its place in float64 (`moved_sdf`)."""
     far = far_centre(mesh.vertices)
-    sdf = build_sdf(moved_mesh(mesh, -far), resolution=resolution, padding=padding)
+    sdf = build_sdf(moved_mesh(mesh, -far), resolution=_OBSTACLE_RESOLUTION, padding=_OBSTACLE_PADDING)
     return Obstacle(mesh, moved_sdf(sdf, far))
 
 

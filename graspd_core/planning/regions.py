@@ -144,7 +144,6 @@ Region = Box | Sphere | NearPoints
 _STEPS = 60
 # A gap up to this width counts as contact [m].
 _TOUCH = 1e-5
-_GRID_RESOLUTION = 32
 # Boxes grow by this as obstacles [m], because the search allows slight penetration and a squeeze closes the fingers.
 _PAD = 0.004
 
@@ -213,7 +212,7 @@ def boxes_in_reach(scene: Scene, hand: HandModel, boxes: Sequence[Box]) -> tuple
         low, high = np.maximum(-half - _PAD, middle - reach), np.minimum(half + _PAD, middle + reach)
         if (low < high).all():
             mesh = _box_mesh(box, low, high)
-            found.append(make_obstacle(mesh, resolution=_GRID_RESOLUTION, padding=0.02))
+            found.append(make_obstacle(mesh))
     return tuple(found)
 
 

@@ -13,7 +13,7 @@ from graspd_bench.rendering.tabletop import CAMERA as D415
 from graspd_bench.rendering.tabletop import TABLE_HALF, depth_views, lowest_pose, moved, ring_poses, tabletop, views_of
 from graspd_core.errors import CloudError
 from graspd_core.mesh.shapes import CAPSULE_RADIUS, HEAD_HALF, PLATE_HALF, SHAPES, SPHERE_RADIUS, make_shape
-from graspd_core.perception.cloud.camera import PinholeCamera, camera_rays, cloud_from_depth, project
+from graspd_core.perception.cloud.camera import PinholeCamera, camera_rays, cloud_from_depth, distort
 from graspd_core.types import TriangleMesh
 
 CAMERA = PinholeCamera(81, 61, 100.0, 100.0, 40.0, 30.0)
@@ -70,7 +70,8 @@ def test_a_scene_appears_where_the_lens_puts_it():
     depth, label = render_scene(balls, lens, pose)
     points = cloud_from_depth(depth, lens).points
     row, column = np.nonzero(depth)
-    assert project(points, lens) == pytest.approx(np.stack([column, row], -1), abs=1e-6)
+    pixels = distort(points[:, :2] / points[:, 2:], lens.distortion)[0] * 150.0 + [80.0, 60.0]
+    assert pixels == pytest.approx(np.stack([column, row], -1), abs=1e-6)
     world = points @ pose[:3, :3].T + pose[:3, 3]
     on_ball = label[row, column] == 0
     assert np.linalg.norm(world[on_ball], axis=1) == pytest.approx(np.full(on_ball.sum(), SPHERE_RADIUS), abs=2e-4)

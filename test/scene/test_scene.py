@@ -15,9 +15,9 @@ from graspd_core import TriangleMesh, load_scene
 from graspd_core.errors import ConfigError, MeshError
 from graspd_core.mesh.sdf import sample_sdf
 from graspd_core.mesh.shapes import SPHERE_RADIUS
-from graspd_core.perception.scene import build_scene, heavy_mass, object_parts
+from graspd_core.perception.scene import build_scene, heavy_mass, moved_grasp, object_parts
 from graspd_core.runtime import disk_cache as cache
-from graspd_core.types import Plane
+from graspd_core.types import Grasp, Plane, Posture
 
 
 @pytest.fixture(autouse=True)
@@ -248,3 +248,11 @@ def test_a_user_without_a_home_directory_has_no_files(own_cache, monkeypatch):
     monkeypatch.delenv("XDG_CACHE_HOME")
     monkeypatch.setattr(Path, "home", homeless)
     assert cache.remember("homeless", lambda: {"numbers": np.zeros(3)}, lambda _: True)["numbers"].shape == (3,)
+
+
+def test_all_postures_of_a_grasp_move():
+    one = Posture(np.zeros(3), np.array([1.0, 0.0, 0.0, 0.0]), np.zeros(2))
+    moved = moved_grasp(Grasp(one, one, one, arrival=one), np.ones(3))
+    for posture in (moved.pregrasp, moved.grasp, moved.squeeze, moved.arrival):
+        assert posture is not None
+        assert posture.position.tolist() == [1.0, 1.0, 1.0]

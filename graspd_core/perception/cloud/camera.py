@@ -15,8 +15,9 @@ import numpy as np
 from jaxtyping import Bool, Float, UInt16
 
 from graspd_core.errors import CloudError
+from graspd_core.mesh.convex_parts import convex_hull
 from graspd_core.perception.cloud.free_space import view_frame
-from graspd_core.perception.cloud.point_cloud import PointCloud, Vector, convex_hull, longest_side, transform_cloud
+from graspd_core.perception.cloud.point_cloud import PointCloud, Vector, longest_side, transform_cloud
 
 DISTORTION_MODELS = {"plumb_bob": 5, "rational_polynomial": 8}
 
@@ -44,10 +45,8 @@ HULL_POINTS = 2000
 ENCODINGS = {"16UC1": ("u2", 1e-3), "mono16": ("u2", 1e-3), "32FC1": ("f4", 1.0), "64FC1": ("f8", 1.0)}
 # Advice for images that hold no depth, by the beginning of the encoding's name.
 _REMEDIES = {
-    "8U": "8 bits per pixel are too few for depth: publish 16UC1 (millimetres) or 32FC1 (metres)",
-    "mono8": "8 bits per pixel are too few for depth: publish 16UC1 (millimetres) or 32FC1 (metres)",
-    "rgb": "it is a colour picture: name the depth image's topic",
-    "bgr": "it is a colour picture: name the depth image's topic",
+    ("8U", "mono8"): "8 bits per pixel are too few for depth: publish 16UC1 (millimetres) or 32FC1 (metres)",
+    ("rgb", "bgr"): "it is a colour picture: name the depth image's topic",
 }
 # In depth images that were cut to 8 bits: greatest depth [m], and smallest fraction of pixels with the greatest depth.
 _MOST_OF_8_BITS, _CUT_SHARE = 0.255, 0.2
@@ -79,9 +78,9 @@ class PinholeCamera:
         if self.width < 1 or self.height < 1:
             raise CloudError(f"camera: an image of {self.width} x {self.height} pixels; valid: at least 1 x 1")
         numbers = (self.fx, self.fy, self.cx, self.cy, *self.distortion)
-        if not (
-            all(abs(number) <= _MAX_CALIBRATION_PX for number in numbers) and min(self.fx, self.fy) >= _MIN_FOCAL_PX
-        ):
+        # For NaN, the comparisons are false.
+        finite = all(abs(number) <= _MAX_CALIBRATION_PX for number in numbers)
+        if not (finite and min(self.fx, self.fy) >= _MIN_FOCAL_PX):
             raise CloudError(
                 f"camera: fx={self.fx}, fy={self.fy}, cx={self.cx}, cy={self.cy} is no calibration; "
                 "valid: finite numbers, fx and fy above 0"
@@ -127,43 +126,32 @@ def camera_rays(camera: PinholeCamera) -> Float[np.ndarray, "height width 3"]:
     return rays
 
 
-def project(points: Float[np.ndarray, "*batch 3"], camera: PinholeCamera) -> _Places:
-    """Return pixel coordinates (column, row) of points [m] in the camera frame. All points must have z > 0."""
-    seen = distort(points[..., :2] / points[..., 2:], camera.distortion)
-    return seen * [camera.fx, camera.fy] + [camera.cx, camera.cy]
-
-
-def distort(ideal: _Places, coefficients: _Numbers) -> _Places:
-    """Apply the lens distortion to positions on the plane at depth 1."""
-    return _lens(ideal, coefficients)[0] if any(coefficients) else np.array(ideal, dtype=float)
-
-
 def undistort(seen: _Places, coefficients: _Numbers) -> _Places:
     """Invert `distort`. Return NaN where the lens model has no inverse."""
+    target, ideal = np.array(seen, dtype=float), np.array(seen, dtype=float)
     if not any(coefficients):
-        return np.array(seen, dtype=float)
-    target = np.asarray(seen, dtype=float)
-    ideal = target.copy()
+        return ideal
     # Beyond the range of the lens model, the iteration diverges. Such pixels become NaN below.
     with np.errstate(over="ignore", invalid="ignore", divide="ignore"):
         for _ in range(_NEWTON_STEPS):
-            image, slope = _lens(ideal, coefficients)
-            a, b, d = np.moveaxis(slope, -1, 0)
+            image, (a, b, d) = distort(ideal, coefficients)
             off = target - image
             determinant = a * d - b * b
             step = np.stack([d * off[..., 0] - b * off[..., 1], a * off[..., 1] - b * off[..., 0]], -1)
             ideal += step / determinant[..., None]
             if np.abs(off[np.isfinite(off)]).max(initial=0.0) < 1e-3 * _NEWTON_TOLERANCE:
                 break
-        image, slope = _lens(ideal, coefficients)
-        a, b, d = np.moveaxis(slope, -1, 0)
+        image, (a, b, d) = distort(ideal, coefficients)
         # Outside its valid range, a lens model folds back: the derivative has a negative determinant or trace.
         found = (np.abs(target - image).max(-1) < _NEWTON_TOLERANCE) & (a * d - b * b > 0) & (a + d > 0)
     return np.where(found[..., None], ideal, np.nan)
 
 
-def _lens(ideal: _Places, coefficients: _Numbers) -> tuple[_Places, Float[np.ndarray, "*batch 3"]]:
-    """Return distorted positions, and (a, b, d). The Jacobian by the ideal positions is [[a, b], [b, d]]."""
+def distort(ideal: _Places, coefficients: _Numbers) -> tuple[_Places, Float[np.ndarray, "3 *batch"]]:
+    """Apply the lens distortion to positions on the plane at depth 1.
+
+    Return the distorted positions, and (a, b, d). Their Jacobian by the ideal positions is [[a, b], [b, d]].
+    """
     k1, k2, p1, p2, k3, k4, k5, k6 = (*coefficients, *[0.0] * (8 - len(coefficients)))
     x, y = ideal[..., 0], ideal[..., 1]
     s = x * x + y * y
@@ -171,13 +159,12 @@ def _lens(ideal: _Places, coefficients: _Numbers) -> tuple[_Places, Float[np.nda
     radial = above / below
     # Derivative of the radial factor by s.
     growth = (k1 + s * (2 * k2 + s * 3 * k3) - radial * (k4 + s * (2 * k5 + s * 3 * k6))) / below
-    image = np.stack(
-        [x * radial + 2 * p1 * x * y + p2 * (s + 2 * x * x), y * radial + p1 * (s + 2 * y * y) + 2 * p2 * x * y], -1
-    )
+    across = x * radial + 2 * p1 * x * y + p2 * (s + 2 * x * x)
+    down = y * radial + p1 * (s + 2 * y * y) + 2 * p2 * x * y
     a = radial + 2 * x * x * growth + 2 * p1 * y + 6 * p2 * x
     b = 2 * x * y * growth + 2 * p1 * x + 2 * p2 * y
     d = radial + 2 * y * y * growth + 6 * p1 * y + 2 * p2 * x
-    return image, np.stack([a, b, d], -1)
+    return np.stack([across, down], -1), np.stack([a, b, d])
 
 
 def reaches_image_border(
@@ -208,9 +195,8 @@ def reaches_image_border(
         if len(near) < MIN_BORDER_POINTS:
             continue
         beside = others[others @ np.array(normal) + offset > -width]
-        if len(beside) < MIN_BORDER_POINTS:
-            continue
-        if _filled(np.concatenate([near, beside]), start, end) >= MIN_FILLED_SHARE:
+        full = _filled(np.concatenate([near, beside]), start, end) >= MIN_FILLED_SHARE
+        if full and len(beside) >= MIN_BORDER_POINTS:
             return True
     return False
 

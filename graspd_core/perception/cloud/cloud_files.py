@@ -8,15 +8,16 @@ Cloud Library).
 from __future__ import annotations
 
 import re
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
-from functools import partial
+from io import BytesIO
 from pathlib import Path
 
 import numpy as np
 from jaxtyping import Float
 
 from graspd_core.errors import CloudError, Extra, first_line
+from graspd_core.mesh.mesh_files import refuse_path
 from graspd_core.perception.cloud.camera import camera_from_calibration, cloud_from_depth, depth_in_metres
 from graspd_core.perception.cloud.point_cloud import PointCloud, Points, Vector, is_rigid
 from graspd_core.perception.cloud.viewpoint_check import seen_from
@@ -81,15 +82,12 @@ def read_ply_points(data: bytes) -> Points:
 def _pcd_header(data: bytes) -> tuple[dict[str, list[str]], int]:
     """Return a pcd file's header as a list of words for each key, and the byte offset of the points."""
     header: dict[str, list[str]] = {}
-    at = 0
-    while at < len(data) and "DATA" not in header:
-        end = data.find(b"\n", at)
-        end = len(data) if end < 0 else end
-        words = data[at:end].decode("ascii", errors="replace").split()
-        at = end + 1
+    file = BytesIO(data)
+    while "DATA" not in header and (line := file.readline()):
+        words = line.decode("ascii", errors="replace").split()
         if words and not words[0].startswith("#"):
             header[words[0]] = words[1:]
-    return header, at
+    return header, file.tell()
 
 
 def _pcd_points(data: bytes, header: dict[str, list[str]], at: int) -> Points | None:
@@ -209,29 +207,24 @@ def load_views(path: str | Path, viewpoint: Vector | None = None, scale: float =
     """
     path = Path(path)
     ending = path.suffix.lower().lstrip(".")
-    if path.is_dir():
-        raise CloudError(f"{path}: is a directory; give a cloud file ({', '.join(CLOUD_ENDINGS)})")
-    if not path.exists():
-        raise CloudError(f"{path}: no such cloud file")
-    if ending in RECORDINGS:
+    if ending in RECORDINGS and path.is_file():
         raise CloudError(f"{path}: {recording_told(path)}")
-    if ending not in CLOUD_ENDINGS:
-        raise CloudError(f"{path}: unknown cloud ending {path.suffix!r}; valid endings: {', '.join(CLOUD_ENDINGS)}")
+    refuse_path(path, "cloud", CLOUD_ENDINGS, CloudError)
+    said = None if viewpoint is None else np.asarray(viewpoint, dtype=float) / scale
     if ending not in ("npy", "npz"):
-        return (_scaled(partial(_read_points, path, ending), viewpoint, scale),)
+        return (_scaled(_read_points(path, ending, said), scale),)
     arrays = read_numpy(path)
     try:
         if "depth" in arrays or "depths" in arrays:
             if viewpoint is not None:
                 raise CloudError("view_point: given with depth, which has its own camera pose; valid with points")
             return _depth_views(arrays, scale)
-        return (_scaled(partial(_points_view, arrays), viewpoint, scale),)
+        return (_scaled(_points_view(arrays, said), scale),)
     except CloudError as error:
         raise CloudError(f"{path}: {error}") from None
 
 
-def _scaled(read: Callable[[Vector | None], PointCloud], viewpoint: Vector | None, scale: float) -> PointCloud:
-    view = read(None if viewpoint is None else np.asarray(viewpoint, dtype=float) / scale)
+def _scaled(view: PointCloud, scale: float) -> PointCloud:
     return replace(view, points=view.points * scale, viewpoint=view.viewpoint * scale)
 
 

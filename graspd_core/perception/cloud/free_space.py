@@ -11,6 +11,8 @@ from dataclasses import dataclass
 
 import numpy as np
 from jaxtyping import Bool, Float
+from scipy.ndimage import binary_closing, distance_transform_edt, minimum_filter
+from scipy.spatial import KDTree
 
 from graspd_core.config import ReconstructionConfig
 from graspd_core.perception.cloud.point_cloud import PointCloud, Points, Vector
@@ -94,9 +96,6 @@ def _make_view_depth(view: PointCloud, whole: PointCloud | None) -> ViewDepth | 
 
     Return None if fewer than five points are in front of the camera, or if all points are in one line of sight.
     """
-    from scipy.ndimage import binary_closing, distance_transform_edt, minimum_filter
-    from scipy.spatial import KDTree
-
     frame = view_frame(view)
     local = (view.points - view.viewpoint) @ frame
     local = local[local[:, 2] > 1e-3]
@@ -136,8 +135,6 @@ def _occluders(
     depth: Float[np.ndarray, "x y"],
 ) -> Float[np.ndarray, "x y"]:
     """Return the depth of the occluder in front of the object in each cell [m], infinite if there is none."""
-    from scipy.ndimage import binary_closing, distance_transform_edt
-
     # Most points are outside the object's image and are dropped first. For NaN, the comparisons are false.
     x, y, forward = ((whole.points - whole.viewpoint) @ frame).T
     high = low + cell * np.array(depth.shape)

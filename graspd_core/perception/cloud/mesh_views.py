@@ -7,9 +7,10 @@ mesh must not be used as a solid, because a table and the objects on the table w
 from __future__ import annotations
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, Int
 
 from graspd_core.errors import MeshError
+from graspd_core.mesh.components import connected_parts
 from graspd_core.mesh.topology import edge_counts, scaled_normals
 from graspd_core.perception.cloud.point_cloud import PointCloud, Points, Vector
 from graspd_core.types import TriangleMesh
@@ -40,9 +41,13 @@ def view_in_mesh(mesh: TriangleMesh, source: str) -> PointCloud | None:
         return None
     corners, normals = mesh.vertices[some], scaled_normals(mesh.vertices, some)
     normals = normals / np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-300)
-    if _faces(corners, normals, np.zeros(3)) and _pixels(corners) and _is_open(mesh):
+    edges, count = edge_counts(mesh.faces)
+    border = edges[count == 1]
+    if len(border) and _faces(corners, normals, np.zeros(3)) and _pixels(corners):
         return PointCloud(mesh.vertices, np.zeros(3), posed=True)
-    if _borders(mesh) >= MIN_BORDERS and _is_grid(mesh) and _camera_place(corners, normals) is not None:
+    used, compact = np.unique(border, return_inverse=True)
+    loops = len(np.unique(connected_parts(len(used), *compact.reshape(-1, 2).T)))
+    if loops >= MIN_BORDERS and _is_grid(mesh, border) and _camera_place(corners, normals) is not None:
         raise MeshError(
             f"{source}: an open mesh of one camera's view, and not in the camera's frame; "
             "give a closed mesh, or the points as a cloud with the camera's position (npz: points, viewpoint)"
@@ -92,35 +97,9 @@ def _camera_place(corners: Float[np.ndarray, "n 3 3"], normals: Points) -> Vecto
     return None
 
 
-def _is_open(mesh: TriangleMesh) -> bool:
-    """Return True if some edge belongs to one face only. Edges at a sample of the vertices are checked first."""
-    for share in (32, 1):
-        # Every face of an edge contains both ends of the edge, so the faces at a vertex include all faces of its edges.
-        wanted = np.arange(len(mesh.vertices)) % share == 0
-        edges, count = edge_counts(mesh.faces[wanted[mesh.faces].any(1)])
-        if (wanted[edges].any(1) & (count == 1)).any():
-            return True
-    return False
-
-
-def _borders(mesh: TriangleMesh) -> int:
-    """Return the number of border loops of the surface."""
-    from scipy.sparse import coo_matrix
-    from scipy.sparse.csgraph import connected_components
-
-    edges, count = edge_counts(mesh.faces)
-    used, compact = np.unique(edges[count == 1], return_inverse=True)
-    if not len(used):
-        return 0
-    one, other = compact.reshape(-1, 2).T
-    graph = coo_matrix((np.ones(len(one), dtype=bool), (one, other)), shape=(len(used), len(used)))
-    return int(connected_components(graph, directed=False)[0])
-
-
-def _is_grid(mesh: TriangleMesh) -> bool:
-    edges, count = edge_counts(mesh.faces)
+def _is_grid(mesh: TriangleMesh, border: Int[np.ndarray, "edges 2"]) -> bool:
     inner = np.ones(len(mesh.vertices), dtype=bool)
-    inner[edges[count == 1]] = False
+    inner[border] = False
     meet = np.bincount(mesh.faces.ravel(), minlength=len(mesh.vertices))
     inner &= meet > 0
     return bool(inner.any() and (meet[inner] == 6).mean() > GRID_SHARE)

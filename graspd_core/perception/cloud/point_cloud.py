@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
-from typing import Any
 
 import numpy as np
 from jaxtyping import Bool, Float
@@ -127,16 +126,6 @@ def measured(points: Points, viewpoint: Vector) -> Bool[np.ndarray, "n"]:
 def longest_side(points: Float[np.ndarray, "n k"]) -> float:
     """Return the longest side of the axis-aligned bounding box, in the unit of the points."""
     return max(float(np.ptp(column)) for column in points.T)
-
-
-def convex_hull(points: Float[np.ndarray, "n k"]) -> Any:
-    """Return SciPy's convex hull of points, or None if the points are too few, flat, or not finite."""
-    from scipy.spatial import ConvexHull, QhullError
-
-    try:
-        return ConvexHull(points)
-    except (QhullError, ValueError):
-        return None
 
 
 def least_axes(spreads: Float[np.ndarray, "n 3 3"]) -> Points:

@@ -14,9 +14,12 @@ from typing import Any
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
+from scipy.spatial import KDTree
 
 from graspd_core.errors import CloudError
-from graspd_core.perception.cloud.point_cloud import PointCloud, Points, Vector, convex_hull, longest_side, measured
+from graspd_core.mesh.components import connected_parts
+from graspd_core.mesh.convex_parts import convex_hull
+from graspd_core.perception.cloud.point_cloud import PointCloud, Points, Vector, longest_side, measured
 from graspd_core.se3 import perpendicular
 
 # An organised cloud [m], NaN where nothing was seen.
@@ -102,8 +105,6 @@ def check_scene(views: Sequence[PointCloud]) -> None:
     Raises:
         CloudError: a view cannot have been seen from its viewpoint. The error says why.
     """
-    from scipy.spatial import KDTree
-
     for view in views:
         if view.posed:
             continue
@@ -133,8 +134,6 @@ def check_viewpoint(thing: PointCloud, view: PointCloud, up: Vector | None = Non
     Raises:
         CloudError: the camera cannot have been at the viewpoint. The error says why.
     """
-    from scipy.spatial import KDTree
-
     own = _thinned(thing)
     if view.posed or len(own) < FEWEST_POINTS:
         return ""
@@ -200,8 +199,6 @@ def check_views(things: Sequence[PointCloud], views: Sequence[PointCloud]) -> st
 
 def empty_share(points: Points, view: PointCloud) -> float:
     """Return the fraction of points that lie in space which the camera of a view saw to be empty."""
-    from scipy.spatial import KDTree
-
     own = _some(points, view.viewpoint, EMPTY_POINTS) - view.viewpoint
     seen = view.points[measured(view.points, view.viewpoint)] - view.viewpoint
     near, far = (np.linalg.norm(ray, axis=1) for ray in (own, seen))
@@ -245,8 +242,6 @@ def hidden_share(points: Points, viewpoint: Vector, nearer: Float[np.ndarray, "p
     A point is hidden if points around it in the image are nearer by more than `nearer` [m]. Most of its neighbours must
     be hidden too. `tree` is the KD-tree of the points.
     """
-    from scipy.spatial import KDTree
-
     ray = points - viewpoint
     distance = np.linalg.norm(ray, axis=1)
     length = float(np.linalg.norm(ray.mean(0)))
@@ -297,10 +292,6 @@ def _surfaces(points: Points) -> Surfaces:
 
     In a graph, each point has two nodes, one for each sign of its normal. Edges join neighbours whose normals agree.
     """
-    from scipy.sparse import coo_matrix
-    from scipy.sparse.csgraph import connected_components
-    from scipy.spatial import KDTree
-
     distance, around = KDTree(points).query(points, k=NEIGHBOURS + 1)
     patch = points[around] - points[around].mean(1, keepdims=True)
     spread, axes = np.linalg.eigh(np.einsum("nka,nkb->nab", patch, patch))
@@ -312,8 +303,7 @@ def _surfaces(points: Points) -> Surfaces:
     a, b, same = a[linked], b[linked], agree[linked] > 0
     many = len(points)
     ends = np.r_[np.where(same, b, b + many), np.where(same, b + many, b)]
-    graph = coo_matrix((np.ones(2 * len(a)), (np.r_[a, a + many], ends)), shape=(2 * many, 2 * many))
-    part = connected_components(graph, directed=False)[1]
+    part = connected_parts(2 * many, np.r_[a, a + many], ends)
     surface: Int[np.ndarray, "points"] = np.minimum(part[:many], part[many:])
     sign = np.where(part[:many] == surface, 1.0, -1.0)
     return normal * sign[:, None], surface, clear & (part[:many] != part[many:])

@@ -4,9 +4,12 @@ from __future__ import annotations
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
+from scipy.ndimage import binary_closing, binary_erosion, distance_transform_edt, gaussian_filter, maximum_filter
+from scipy.spatial import KDTree
 
+from graspd_core.mesh.convex_parts import convex_hull
 from graspd_core.perception.cloud.free_space import FreeSpace, empty_depth, facing
-from graspd_core.perception.cloud.point_cloud import Points, convex_hull
+from graspd_core.perception.cloud.point_cloud import Points
 from graspd_core.perception.reconstruct.merge_views import Surfels, join, nothing, take, thin
 
 # The object ends at an outline point if the space at this distance outwards [m] is seen to be empty.
@@ -28,9 +31,6 @@ def extrude(seen: Surfels, free_space: FreeSpace, step: float) -> Surfels:
 
     At each wall's top, cameras must see empty space just outside the outline. The cameras must not contradict the wall.
     """
-    from scipy.ndimage import binary_closing, binary_erosion, distance_transform_edt, gaussian_filter, maximum_filter
-    from scipy.spatial import KDTree
-
     margin = 6
     low = seen.points[:, :2].min(0) - margin * step
     index = tuple(np.floor((seen.points[:, :2] - low) / step).astype(int).T)
@@ -106,8 +106,6 @@ def _walls(
     surfels: Surfels, bottom: float, free_space: FreeSpace, step: float
 ) -> tuple[Surfels, Float[np.ndarray, "n 2"]]:
     """Return walls beneath the outline seen from above, down to the height `bottom` [m], and their lower ends [m]."""
-    from scipy.spatial import KDTree
-
     hull = convex_hull(surfels.points[:, :2])
     if hull is None:
         return nothing(), np.zeros((0, 2))
@@ -129,8 +127,6 @@ def _walls(
 
 def _base(feet: Float[np.ndarray, "n 2"], free_space: FreeSpace, step: float) -> Surfels:
     """Return the hidden bottom in the hull of `feet`, the lower ends of walls. Return nothing if walls are missing."""
-    from scipy.spatial import KDTree
-
     hull = convex_hull(feet)
     if hull is None:
         return nothing()

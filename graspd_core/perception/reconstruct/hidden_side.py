@@ -9,6 +9,7 @@ from dataclasses import replace
 
 import numpy as np
 from jaxtyping import Float
+from scipy.spatial import KDTree
 
 from graspd_core.errors import GraspdError
 from graspd_core.mesh.mesh_files import surface_samples
@@ -50,8 +51,6 @@ def next_view(evidence: Evidence, mesh: TriangleMesh, shift: Vector) -> Float[np
     Returns:
         The pose. None if no candidate shows any hidden surface, or if no camera position is known.
     """
-    from scipy.spatial import KDTree
-
     if not evidence.free_space.view_depths:
         return None
     points, normals = surface_samples(mesh, _SAMPLES, seed=0)

@@ -15,9 +15,11 @@ from functools import lru_cache
 
 import numpy as np
 from jaxtyping import Float
+from scipy.spatial import KDTree
 
 from graspd_core.config import ReconstructionConfig
 from graspd_core.errors import CloudError
+from graspd_core.mesh.convex_parts import even_directions
 from graspd_core.mesh.topology import packed_rows, voxel_keys
 from graspd_core.perception.cloud.free_space import FreeSpace, view_frame
 from graspd_core.perception.cloud.point_cloud import (
@@ -99,8 +101,6 @@ def merge_views(
 
 def orient_view(view: PointCloud, step: float, settings: ReconstructionConfig) -> Surfels:
     """Return the surface points of one view, about `step` [m] apart, with normals towards its camera."""
-    from scipy.spatial import KDTree
-
     points = _thin_by_sight(view, step)
     if len(points) <= settings.neighbours:
         return nothing()
@@ -164,8 +164,6 @@ def is_unposed(view: PointCloud, axis_known: bool = False) -> bool:
         view: the object's points.
         axis_known: whether the camera's direction is known.
     """
-    from scipy.spatial import KDTree
-
     points = clean_cloud(view.points)
     if (view.viewpoint > points.min(0)).all() and (view.viewpoint < points.max(0)).all() and is_all_round(view):
         return True
@@ -210,8 +208,6 @@ def orient_unposed(view: PointCloud, step: float) -> Surfels:
     View the cloud from many directions. In each image cell, the nearest point is taken to face the viewer. So the two
     sides of a thin wall stay apart. Orientation by neighbours would mix the two sides.
     """
-    from scipy.spatial import KDTree
-
     points = view.thinned(step * UNPOSED_THINNING).points
     seen_from, place, many = _seen_from(points), KDTree(points), min(NORMAL_NEIGHBOURS, len(points))
     near = np.asarray(place.query(points, k=many)[1])
@@ -234,14 +230,9 @@ def _least_axes_of(groups: Float[np.ndarray, "n k 3"]) -> Points:
 
 def _seen_from(points: Points) -> Points:
     """Return for each point the sum of the directions from which it is the nearest point in its image cell."""
-    from scipy.spatial import KDTree
-
     width = 2 * float(np.median(KDTree(points).query(points, k=5)[0][:, -1]))
     rng, total = np.random.default_rng(0), np.zeros_like(points)
-    turn = np.arange(UNPOSED_DIRECTIONS) + 0.5
-    height, angle = 1 - 2 * turn / UNPOSED_DIRECTIONS, np.pi * (1 + 5**0.5) * turn
-    flat = np.sqrt(1 - height**2)
-    for way in np.column_stack([flat * np.cos(angle), flat * np.sin(angle), height]):
+    for way in even_directions(UNPOSED_DIRECTIONS).T:
         right = perpendicular(way)
         image = np.column_stack([points @ right, points @ np.cross(way, right)]) + rng.uniform(0, width, 2)
         order = np.argsort(-(points @ way))

@@ -15,12 +15,17 @@ from itertools import product
 from typing import Any
 
 import numpy as np
+import scipy.fft
 from jaxtyping import Bool, Float
+from scipy.ndimage import binary_dilation, gaussian_filter, label
+from scipy.sparse import csr_array
+from scipy.spatial import KDTree
 
 from graspd_core.errors import CloudError
+from graspd_core.mesh.convex_parts import convex_hull
 from graspd_core.mesh.surface_queries import closest_points, make_surface
 from graspd_core.perception.cloud.free_space import FreeSpace, empty_depth
-from graspd_core.perception.cloud.point_cloud import Points, convex_hull
+from graspd_core.perception.cloud.point_cloud import Points
 from graspd_core.perception.reconstruct.merge_views import Surfels
 from graspd_core.types import TriangleMesh
 
@@ -62,8 +67,6 @@ def grid_cell(surfels: Surfels, least: float, cells: int = GRID_CELLS) -> float:
 
 def part_walls(surfels: Surfels, cell: float) -> Surfels:
     """Increase the thickness of thin walls to `MIN_WALL_CELLS` cells. On the grid, closer sides would cancel."""
-    from scipy.spatial import KDTree
-
     points, normals = surfels.points, surfels.normals
     thinnest = MIN_WALL_CELLS * cell
     # The other side of a wall is nearest in position and opposite normal. `farthest` is the limit in six dimensions.
@@ -106,8 +109,6 @@ def close_surface(surfels: Surfels, field: Field, free_space: FreeSpace, cell: f
         field: function that returns the signed distance near the fitted surface, at the nodes of a grid.
         cell: cell width of this grid [m].
     """
-    from scipy.ndimage import gaussian_filter
-
     known = surfels.points
     if free_space.standing:
         known = np.concatenate([known, _beneath_floors(surfels, free_space.lowest)])
@@ -116,10 +117,8 @@ def close_surface(surfels: Surfels, field: Field, free_space: FreeSpace, cell: f
     nodes = np.stack(np.meshgrid(*axes, indexing="ij"), -1)
     value = field(surfels, nodes, cell)
     inner = value < BAND_CELLS * cell
-    beyond = (
-        np.maximum(empty_depth(free_space, nodes[inner]), _outside_hull(known, nodes[inner], cell)) - free_space.slack
-    )
-    value[inner] = np.maximum(value[inner], beyond)
+    beyond = np.maximum(empty_depth(free_space, nodes[inner]), _outside_hull(known, nodes[inner], cell))
+    value[inner] = np.maximum(value[inner], beyond - free_space.slack)
     value = gaussian_filter(value, 0.5)
     if free_space.standing:
         value = np.maximum(value, -nodes[..., 2])
@@ -156,8 +155,6 @@ def _signed(surface: TriangleMesh, nodes: Nodes, cell: float) -> Grid:
     The surface has no border within the grid, so it divides the grid into regions. Near the surface, the normal of the
     nearest face gives a node's sign. Each region takes the sign of most of its nodes near the surface.
     """
-    from scipy.ndimage import label
-
     near = _touched(surface, nodes, cell)
     closest, normals = closest_points(make_surface(surface), nodes[near])
     offset = nodes[near] - closest
@@ -174,8 +171,6 @@ def _signed(surface: TriangleMesh, nodes: Nodes, cell: float) -> Grid:
 
 def _touched(surface: TriangleMesh, nodes: Nodes, cell: float) -> Bool[np.ndarray, "x y z"]:
     """Return which nodes are within about two cells of the surface. The faces must be smaller than two cells."""
-    from scipy.ndimage import binary_dilation
-
     points = np.concatenate([surface.vertices, surface.vertices[surface.faces].mean(1)])
     index = np.round((points - nodes[0, 0, 0]) / cell).astype(int)
     index = index[((index >= 0) & (index < nodes.shape[:3])).all(1)]
@@ -196,8 +191,6 @@ def _outside_hull(points: Points, nodes: Float[np.ndarray, "m 3"], cell: float) 
 
 def _one_solid(value: Grid, cell: float) -> Grid:
     """Return the field with only its largest body. Fill cavities of the body, and close it at the grid's border."""
-    from scipy.ndimage import label
-
     border = np.ones(value.shape, dtype=bool)
     border[1:-1, 1:-1, 1:-1] = False
     value = np.where(border, np.maximum(value, 0.5 * cell), value)
@@ -221,8 +214,6 @@ def grid_poisson_field(surfels: Surfels, nodes: Nodes, cell: float) -> Grid:
     Raises:
         CloudError: the points and normals do not fit one surface.
     """
-    import scipy.fft
-
     counts = nodes.shape[:3]
     fft: Any = scipy.fft  # typed as Any, because SciPy declares only the dispatch types
     shape = tuple(int(fft.next_fast_len(count + _MARGIN, real=True)) for count in counts)
@@ -263,8 +254,6 @@ def grid_poisson_field(surfels: Surfels, nodes: Nodes, cell: float) -> Grid:
 
 def _trilinear(place: Float[np.ndarray, "points 3"], shape: tuple[int, ...]) -> Any:
     """Return the matrix (points × nodes) that interpolates a field. `place` holds the points' positions in cells."""
-    from scipy.sparse import csr_array
-
     corners = np.array(list(product((0, 1), repeat=3)))
     low = np.floor(place).astype(int)
     share = (place - low)[:, None]

@@ -14,15 +14,17 @@ from functools import partial
 
 import numpy as np
 from jaxtyping import Float
+from scipy.spatial import KDTree
 
 from graspd_core.config import ReconstructionConfig
 from graspd_core.errors import CloudError, MeshError
 from graspd_core.mesh.mesh_files import check_mesh, simplify
 from graspd_core.mesh.surface_queries import make_surface, surface_distance
-from graspd_core.mesh.topology import is_closed
+from graspd_core.mesh.topology import is_closed, scaled_normals
 from graspd_core.perception.cloud.free_space import FreeSpace, make_view_depths
 from graspd_core.perception.cloud.point_cloud import PointCloud, Points, Vector, clean_cloud, measured
 from graspd_core.perception.cloud.viewpoint_check import refuse_no_place
+from graspd_core.perception.reconstruct import poisson
 from graspd_core.perception.reconstruct.extrusion import MAX_FOOT_HEIGHT_M, with_foot
 from graspd_core.perception.reconstruct.merge_views import (
     Evidence,
@@ -33,15 +35,6 @@ from graspd_core.perception.reconstruct.merge_views import (
     nothing,
     orient_unposed,
     point_step,
-)
-from graspd_core.perception.reconstruct.poisson import (
-    GRID_CELLS,
-    Field,
-    close_surface,
-    grid_cell,
-    grid_poisson_field,
-    part_walls,
-    poisson_field,
 )
 from graspd_core.perception.reconstruct.shape_completion import Completion, complete_shape
 from graspd_core.se3 import perpendicular
@@ -114,7 +107,7 @@ def reconstruct(
             make_view_depths(local, around), standing, lowest, settings.outline_slack, settings.surface_tolerance
         )
         guess = complete_shape(seen, free_space, step, settings)
-    cells = GRID_CELLS
+    cells = poisson.GRID_CELLS
     if unposed and _has_thin_walls(seen, settings.min_cell):
         settings, cells = replace(settings, min_cell=_WALL_CELL * settings.min_cell), _WALL_CELLS
     mesh = _closed(seen, guess.surfels, free_space, step, settings, cells)
@@ -132,10 +125,7 @@ def _by_eye(whole: Sequence[PointCloud]) -> dict[tuple[float, ...], PointCloud]:
     """Return what was seen from each camera position. Several clouds of a camera that only turned become one cloud."""
     places = [tuple(view.viewpoint.astype(float)) for view in whole]
     found = {place: [view for view, at in zip(whole, places, strict=True) if at == place] for place in places}
-    return {
-        place: views[0] if len(views) == 1 else replace(views[0], points=np.concatenate([v.points for v in views]))
-        for place, views in found.items()
-    }
+    return {place: replace(of[0], points=np.concatenate([v.points for v in of])) for place, of in found.items()}
 
 
 def _in_frame(view: PointCloud, rotation: Float[np.ndarray, "3 3"], origin: Vector) -> PointCloud:
@@ -145,24 +135,19 @@ def _in_frame(view: PointCloud, rotation: Float[np.ndarray, "3 3"], origin: Vect
 
 
 def _has_thin_walls(seen: Surfels, least: float) -> bool:
-    moved = part_walls(seen, grid_cell(seen, least)).points != seen.points
+    moved = poisson.part_walls(seen, poisson.grid_cell(seen, least)).points != seen.points
     return float(moved.any(1).mean()) > _THIN_SHARE
 
 
 def _closed(
-    seen: Surfels,
-    guess: Surfels,
-    free_space: FreeSpace,
-    step: float,
-    settings: ReconstructionConfig,
-    cells: int,
+    seen: Surfels, guess: Surfels, free_space: FreeSpace, step: float, settings: ReconstructionConfig, cells: int
 ) -> TriangleMesh:
     """Close the surface by the grid solver. Use Open3D's solver if `settings` ask for it or no surface fits."""
-    adaptive = partial(poisson_field, finest=settings.poisson_cell)
+    adaptive = partial(poisson.poisson_field, finest=settings.poisson_cell)
     small = float(np.ptp(seen.points, axis=0).max()) < _LEAST_CELLS * settings.min_cell
     if settings.poisson == "grid" and not small:
         with suppress(CloudError):
-            return closed_mesh(seen, guess, free_space, step, settings, grid_poisson_field, cells)
+            return closed_mesh(seen, guess, free_space, step, settings, poisson.grid_poisson_field, cells)
     return closed_mesh(seen, guess, free_space, step, settings, adaptive, cells)
 
 
@@ -172,7 +157,7 @@ def closed_mesh(
     free_space: FreeSpace,
     step: float,
     settings: ReconstructionConfig,
-    field: Field,
+    field: poisson.Field,
     cells: int,
 ) -> TriangleMesh:
     """Return a closed mesh through the seen and the guessed surfels, down to the support if there is one.
@@ -185,15 +170,13 @@ def closed_mesh(
         CloudError: no closed surface fits the seen points.
     """
     known = with_foot(join(seen, guess), free_space, step)
-    known = part_walls(known, grid_cell(known, settings.min_cell, cells))
-    cell = grid_cell(known, settings.min_cell, cells)
-    return _finished(close_surface(known, field, free_space, cell), seen, settings)
+    known = poisson.part_walls(known, poisson.grid_cell(known, settings.min_cell, cells))
+    cell = poisson.grid_cell(known, settings.min_cell, cells)
+    return _finished(poisson.close_surface(known, field, free_space, cell), seen, settings)
 
 
 def _clean(views: Sequence[PointCloud], settings: ReconstructionConfig) -> list[PointCloud]:
     """Drop points that are not finite or far from the others, and views with too few points for a surface."""
-    from scipy.spatial import KDTree
-
     if len(views) == 0:
         raise CloudError("cloud: no view at all; at least one is needed")
     for view in views:
@@ -274,8 +257,6 @@ def _fewer(mesh: TriangleMesh, most: int) -> TriangleMesh:
 
 
 def _confidence(mesh: TriangleMesh, seen: Points, settings: ReconstructionConfig) -> Float[np.ndarray, "vertices"]:
-    from scipy.spatial import KDTree
-
     far = settings.guessed_distance
     distance, _ = KDTree(seen).query(mesh.vertices, distance_upper_bound=far)
     return np.clip((far - distance) / (far - settings.seen_distance), 0.0, 1.0)
@@ -306,8 +287,6 @@ def _unseen_share(mesh: TriangleMesh, seen: Surfels, standing: bool, reach: floa
     Args:
         reach: largest distance that counts as near [m]. Normals 60° apart count like a distance of `reach`.
     """
-    from scipy.spatial import KDTree
-
     area, normals = _open_area(mesh, standing)
     place = np.hstack([mesh.vertices[mesh.faces].mean(1), reach * normals])
     far = KDTree(np.hstack([seen.points, reach * seen.normals])).query(place)[0] > reach
@@ -316,9 +295,8 @@ def _unseen_share(mesh: TriangleMesh, seen: Surfels, standing: bool, reach: floa
 
 def _open_area(mesh: TriangleMesh, standing: bool) -> tuple[Float[np.ndarray, "faces"], Float[np.ndarray, "faces 3"]]:
     """Return area [m²] and unit normal of each face. The area of faces on the support at z = 0 is set to zero."""
-    a, b, c = mesh.vertices[mesh.faces].transpose(1, 0, 2)
-    across = np.cross(b - a, c - a)
+    across = scaled_normals(mesh.vertices, mesh.faces)
     length = np.linalg.norm(across, axis=1)
-    foot = (across[:, 2] < -_DOWN * length) & (np.maximum(np.maximum(a, b), c)[:, 2] < MAX_FOOT_HEIGHT_M)
+    foot = (across[:, 2] < -_DOWN * length) & (mesh.vertices[mesh.faces, 2].max(1) < MAX_FOOT_HEIGHT_M)
     normals = across / np.maximum(length, 1e-30)[:, None]
     return 0.5 * np.where(foot & standing, 0.0, length), normals

@@ -11,6 +11,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
+from scipy.spatial import KDTree
 
 from graspd_core.mesh.topology import packed_rows
 from graspd_core.perception.cloud.free_space import FreeSpace, weigh
@@ -167,12 +168,11 @@ class Revolution:
     """The surface made by revolving the seen part about an axis.
 
     Attributes:
-        axis, surfels: axis of revolution, and surfels of the whole surface.
+        surfels: surfels of the whole surface.
         agree, wrong: fractions of the surface that the cameras confirm and contradict.
         share: fraction of the seen points that lie on the surface.
     """
 
-    axis: Axis
     surfels: Surfels
     agree: float
     wrong: float
@@ -198,17 +198,13 @@ def find_revolution(surfels: Surfels, free_space: FreeSpace, step: float) -> Rev
 
 def revolve(surfels: Surfels, free_space: FreeSpace, axis: Axis, step: float) -> Revolution | None:
     """Revolve the seen profile about the axis, without rings that the cameras contradict. Return None if few remain."""
-    from scipy.spatial import KDTree
-
     _, rows = half_plane(surfels, axis)
     fits = turned(rows, step)
     if fits.sum() < MIN_AXIS_POINTS:
         return None
     profile = _profile(rows[fits], step)
-    right = perpendicular(axis.direction)
-    up = np.cross(axis.direction, right)
     row = np.repeat(np.arange(len(profile)), RING_SAMPLES)
-    confirmed, wrong = _confirmed_and_wrong(profile, axis, right, up, free_space)
+    confirmed, wrong = _confirmed_and_wrong(profile, axis, free_space)
     good = np.bincount(row, wrong) / RING_SAMPLES < MAX_CONTRADICTED_SHARE
     if good.sum() < 5:
         return None
@@ -216,12 +212,12 @@ def revolve(surfels: Surfels, free_space: FreeSpace, axis: Axis, step: float) ->
     kept = good[row]
     mean = lambda x: float((x * weight[row] / RING_SAMPLES)[kept].sum())  # noqa: E731
     explained = float((KDTree(profile[good, :2]).query(rows[:, :2])[0] < 2 * step).mean())
-    closed = np.vstack([profile[good], *_ends(profile[good], axis, right, up, free_space, step)])
+    closed = np.vstack([profile[good], *_ends(profile[good], axis, free_space, step)])
     counts = np.maximum(np.ceil(2 * np.pi * closed[:, 1] / step), 3).astype(int)
-    return Revolution(axis, _ring(closed, axis, right, up, counts), mean(confirmed), mean(wrong), explained)
+    return Revolution(_ring(closed, axis, counts), mean(confirmed), mean(wrong), explained)
 
 
-def _ends(profile: Rows, axis: Axis, right, up, free_space: FreeSpace, step: float) -> list[Rows]:
+def _ends(profile: Rows, axis: Axis, free_space: FreeSpace, step: float) -> list[Rows]:
     """Return rows that close each end of the profile that is off the axis: a flat cap, or a curve down to the support.
 
     A cap is added only if the cameras saw empty space beyond the rim. Neither cap nor curve may contradict the cameras.
@@ -243,9 +239,9 @@ def _ends(profile: Rows, axis: Axis, right, up, free_space: FreeSpace, step: flo
             patch = np.column_stack([np.full((n := int(rim[1] / step)), way * end), np.linspace(0.3 * step, rim[1], n)])
             patch = np.column_stack([patch, np.full(n, way), np.zeros(n)])
             beyond = patch[-1:] + np.array([[0.008 * way, 0, 0, 0]])
-            if (_confirmed_and_wrong(beyond, axis, right, up, free_space)[1] > 0.1).mean() < 0.2:
+            if (_confirmed_and_wrong(beyond, axis, free_space)[1] > 0.1).mean() < 0.2:
                 continue
-        if len(patch) and _confirmed_and_wrong(patch, axis, right, up, free_space)[1].mean() < 0.1:
+        if len(patch) and _confirmed_and_wrong(patch, axis, free_space)[1].mean() < 0.1:
             found.append(patch)
     return found
 
@@ -266,8 +262,8 @@ def _foot(rim, way: float, ground: float, step: float) -> Rows:
     return np.column_stack([way * (ground - z), r, -way * slope[:, 0], -slope[:, 1]])
 
 
-def _confirmed_and_wrong(rows: Rows, axis: Axis, right, up, free_space: FreeSpace) -> tuple[np.ndarray, np.ndarray]:
-    ring = _ring(rows, axis, right, up, np.full(len(rows), RING_SAMPLES))
+def _confirmed_and_wrong(rows: Rows, axis: Axis, free_space: FreeSpace) -> tuple[np.ndarray, np.ndarray]:
+    ring = _ring(rows, axis, np.full(len(rows), RING_SAMPLES))
     return weigh(free_space, ring.points, ring.normals)
 
 
@@ -282,12 +278,13 @@ def _profile(rows: Float[np.ndarray, "n 4"], step: float) -> Float[np.ndarray, "
     return mean[count > 1] if (count > 1).sum() > 10 else mean
 
 
-def _ring(profile, axis: Axis, right, up, counts) -> Surfels:
+def _ring(profile: Rows, axis: Axis, counts: Int[np.ndarray, "rows"]) -> Surfels:
     """Turn each profile row about the axis. Return the surfels. `counts` gives the number of surfels for each row."""
+    right = perpendicular(axis.direction)
     rows = np.repeat(np.arange(len(profile)), counts)
     place = np.arange(len(rows)) - np.repeat(np.cumsum(counts) - counts, counts)
     turn = 2 * np.pi * place / np.repeat(counts, counts)
-    outward = np.cos(turn)[:, None] * right + np.sin(turn)[:, None] * up
+    outward = np.cos(turn)[:, None] * right + np.sin(turn)[:, None] * np.cross(axis.direction, right)
     height, radius, along, across = profile[rows].T
     points = axis.point + height[:, None] * axis.direction + radius[:, None] * outward
     normals = along[:, None] * axis.direction + across[:, None] * outward

@@ -10,6 +10,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+from scipy.spatial import KDTree
 
 from graspd_core.config import ReconstructionConfig
 from graspd_core.perception.cloud.free_space import FreeSpace, empty_depth
@@ -47,8 +48,6 @@ class Completion:
 
 def complete_shape(seen: Surfels, free_space: FreeSpace, step: float, settings: ReconstructionConfig) -> Completion:
     """Guess the unseen side by the rule that best explains the seen surface and adds most surface to it."""
-    from scipy.spatial import KDTree
-
     missing = openness(with_foot(seen, free_space, step), step)
     turned = find_revolution(seen, free_space, step)
     if turned is not None and turned.share - FAULT_WEIGHT * turned.wrong > settings.revolution_share:
@@ -85,8 +84,6 @@ def _counts(guess: Surfels, seen: Surfels) -> bool:
 
 def plausible(guess: Surfels, known: Surfels, free_space: FreeSpace, step: float) -> Surfels:
     """Return the guess, thinned to `step` [m], without points that contradict the cameras or repeat known surface."""
-    from scipy.spatial import KDTree
-
     guess = take(guess, empty_depth(free_space, guess.points) < free_space.slack)
     distance, nearest = KDTree(known.points).query(guess.points, distance_upper_bound=3 * step)
     alike = (guess.normals * known.normals[np.minimum(nearest, len(known.points) - 1)]).sum(1) > 0

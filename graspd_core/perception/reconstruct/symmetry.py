@@ -12,6 +12,7 @@ from typing import Any
 
 import numpy as np
 from jaxtyping import Float
+from scipy.spatial import KDTree
 
 from graspd_core.perception.cloud.free_space import FreeSpace, on_seen, weigh
 from graspd_core.perception.cloud.point_cloud import Points, Vector
@@ -164,8 +165,6 @@ def _closes(linear: Float[np.ndarray, "k 3 3"], side: Vector, standing: bool) ->
 
 def _sample(surfels: Surfels) -> _Sample:
     """Return random points and random rim points, by fixed seeds. A rim point has neighbours on one side only."""
-    from scipy.spatial import KDTree
-
     answer: Any = KDTree(surfels.points).query(surfels.points, k=17)
     distance, near = answer
     aside = np.linalg.norm(surfels.points[near[:, 1:]].mean(1) - surfels.points, axis=1)

@@ -17,12 +17,12 @@ from itertools import combinations
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
-from scipy.sparse import coo_matrix
-from scipy.sparse.csgraph import connected_components
 from scipy.spatial import KDTree
 
 from graspd_core.config import SegmentationConfig
-from graspd_core.perception.cloud.point_cloud import Eyes, Points, Vector, convex_hull, least_axes, longest_side
+from graspd_core.mesh.components import connected_parts
+from graspd_core.mesh.convex_parts import convex_hull
+from graspd_core.perception.cloud.point_cloud import Eyes, Points, Vector, least_axes, longest_side
 from graspd_core.perception.segment.planes import FlatPart
 
 # Flying pixels lie along lines of sight between two surfaces. The weight around a flying pixel is below this fraction
@@ -224,8 +224,7 @@ def _bend(
 def _linked(kept: Bool[np.ndarray, "n"], links: Int[np.ndarray, "links 2"]) -> Int[np.ndarray, "n"]:
     """Return the connected component of each kept point, -1 for the other points."""
     one, other = links[kept[links].all(1)].T
-    graph = coo_matrix((np.ones(len(one), dtype=bool), (one, other)), shape=(len(kept), len(kept)))
-    return np.where(kept, connected_components(graph, directed=False)[1], -1)
+    return np.where(kept, connected_parts(len(kept), one, other), -1)
 
 
 def merge_occluded(

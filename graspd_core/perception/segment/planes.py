@@ -10,11 +10,13 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
+from scipy.ndimage import binary_dilation, label
 
 from graspd_core.config import SegmentationConfig
 from graspd_core.errors import Extra
+from graspd_core.mesh.convex_parts import convex_hull
 from graspd_core.mesh.topology import packed_rows
-from graspd_core.perception.cloud.point_cloud import Eyes, Points, Vector, convex_hull, longest_side
+from graspd_core.perception.cloud.point_cloud import Eyes, Points, Vector, longest_side
 from graspd_core.types import Plane
 
 # Greatest number of points for RANSAC, chosen evenly.
@@ -165,8 +167,6 @@ def _measure(
     points: Points, inliers: Bool[np.ndarray, "n"], plane: Plane, noise: float, settings: SegmentationConfig
 ) -> FlatPart | None:
     """Return the largest connected region of the inliers as a flat part, or None if the region has no hull."""
-    from scipy.ndimage import binary_dilation, label
-
     axes = np.linalg.svd(plane.normal[None])[2][1:].T
     rows = np.flatnonzero(inliers)
     flat = points[rows] @ axes

@@ -16,15 +16,7 @@ from graspd_core.errors import CloudError, NoObjectError
 from graspd_core.perception.cloud.camera import MIN_BORDER_POINTS, reaches_image_border
 from graspd_core.perception.cloud.point_cloud import MIN_POINTS, Eyes, PointCloud, Vector
 from graspd_core.perception.cloud.voxel_downsample import Labels, Mask, VoxelScene, voxel_downsample
-from graspd_core.perception.segment.clusters import (
-    extent,
-    heaped_things,
-    link_length,
-    link_points,
-    merge_occluded,
-    renumber,
-    touching_things,
-)
+from graspd_core.perception.segment import clusters
 from graspd_core.perception.segment.planes import find_planes
 from graspd_core.perception.segment.support_plane import Ground, find_ground, stands_on
 from graspd_core.perception.segment.target_selection import (
@@ -95,7 +87,7 @@ def segment(
     parts = _parts(parted, chosen)
     if named:
         chosen = select_part(scene, parts, target, views, settings)
-    if not free and not marked and extent(scene.mean[chosen]) > settings.largest_object:
+    if not free and not marked and clusters.extent(scene.mean[chosen]) > settings.largest_object:
         raise NoObjectError(_nothing(parted))
     found = _cut_out(views, scene, chosen, ground)
     total = sum(len(view.points) for view in found.values())
@@ -127,11 +119,11 @@ def find_things(
     scene, label, most = parted.scene, parted.label, parted.settings.largest_object
     known, found = _candidates(parted), []
     # If a cluster is too large for an object, its parts between seams may be objects.
-    large = [k for k in range(int(label.max(initial=-1)) + 1) if extent(scene.mean[label == k]) > most]
+    large = [k for k in range(int(label.max(initial=-1)) + 1) if clusters.extent(scene.mean[label == k]) > most]
     for k in [*known, *(k for k in large if k not in known)]:
         part = _parts(parted, label == k)
         for mine in (part == number for number in range(int(part.max()) + 1)):
-            if extent(scene.mean[mine]) <= most:
+            if clusters.extent(scene.mean[mine]) <= most:
                 found.append(scene.points[mine[scene.voxel]])
     return tuple(found)
 
@@ -172,25 +164,25 @@ def _parted(views: Sequence[PointCloud], settings: SegmentationConfig, target: T
 
 def _things(scene: VoxelScene, ground: Ground, eyes: Eyes, settings: SegmentationConfig) -> Labels:
     points, distance = scene.mean[ground.left], scene.mean_distance[ground.left]
-    link = link_length(points, settings)
-    found = link_points(points, scene.weight[ground.left], link, settings.neighbour_share)
-    found = merge_occluded(points, distance, found, eyes, link=link, settings=settings, support=ground.support)
+    link = clusters.link_length(points, settings)
+    found = clusters.link_points(points, scene.weight[ground.left], link, settings.neighbour_share)
+    found = clusters.merge_occluded(points, distance, found, eyes, link=link, settings=settings, support=ground.support)
     label = np.full(len(ground.left), -1)
     label[ground.left] = found
     for k in range(int(label.max(initial=-1)) + 1):
         rows = np.flatnonzero(label == k)
         own, part = scene.mean[rows], ground.support
-        small = scene.count[rows].sum() < settings.min_points or extent(own) < settings.smallest_object
+        small = scene.count[rows].sum() < settings.min_points or clusters.extent(own) < settings.smallest_object
         if small or (part is not None and part.height(own).max() < settings.smallest_object):
             label[rows] = -1
-    return renumber(label)
+    return clusters.renumber(label)
 
 
 def _candidates(parted: _Parted) -> list[int]:
     """Return indices of objects of graspable size that stand on the support. If none does, ignore the support."""
     scene, label, settings, part = parted.scene, parted.label, parted.settings, parted.ground.support
     things = {k: label == k for k in range(int(label.max(initial=-1)) + 1)}
-    fits = [k for k, mine in things.items() if extent(scene.mean[mine]) <= settings.largest_object]
+    fits = [k for k, mine in things.items() if clusters.extent(scene.mean[mine]) <= settings.largest_object]
     if part is None:
         return fits
     distance = scene.mean_distance
@@ -263,9 +255,9 @@ def _parts(parted: _Parted, chosen: Mask) -> Labels:
     if support is not None:
         points, eyes = scene.mean[chosen], parted.eyes
         if parted.settings.piled:
-            part[chosen] = heaped_things(points, eyes, scene.size)
+            part[chosen] = clusters.heaped_things(points, eyes, scene.size)
         else:
-            part[chosen] = touching_things(points, eyes, support.height(points), scene.size)
+            part[chosen] = clusters.touching_things(points, eyes, support.height(points), scene.size)
     return part
 
 
@@ -325,7 +317,7 @@ def _nothing(parted: _Parted) -> str:
     scene, label, ground, settings = parted.scene, parted.label, parted.ground, parted.settings
     told = f"cloud: no graspable object among {len(scene.points)} points:"
     if label.max(initial=-1) >= 0:
-        sizes = [extent(scene.mean[label == k]) for k in range(int(label.max()) + 1)]
+        sizes = [clusters.extent(scene.mean[label == k]) for k in range(int(label.max()) + 1)]
         limit = f"longer than largest_object={settings.largest_object:g} m (the shortest {min(sizes):.2f} m)"
         return f"{told} {seen(scene, label)}, {limit}; give the wanted part as a box or a mask"
     flat = ([] if ground.support is None else [ground.support]) + list(ground.background)

@@ -16,7 +16,8 @@ from jaxtyping import Float
 from scipy.spatial import KDTree
 
 from graspd_core.config import SegmentationConfig
-from graspd_core.perception.cloud.point_cloud import Eyes, Points, convex_hull
+from graspd_core.mesh.convex_parts import convex_hull
+from graspd_core.perception.cloud.point_cloud import Eyes, Points
 from graspd_core.perception.cloud.voxel_downsample import Mask, VoxelScene
 from graspd_core.perception.segment.clusters import extent, link_length, link_points
 from graspd_core.perception.segment.planes import FlatPart

@@ -10,7 +10,8 @@ from jaxtyping import Bool, Float
 
 from graspd_core.config import SegmentationConfig
 from graspd_core.errors import CloudError, NoObjectError
-from graspd_core.perception.cloud.point_cloud import PointCloud, Points, Vector, convex_hull
+from graspd_core.mesh.convex_parts import convex_hull
+from graspd_core.perception.cloud.point_cloud import PointCloud, Points, Vector
 from graspd_core.perception.cloud.voxel_downsample import Labels, Mask, VoxelScene
 from graspd_core.perception.segment.clusters import extent
 
