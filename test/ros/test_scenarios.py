@@ -176,8 +176,9 @@ def test_a_cloud_that_tf_does_not_lead_from_is_refused_and_the_node_lives(client
 
 def test_a_client_killed_amid_its_goal_leaves_the_node_serving(client, node, start_python):
     doomed, awaited = start_python("-c", DOOMED), {"asked for the result", "optimise"}
-    while awaited:
-        awaited.discard(doomed.stdout.readline().strip())
+    while awaited and (line := doomed.stdout.readline()):
+        awaited.discard(line.strip())
+    assert not awaited
     assert not client.answers
     doomed.send_signal(signal.SIGKILL)
     assert doomed.wait() == -signal.SIGKILL

@@ -21,7 +21,7 @@ from graspd_ros.node import foreign_ros, log_directory
 LAUNCH = Path(__file__).parents[2] / "graspd_ros" / "launch" / "graspd.launch.py"
 pytestmark = pytest.mark.timeout(300)
 HANDS = {"left": "allegro_left", "right": "allegro_right"}
-FEW = {"num_grasps": 1, "preset": "fast", "deadline": 100.0}
+FEW = {"num_grasps": 1, "preset": "fast", "deadline": 600.0}  # the goals wait until the nodes are ready
 
 
 @pytest.mark.parametrize("package", ["rclpy", "sensor_msgs"])
