@@ -22,17 +22,8 @@ from graspd_core import Box, PointCloud, Sphere, load_scene, preset_names
 from graspd_core.errors import CloudError, GraspdError, MeshError, NoObjectError, ResourceError, TransformError
 from graspd_ros.convert import pose_matrix
 from graspd_ros.error_codes import ErrorCode, RequestError, code_of, sentence_of
-from graspd_ros.inputs import sensor_frames
-from graspd_ros.inputs.request_builder import (
-    MOST_MESH_BYTES,
-    SOURCES,
-    RequestBuilder,
-    Source,
-    SourceInput,
-    check_request,
-    resolve_mesh,
-    settings_of,
-)
+from graspd_ros.inputs import request_builder, sensor_frames
+from graspd_ros.inputs.request_builder import SOURCES, RequestBuilder, check_request, resolve_mesh, settings_of
 from graspd_ros.inputs.sensor_frames import MOST_CLOUD_BYTES, MOST_VIEWS, SensorFrame, Views, cloud_frame, trimmed
 from graspd_ros.parameters import MOST_GRASPS, Settings
 from graspd_ros.request import Request
@@ -417,7 +408,7 @@ def test_no_spelling_leads_out(root: Path, scheme: str, parts: list[str]):
 
 def test_a_mesh_too_large_to_read_is_refused_before_it_is_read(root: Path):
     with (root / "huge.obj").open("wb") as file:
-        file.truncate(MOST_MESH_BYTES + 1)
+        file.truncate(request_builder.MOST_MESH_BYTES + 1)
     with pytest.raises(MeshError, match="at most 100 MB"):
         resolve_mesh("huge.obj", [str(root)])
 
@@ -571,11 +562,11 @@ def test_a_source_without_a_row_is_refused_and_the_rows_are_named(monkeypatch):
 def test_a_source_is_one_row(monkeypatch):
     scene, given = load_scene("shape:box", resolution=16), []
 
-    def from_scanner(asked: SourceInput) -> Request:
+    def from_scanner(asked: request_builder.SourceInput) -> Request:
         given.append((asked.message, asked.settings.num_grasps))
         return asked.request("scanner", SEEN, lambda: scene)
 
-    monkeypatch.setitem(SOURCES, SCANNER, Source("scanner", from_scanner))
+    monkeypatch.setitem(SOURCES, SCANNER, request_builder.Source("scanner", from_scanner))
     message = GraspRequest(source=SCANNER, num_grasps=3, header=Header(frame_id="map"))
     request = intake().from_message("r", Settings(), message)
     assert given == [(message, 3)]
