@@ -159,14 +159,9 @@ def moved_result(result: GraspResult, T_new_old: Matrix) -> GraspResult:
 
 def moved_grasp(grasp: Grasp, T: Matrix) -> Grasp:
     """Return a grasp transformed by `T` to another frame."""
-    return replace(
-        grasp,
-        pregrasp=_moved_posture(grasp.pregrasp, T),
-        grasp=_moved_posture(grasp.grasp, T),
-        squeeze=_moved_posture(grasp.squeeze, T),
-        arrival=None if grasp.arrival is None else _moved_posture(grasp.arrival, T),
-        contacts=tuple(_moved_contact(contact, T) for contact in grasp.contacts),
-    )
+    names = [name for name in ("pregrasp", "grasp", "squeeze", "arrival") if getattr(grasp, name) is not None]
+    postures = {name: _moved_posture(getattr(grasp, name), T) for name in names}
+    return replace(grasp, **postures, contacts=tuple(_moved_contact(contact, T) for contact in grasp.contacts))
 
 
 def moved_plane(plane: Plane, T: Matrix) -> Plane:

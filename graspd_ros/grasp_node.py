@@ -31,21 +31,14 @@ from std_msgs.msg import String
 from std_srvs.srv import Trigger
 
 from graspd_core import hand_names, load_hand, warm_up
-from graspd_core.errors import CloudError, ConfigError, GraspdError
+from graspd_core.errors import ConfigError, GraspdError
 from graspd_core.hands.model import all_joint_names
 from graspd_core.runtime.worker_process import trim_heap
 from graspd_core.transforms import TransformBuffer
 from graspd_ros.convert import nanoseconds
-from graspd_ros.error_codes import ErrorCode, RequestError, code_of, sentence_of
+from graspd_ros.error_codes import ErrorCode, code_of, sentence_of
 from graspd_ros.inputs.request_builder import SOURCES, RequestBuilder
-from graspd_ros.inputs.sensor_frames import (
-    DepthMessage,
-    ImagePairs,
-    SensorFrame,
-    Views,
-    cloud_frame,
-    depth_sensor_frame,
-)
+from graspd_ros.inputs.sensor_frames import DepthMessage, ImagePairs, SensorFrame, cloud_frame, depth_sensor_frame
 from graspd_ros.inputs.sensor_topics import SensorTopic
 from graspd_ros.inputs.solids import SceneObject, updated_objects
 from graspd_ros.inputs.tf_listener import TransformListener, check_arm, heard_robot
@@ -113,7 +106,7 @@ class GraspNode(Node):
             options = QoSOverridingOptions.with_default_policies()
             self.create_subscription(kind, topic, callback, qos, qos_overriding_options=options)
 
-        listen(GraspRequest, "~/request", self._on_request, REQUEST_DEPTH)
+        listen(GraspRequest, "~/request", lambda message: self._take_request(message, "request"), REQUEST_DEPTH)
         listen(String, "~/mesh", self._on_mesh, 10)
         listen(String, "~/cancel", self._on_cancel, REQUEST_DEPTH)
         image = SensorTopic(self, Image, "depth/image_rect", self._on_depth)
@@ -135,7 +128,8 @@ class GraspNode(Node):
         def cancel(request_id: str) -> bool:
             return self._worker.cancel(request_id) > 0
 
-        servers = [GoalServer(self, SynthesizeGrasps, "~/synthesize", SynthesizeMessages, self._on_goal, cancel)]
+        take = lambda goal, listener: self._take_request(goal.request, "goal", listener)  # noqa: E731
+        servers = [GoalServer(self, SynthesizeGrasps, "~/synthesize", SynthesizeMessages, take, cancel)]
         try:
             from grasping_msgs.action import GraspPlanning
 
@@ -165,12 +159,6 @@ class GraspNode(Node):
         name, builder = self._request_builder.new_id("mesh"), self._request_builder
         self._take("mesh", name, lambda settings: builder.from_mesh(name, settings, message.data))
 
-    def _on_request(self, message: GraspRequest) -> None:
-        self._take_request(message, "request", None)
-
-    def _on_goal(self, goal: SynthesizeGrasps.Goal, listener: Listener) -> str:
-        return self._take_request(goal.request, "goal", listener)
-
     def _on_planning_goal(self, goal: Any, listener: Goal) -> str:
         from graspd_ros.grasp_planning import request_from_goal
 
@@ -183,19 +171,14 @@ class GraspNode(Node):
         return name
 
     def _on_points(self, message: PointCloud2) -> None:
-        try:
-            self._see(cloud_frame(message, nanoseconds(self._now())))
-        except RequestError as error:  # the cloud is too large
-            self._responses.cloud_not_taken(self._request_builder.new_id("cloud"), error)
+        self._on_sensor(lambda now: cloud_frame(message, now))
 
     def _on_depth(self, message: DepthMessage | CameraInfo) -> None:
-        try:
+        def paired(now: int) -> SensorFrame | None:
             pair = self._pairs.add(message)
-        except CloudError as error:  # the image is broken
-            self._responses.cloud_not_taken(self._request_builder.new_id("cloud"), error)
-        else:
-            if pair is not None:
-                self._see(depth_sensor_frame(*pair, nanoseconds(self._now())))
+            return None if pair is None else depth_sensor_frame(*pair, now)
+
+        self._on_sensor(paired)
 
     def _on_collision_object(self, message: Any) -> None:
         try:
@@ -213,8 +196,8 @@ class GraspNode(Node):
         return response
 
     def _on_reset(self, _: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
-        cancelled, views = self._worker.cancel(""), len(self._request_builder.views.clouds)
-        self._request_builder.forget()
+        cancelled, views = self._worker.cancel(""), self._request_builder.drop_views()
+        self._request_builder.newest = None
         self._pairs.forget()
         self._responses.forget()
         response.success, response.message = True, f"cancelled {cancelled} requests, dropped {views} views"
@@ -230,8 +213,7 @@ class GraspNode(Node):
         return response
 
     def _on_reset_views(self, _: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
-        response.success, response.message = True, f"dropped {len(self._request_builder.views.clouds)} views"
-        self._request_builder.views = Views()
+        response.success, response.message = True, f"dropped {self._request_builder.drop_views()} views"
         return response
 
     def _watch_sensors(self) -> None:
@@ -262,7 +244,7 @@ class GraspNode(Node):
 
     # Make requests from messages and submit them to the worker.
 
-    def _take_request(self, message: GraspRequest, kind: str, listener: Listener | None) -> str:
+    def _take_request(self, message: GraspRequest, kind: str, listener: Listener | None = None) -> str:
         name, builder = message.id or self._request_builder.new_id(kind), self._request_builder
         source = SOURCES[message.source].name if message.source in SOURCES else "request"
         self._take(source, name, lambda settings: builder.from_message(name, settings, message, listener), listener)
@@ -278,18 +260,20 @@ class GraspNode(Node):
         else:
             self._submit(request)
 
+    def _on_sensor(self, read: Callable[[int], SensorFrame | None]) -> None:
+        try:
+            sensor_frame = read(nanoseconds(self._now()))
+            if sensor_frame is not None:
+                self._see(sensor_frame)
+        except GraspdError as error:
+            self._responses.cloud_not_taken(self._request_builder.new_id("cloud"), error)
+
     def _see(self, sensor_frame: SensorFrame) -> None:
         self._responses.counters.count(RECEIVED)
-        self._request_builder.newest, settings = sensor_frame, self._settings.now
-        if settings.cloud_policy == "off":
-            return
-        request_id = self._request_builder.new_id("cloud")
-        try:
-            request = self._request_builder.from_sensor_frame(request_id, settings, sensor_frame)
-        except GraspdError as error:
-            self._responses.cloud_not_taken(request_id, error)
-        else:
-            self._submit(request)
+        builder, settings = self._request_builder, self._settings.now
+        builder.newest = sensor_frame
+        if settings.cloud_policy != "off":
+            self._submit(builder.from_sensor_frame(builder.new_id("cloud"), settings, sensor_frame))
 
     def _submit(self, request: Request) -> None:
         if self._collision_objects:

@@ -6,20 +6,21 @@ The object stands on the support surface, a plane that the hand must not cross.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import replace
 from typing import Any
 
 from graspd_msgs.msg import Grasp, GraspArray, GraspProgress
 from grasping_msgs.action import GraspPlanning
-from grasping_msgs.msg import Object
 
 from graspd_core import HandModel, Scene, TriangleMesh, load_scene
 from graspd_core.hands.kinematics import RETREAT
 from graspd_core.runtime.worker_process import run_isolated
 from graspd_core.types import joined
-from graspd_ros.convert import array_of
+from graspd_ros.convert import array_of, nanoseconds
 from graspd_ros.error_codes import ErrorCode, RequestError
 from graspd_ros.inputs.request_builder import RequestBuilder
+from graspd_ros.inputs.sensor_frames import cloud_frame
 from graspd_ros.inputs.solids import bad_message, placed_shapes, plane_of, with_support
 from graspd_ros.outputs.moveit import moveit_grasp
 from graspd_ros.parameters import Settings
@@ -82,29 +83,25 @@ def request_from_goal(
     if goal.group_name not in ("", hand):
         fault = f"group_name: unknown hand {goal.group_name[:128]!r}; this node plans for {hand!r}"
         raise RequestError(ErrorCode.WRONG_HAND, fault)
-    target = goal.object
-    plane = plane_of(target.surface)
-    if target.meshes or target.primitives:
-        mesh, header = _solid(target), target.header
-        load = with_support(lambda: _load(mesh, settings), plane)
-        return builder.from_loader(request_id, header, settings, load, listener)
-    cluster = target.point_cluster
-    if not cluster.data:
-        raise bad_message("object", "no meshes, no primitives and no point_cluster; give one of these")
-    header = cluster.header if cluster.header.frame_id else target.header
-    if plane is not None and target.header.frame_id not in ("", header.frame_id):
-        fault = f"surface: frame {target.header.frame_id!r}, point_cluster: {header.frame_id!r}; give both in one frame"
-        raise bad_message("object", fault)
-    cluster.header = header
-    request = builder.from_cluster(request_id, replace(settings, segment=False), cluster, listener)
-    return replace(request, load=with_support(request.load, plane))
-
-
-def _load(mesh: TriangleMesh, settings: Settings) -> Scene:
-    return run_isolated(load_scene, mesh, mass=settings.mass or None, friction=settings.friction)
-
-
-def _solid(target: Object) -> TriangleMesh:
+    target, plane = goal.object, plane_of(goal.object.surface)
+    header, cluster, settings = target.header, target.point_cluster, replace(settings, segment=False)
     if target.meshes:
-        return joined(*placed_shapes("mesh", target.meshes, target.mesh_poses, "object"))
-    return joined(*placed_shapes("primitive", target.primitives, target.primitive_poses, "object"))
+        load = _loader(placed_shapes("mesh", target.meshes, target.mesh_poses, "object"), settings)
+    elif target.primitives:
+        load = _loader(placed_shapes("primitive", target.primitives, target.primitive_poses, "object"), settings)
+    elif not cluster.data:
+        raise bad_message("object", "no meshes, no primitives and no point_cluster; give one of these")
+    else:
+        header = cluster.header = cluster.header if cluster.header.frame_id else target.header
+        given, seen = target.header.frame_id, header.frame_id
+        if plane is not None and given not in ("", seen):
+            fault = f"surface: frame {given!r}, point_cluster: {seen!r}; give both in one frame"
+            raise bad_message("object", fault)
+        load = builder.loader_of(settings, cloud_frame(cluster, nanoseconds(builder.now())))
+    frame, load = header.frame_id or settings.mesh_frame, with_support(load, plane)
+    return builder.request(request_id, "grasp_planning", frame, header.stamp, settings, load, listener=listener)
+
+
+def _loader(shapes: list[TriangleMesh], settings: Settings) -> Callable[[], Scene]:
+    mass, mesh = settings.mass or None, joined(*shapes)
+    return lambda: run_isolated(load_scene, mesh, mass=mass, friction=settings.friction)

@@ -71,6 +71,5 @@ def answer_known(
             found = library_result(library, grasps, count, time.perf_counter() - began)
             return replace(found, mass=entry.mass, tried_mass=entry.mass), None
     scene = request.load()
-    plan |= {"deadline": max(request.time_left(), 1e-3), "count": count}
-    plan |= {"verify": settings.verify, "restrictions": restrictions}
+    plan |= {"deadline": max(request.time_left(), 1e-3), "count": count, "restrictions": restrictions}
     return known_or_planned(library, scene, hand, wanted=lambda grasps: unlike(grasps, excluded), **plan), scene

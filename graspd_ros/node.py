@@ -109,9 +109,8 @@ def probe() -> str:
 
     rclpy.init()
     node = rclpy.create_node("graspd_doctor")
-    node.create_publisher(PoseStamped, "~/probe_pose", 1)
-    node.create_publisher(PointCloud2, "~/probe_points", 1)
-    node.create_publisher(GraspRequest, "~/probe_request", 1)
+    for kind in (PoseStamped, PointCloud2, GraspRequest):
+        node.create_publisher(kind, f"~/probe_{kind.__name__}", 1)
     node.destroy_node()
     rclpy.shutdown()
     return f"{get_rmw_implementation_identifier()}, makes a node"

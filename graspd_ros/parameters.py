@@ -36,14 +36,12 @@ def _setting(
     default: Any,
     description: str,
     *,
-    low: float | None = None,
-    high: float | None = None,
+    limits: tuple[float, float] | None = None,
     choices: Iterable[str] = (),
     check: Callable[[Any], object] | None = None,
     read_only: bool = False,
 ) -> Any:
-    limits = None if low is None else (low, high)
-    metadata = {"description": description, "range": limits, "choices": tuple(choices)}
+    metadata = {"description": description, "limits": limits, "choices": tuple(choices)}
     metadata |= {"check": check, "read_only": read_only}
     if isinstance(default, list):
         return dataclasses.field(default_factory=lambda: list(default), metadata=metadata)
@@ -60,33 +58,25 @@ def _check_device(name: str) -> None:
         raise ConfigError(f"{name!r} is not a device of this machine; valid: {', '.join(valid)}") from None
 
 
-def _check_scene_config(path: str) -> None:
-    if path:
-        load_scene_config(path)
-
-
 def _check_arm(name: str) -> None:
-    if name:
-        from graspd_core import load_arm
-        from graspd_core.arms.arm import from_robot_description, read_arm_file
+    from graspd_core import load_arm
+    from graspd_core.arms.arm import from_robot_description, read_arm_file
 
-        if not from_robot_description(read_arm_file(name)[1]):
-            load_arm(name)
+    if not from_robot_description(read_arm_file(name)[1]):
+        load_arm(name)
 
 
 def _check_library(path: str) -> None:
-    if path:
-        from graspd_core.library.grasp_library import GraspLibrary
+    from graspd_core.library.grasp_library import GraspLibrary
 
-        GraspLibrary(Path(path)).checked()
+    GraspLibrary(Path(path)).checked()
 
 
 def _check_topic(name: str) -> None:
-    if name:
-        try:
-            validate_topic_name(name)
-        except InvalidTopicNameException:
-            raise ConfigError(f"{name!r} is no topic; valid: a name such as /collision_object") from None
+    try:
+        validate_topic_name(name)
+    except InvalidTopicNameException:
+        raise ConfigError(f"{name!r} is no topic; valid: a name such as /collision_object") from None
 
 
 def _check_corner(corner: Any) -> None:
@@ -118,11 +108,10 @@ class Settings:
     torch_threads: int = _setting(
         1,
         "number of threads for optimiser and trials; several are slower on a busy machine",
-        low=1,
-        high=64,
+        limits=(1, 64),
         read_only=True,
     )
-    queue_size: int = _setting(4, "number of requests that may wait", low=0, high=64, read_only=True)
+    queue_size: int = _setting(4, "number of requests that may wait", limits=(0, 64), read_only=True)
     busy_policy: str = _setting("queue", "treatment of a request while the node is busy", choices=BusyPolicy)
     cloud_policy: str = _setting(
         "newest",
@@ -131,10 +120,10 @@ class Settings:
         choices=CLOUD_POLICIES,
     )
     cloud_max_age: float = _setting(
-        5.0, "greatest age of clouds and depth images, older ones are refused [s]; 0: any age", low=0.0, high=1e6
+        5.0, "greatest age of clouds and depth images, older ones are refused [s]; 0: any age", limits=(0.0, 1e6)
     )
     segment: bool = _setting(True, "whether the object is cut out of the cloud; false: clouds show only the object")
-    voxel_size: float = _setting(0.0, "clouds keep one point per cube of this side [m]; 0: all points", low=0, high=1)
+    voxel_size: float = _setting(0.0, "clouds keep one point per cube of this side [m]; 0: all points", limits=(0, 1))
     roi_min: list[float] = _setting(
         [-WORKSPACE] * 3, "lower corner of the workspace, in the frame of the cloud [m]", check=_check_corner
     )
@@ -142,8 +131,7 @@ class Settings:
         [WORKSPACE] * 3, "upper corner of the workspace, in the frame of the cloud [m]", check=_check_corner
     )
     sensor_frame: str = _setting(
-        "",
-        "frame in /tf at whose origin the camera of the clouds is; empty: the frame of the cloud",
+        "", "frame in /tf at whose origin the camera of the clouds is; empty: the frame of the cloud"
     )
     view_point: list[float] = _setting(
         [0.0] * 3,
@@ -154,7 +142,7 @@ class Settings:
         "",
         "path of a yaml file with settings for segmentation, reconstruction and obstacles, as for `--scene`; "
         "empty: the defaults",
-        check=_check_scene_config,
+        check=load_scene_config,
     )
     collision_objects: str = _setting(
         "",
@@ -171,31 +159,31 @@ class Settings:
     )
     fixed_frame: str = _setting("", "frame of the views of ~/add_view, in /tf; empty: the frame of the first view")
     output_frame: str = _setting("", "frame of the results in /tf; empty: the frame of the input")
-    num_grasps: int = _setting(8, "number of grasps to find and verify", low=1, high=MOST_GRASPS)
+    num_grasps: int = _setting(8, "number of grasps to find and verify", limits=(1, MOST_GRASPS))
     preset: str = _setting("balanced", "name of a built-in preset, or path of a preset file", check=load_preset)
     verify: str = _setting("standard", "trials that a grasp must pass", choices=VERIFICATIONS)
-    deadline: float = _setting(60.0, "time limit of a request [s]", low=BUDGETS[0], high=BUDGETS[1])
-    seed: int = _setting(0, "seed of all random draws", low=0, high=2**63 - 1)
+    deadline: float = _setting(60.0, "time limit of a request [s]", limits=BUDGETS)
+    seed: int = _setting(0, "seed of all random draws", limits=(0, 2**63 - 1))
     mass: float = _setting(
-        0.0, "mass of the object [kg]; 0: unknown, the largest likely mass for its volume", low=0.0, high=MASSES[1]
+        0.0, "mass of the object [kg]; 0: unknown, the largest likely mass for its volume", limits=(0.0, MASSES[1])
     )
-    friction: float = _setting(0.6, "friction coefficient between hand and object", low=0.01, high=5.0)
-    mesh_scale: float = _setting(1.0, "metres per unit of a mesh", low=SCALES[0], high=SCALES[1])
+    friction: float = _setting(0.6, "friction coefficient between hand and object", limits=(0.01, 5.0))
+    mesh_scale: float = _setting(1.0, "metres per unit of a mesh", limits=SCALES)
     mesh_frame: str = _setting("object", "frame id of grasps on a mesh if the request gives none: the mesh's frame")
     mesh_roots: list[str] = _setting(
         [".", "package://graspd_ros"], "directories from which meshes may be read: paths or package://NAME"
     )
-    progress_rate: float = _setting(10.0, "greatest rate of progress reports [Hz]", low=0.1, high=10.0)
+    progress_rate: float = _setting(10.0, "greatest rate of progress reports [Hz]", limits=(0.1, 10.0))
     joint_speed: float = _setting(
-        1.0, "greatest speed of the finger joints in a trajectory [rad/s]", low=0.01, high=100.0
+        1.0, "greatest speed of the finger joints in a trajectory [rad/s]", limits=(0.01, 100.0)
     )
-    base_speed: float = _setting(0.05, "greatest speed of the hand's base in a trajectory [m/s]", low=0.001, high=10.0)
+    base_speed: float = _setting(0.05, "greatest speed of the hand's base in a trajectory [m/s]", limits=(0.001, 10.0))
     base_turn: float = _setting(
-        0.5, "greatest angular speed of the hand's base in a trajectory [rad/s]", low=0.01, high=100.0
+        0.5, "greatest angular speed of the hand's base in a trajectory [rad/s]", limits=(0.01, 100.0)
     )
-    shortest_stage: float = _setting(1.0, "least duration of each stage of a trajectory [s]", low=0.01, high=100.0)
+    shortest_stage: float = _setting(1.0, "least duration of each stage of a trajectory [s]", limits=(0.01, 100.0))
     publish_markers: bool = _setting(True, "whether ~/markers shows the result")
-    marker_grasps: int = _setting(1, "number of best grasps that ~/markers shows", low=0, high=MOST_GRASPS)
+    marker_grasps: int = _setting(1, "number of best grasps that ~/markers shows", limits=(0, MOST_GRASPS))
     marker_parts: list[str] = _setting(
         list(USUAL_PARTS), f"what ~/markers shows: any of {', '.join(PARTS)}", check=_check_parts
     )
@@ -318,15 +306,15 @@ def _check_value(name: str, value: Any) -> None:
             raise ConfigError(f"parameter {name}: {value!r}; valid: {text}")
         return
     choices, check, value = setting.metadata["choices"], setting.metadata["check"], _word(setting, value)
-    if _is_number(setting) and not _is_number_like(value):
-        raise ConfigError(f"parameter {name}: {value!r} is no number; valid: a number such as 1.0")
-    if _is_number(setting) and setting.metadata["range"] is not None:
-        low, high = setting.metadata["range"]
+    if _is_number(setting):
+        low, high = setting.metadata["limits"]
+        if not _is_number_like(value):
+            raise ConfigError(f"parameter {name}: {value!r} is no number; valid: a number such as 1.0")
         if not low <= value <= high:
             raise ConfigError(f"parameter {name}: {value!r}; valid: {low:g} to {high:g}")
     if choices and value not in choices:
         raise ConfigError(f"parameter {name}: {value!r} is not one of {', '.join(choices)}")
-    if check is not None:
+    if check is not None and not (value == setting.default == ""):  # by default, "" switches a part of the node off
         try:
             check(value)
         except GraspdError as error:
@@ -365,8 +353,8 @@ def _descriptor(setting: dataclasses.Field) -> ParameterDescriptor:
         dynamic_typing="off" in choices or _is_number(setting) or setting.name in _CORNERS,
         additional_constraints=f"one of {', '.join(choices)}" if choices else "",
     )
-    if setting.metadata["range"] is not None:
-        low, high = setting.metadata["range"]
+    if setting.metadata["limits"] is not None:
+        low, high = setting.metadata["limits"]
         if _is_number(setting):
             descriptor.floating_point_range = [FloatingPointRange(from_value=float(low), to_value=float(high))]
         else:

@@ -108,7 +108,8 @@ def _publishers(node: Any, bag: Path, wanted: Sequence[str]) -> dict[str, tuple[
         qos = QoSProfile(depth=100 if latched else DEPTH, durability=durability)
         publishers[topic.name] = node.create_publisher(kind, topic.name, qos), kind
     if not publishers:
-        raise BagError(f"{bag}: no topic has a type that is installed here; the bag has: {_types(recorded)}")
+        types = ", ".join(f"{topic.name} ({topic.type})" for topic in recorded) or "none"
+        raise BagError(f"{bag}: no topic has a type that is installed here; the bag has: {types}")
     return publishers
 
 
@@ -118,10 +119,6 @@ def _message_type(topic: BagTopic) -> type | None:
         return getattr(importlib.import_module(f"{package}.msg"), name, None)
     except ImportError:
         return None
-
-
-def _types(topics: tuple[BagTopic, ...]) -> str:
-    return ", ".join(f"{topic.name} ({topic.type})" for topic in topics) or "none"
 
 
 def _wait_for_subscriber(publishers: dict[str, tuple[Any, type]], timeout: float, stop: threading.Event) -> None:
@@ -153,11 +150,8 @@ def _shifted(data: bytes, kind: type, start: int, began: int, rate: float) -> An
 
     message = deserialize_message(data, kind)
     for stamped in (message, *getattr(message, "transforms", ())):
-        if hasattr(stamped, "header"):
-            stamp = stamped.header.stamp
-            if not nanoseconds(stamp):
-                continue
-            set_nanoseconds(stamp, max(0, began + round((nanoseconds(stamp) - start) / rate)))
+        if hasattr(stamped, "header") and (stamp := nanoseconds(stamped.header.stamp)):
+            set_nanoseconds(stamped.header.stamp, max(0, began + round((stamp - start) / rate)))
     return message
 
 

@@ -42,9 +42,9 @@ class KnownObject:
     If `required` is True, a missing entry is an error.
     """
 
-    name: str
-    path: str
-    required: bool
+    name: str = ""
+    path: str = ""
+    required: bool = False
 
 
 @dataclass(frozen=True, eq=False)

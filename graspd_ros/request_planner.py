@@ -20,30 +20,17 @@ import torch
 from builtin_interfaces.msg import Time
 from jaxtyping import Float
 
-from graspd_core import HandModel, Scene, load_preset, plan_grasps, save_result
+from graspd_core import Grasp, GraspResult, HandModel, Outcome, Scene, Verdict, load_preset, plan_grasps, save_result
 from graspd_core.config import load_scene_config
 from graspd_core.perception.obstacles import held_hull
 from graspd_core.planning.any_thing import Failure, plan_any_thing, result_of_things
 from graspd_core.planning.any_thing import unlike as unlike_postures
 from graspd_core.planning.plan_grasps import SEEDS
-from graspd_core.types import (
-    Grasp,
-    GraspResult,
-    Outcome,
-    Posture,
-    Progress,
-    ProgressHook,
-    Stage,
-    StopHook,
-    Timing,
-    TriangleMesh,
-    Verdict,
-)
+from graspd_core.types import Posture, Progress, ProgressHook, Stage, StopHook, Timing, TriangleMesh
 from graspd_core.verify.prepared_grasp import arrival, make_metrics_context
 from graspd_core.verify.robustness import begin_in_thread
 from graspd_ros.convert import (
     Matrix,
-    matrix_of,
     matrix_of_posture,
     moved_grasp,
     moved_points,
@@ -150,20 +137,18 @@ class RecentRuns:
         for row, name in enumerate(request.exclude):
             run = self._grasp(name)[0]
             for place, _ in run.planned.objects[:1]:
-                placed = run.T_frame_object @ matrix_of(place, (1.0, 0.0, 0.0, 0.0))
-                places[row] = request.to_object(run.frame, placed, lookup)[:3, 3]
-        grasps = _postures(excluded)
-        return [Failure(place, grasp) for place, grasp in zip(places, grasps, strict=True)]
+                T_object_run = request.to_object(run.frame, run.T_frame_object, lookup)
+                places[row] = moved_points(place[None], T_object_run)[0]
+        return [Failure(*failed) for failed in zip(places, _postures(excluded), strict=True)]
 
     def _grasp(self, name: str) -> tuple[_Run, Grasp]:
         run_id, _, rank = name.rpartition("/")
         run = self._runs.get(run_id)
-        rows = () if run is None else run.grasps
-        found = next((grasp for row, grasp in enumerate(rows) if str(row) == rank), None)
-        if run is None or found is None:
+        found = {} if run is None else {str(row): grasp for row, grasp in enumerate(run.grasps)}
+        if run is None or rank not in found:
             kept = ", ".join(self._runs) or "none"
             raise bad_request(f"exclude: no grasp {name[:128]!r} in the last {MOST_RUNS} runs; kept: {kept}")
-        return run, found
+        return run, found[rank]
 
     def next_best(self, request: Request, excluded: Sequence[Matrix]) -> Planned | None:
         """Return earlier grasps of the same object that are not similar to `excluded`. None if no grasp is left.
@@ -306,32 +291,30 @@ class Planner:
         self, request: Request, excluded: list[Matrix], reach: tuple[Reach, ...], stop: StopHook, report: ProgressHook
     ) -> Planned:
         """Plan grasps, drop those similar to `excluded`, and write the rest to a file if `output_dir` is set."""
-        settings = request.settings
+        settings, objects, arrived = request.settings, (), None
         config = load_preset(settings.preset)
         steering = () if request.steering is None else (request.steering(),)
-        restrictions = (*steering, *reach)
         plan: dict[str, Any] = {"preset": config, "device": settings.device, "progress": report, "stop": stop}
         # Another seed makes grasps similar to the excluded grasps less likely.
-        plan["seed"], objects = (settings.seed + len(excluded)) % SEEDS, ()
+        plan["seed"] = (settings.seed + len(excluded)) % SEEDS
+        plan |= {"restrictions": (*steering, *reach), "verify": settings.verify}
         if request.views is not None:
             failures = self._runs.failures(request, excluded, self._placing(request, stop))
-            plan |= {"restrictions": restrictions, "verify": settings.verify}
             result, scene, objects = _any_object(request, self._hand, failures, **plan)
         elif settings.grasp_library and request.known is not None:
             from graspd_ros.known_objects import answer_known
 
-            result, scene = answer_known(request, request.known, self._hand, excluded, restrictions, **plan)
-            if request.closes_late:
-                scene = scene or request.load()
-                result = replace(result, tried=tuple(map(_arrivals(scene, self._hand), result.tried)))
+            result, scene = answer_known(request, request.known, self._hand, excluded, **plan)
         else:
             scene = request.load()
-            arrived = _arrivals(scene, self._hand) if request.closes_late else lambda grasp: grasp
-            plan["progress"] = lambda progress: report(_with_found(progress, arrived))
-            plan |= {"deadline": max(request.time_left(), 1e-3), "restrictions": restrictions}
-            count = settings.num_grasps + len(excluded)
-            result = plan_grasps(scene, self._hand, count=count, verify=settings.verify, **plan)
-            result = replace(result, tried=tuple(map(arrived, result.tried)))
+            if request.closes_late:
+                arrived = _arrivals(scene, self._hand)
+                plan["progress"] = lambda progress, arrived=arrived: report(_with_found(progress, arrived))
+            plan |= {"deadline": max(request.time_left(), 1e-3), "count": settings.num_grasps + len(excluded)}
+            result = plan_grasps(scene, self._hand, **plan)
+        if request.closes_late and result.tried:
+            scene = scene or request.load()
+            result = replace(result, tried=tuple(map(arrived or _arrivals(scene, self._hand), result.tried)))
         if excluded:
             result = without(result, excluded, settings.num_grasps)
         # The mass of an object that the request names is the library's. Of a mesh it is assumed, as without library.
@@ -366,8 +349,6 @@ def _any_object(
     things = plan_any_thing(views, hand, failures=failures, **about, **plan)
     result = result_of_things(things, settings.seed)
     scene = next((thing.scene for thing in things if thing.scene is not None), None)
-    if scene is not None and request.closes_late:
-        result = replace(result, tried=tuple(map(_arrivals(scene, hand), result.tried)))
     result = replace(result, warnings=(*told, *result.warnings))
     return result, scene, tuple((thing.place, thing.reason) for thing in things)
 

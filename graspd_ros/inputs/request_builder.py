@@ -10,6 +10,7 @@ import itertools
 import re
 import time
 from collections.abc import Callable, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
@@ -21,9 +22,8 @@ from builtin_interfaces.msg import Time
 from geometry_msgs.msg import Pose
 from graspd_msgs.msg import GraspRequest
 from jaxtyping import Float
-from sensor_msgs.msg import Image, PointCloud2
+from sensor_msgs.msg import Image
 from shape_msgs.msg import SolidPrimitive
-from std_msgs.msg import Header
 
 from graspd_core import Box, NearPoints, PointCloud, Scene, Sphere, Steering, Target, load_scene, preset_names
 from graspd_core.errors import MeshError
@@ -46,6 +46,7 @@ MOST_MESH_BYTES = 10**8  # an OBJ file of about 1.5 million faces. Reading a lar
 MOST_PATH = 4096
 _FORMS = "a path, file:///path or package://package/path"
 _ID = re.compile(rf"[A-Za-z0-9_.:@+-]{{1,{MOST_ID}}}")
+Load = Callable[[], Scene]
 _OF_ONE_CLOUD = (GraspRequest.CLOUD, GraspRequest.LATEST_CLOUD)
 # An angle of 0 in a message means the default of `Steering`.
 _DEFAULTS = Steering()
@@ -69,7 +70,7 @@ class RequestBuilder:
         self.missing: Mapping[str, str] = {}
         self.views = Views()
         self._hand = hand
-        self._now = now
+        self.now = now
         self.lookup = lookup
         self.lookup_in_time = lookup_in_time or lookup
         self._numbers = itertools.count(1)
@@ -79,16 +80,17 @@ class RequestBuilder:
         """Return a new id that begins with `kind`. Ids name output files, so they stay unique after a restart."""
         return f"{kind}-{self._started}-{next(self._numbers)}"
 
-    def forget(self) -> None:
-        """Delete the newest sensor frame and the views."""
-        self.newest, self.views = None, Views()
+    def drop_views(self) -> int:
+        """Delete the views. Return their number."""
+        dropped, self.views = len(self.views.clouds), Views()
+        return dropped
 
     def latest(self, settings: Settings) -> SensorFrame:
         """Return the newest sensor frame. Raises RequestError: no frame has arrived, or the newest frame is too old."""
         if self.newest is None:
             why = "".join(f"; {reason}" for reason in self.missing.values())
             raise RequestError(ErrorCode.NO_CLOUD, f"no cloud or depth image has arrived yet{why}")
-        self.newest.check(nanoseconds(self._now()), settings.cloud_max_age)
+        self.newest.check(nanoseconds(self.now()), settings.cloud_max_age)
         return self.newest
 
     def add_view(self, settings: Settings) -> None:
@@ -101,13 +103,12 @@ class RequestBuilder:
 
     def from_mesh(self, request_id: str, settings: Settings, uri: str) -> Request:
         """Return the request for a mesh given only by its path. Raises MeshError: the path is not usable."""
-        path = resolve_mesh(uri, settings.mesh_roots)
-        load, known = mesh_loader(path, settings), known_mesh(path, settings)
-        return Request(request_id, "mesh", settings.mesh_frame, self._now(), settings, load, timeless=True, known=known)
+        load, known = mesh_source(resolve_mesh(uri, settings.mesh_roots), settings)
+        return self.request(request_id, "mesh", settings.mesh_frame, Time(), settings, load, known=known)
 
     def from_sensor_frame(self, request_id: str, settings: Settings, sensor_frame: SensorFrame) -> Request:
         """Return the request for a sensor frame without a GraspRequest. Raises RequestError: the frame is unusable."""
-        load = self._frame_loader(settings, sensor_frame)
+        load = self.loader_of(settings, sensor_frame)
         newest = settings.cloud_policy == "newest"
         return Request(request_id, "cloud", sensor_frame.frame, sensor_frame.stamp, settings, load, only_newest=newest)
 
@@ -123,12 +124,10 @@ class RequestBuilder:
             raise bad_request("any_object: the parameter segment is false; set segment to true to see several objects")
         settings = settings_of(message, settings)
         source = source_of(message)
-        given = SourceInput(request_id, source.name, message, settings, listener, self._now(), self)
-        request = source.find(given)
-        steering, exclude = self._steering(message, request), tuple(message.exclude)
+        request = source.find(SourceInput(request_id, source.name, message, settings, listener, self))
+        request = replace(request, steering=self._steering(message, request), closes_late=message.closes_late)
         lost = [(pose.header.frame_id, pose_matrix(pose.pose, "exclude_poses")) for pose in message.exclude_poses]
-        fields = {"steering": steering, "exclude": exclude, "exclude_poses": tuple(lost)}
-        return replace(request, closes_late=message.closes_late, **fields)
+        return replace(request, exclude=tuple(message.exclude), exclude_poses=tuple(lost))
 
     def _steering(self, message: GraspRequest, request: Request) -> Callable[[], Steering] | None:
         """Check the constraint fields. Return a function that makes the constraints, or None without constraints."""
@@ -151,25 +150,17 @@ class RequestBuilder:
             return seen
         return lambda: replace(seen(), region=NearPoints(region_points()))
 
-    def from_loader(
-        self, request_id: str, header: Header, settings: Settings, load: Callable[[], Scene], listener: Listener | None
+    def request(
+        self, request_id: str, source: str, frame: str, stamp: Time, settings: Settings, load: Load, **fields: Any
     ) -> Request:
-        """Return the request for a GraspPlanning object. If the header has no frame, use the parameter `mesh_frame`."""
-        timeless = nanoseconds(header.stamp) == 0
-        stamp = self._now() if timeless else header.stamp
-        frame = header.frame_id or settings.mesh_frame
-        more = {"listener": listener, "timeless": timeless}
-        return Request(request_id, "grasp_planning", frame, stamp, settings, load, **more)
+        """Return the request for an object in a frame. A zero stamp means now. `fields` set other fields of Request."""
+        timeless = nanoseconds(stamp) == 0
+        stamp = self.now() if timeless else stamp
+        return Request(request_id, source, frame, stamp, settings, load, timeless=timeless, **fields)
 
-    def from_cluster(
-        self, request_id: str, settings: Settings, cloud: PointCloud2, listener: Listener | None
-    ) -> Request:
-        """Return the request for a cloud of one object. Raises RequestError: the cloud is too large or too old."""
-        load = self._frame_loader(settings, cloud_frame(cloud, nanoseconds(self._now())))
-        return self.from_loader(request_id, cloud.header, settings, load, listener)
-
-    def _frame_loader(self, settings: Settings, frame: SensorFrame) -> Callable[[], Scene]:
-        frame.check(nanoseconds(self._now()), settings.cloud_max_age)
+    def loader_of(self, settings: Settings, frame: SensorFrame) -> Load:
+        """Return a function that makes a scene from a sensor frame. Raises RequestError: the frame is unusable."""
+        frame.check(nanoseconds(self.now()), settings.cloud_max_age)
         return frame_loader(frame, settings, place_of(settings), self.lookup_in_time)
 
 
@@ -200,7 +191,12 @@ def check_request(message: GraspRequest, hand: str) -> None:
             given = (message.mesh_uri or message.known_object)[:MOST_PATH]
             fault = f"given with {given}, a mesh; valid with CLOUD=0, LATEST_CLOUD=2 and VIEWS=3"
             raise bad_request(f"target_point: {fault}")
-    _check_camera_and_mask(message)
+    if message.use_view_point:
+        near(message.view_point, "view_point")
+    if message.target_mask.height and (message.use_target_point or message.alone):
+        other = "target_point" if message.use_target_point else "alone"
+        raise bad_request(f"target_mask: cannot be combined with {other}; remove one of them")
+    _check_mask_source(message, "target_mask")
     _check_any_object(message)
     if message.source not in (GraspRequest.MESH, GraspRequest.KNOWN) and any(message.surface.coef):
         raise bad_request(f"surface: source is {message.source}, a cloud; valid sources: MESH=1, KNOWN=4")
@@ -213,28 +209,19 @@ def check_request(message: GraspRequest, hand: str) -> None:
         raise bad_request(f"exclude: {counts}; valid: at most {MOST_EXCLUDED} together")
 
 
-def _check_camera_and_mask(message: GraspRequest) -> None:
-    if message.use_view_point:
-        near(message.view_point, "view_point")
-    if message.target_mask.height and (message.use_target_point or message.alone):
-        other = "target_point" if message.use_target_point else "alone"
-        raise bad_request(f"target_mask: cannot be combined with {other}; remove one of them")
-    _check_mask_source(message, "target_mask", message.target_mask.height)
-
-
 def _check_any_object(message: GraspRequest) -> None:
     if not message.any_object:
         return
-    given = {"use_target_point": message.use_target_point, "alone": message.alone}
-    given["target_mask"] = message.target_mask.height > 0
+    masked = message.target_mask.height > 0
+    given = {"use_target_point": message.use_target_point, "alone": message.alone, "target_mask": masked}
     for other in (name for name, value in given.items() if value):
         raise bad_request(f"any_object: {other} is given too and selects an object; remove one of them")
     if message.source in (GraspRequest.MESH, GraspRequest.KNOWN):
         raise bad_request(f"any_object: source is {message.source}; valid sources: CLOUD=0, LATEST_CLOUD=2, VIEWS=3")
 
 
-def _check_mask_source(message: GraspRequest, name: str, height: int) -> None:
-    if height and message.source not in _OF_ONE_CLOUD:
+def _check_mask_source(message: GraspRequest, name: str) -> None:
+    if getattr(message, name).height and message.source not in _OF_ONE_CLOUD:
         raise bad_request(f"{name}: source is {message.source}; valid sources: CLOUD=0, LATEST_CLOUD=2")
 
 
@@ -275,9 +262,7 @@ def steering_of(message: GraspRequest, T_object_header: Matrix) -> Steering:
     boxes = zip(message.avoid, message.avoid_poses, strict=True)
     avoid = [_box("avoid", solid, pose, T_object_header) for solid, pose in boxes]
     direction = np.array(unit_vector("approach_direction", given)) if given else None
-    zero = None
-    if message.use_roll and direction is not None:
-        zero = rotation @ zero_of_roll(direction)
+    zero = rotation @ zero_of_roll(direction) if message.use_roll and direction is not None else None
     return Steering(
         approach_direction=None if direction is None else rotation @ direction,
         approach_angle=message.approach_angle or _DEFAULTS.approach_angle,
@@ -297,7 +282,7 @@ def _check(message: GraspRequest) -> None:
         raise bad_request("roll: use_roll is false; set use_roll to true")
     if message.region_mask.height and message.region.dimensions:
         raise bad_request("region_mask: region is given too; remove one of them")
-    _check_mask_source(message, "region_mask", message.region_mask.height)
+    _check_mask_source(message, "region_mask")
     if len(message.avoid) != len(message.avoid_poses) or len(message.avoid) > MOST_BOXES:
         counts = f"{len(message.avoid)} boxes, {len(message.avoid_poses)} poses"
         raise bad_request(f"avoid: {counts}; valid: one pose for each box, at most {MOST_BOXES} boxes")
@@ -342,15 +327,12 @@ class SourceInput:
     message: GraspRequest
     settings: Settings
     listener: Listener | None
-    now: Time
     builder: RequestBuilder
 
-    def request(self, frame: str, stamp: Time, load: Callable[[], Scene], **fields: Any) -> Request:
-        """Return the request for an object in a frame. A zero stamp means now. `fields` set other fields of Request."""
-        timeless = nanoseconds(stamp) == 0
-        fields |= {"listener": self.listener, "timeless": timeless}
-        stamp = self.now if timeless else stamp
-        return Request(self.request_id, self.source, frame, stamp, self.settings, load, **fields)
+    def request(self, frame: str, stamp: Time, load: Load, **fields: Any) -> Request:
+        """Return `RequestBuilder.request` of this input."""
+        about = self.request_id, self.source, frame, stamp, self.settings, load
+        return self.builder.request(*about, listener=self.listener, **fields)
 
 
 @dataclass(frozen=True)
@@ -364,15 +346,11 @@ class Source:
     find: Callable[[SourceInput], Request]
 
 
-def mesh_loader(path: Path, settings: Settings) -> Callable[[], Scene]:
-    """Return a function that loads a mesh as a scene."""
+def mesh_source(path: Path, settings: Settings, *, required: bool = False) -> tuple[Load, KnownObject | None]:
+    """Return a function that loads a mesh as a scene, and the mesh's key in the library. None without a library."""
     mass, friction, scale = settings.mass or None, settings.friction, settings.mesh_scale
-    return lambda: run_isolated(load_scene, str(path), mass=mass, friction=friction, scale=scale)
-
-
-def known_mesh(path: Path, settings: Settings) -> KnownObject | None:
-    """Return the library key of a mesh, or None if the node has no library."""
-    return KnownObject("", str(path), False) if settings.grasp_library else None
+    load = lambda: run_isolated(load_scene, str(path), mass=mass, friction=friction, scale=scale)  # noqa: E731
+    return load, KnownObject(path=str(path), required=required) if settings.grasp_library else None
 
 
 def frame_loader(
@@ -382,7 +360,7 @@ def frame_loader(
     lookup: Lookup,
     point: Callable[[], Float[np.ndarray, "3"] | None] = lambda: None,
     mask: Image | None = None,
-) -> Callable[[], Scene]:
+) -> Load:
     """Return a function that makes a scene from one sensor frame. The worker's thread calls `lookup` and `point`.
 
     `point` returns a point [m] on or near the target object, in the frame of the points, or None. If `mask` is
@@ -414,20 +392,21 @@ def frame_views(frame: SensorFrame, settings: Settings, place: CameraPlace, look
 
 
 def _from_cloud(given: SourceInput) -> Request:
-    frame = cloud_frame(given.message.cloud, nanoseconds(given.now))
+    now = nanoseconds(given.builder.now())
+    frame = cloud_frame(given.message.cloud, now)
     if given.message.cloud.data:  # an empty cloud gets a more specific error later
-        frame.check(nanoseconds(given.now), given.settings.cloud_max_age)
+        frame.check(now, given.settings.cloud_max_age)
     return _of_frame(given, frame)
 
 
 def _from_mesh(given: SourceInput) -> Request:
-    settings = given.settings
+    settings, required = given.settings, given.message.source == GraspRequest.KNOWN
     path = resolve_mesh(given.message.mesh_uri, settings.mesh_roots)
     # Equal keys mean: same unchanged file, scale, mass and friction.
     about = path.stat()
     file = f"{path} {about.st_mtime_ns} {about.st_size}"
     key = f"mesh {file} {settings.mesh_scale} {settings.mass} {settings.friction}"
-    found = _placed(given, mesh_loader(path, settings), key, known_mesh(path, settings))
+    found = _placed(given, key, *mesh_source(path, settings, required=required))
     if found.surface is None:
         return found
     # Grasps of an earlier run are reused only on the same support surface.
@@ -440,16 +419,15 @@ def _from_known(given: SourceInput) -> Request:
     if not settings.grasp_library:
         raise bad_request("source: KNOWN=4 needs a library; set the parameter grasp_library")
     if not message.known_object:
-        found = _from_mesh(given)
-        return replace(found, known=found.known and replace(found.known, required=True))
+        return _from_mesh(given)
     # Import here, so that a node without a library does not load this module.
     from graspd_ros.known_objects import named_loader
 
-    known = KnownObject(message.known_object, "", True)
-    return _placed(given, named_loader(known, settings), f"known {message.known_object}", known)
+    known = KnownObject(message.known_object, required=True)
+    return _placed(given, f"known {message.known_object}", named_loader(known, settings), known)
 
 
-def _placed(given: SourceInput, load: Callable[[], Scene], key: str, known: KnownObject | None) -> Request:
+def _placed(given: SourceInput, key: str, load: Load, known: KnownObject | None) -> Request:
     message = given.message
     header, pose = message.header, pose_matrix(message.object_pose)
     surface = plane_of(message.surface, np.linalg.inv(pose))
@@ -509,15 +487,11 @@ def _of_frame(given: SourceInput, frame: SensorFrame) -> Request:
     key = ""
     if nanoseconds(frame.stamp) and mask is None:
         aim = f"{message.header.frame_id} {message.target_point}" if message.use_target_point else ""
-        key = f"{frame.kind} {frame.frame} {nanoseconds(frame.stamp)} {frame.content()} {aim} {place} {_cut(given)}"
+        key = f"{frame.kind} {frame.frame} {nanoseconds(frame.stamp)} {frame.content()} {aim} {place}"
+        used = given.settings  # these settings decide which object a cloud shows
+        key += f" {used.segment} {used.mass} {used.friction} {used.roi_min} {used.roi_max} {used.voxel_size}"
+        key += f" {used.scene_config}"
     return given.request(frame.frame, frame.stamp, load, object_key=key, region_points=region_points)
-
-
-def _cut(given: SourceInput) -> str:
-    """Return, as text, the settings that decide which object a cloud shows."""
-    used = given.settings
-    workspace = f"{used.roi_min} {used.roi_max} {used.voxel_size}"
-    return f"{used.segment} {used.mass} {used.friction} {workspace} {used.scene_config}"
 
 
 def _region_points(frame: SensorFrame, mask: Image) -> Float[np.ndarray, "points 3"]:
@@ -569,13 +543,9 @@ def _allowed_roots(roots: Sequence[str]) -> list[Path]:
     """Return the existing directories of `mesh_roots`, with links resolved."""
     found = []
     for root in roots:
-        try:
-            path = _local_path(root).expanduser().resolve()
-        except MeshError:
-            continue  # the package is not installed
-        if path.is_dir():
-            found.append(path)
-    return found
+        with suppress(MeshError):  # the package is not installed
+            found.append(_local_path(root).expanduser().resolve())
+    return [path for path in found if path.is_dir()]
 
 
 def _local_path(uri: str) -> Path:

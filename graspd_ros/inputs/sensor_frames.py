@@ -22,15 +22,7 @@ from sensor_msgs.msg import CameraInfo, CompressedImage, Image, PointCloud2
 
 from graspd_core import PointCloud, Scene, Target, cloud_from_depth, load_preset, scene_from_views
 from graspd_core.config import load_scene_config
-from graspd_core.io.messages import (
-    ORIGIN,
-    CameraPlace,
-    depth_and_camera,
-    frame_fault,
-    image_size,
-    no_lookup,
-    pixels_from_message,
-)
+from graspd_core.io.messages import CameraPlace, depth_and_camera, frame_fault, image_size, pixels_from_message
 from graspd_core.perception.cloud.camera import camera_rays
 from graspd_core.perception.cloud.point_cloud import crop, transform_cloud
 from graspd_core.perception.cloud.voxel_downsample import unit_hint
@@ -40,7 +32,6 @@ from graspd_ros.convert import Matrix, array_of, nanoseconds
 from graspd_ros.error_codes import ErrorCode, RequestError, bad_request
 from graspd_ros.parameters import WORKSPACE, Settings
 
-CLOUD = "cloud"  # `kind` of a SensorFrame from a cloud message, which does not contain the camera's position
 Pixels = Float[np.ndarray, "height width 3"]
 # Function that returns `T_target_source` at a time. May raise a TransformError.
 Lookup = Callable[[str, str, Time], Matrix]
@@ -112,17 +103,15 @@ def cloud_frame(message: PointCloud2, arrived: int) -> SensorFrame:
         fault = f"the cloud has {len(message.data)} bytes; valid: at most {MOST_CLOUD_BYTES}"
         raise RequestError(ErrorCode.BAD_CLOUD, fault)
     header = message.header
-    read = lambda place=ORIGIN, lookup=no_lookup: place.cloud(message, lookup)  # noqa: E731
+    read = lambda place, lookup: place.cloud(message, lookup)  # noqa: E731
     pixels, content = partial(pixels_from_message, message), partial(_content, message, message.fields)
-    return SensorFrame(CLOUD, header.frame_id, header.stamp, arrived, read, pixels, content)
+    return SensorFrame("cloud", header.frame_id, header.stamp, arrived, read, pixels, content)
 
 
 def depth_sensor_frame(image: DepthMessage, info: CameraInfo, arrived: int) -> SensorFrame:
     """Return the sensor frame of a depth image with calibration that arrived at `arrived` [ns]."""
-
-    def read(place: CameraPlace = ORIGIN, lookup: object = None) -> PointCloud:
-        # The camera of a depth image is at the origin of its frame.
-        return cloud_from_depth(*depth_and_camera(image, info, rectified=True))
+    # The camera of a depth image is at the origin of its frame.
+    read = lambda *_: cloud_from_depth(*depth_and_camera(image, info, rectified=True))  # noqa: E731
 
     def pixels() -> Pixels:
         depth, camera = depth_and_camera(image, info, rectified=True)
@@ -159,22 +148,20 @@ class ImagePairs:
             self._infos.move_to_end(kind)
             while len(self._infos) > MOST_CALIBRATIONS:
                 self._infos.popitem(last=False)
-            image, self._waiting = self._waiting, None
+            if self._waiting is None:
+                return None
+            message = self._waiting
         else:
             if not self._images:
                 self._alone_since = self._clock()
             self._images += 1
-            image = message
-        if image is None:
-            return None
-        kind = _kind(image)
+        kind = _kind(message)
+        self._waiting = message
         info = self._infos.get(kind) or self._infos.get(("", *kind[1:]))
         if info is None:
-            self._waiting = image
             return None
-        self._images = self._calibrations = 0
-        self._waiting = None
-        return image, info
+        self.forget()
+        return message, info
 
     def forget(self) -> None:
         """Delete the image that waits. Calibrations stay, because many cameras send them only once."""

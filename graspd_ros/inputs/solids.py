@@ -172,19 +172,16 @@ def with_collision_objects(request: Request, lookup: FrameLookup) -> Request:
 
     `lookup` transforms between frames at the request's time. Raises TransformError: an object's frame is unknown.
     """
-    settings, load = request.settings, request.load
-    placed = {name: _placed_shapes(name, kept, request, lookup) for name, kept in request.collision_objects.items()}
+    settings, load, placed = request.settings, request.load, dict[str, list[TriangleMesh]]()
+    for name, neighbour in request.collision_objects.items():
+        try:
+            T = request.to_object(neighbour.frame, neighbour.T_frame_object, lookup)
+        except TransformError as error:
+            raise TransformError(f"collision object {name!r}: {error}") from None
+        placed[name] = [moved_mesh(shape, T) for shape in neighbour.shapes]
 
     def loaded() -> Scene:
         config = load_scene_config(settings.scene_config) if settings.scene_config else SceneConfig()
         return with_neighbours(load(), placed, config)
 
     return replace(request, load=loaded, solids=placed)
-
-
-def _placed_shapes(name: str, neighbour: SceneObject, request: Request, lookup: FrameLookup) -> list[TriangleMesh]:
-    try:
-        T = request.to_object(neighbour.frame, neighbour.T_frame_object, lookup)
-    except TransformError as error:
-        raise TransformError(f"collision object {name!r}: {error}") from None
-    return [moved_mesh(shape, T) for shape in neighbour.shapes]

@@ -17,6 +17,7 @@ import math
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from builtin_interfaces.msg import Time
@@ -30,22 +31,11 @@ from std_msgs.msg import ColorRGBA, Header
 from trajectory_msgs.msg import JointTrajectory, JointTrajectoryPoint
 from visualization_msgs.msg import Marker, MarkerArray
 
-from graspd_core import HandModel
+from graspd_core import ArmPath, Grasp, HandModel, Outcome, Posture, Progress, Verdict
 from graspd_core.errors import ConfigError
 from graspd_core.hands.kinematics import RETREAT, link_poses
 from graspd_core.hands.model import Mount, Primitive, all_joint_names, all_joint_positions
-from graspd_core.types import (
-    ArmPath,
-    Contact,
-    Grasp,
-    GraspResult,
-    Outcome,
-    Posture,
-    Progress,
-    Stage,
-    TrialResult,
-    Verdict,
-)
+from graspd_core.types import Contact, Stage
 from graspd_ros.convert import (
     Matrix,
     duration_of,
@@ -58,14 +48,12 @@ from graspd_ros.convert import (
 )
 from graspd_ros.error_codes import ErrorCode
 
+if TYPE_CHECKING:
+    from graspd_ros.request_planner import Planned
+
 UNMEASURED = -1.0
-VERDICTS = {
-    Verdict.UNVERIFIED: GraspMessage.UNVERIFIED,
-    Verdict.VERIFIED: GraspMessage.VERIFIED,
-    Verdict.FAILED: GraspMessage.FAILED,
-}
-# Error codes of outcomes that do not fulfil the request.
-_SHORT = {
+_CODES = {
+    Outcome.SUCCEEDED: ErrorCode.NONE,
     Outcome.TOO_FEW: ErrorCode.NO_GRASP,
     Outcome.NO_CANDIDATES: ErrorCode.NO_GRASP,
     Outcome.DEADLINE: ErrorCode.DEADLINE,
@@ -109,30 +97,21 @@ class Pace:
 
 @dataclass(frozen=True)
 class AnswerEnding:
-    """Outcome of a request, for a GraspArray. The grasps of `result` are in the answer's frame.
-
-    `mass` is the object's mass for planning and trials [kg], 0 if unknown. `mass_assumed`: no mass was given.
-    For a request for any object, `objects` has each object's position [m], and the reason if no grasp is verified.
-    """
+    """Outcome of a request, for a GraspArray. `planned` is None if the request was not worked on."""
 
     status: int
     code: ErrorCode
     message: str
-    result: GraspResult | None = None
-    mass: float = 0.0
-    mass_assumed: bool = False
-    objects: Sequence[tuple[np.ndarray, str]] = ()
+    planned: Planned | None = None
 
 
-def ending_of(result: GraspResult) -> AnswerEnding:
+def ending_of(planned: Planned) -> AnswerEnding:
     """Return status, error code and message for the GraspArray of a planning result."""
-    message = result.message or result.outcome.value
-    if result.outcome is Outcome.SUCCEEDED:
-        return AnswerEnding(GraspArray.SUCCEEDED, ErrorCode.NONE, message, result)
-    if result.outcome is Outcome.CANCELLED:
-        return AnswerEnding(GraspArray.CANCELLED, ErrorCode.CANCELLED, message, result)
+    result = planned.result
     some = any(grasp.verdict is not Verdict.FAILED for grasp in result.tried)
-    return AnswerEnding(GraspArray.PARTIAL if some else GraspArray.FAILED, _SHORT[result.outcome], message, result)
+    ends = {Outcome.SUCCEEDED: GraspArray.SUCCEEDED, Outcome.CANCELLED: GraspArray.CANCELLED}
+    status = ends.get(result.outcome, GraspArray.PARTIAL if some else GraspArray.FAILED)
+    return AnswerEnding(status, _CODES[result.outcome], result.message or result.outcome.value, planned)
 
 
 def array_message(
@@ -145,34 +124,25 @@ def array_message(
         status=ending.status,
         error_code=str(ending.code),
         message=ending.message,
-        mass=_number(ending.mass, 0.0),
-        mass_assumed=ending.mass_assumed,
         elapsed=elapsed,
-        objects=[point_of(place) for place, _ in ending.objects],
-        object_reasons=[reason for _, reason in ending.objects],
     )
-    if ending.result is not None:
-        message.outcome = ending.result.outcome.name.lower()
-        message.warnings = list(ending.result.warnings)
-        if ending.result.next_view is not None:
-            message.next_view = PoseStamped(header=header, pose=pose_of_matrix(ending.result.next_view))
-        ranked = enumerate(ending.result.tried)
+    if ending.planned is not None:
+        planned, result = ending.planned, ending.planned.result
+        message.mass, message.mass_assumed = _number(planned.mass, 0.0), planned.mass_assumed
+        message.objects = [point_of(place) for place, _ in planned.objects]
+        message.object_reasons = [reason for _, reason in planned.objects]
+        message.outcome, message.warnings = result.outcome.name.lower(), list(result.warnings)
+        if result.next_view is not None:
+            message.next_view = PoseStamped(header=header, pose=pose_of_matrix(result.next_view))
         message.grasps = [
-            grasp_message(grasp, rank, request_id, header, hand, pace, mass=ending.result.tried_mass)
-            for rank, grasp in ranked
+            grasp_message(grasp, rank, request_id, header, hand, pace, mass=result.tried_mass)
+            for rank, grasp in enumerate(result.tried)
         ]
     return message
 
 
 def grasp_message(
-    grasp: Grasp,
-    rank: int,
-    request_id: str,
-    header: Header,
-    hand: HandModel,
-    pace: Pace,
-    *,
-    mass: float | None = None,
+    grasp: Grasp, rank: int, request_id: str, header: Header, hand: HandModel, pace: Pace, *, mass: float | None = None
 ) -> GraspMessage:
     """Return one grasp in the header's frame. Raises FloatingPointError if the grasp contains a NaN.
 
@@ -184,7 +154,7 @@ def grasp_message(
         header=header,
         id=f"{request_id}/{rank}",
         rank=rank,
-        verdict=VERDICTS[grasp.verdict],
+        verdict=getattr(GraspMessage, grasp.verdict.name),
         reason=grasp.reason,
         hand=hand.name,
         base_link=hand.base_link,
@@ -200,7 +170,16 @@ def grasp_message(
             for name, value in (grasp.metrics or {}).items()
             if value is not None and math.isfinite(value)
         ],
-        trials=[_trial(trial) for trial in grasp.trials],
+        trials=[
+            TrialMessage(
+                name=trial.name,
+                passed=trial.passed,
+                displacement=_number(trial.displacement),
+                rotation=_number(trial.rotation),
+                reason=trial.reason,
+            )
+            for trial in grasp.trials
+        ],
         contacts=[_contact_message(contact) for contact in grasp.contacts],
         trajectory=trajectory_of(grasp, hand, pace),
         trajectory_base_poses=base_poses(grasp, header.frame_id, header.stamp),
@@ -220,10 +199,8 @@ def grasp_message(
 
 
 def _contact_message(contact: Contact) -> ContactMessage:
-    position, normal, force = contact.position, contact.normal, contact.force or (0.0, 0.0, 0.0)
-    return ContactMessage(
-        link=contact.link, position=point_of(position), normal=vector_of(normal), force=vector_of(force)
-    )
+    normal, force = vector_of(contact.normal), vector_of(contact.force or (0.0, 0.0, 0.0))
+    return ContactMessage(link=contact.link, position=point_of(contact.position), normal=normal, force=force)
 
 
 def progress_message(progress: Progress, request_id: str, frame: str, stamp: Time, elapsed: float) -> GraspProgress:
@@ -282,16 +259,6 @@ def _check_finite(grasp: Grasp, rank: int) -> None:
     wrong = [name for name, values in parts.items() if not np.isfinite(values).all()]
     if wrong:
         raise FloatingPointError(f"grasp {rank}: not finite: {', '.join(wrong)}")
-
-
-def _trial(trial: TrialResult) -> TrialMessage:
-    return TrialMessage(
-        name=trial.name,
-        passed=trial.passed,
-        displacement=_number(trial.displacement),
-        rotation=_number(trial.rotation),
-        reason=trial.reason,
-    )
 
 
 def _number(value: float, otherwise: float = UNMEASURED) -> float:
@@ -432,34 +399,23 @@ def result_markers(
 def _parts_of(
     grasp: Grasp, rank: int, hand: HandModel, solids: Sequence[Primitive]
 ) -> dict[str, Callable[[], Iterable[Marker]]]:
-    T_frame_base, colour = matrix_of_posture(grasp.grasp), COLOURS[grasp.verdict]
+    clear, faint = _colour(COLOURS[grasp.verdict], 0.8), _colour(COLOURS[grasp.verdict], _FAINT)
     return {
-        "hand": lambda: _hand(hand, solids, grasp.grasp, colour),
-        "pregrasp": lambda: _faint(_hand(hand, solids, grasp.pregrasp, colour)),
-        "squeeze": lambda: _faint(_hand(hand, solids, grasp.squeeze, colour)),
+        "hand": lambda: _hand(hand, solids, grasp.grasp, clear),
+        "pregrasp": lambda: _hand(hand, solids, grasp.pregrasp, faint),
+        "squeeze": lambda: _hand(hand, solids, grasp.squeeze, faint),
         "contacts": lambda: map(_contact, grasp.contacts),
-        "axes": lambda: _axes(T_frame_base),
-        "text": lambda: [_text(grasp, rank, T_frame_base)],
+        "axes": lambda: _axes(matrix_of_posture(grasp.grasp)),
+        "text": lambda: [_text(grasp, rank, (1.0, 1.0, 1.0))],
     }
 
 
-def _faint(markers: Iterable[Marker]) -> Iterator[Marker]:
-    for marker in markers:
-        marker.color.a = _FAINT
-        yield marker
+def _rejected(grasp: Grasp, rank: int) -> list[Marker]:
+    colour = COLOURS[Verdict.FAILED]
+    return [_arrow(grasp.pregrasp.position, grasp.grasp.position, colour), _text(grasp, rank, colour)]
 
 
-def _rejected(grasp: Grasp, rank: int) -> Iterator[Marker]:
-    start, end = grasp.pregrasp.position, grasp.grasp.position
-    yield _arrow(np.asarray(start), np.asarray(end), COLOURS[Verdict.FAILED])
-    text = _text(grasp, rank, matrix_of_posture(grasp.grasp))
-    text.color = _colour(COLOURS[Verdict.FAILED], 1.0)
-    yield text
-
-
-def _hand(
-    hand: HandModel, solids: Sequence[Primitive], posture: Posture, colour: tuple[float, float, float]
-) -> Iterator[Marker]:
+def _hand(hand: HandModel, solids: Sequence[Primitive], posture: Posture, colour: ColorRGBA) -> Iterator[Marker]:
     """Yield the markers of the hand's shapes `solids`. A capsule is drawn as a cylinder and two spheres."""
     T_frame_base = matrix_of_posture(posture)
     rotations, translations = link_poses(hand, posture.joint_positions)
@@ -468,19 +424,16 @@ def _hand(
         T = T_frame_base @ T_base_link @ _matrix(solid.rotation, solid.translation)
         pose, size = pose_of_matrix(T), solid.size
         if solid.kind == "hull":
-            marker = Marker(type=Marker.TRIANGLE_LIST, pose=pose, scale=vector_of((1, 1, 1)), color=_colour(colour))
-            marker.points = _corners(solid)
-            yield marker
+            yield _solid(Marker.TRIANGLE_LIST, pose, (1, 1, 1), colour, points=_corners(solid))
         elif solid.kind == "box":
             yield _solid(Marker.CUBE, pose, 2 * np.array(size), colour)
         elif solid.kind == "sphere":
             yield _solid(Marker.SPHERE, pose, np.full(3, 2 * size[0]), colour)
         else:
-            yield _solid(Marker.CYLINDER, pose, np.array([2 * size[0], 2 * size[0], 2 * size[1]]), colour)
-            if solid.kind == "capsule":
-                for end in (-size[1], size[1]):
-                    ball = pose_of_matrix(T @ _matrix(np.eye(3), np.array([0.0, 0.0, end])))
-                    yield _solid(Marker.SPHERE, ball, np.full(3, 2 * size[0]), colour)
+            yield _solid(Marker.CYLINDER, pose, 2 * np.array([size[0], size[0], size[1]]), colour)
+            for end in (-size[1], size[1]) if solid.kind == "capsule" else ():
+                ball = Pose(position=point_of(T[:3, 3] + end * T[:3, 2]))
+                yield _solid(Marker.SPHERE, ball, np.full(3, 2 * size[0]), colour)
 
 
 # The lists are cached, because thousands of points take tens of milliseconds. Nothing modifies the lists.
@@ -502,33 +455,25 @@ def _axes(T_frame_base: Matrix) -> Iterator[Marker]:
         yield _arrow(origin, origin + _AXIS_LENGTH * T_frame_base[:3, axis], colour)
 
 
-def _text(grasp: Grasp, rank: int, T_frame_base: Matrix) -> Marker:
+def _text(grasp: Grasp, rank: int, colour: tuple[float, float, float]) -> Marker:
     lines = [f"#{rank} {grasp.verdict}"]
     payload = (grasp.metrics or {}).get("payload")
     if payload is not None:
         lines.append(f"holds {payload:.2g} kg")
     if grasp.reason:
         lines.append(grasp.reason)
-    above = _matrix(np.eye(3), T_frame_base[:3, 3] + [0.0, 0.0, _TEXT_ABOVE])
-    return Marker(
-        type=Marker.TEXT_VIEW_FACING,
-        pose=pose_of_matrix(above),
-        scale=vector_of((0, 0, _TEXT_HEIGHT)),
-        color=_colour((1.0, 1.0, 1.0), 1.0),
-        text="\n".join(lines),
-    )
-
-
-def _solid(kind: int, pose: Pose, size: np.ndarray, colour: tuple[float, float, float]) -> Marker:
-    return Marker(type=kind, pose=pose, scale=vector_of(size), color=_colour(colour))
+    above = Pose(position=point_of(grasp.grasp.position + np.array([0.0, 0.0, _TEXT_ABOVE])))
+    size, text = (0, 0, _TEXT_HEIGHT), "\n".join(lines)
+    return _solid(Marker.TEXT_VIEW_FACING, above, size, _colour(colour), text=text)
 
 
 def _arrow(tail: np.ndarray, tip: np.ndarray, colour: tuple[float, float, float]) -> Marker:
-    # The points are in the header's frame. RViz still needs a valid quaternion in the pose.
-    marker = Marker(type=Marker.ARROW, scale=vector_of((0.004, 0.008, 0.01)), color=_colour(colour, 1.0))
-    marker.pose.orientation.w = 1.0
-    marker.points = [point_of(tail), point_of(tip)]
-    return marker
+    points = [point_of(tail), point_of(tip)]  # in the header's frame
+    return _solid(Marker.ARROW, Pose(), (0.004, 0.008, 0.01), _colour(colour), points=points)
+
+
+def _solid(kind: int, pose: Pose, size: Sequence[float] | np.ndarray, colour: ColorRGBA, **fields: Any) -> Marker:
+    return Marker(type=kind, pose=pose, scale=vector_of(size), color=colour, **fields)
 
 
 def _matrix(rotation: np.ndarray, translation: np.ndarray) -> Matrix:
@@ -537,6 +482,6 @@ def _matrix(rotation: np.ndarray, translation: np.ndarray) -> Matrix:
     return T
 
 
-def _colour(rgb: tuple[float, float, float], alpha: float = 0.8) -> ColorRGBA:
+def _colour(rgb: tuple[float, float, float], alpha: float = 1.0) -> ColorRGBA:
     r, g, b = rgb
     return ColorRGBA(r=r, g=g, b=b, a=alpha)

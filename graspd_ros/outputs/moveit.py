@@ -14,23 +14,14 @@ from types import ModuleType
 from typing import Any
 
 import numpy as np
-from geometry_msgs.msg import PoseStamped
+from geometry_msgs.msg import Pose, PoseStamped
 from graspd_msgs.msg import Grasp
 from shape_msgs.msg import Mesh, MeshTriangle
 from trajectory_msgs.msg import JointTrajectory
 
 from graspd_core import HandModel, TriangleMesh
 from graspd_core.errors import ConfigError, GraspdError
-from graspd_ros.convert import (
-    Matrix,
-    matrix_of_pose,
-    nanoseconds,
-    point_of,
-    pose_of,
-    pose_of_matrix,
-    set_nanoseconds,
-    vector_of,
-)
+from graspd_ros.convert import Matrix, matrix_of_pose, nanoseconds, point_of, pose_of_matrix, set_nanoseconds, vector_of
 
 # MoveIt's `min_distance` as a fraction of `desired_distance`.
 _LEAST_APPROACH = 0.5
@@ -49,7 +40,6 @@ def moveit_grasp(
     T_parent_base: Matrix | None = None,
     effort: Sequence[float] = (),
     touch: Sequence[str] = (),
-    messages: ModuleType | None = None,
 ) -> Any:
     """Return the moveit_msgs/Grasp of a graspd_msgs/Grasp.
 
@@ -62,7 +52,6 @@ def moveit_grasp(
             description is used, or identity without a mount.
         touch: names of the collision objects that the hand may touch, usually the grasped object.
         effort: greatest effort per joint in the trajectory's order [N·m] or [N]. Empty leaves efforts out.
-        messages: module with the message classes. If None, `moveit_msgs.msg` is used.
 
     Raises:
         MoveItMissing: moveit_msgs is not installed.
@@ -73,7 +62,7 @@ def moveit_grasp(
     up = np.array(retreat, dtype=float)
     if not (np.isfinite(up).all() and up.any()):
         raise ConfigError(f"retreat: {retreat}; valid: a finite direction that is not zero")
-    messages = messages or _moveit_messages()
+    messages = _moveit_messages()
     first, *closing = deepcopy(grasp.trajectory.points)
     T_frame_grasp = T_frame_base = matrix_of_pose(grasp.grasp_pose)
     if waits := dict(zip(grasp.arrival_joints.name, grasp.arrival_joints.position, strict=True)):
@@ -100,9 +89,7 @@ def moveit_grasp(
     )
 
 
-def attached_object(
-    grasp: Grasp, hull: TriangleMesh, hand: HandModel, mass: float = 0.0, messages: ModuleType | None = None
-) -> Any:
+def attached_object(grasp: Grasp, hull: TriangleMesh, hand: HandModel, mass: float = 0.0) -> Any:
     """Return the object that the hand holds after the squeeze, as a moveit_msgs/AttachedCollisionObject.
 
     The object is attached to the hand's base link, and all links of the hand may touch it. Its id is the id of the
@@ -113,11 +100,10 @@ def attached_object(
         hull: hull of the object in the frame of the base link at the grasp [m].
         hand: the hand.
         mass: mass of the object [kg]. 0 if unknown.
-        messages: module with the message classes. If None, `moveit_msgs.msg` is used.
 
     Raises MoveItMissing: moveit_msgs is not installed, or its version lacks this message.
     """
-    kind = attached_kind(messages)
+    kind = attached_kind()
     if kind is None:
         raise MoveItMissing("moveit_msgs/AttachedCollisionObject is not installed; install moveit_msgs of ROS 2 Jazzy")
     center = hull.vertices.mean(0)
@@ -129,17 +115,17 @@ def attached_object(
     message.object.header.frame_id = grasp.base_link
     message.object.header.stamp = grasp.header.stamp
     message.object.id = grasp.id.rpartition("/")[0]
-    message.object.pose = pose_of(center, (1.0, 0.0, 0.0, 0.0))
-    message.object.meshes, message.object.mesh_poses = [shape], [pose_of(np.zeros(3), (1.0, 0.0, 0.0, 0.0))]
+    message.object.pose = Pose(position=point_of(center))
+    message.object.meshes, message.object.mesh_poses = [shape], [Pose()]
     message.object.operation = message.object.ADD
     message.detach_posture = _posture(grasp, [deepcopy(next(iter(grasp.trajectory.points)))])
     return message
 
 
-def attached_kind(messages: ModuleType | None = None) -> type | None:
+def attached_kind() -> type | None:
     """Return the class moveit_msgs/AttachedCollisionObject. None if it is not installed."""
     try:
-        return getattr(messages or _moveit_messages(), "AttachedCollisionObject", None)
+        return getattr(_moveit_messages(), "AttachedCollisionObject", None)
     except MoveItMissing:
         return None
 

@@ -66,14 +66,13 @@ _ENDINGS = {
     WorkerEnding.SUPERSEDED: messages.AnswerEnding(GraspArray.SUPERSEDED, ErrorCode.SUPERSEDED, _NEWER),
 }
 
+# Latched topics that ~/reset clears.
 SHOWN = {
     JointState: "~/joint_states",
     PoseStamped: "~/grasp_pose",
     JointTrajectory: "~/trajectory",
     MarkerArray: "~/markers",
 }
-# Late subscribers get the last message of each of these topics.
-LATCHED = {GraspArray: "~/grasps", **SHOWN}
 
 
 @dataclass(frozen=True)
@@ -234,7 +233,8 @@ class Publishers:
         }
         self.attached = attached_kind()
         self._shown = {**SHOWN, **({self.attached: "~/attached_object"} if self.attached else {})}
-        self._publishers |= {kind: self._latched(kind, topic) for kind, topic in (LATCHED | self._shown).items()}
+        latched = {GraspArray: "~/grasps", **self._shown}
+        self._publishers |= {kind: self._latched(kind, topic) for kind, topic in latched.items()}
 
     def _latched(self, kind: type, topic: str) -> Any:
         return self._node.create_publisher(
@@ -337,8 +337,12 @@ class Responses:
         """Return a hook that publishes progress at up to `progress_rate` [Hz], and gives each grasp to the listener."""
         lowest, last, period = math.inf, -math.inf, 1 / request.settings.progress_rate
 
-        def publish_progress(progress: Progress) -> None:
+        def hook(progress: Progress) -> None:
             nonlocal lowest, last
+            if progress.found is not None and request.listener is not None:
+                rank, header = progress.verified - 1, Header(frame_id=request.frame_out, stamp=request.stamp)
+                found = messages.grasp_message(progress.found, rank, request.id, header, self._hand, _pace(request))
+                request.listener.found(found)
             if (now := time.monotonic()) - last < period:
                 return
             last, elapsed = now, request.elapsed()
@@ -349,13 +353,6 @@ class Responses:
             self.publishers.emit("progress", request.id, request.source, **event)
             message = messages.progress_message(progress, request.id, request.frame_out, self._now(), elapsed)
             self._report(request, message)
-
-        def hook(progress: Progress) -> None:
-            if progress.found is not None and request.listener is not None:
-                rank, header = progress.verified - 1, Header(frame_id=request.frame_out, stamp=request.stamp)
-                found = messages.grasp_message(progress.found, rank, request.id, header, self._hand, _pace(request))
-                request.listener.found(found)
-            publish_progress(progress)
 
         return hook
 
@@ -388,18 +385,15 @@ class Responses:
             if time.monotonic() - self._superseded_reported >= COUNT_PERIOD:
                 self._report_superseded(request.id)
         else:
-            found = {"result": report.value.result, **_weight(report.value)} if report.value else {}
-            found |= {"objects": report.value.objects} if report.value else {}
-            answer = self._answer(request, dataclasses.replace(_ENDINGS[report.ending], **found))
+            answer = self._answer(request, dataclasses.replace(_ENDINGS[report.ending], planned=report.value))
             self.publishers.emit(report.ending.value, request.id, request.source)
             self._publish(answer, request.listener)
 
     def _result(self, request: Request, planned: Planned) -> None:
         result, hand = planned.result, self._hand
         # Make all messages before publishing any, so that an invalid result is reported as an error only.
-        ending = dataclasses.replace(messages.ending_of(result), objects=planned.objects, **_weight(planned))
-        answer = self._answer(request, ending)
-        event = {**result_event(result), **_weight(planned)}
+        answer = self._answer(request, messages.ending_of(planned))
+        event = {**result_event(result), "mass": planned.mass, "mass_assumed": planned.mass_assumed}
         latched = []
         best = presentable(result)
         if best is not None:
@@ -476,10 +470,6 @@ class Responses:
         return self._node.get_logger()
 
 
-def _weight(planned: Planned) -> dict[str, Any]:
-    return {"mass": planned.mass, "mass_assumed": planned.mass_assumed}
-
-
 def _pace(request: Request) -> Pace:
     settings = request.settings
     return Pace(settings.joint_speed, settings.base_speed, settings.base_turn, settings.shortest_stage)
@@ -487,8 +477,7 @@ def _pace(request: Request) -> Pace:
 
 def presentable(result: GraspResult) -> Grasp | None:
     """Return the best grasp if it is usable, otherwise None, so that topics for robots get no doubtful grasp."""
-    best = result.tried[0] if result.tried else None
-    return best if best is not None and best.usable else None
+    return next((best for best in result.tried[:1] if best.usable), None)
 
 
 def progress_event(progress: Progress) -> dict[str, Any]:

@@ -38,8 +38,8 @@ from graspd_ros.parameters import Settings
 LATCHED = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
 PATIENCE = 200.0  # seconds until what is waited for is held to never come; a test's own limit is 300
 
-READ_ONLY = {"hand", "hand_prefix", "device", "torch_threads", "queue_size", "collision_objects"}
-DEFAULTS = {n: v for n, v in dataclasses.asdict(Settings()).items() if n not in READ_ONLY} | {"output_dir": "out"}
+CHANGEABLE = [field.name for field in dataclasses.fields(Settings) if not field.metadata["read_only"]]
+DEFAULTS = {name: getattr(Settings(), name) for name in CHANGEABLE} | {"output_dir": "out"}
 TERMINAL = {"result", "error", "cancelled", "superseded"}
 
 Event = dict[str, Any]
@@ -60,14 +60,14 @@ class Client:
         self.events: list[Event] = []
         self.joints: list[JointState] = []
         self.poses: list[PoseStamped] = []
-        told = QoSProfile(depth=100, durability=DurabilityPolicy.TRANSIENT_LOCAL)
-        self.node.create_subscription(String, "/graspd/status", self._on_status, told)
+        deep = QoSProfile(depth=500, durability=DurabilityPolicy.TRANSIENT_LOCAL)
+        keep = lambda message: self.events.append(json.loads(message.data))  # noqa: E731
+        self.node.create_subscription(String, "/graspd/status", keep, deep)
         self.node.create_subscription(JointState, "/graspd/joint_states", self.joints.append, LATCHED)
         self.node.create_subscription(PoseStamped, "/graspd/grasp_pose", self.poses.append, LATCHED)
         self.progress: list[GraspProgress] = []
         self.answers: list[GraspArray] = []
         self.node.create_subscription(GraspProgress, "/graspd/progress", self.progress.append, 500)
-        deep = QoSProfile(depth=500, durability=DurabilityPolicy.TRANSIENT_LOCAL)
         self.node.create_subscription(GraspArray, "/graspd/grasps", self.answers.append, deep)
         self._request = self.node.create_publisher(GraspRequest, "/graspd/request", 500)
         self._mesh = self.node.create_publisher(String, "/graspd/mesh", 10)
@@ -76,9 +76,6 @@ class Client:
         self._services: dict[str, Any] = {}
         self._health: list[Any] = []
         self.node.create_subscription(DiagnosticArray, "/diagnostics", self._health.append, 10)
-
-    def _on_status(self, message: String) -> None:
-        self.events.append(json.loads(message.data))
 
     def spin_until(self, condition: Callable[[], Any], what: str) -> Any:
         """Spin until the condition gives something true, and return that; fail the test where it never comes."""
@@ -145,11 +142,8 @@ class Client:
     def send_mesh(self, uri: str | Path) -> None:
         self._mesh.publish(String(data=str(uri)))
 
-    def send_request(self, **fields: Any) -> None:
-        self._request.publish(GraspRequest(**fields))
-
-    def send_message(self, request: GraspRequest) -> None:
-        self._request.publish(request)
+    def send_request(self, request: GraspRequest | None = None, **fields: Any) -> None:
+        self._request.publish(request or GraspRequest(**fields))
 
     def show(self, send: Callable[[], Any], header: Header) -> None:
         """Send what a camera sees until it is the node's newest: it comes once, and the node may miss it."""
@@ -323,6 +317,23 @@ def make_node() -> Iterator[Callable[..., Node]]:
     for node in made:
         node.destroy_node()
         rclpy.shutdown(context=node.context)
+
+
+@pytest.fixture
+def start_python(domain: int, tmp_path: Path) -> Iterator[Callable[..., subprocess.Popen[str]]]:
+    """Starts Python with arguments in the tests' DDS domain, its streams piped."""
+    started: list[subprocess.Popen[str]] = []
+
+    def start(*arguments: Any) -> subprocess.Popen[str]:
+        environment = {**os.environ, "ROS_DOMAIN_ID": str(domain), "ROS_LOG_DIR": str(tmp_path / "log")}
+        command, pipe = [sys.executable, *map(str, arguments)], subprocess.PIPE
+        started.append(subprocess.Popen(command, env=environment, stdin=pipe, stdout=pipe, stderr=pipe, text=True))
+        return started[-1]
+
+    yield start
+    for process in started:
+        process.terminate()  # killed, it would leave its shared memory behind
+        process.communicate()
 
 
 @pytest.fixture(scope="session")

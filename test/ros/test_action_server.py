@@ -92,11 +92,7 @@ def test_a_goal_is_cancelled_while_it_runs_and_while_it_waits(client, node, acti
 
 def test_a_goal_that_is_refused_or_superseded_is_aborted_and_told_why(client, node, actions):
     status, result = Goal(client, actions, hand="no_such_hand").end()
-    assert (status, result.status, result.error_code) == (
-        GoalStatus.STATUS_ABORTED,
-        GraspArray.REFUSED,
-        "WRONG_HAND",
-    )
+    assert (status, result.status, result.error_code) == (GoalStatus.STATUS_ABORTED, GraspArray.REFUSED, "WRONG_HAND")
     first = Goal(client, actions, id="first", **LONG)
     first.reaches("load")
     client.set_parameters(busy_policy="reject")

@@ -25,7 +25,6 @@ from graspd_ros.inputs.request_builder import RequestBuilder
 from graspd_ros.parameters import Settings
 
 EXAMPLE = Path(__file__).parents[2] / "examples" / "moveit_client.py"
-TABLE = Plane(coef=[0.0, 0.0, 1.0, 0.0])
 FEW = {"num_grasps": 2, "preset": "fast", "deadline": 100.0}
 
 pytestmark = pytest.mark.timeout(300)

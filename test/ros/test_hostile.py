@@ -15,11 +15,11 @@ from sensor_msgs.msg import CameraInfo, Image, PointCloud2, PointField
 from std_msgs.msg import Header
 
 from graspd_core.errors import GraspdError
+from graspd_core.io.messages import CameraPlace, no_lookup
 from graspd_ros.inputs.request_builder import RequestBuilder
 from graspd_ros.inputs.sensor_frames import ImagePairs, cloud_frame, depth_sensor_frame
 from graspd_ros.outputs.responses import status_line
 from graspd_ros.parameters import Settings
-from graspd_ros.request import Request
 
 HAND = "allegro_right"
 floats = st.one_of(st.floats(), st.sampled_from([0.0, 1.0, np.nan, np.inf, -np.inf, 1e308, 5e-324]))
@@ -84,11 +84,6 @@ def refused(call: Any) -> tuple[Any, str]:
     return None, message
 
 
-def read(request: Request) -> None:
-    """Read the object, as the worker does."""
-    refused(request.load)
-
-
 @settings(max_examples=60)
 @given(message=requests, now=stamps)
 def test_any_request_is_taken_or_refused_in_one_line(tmp_path_factory, message: GraspRequest, now: Time):
@@ -96,7 +91,7 @@ def test_any_request_is_taken_or_refused_in_one_line(tmp_path_factory, message: 
     roots = Settings(mesh_roots=[str(tmp_path_factory.getbasetemp())])
     request, _ = refused(lambda: intake.from_message("r", roots, message))
     if request is not None and message.source == GraspRequest.CLOUD:
-        read(request)
+        refused(request.load)
 
 
 @settings(max_examples=60)
@@ -105,7 +100,7 @@ def test_any_cloud_is_read_or_refused_in_one_line(message: PointCloud2, now: Tim
     intake = RequestBuilder(HAND, lambda: now, lambda target, source, stamp: np.eye(4))
     sensor_frame = cloud_frame(message, 5)
     refused(lambda: intake.from_sensor_frame("r", Settings(), sensor_frame))
-    view, _ = refused(sensor_frame.read)
+    view, _ = refused(lambda: sensor_frame.read(CameraPlace(), no_lookup))
     if view is not None:
         assert np.isfinite(view.points).all()
 
@@ -140,7 +135,7 @@ def test_200_hostile_messages_leave_a_node_that_grasps(client, node):
     @given(request=requests, cloud=clouds, image=images, info=infos, text=texts)
     def throw(request: GraspRequest, cloud: PointCloud2, image: Image, info: CameraInfo, text: str) -> None:
         request.id = f"hostile-{sent['count']}"
-        client.send_message(request)
+        client.send_request(request)
         client.send_cloud(cloud)
         info.header = image.header
         images_out.publish(image)

@@ -19,7 +19,6 @@ from rosidl_parser.definition import AbstractNestedType, AbstractString, Array, 
 
 SOURCES = Path(__file__).parents[2] / "msg_defs"
 MESSAGES = sorted(path.stem for path in SOURCES.glob("msg/*.msg"))
-TIMEOUT = 100.0
 
 # Values that each type keeps exactly: never zero, so that a field left behind is seen.
 INTEGERS = {"uint8": 2**8, "int8": 2**7, "uint16": 2**16, "int32": 2**31, "uint32": 2**32, "int64": 2**63}

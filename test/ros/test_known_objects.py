@@ -26,7 +26,6 @@ from graspd_ros.inputs.request_builder import RequestBuilder
 from graspd_ros.inputs.solids import SceneObject
 from graspd_ros.parameters import Settings
 from graspd_ros.request_planner import Planned, Planner
-from graspd_ros.worker import StopHook
 
 
 @pytest.fixture(scope="module")
@@ -56,11 +55,7 @@ class Node:
         usual = {"preset": "fast", "num_grasps": 2, "grasp_library": "known.grasps", "mesh_roots": ["."]}
         self.settings = Settings(**{**usual, **settings})
         self._builder = RequestBuilder(hand.name, lambda: Time(sec=1), lambda *_: np.eye(4))
-        self._planner = Planner(hand, self._lookup)
-
-    @staticmethod
-    def _lookup(target: str, source: str, stamp: Time, stop: StopHook) -> np.ndarray:
-        return np.eye(4)
+        self._planner = Planner(hand, lambda *_: np.eye(4))
 
     def answer(self, **fields: object) -> Planned:
         fields.setdefault("id", "r")

@@ -10,6 +10,8 @@ import pytest
 from graspd_msgs.msg import GraspArray, GraspRequest
 from rcl_interfaces.srv import GetParameters
 
+from graspd_ros.convert import array_of, wxyz_of
+
 FEW = {"num_grasps": 2, "preset": "fast", "deadline": 100.0, "busy_policy": "queue"}
 # Work that is still going on when the next request arrives.
 LONG = {"num_grasps": 256, "preset": "accurate", "deadline": 600.0, "busy_policy": "queue"}
@@ -19,10 +21,6 @@ pytestmark = pytest.mark.timeout(300)
 EXAMPLE = Path(__file__).parents[2] / "examples" / "ros_client.py"
 SPHERE = {"source": GraspRequest.MESH, "mesh_uri": "sphere.obj"}
 UNENDING = {"num_grasps": 256, "preset": "accurate", "time_budget": 600.0}
-
-
-def position_of(pose) -> np.ndarray:
-    return np.array([pose.pose.position.x, pose.pose.position.y, pose.pose.position.z])
 
 
 def test_a_mesh_becomes_progress_and_a_grasp(client, node):
@@ -42,10 +40,8 @@ def test_a_mesh_becomes_progress_and_a_grasp(client, node):
     (joints,), (pose,) = client.joints, client.poses
     assert len(joints.name) == len(joints.position) == 16
     assert pose.header.frame_id == "object"
-    assert np.linalg.norm(position_of(pose)) < HAND_LENGTH
-    w, *xyz = result["best"]["quaternion_wxyz"]
-    orientation = pose.pose.orientation
-    assert [orientation.w, orientation.x, orientation.y, orientation.z] == pytest.approx([w, *xyz])
+    assert np.linalg.norm(array_of(pose.pose.position)) < HAND_LENGTH
+    assert wxyz_of(pose.pose.orientation) == pytest.approx(result["best"]["quaternion_wxyz"])
     order = [e["event"] for e in client.events if e.get("request") == accepted["request"]]
     assert order == ["accepted", *["progress"] * (len(order) - 2), "result"]
 
@@ -53,25 +49,24 @@ def test_a_mesh_becomes_progress_and_a_grasp(client, node):
 def test_the_answer_says_what_the_object_weighed_and_whether_anybody_said_so(client, node):
     """The mass of the request, the parameter's, else one that is assumed."""
     client.set_parameters(**FEW)
-    sphere = {"source": GraspRequest.MESH, "mesh_uri": "sphere.obj"}
-    client.send_request(id="light", mass=0.07, **sphere)
+    client.send_request(id="light", mass=0.07, **SPHERE)
     told = client.answer("light")
     assert (told.status, told.mass, told.mass_assumed) == (GraspArray.SUCCEEDED, pytest.approx(0.07), False)
     figures = {metric.name: metric.value for metric in told.grasps[0].metrics}
     assert figures["payload"] > 0.07
     event = client.event(event="result", request="light")
     assert (event["mass"], event["mass_assumed"]) == (pytest.approx(0.07), False)
-    client.send_request(id="next", mass=0.07, exclude=["light/0"], **sphere)
+    client.send_request(id="next", mass=0.07, exclude=["light/0"], **SPHERE)
     assert client.answer("next").mass == pytest.approx(0.07)
     client.set_parameters(mass=0.09)
-    client.send_request(id="parameter", **sphere)
+    client.send_request(id="parameter", **SPHERE)
     assert client.answer("parameter").mass == pytest.approx(0.09)
     client.set_parameters(mass=0.0)
-    client.send_request(id="unknown", **sphere)
+    client.send_request(id="unknown", **SPHERE)
     unknown = client.answer("unknown")
     assert unknown.mass_assumed
     assert unknown.mass > 0.1
-    client.send_request(id="heavy", mass=float("nan"), **sphere)
+    client.send_request(id="heavy", mass=float("nan"), **SPHERE)
     assert "mass: nan; valid: 1e-06 to 100 kg, 0 for the parameter" in client.answer("heavy").message
 
 

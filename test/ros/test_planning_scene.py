@@ -14,6 +14,7 @@ from scipy.spatial.transform import Rotation
 from shape_msgs.msg import Mesh, MeshTriangle, Plane, SolidPrimitive
 from std_msgs.msg import Header
 from tf2_msgs.msg import TFMessage
+from trimesh.transformations import translation_matrix
 
 from graspd_core import hand_mesh, load_hand, load_scene
 from graspd_core.errors import GraspdError, TransformError
@@ -55,6 +56,12 @@ def test_later_requests_keep_clear_of_the_scene_and_bad_messages_do_no_harm(clie
     shelf.transform.translation, shelf.transform.rotation = Vector3(x=WALL + 0.25), Quaternion(w=1.0)
     frames.publish(TFMessage(transforms=[shelf]))
 
+    def settle() -> None:
+        """Wait until the node has taken all messages, whose last it refuses."""
+        client.forget()
+        things.publish(CollisionObject(id="nobody", operation=CollisionObject.REMOVE))
+        client.event(event="refused", source="collision_objects")
+
     def ask(name: str, **fields: Any) -> GraspArray:
         client.send_request(id=name, source=GraspRequest.MESH, mesh_uri="mug.obj", **fields)
         return client.answer(name)
@@ -72,24 +79,18 @@ def test_later_requests_keep_clear_of_the_scene_and_bad_messages_do_no_harm(clie
     # A wall in a frame of its own, and the mug as the scene has it.
     things.publish(box("mug", [0.09, 0.08, 0.09], 0.0, "object"))
     things.publish(box("wall", [0.5, 1.0, 1.0], 0.0, "shelf"))
-    things.publish(CollisionObject(id="nobody", operation=CollisionObject.REMOVE))
-    client.forget()
-    client.event(event="refused", source="collision_objects")
+    settle()
     answer = ask("walled")
     assert farthest(answer) < WALL + 0.002
     assert [w for w in answer.warnings if "collision object 'mug' fills the place of the object to grasp" in w]
 
     things.publish(box("lost", [0.1, 0.1, 0.1], 0.0, "nowhere"))
-    things.publish(CollisionObject(id="nobody", operation=CollisionObject.REMOVE))
-    client.forget()
-    client.event(event="refused", source="collision_objects")
+    settle()
     lost = ask("lost")
     assert lost.status == GraspArray.FAILED
     assert lost.message.startswith("collision object 'lost': unknown frame 'nowhere'; known:")
     things.publish(CollisionObject(operation=CollisionObject.REMOVE))
-    things.publish(CollisionObject(id="nobody", operation=CollisionObject.REMOVE))
-    client.forget()
-    client.event(event="refused", source="collision_objects")
+    settle()
     assert farthest(ask("cleared", **there)) > WALL
 
 
@@ -186,9 +187,7 @@ def request(things: Mapping[str, SceneObject], pose: np.ndarray | None = None) -
 
 def test_things_come_to_the_object_through_their_frame_and_its_pose():
     things = updated_objects({}, message(frame="shelf", **crate(), pose=Pose(position=Point(x=0.1))))
-    T_map_shelf, T_map_object = np.eye(4), np.eye(4)
-    T_map_shelf[:3, 3] = [1.0, 0.0, 0.0]
-    T_map_object[:3, 3] = [0.95, 0.0, 0.0]
+    T_map_shelf, T_map_object = (translation_matrix([x, 0.0, 0.0]) for x in (1.0, 0.95))
     frames = lambda *names: {("map", "shelf"): T_map_shelf}[names]  # noqa: E731
     (obstacle,) = with_collision_objects(request(things, T_map_object), frames).load().obstacles
     assert obstacle.mesh.vertices[:, 0].mean() == pytest.approx(0.15, abs=0.005)

@@ -1,8 +1,6 @@
 """A recording goes out over DDS as it was recorded, and comes in by a subscription."""
 
-import os
 import signal
-import subprocess
 import sys
 import threading
 import time
@@ -60,24 +58,6 @@ def heard(client):
         client.node.destroy_subscription(subscription)
 
 
-@pytest.fixture
-def play_process(client, bag: Path):
-    """Starts `graspd_play` in the tests' DDS domain; it waits for a subscriber."""
-    started: list[subprocess.Popen[str]] = []
-
-    def start(*options: str) -> subprocess.Popen[str]:
-        domain = str(client.context.get_domain_id())
-        environment = {**os.environ, "ROS_DOMAIN_ID": domain, "ROS_LOG_DIR": str(bag.parent / "log")}
-        command = [sys.executable, "-m", "graspd_ros.player", str(bag), "--wait", str(TIMEOUT), *options]
-        started.append(subprocess.Popen(command, env=environment, stderr=subprocess.PIPE, text=True))
-        return started[-1]
-
-    yield start
-    for process in started:
-        process.kill()
-        process.communicate()
-
-
 def test_a_recording_comes_in_as_it_was_recorded(client, bag, heard):
     played: list[int] = []
     topics = ("/play/points", "/play/image", "/play/camera_info")
@@ -123,8 +103,9 @@ def test_a_message_without_a_stamp_gets_none():
         assert shifted == message
 
 
-def test_the_command_loops_under_other_names_until_a_signal(client, play_process, heard):
-    process = play_process("--rate", "20", "--loop", "--ros-args", "-r", "/play/image:=/play/other")
+def test_the_command_loops_under_other_names_until_a_signal(client, start_python, bag, heard):
+    options = ("--wait", TIMEOUT, "--rate", 20, "--loop", "--ros-args", "-r", "/play/image:=/play/other")
+    process = start_python("-m", "graspd_ros.player", bag, *options)
     client.spin_until(lambda: len(heard[PointCloud2]) >= 5, "clouds of a third round")
     process.send_signal(signal.SIGINT)
     _, errors = process.communicate(timeout=TIMEOUT)

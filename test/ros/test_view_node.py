@@ -1,7 +1,6 @@
 """`graspd_view` follows a node: what the topics say is on the page."""
 
 import math
-import time
 from typing import Any
 
 import numpy as np
@@ -74,14 +73,12 @@ def test_what_a_node_publishes_is_shown(client):
     assert session.hand.name == "parallel_gripper"
     assert session.grasps[0].reason == "the simulation diverged"
     client.spin_until(progress.get_subscription_count, "match")
-    end = time.monotonic() + 20
 
     def told() -> bool:
         progress.publish(GraspProgress(request_id="can-2", stage="optimise", step=3, of=9))
-        return any(line.startswith("can-2: optimise 3 of 9") for line in viewer.lines) or time.monotonic() > end
+        return any(line.startswith("can-2: optimise 3 of 9") for line in viewer.lines)
 
     client.spin_until(told, "progress")
-    assert any(line.startswith("can-2: optimise 3 of 9") for line in viewer.lines)
 
 
 def test_the_hand_of_a_node_with_a_prefix_is_shown(client):

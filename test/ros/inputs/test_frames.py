@@ -1,11 +1,9 @@
 """Matrices of messages, results in another frame, /tf over DDS, and where the arm stands that carries the hand."""
 
 import math
-import os
-import subprocess
 import sys
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
@@ -174,17 +172,6 @@ def test_a_transform_that_comes_late_is_waited_for(node: Node, monkeypatch: pyte
     assert time.monotonic() - begun >= 0.1
 
 
-@pytest.fixture
-def robot(domain: int) -> Iterator[subprocess.Popen]:
-    environment = {**os.environ, "ROS_DOMAIN_ID": str(domain), "ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOST"}
-    process = subprocess.Popen([sys.executable, "-c", PUBLISHER], env=environment, stdout=subprocess.PIPE, text=True)
-    assert process.stdout is not None
-    yield process
-    process.terminate()  # killed, it would leave its shared memory behind
-    process.wait()
-    process.stdout.close()
-
-
 def spin_until(node: Node, condition: Callable[[], bool]) -> None:
     executor = SingleThreadedExecutor(context=node.context)
     executor.add_node(node)
@@ -193,8 +180,8 @@ def spin_until(node: Node, condition: Callable[[], bool]) -> None:
     executor.shutdown()
 
 
-def test_tf_of_another_process_is_heard_and_told_right(node: Node, robot: subprocess.Popen):
-    assert robot.stdout is not None
+def test_tf_of_another_process_is_heard_and_told_right(node: Node, start_python):
+    robot = start_python("-c", PUBLISHER)
     assert robot.stdout.readline() == "ready\n"  # published before anyone listened: /tf_static comes late all the same
     buffer = TransformBuffer()
     listener = tf_listener.TransformListener(node, buffer)
@@ -252,9 +239,7 @@ def request(settings: Settings, pose: np.ndarray | None = None) -> Request:
 
 def at(x: float, y: float, z: float) -> np.ndarray:
     """A pose turned by a quarter about z."""
-    pose = np.eye(4)
-    pose[:2, :2], pose[:3, 3] = [[0.0, -1.0], [1.0, 0.0]], [x, y, z]
-    return pose
+    return matrix((x, y, z), Rotation.from_euler("z", 90, degrees=True))
 
 
 def test_the_base_is_placed_in_the_frame_of_the_object():

@@ -16,22 +16,14 @@ from hypothesis import strategies as st
 from sensor_msgs.msg import Image, PointCloud2
 from shape_msgs.msg import SolidPrimitive
 from std_msgs.msg import Header
+from trimesh.transformations import translation_matrix
 
 from graspd_core import Box, PointCloud, Sphere, load_scene, preset_names
 from graspd_core.errors import CloudError, GraspdError, MeshError, NoObjectError, ResourceError, TransformError
 from graspd_ros.convert import pose_matrix
 from graspd_ros.error_codes import ErrorCode, RequestError, code_of, sentence_of
-from graspd_ros.inputs import sensor_frames
-from graspd_ros.inputs.request_builder import (
-    MOST_MESH_BYTES,
-    SOURCES,
-    RequestBuilder,
-    Source,
-    SourceInput,
-    check_request,
-    resolve_mesh,
-    settings_of,
-)
+from graspd_ros.inputs import request_builder, sensor_frames
+from graspd_ros.inputs.request_builder import SOURCES, RequestBuilder, check_request, resolve_mesh, settings_of
 from graspd_ros.inputs.sensor_frames import MOST_CLOUD_BYTES, MOST_VIEWS, SensorFrame, Views, cloud_frame, trimmed
 from graspd_ros.parameters import MOST_GRASPS, Settings
 from graspd_ros.request import Request
@@ -158,9 +150,7 @@ def test_whatever_passes_gives_settings_within_the_parameters_ranges(id, source,
 
 def test_a_pose_without_turn_is_a_place_and_a_wrong_one_is_refused():
     none = Pose(position=Point(x=1.0, y=2.0, z=3.0), orientation=Quaternion(w=0.0))
-    expected = np.eye(4)
-    expected[:3, 3] = [1.0, 2.0, 3.0]
-    np.testing.assert_array_equal(pose_matrix(none), expected)
+    np.testing.assert_array_equal(pose_matrix(none), translation_matrix([1.0, 2.0, 3.0]))
     quarter = pose_matrix(Pose(orientation=Quaternion(z=math.sqrt(0.5), w=math.sqrt(0.5))))
     np.testing.assert_allclose(quarter[:3, 0], [0, 1, 0], atol=1e-15)
     for pose, culprit in [
@@ -192,9 +182,7 @@ def test_views_are_gathered_in_one_frame():
     def lookup(target: str, source: str, stamp: Time) -> np.ndarray:
         if source == "lost":
             raise TransformError("unknown frame 'lost'; known: map")
-        pose = np.eye(4)
-        pose[0, 3] = 1.0
-        return pose
+        return translation_matrix([1.0, 0.0, 0.0])
 
     taker, settings = intake(lookup), Settings(fixed_frame="map")
     with pytest.raises(RequestError, match="call ~/add_view") as refused:
@@ -219,7 +207,7 @@ def test_views_are_gathered_in_one_frame():
     with pytest.raises(GraspdError, match="lost"):
         taker.add_view(settings)
     assert len(taker.views.clouds) == 2
-    taker.forget()
+    assert taker.drop_views() == 2
     assert taker.views == Views()
 
 
@@ -234,10 +222,7 @@ def test_the_number_of_views_and_their_size_are_bounded():
         views.add(few, few.read(), settings, lambda *_: np.eye(4))
 
 
-@given(
-    st.lists(st.tuples(*[st.floats(-2, 2)] * 3), min_size=1, max_size=50),
-    st.sampled_from([0.0, 1e-8, 0.1, 0.5]),
-)
+@given(st.lists(st.tuples(*[st.floats(-2, 2)] * 3), min_size=1, max_size=50), st.sampled_from([0.0, 1e-8, 0.1, 0.5]))
 def test_trimming_keeps_points_of_the_workspace_at_most_one_a_voxel(rows, voxel):
     points = np.array(rows)
     settings = Settings(roi_min=[-1.0] * 3, roi_max=[1.0] * 3, voxel_size=voxel)
@@ -344,14 +329,14 @@ def test_clouds_of_one_image_are_one_object_only_where_they_show_the_same(make_c
     assert key(ball, voxel_size=0.01) != key(ball)
 
 
-@pytest.fixture
-def root(tmp_path: Path) -> Path:
-    root = tmp_path / "root"
+@pytest.fixture(scope="module")
+def root(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    root = tmp_path_factory.mktemp("meshes") / "root"
     (root / "sub dir").mkdir(parents=True)
     (root / "mug.obj").write_text("")
     (root / "sub dir" / "cup.obj").write_text("")
-    (tmp_path / "secret.obj").write_text("")
-    (root / "link.obj").symlink_to(tmp_path / "secret.obj")
+    (root.parent / "secret.obj").write_text("")
+    (root / "link.obj").symlink_to(root.parent / "secret.obj")
     (root / "inner.obj").symlink_to(root / "mug.obj")
     return root
 
@@ -413,14 +398,7 @@ PARTS = st.sampled_from(["..", ".", "root", "sub dir", "mug.obj", "secret.obj", 
 
 
 @given(st.sampled_from(["", "file://", "file:///", "package://"]), st.lists(PARTS, max_size=8))
-def test_no_spelling_leads_out(tmp_path_factory: pytest.TempPathFactory, scheme: str, parts: list[str]):
-    base = tmp_path_factory.getbasetemp() / "spellings"
-    root = base / "root"
-    if not root.exists():
-        (root / "sub dir").mkdir(parents=True)
-        (root / "mug.obj").write_text("")
-        (base / "secret.obj").write_text("")
-        (root / "link.obj").symlink_to(base / "secret.obj")
+def test_no_spelling_leads_out(root: Path, scheme: str, parts: list[str]):
     try:
         found = resolve_mesh(scheme + "/".join(parts), [str(root)])
     except MeshError:
@@ -430,7 +408,7 @@ def test_no_spelling_leads_out(tmp_path_factory: pytest.TempPathFactory, scheme:
 
 def test_a_mesh_too_large_to_read_is_refused_before_it_is_read(root: Path):
     with (root / "huge.obj").open("wb") as file:
-        file.truncate(MOST_MESH_BYTES + 1)
+        file.truncate(request_builder.MOST_MESH_BYTES + 1)
     with pytest.raises(MeshError, match="at most 100 MB"):
         resolve_mesh("huge.obj", [str(root)])
 
@@ -486,9 +464,7 @@ def test_wishes_in_another_frame_than_the_cloud_go_by_tf():
 
 def test_point_and_wishes_are_placed_where_the_camera_stood_when_it_saw(make_cloud, monkeypatch):
     def lookup(target: str, source: str, stamp: Time) -> np.ndarray:
-        T = np.eye(4)
-        T[2, 3] = 5.0 if stamp == SEEN else -1.0  # the camera has moved since
-        return T
+        return translation_matrix([0.0, 0.0, 5.0 if stamp == SEEN else -1.0])  # the camera has moved since
 
     cloud, targets = make_cloud(np.ones((100, 3))), []
     cloud.header.stamp = SEEN
@@ -586,14 +562,14 @@ def test_a_source_without_a_row_is_refused_and_the_rows_are_named(monkeypatch):
 def test_a_source_is_one_row(monkeypatch):
     scene, given = load_scene("shape:box", resolution=16), []
 
-    def from_scanner(asked: SourceInput) -> Request:
-        given.append((asked.message, asked.settings.num_grasps, asked.now))
+    def from_scanner(asked: request_builder.SourceInput) -> Request:
+        given.append((asked.message, asked.settings.num_grasps))
         return asked.request("scanner", SEEN, lambda: scene)
 
-    monkeypatch.setitem(SOURCES, SCANNER, Source("scanner", from_scanner))
+    monkeypatch.setitem(SOURCES, SCANNER, request_builder.Source("scanner", from_scanner))
     message = GraspRequest(source=SCANNER, num_grasps=3, header=Header(frame_id="map"))
     request = intake().from_message("r", Settings(), message)
-    assert given == [(message, 3, NOW)]
+    assert given == [(message, 3)]
     assert (request.source, request.frame, request.stamp, request.timeless) == ("scanner", "scanner", SEEN, False)
     assert request.T_frame_object is None
     assert request.settings.num_grasps == 3

@@ -17,27 +17,13 @@ from std_msgs.msg import Header
 from graspd_bench.rendering.depth_noise import DEFAULT
 from graspd_bench.rendering.tabletop import depth_views, ring_poses, tabletop
 from graspd_core.errors import CloudError, TransformError
-from graspd_core.io.messages import (
-    camera_from_message,
-    depth_and_camera,
-    depth_from_message,
-    frame_fault,
-    image_size,
-)
+from graspd_core.io.messages import camera_from_message, depth_and_camera, depth_from_message, frame_fault, image_size
 from graspd_core.mesh.shapes import make_shape
 from graspd_core.perception.cloud.camera import PinholeCamera, camera_rays
 from graspd_ros.error_codes import ErrorCode, RequestError, code_of
+from graspd_ros.inputs import sensor_frames
 from graspd_ros.inputs.request_builder import RequestBuilder
-from graspd_ros.inputs.sensor_frames import (
-    MOST_CALIBRATIONS,
-    UNPAIRED,
-    CameraPlace,
-    ImagePairs,
-    cloud_frame,
-    depth_sensor_frame,
-    place_of,
-    seen_by_camera,
-)
+from graspd_ros.inputs.sensor_frames import ImagePairs, cloud_frame, depth_sensor_frame, place_of, seen_by_camera
 from graspd_ros.parameters import Settings
 
 CAMERA = PinholeCamera(320, 240, 308.0, 308.0, 159.5, 119.5)
@@ -48,14 +34,13 @@ SECOND = 1_000_000_000
 DTYPES = {"16UC1": "u2", "mono16": "u2", "32FC1": "f4", "64FC1": "f8"}
 
 
-def header(stamp: int = 0, frame: str = "camera") -> Header:
-    return Header(frame_id=frame, stamp=Time(sec=stamp // SECOND, nanosec=stamp % SECOND))
+def header(stamp: int = 0) -> Header:
+    return Header(frame_id="camera", stamp=Time(sec=stamp // SECOND, nanosec=stamp % SECOND))
 
 
 def image(depth: np.ndarray, encoding: str, stamp: int = 0) -> Image:
     """An image of depth in metres."""
-    pixels = depth * 1000 if DTYPES[encoding] == "u2" else depth
-    pixels = np.round(pixels) if DTYPES[encoding] == "u2" else pixels
+    pixels = np.round(depth * 1000) if DTYPES[encoding] == "u2" else depth
     rows = pixels.astype("<" + DTYPES[encoding]).view(np.uint8).reshape(len(depth), -1)
     return Image(
         header=header(stamp),
@@ -156,7 +141,7 @@ def test_an_image_takes_the_last_calibration_of_its_frame_and_size():
     other.header.frame_id = "elsewhere"
     assert pairs.add(other) is None
     assert pairs.unpaired() == ""
-    now[0] = UNPAIRED
+    now[0] = sensor_frames.UNPAIRED
     assert pairs.unpaired() == (
         "depth images: 1 images and 2 CameraInfos received, but no pair matches; last image: 64 x 48 in 'camera', "
         "last CameraInfo: 64 x 48 in 'elsewhere'; valid: a CameraInfo of the same frame and size"
@@ -203,7 +188,7 @@ def test_memory_is_bounded_and_no_image_is_given_out_twice(arrivals: list[tuple[
     for is_image, width in arrivals:
         message = image(np.ones((1, width + 1)), "16UC1") if is_image else calibration(width + 1, 1)
         pair = pairs.add(message)
-        assert len(pairs._infos) <= MOST_CALIBRATIONS
+        assert len(pairs._infos) <= sensor_frames.MOST_CALIBRATIONS
         if pair is not None:
             assert image_size(pair[0]) == image_size(pair[1])
             assert not any(pair[0] is image for image in given_out)
@@ -327,12 +312,12 @@ def test_a_cloud_of_another_frame_is_refused_unless_somebody_says_where_its_came
 
 def test_the_request_goes_before_the_parameters_and_a_point_before_a_frame():
     settings = Settings(sensor_frame="head", view_point=[0.0, 0.0, 1.0])
-    assert place_of(Settings()) == CameraPlace()
-    assert place_of(settings) == CameraPlace((0.0, 0.0, 1.0), "head")
+    assert place_of(Settings()) == sensor_frames.CameraPlace()
+    assert place_of(settings) == sensor_frames.CameraPlace((0.0, 0.0, 1.0), "head")
     assert place_of(settings, GraspRequest()) == place_of(settings)
-    assert place_of(settings, GraspRequest(sensor_frame="wrist")) == CameraPlace(sensor_frame="wrist")
+    assert place_of(settings, GraspRequest(sensor_frame="wrist")) == sensor_frames.CameraPlace(sensor_frame="wrist")
     said = GraspRequest(sensor_frame="wrist", use_view_point=True)
-    assert place_of(settings, said) == CameraPlace((0.0, 0.0, 0.0))
+    assert place_of(settings, said) == sensor_frames.CameraPlace((0.0, 0.0, 0.0))
 
 
 def test_a_cloud_that_came_unasked_is_seen_from_where_the_parameters_say(scene):

@@ -1,8 +1,6 @@
 """Topics of sensors over DDS, from processes of their own: large clouds, what is offered, what is lost or missing."""
 
-import os
 import subprocess
-import sys
 from collections.abc import Callable, Iterator
 from typing import Any
 
@@ -72,23 +70,12 @@ def node(monkeypatch: pytest.MonkeyPatch, domain: int, make_node) -> Iterator[No
 
 
 @pytest.fixture
-def publish(node: Node, domain: int) -> Iterator[Start]:
-    started: list[subprocess.Popen[str]] = []
-
+def publish(node: Node, start_python: Start) -> Start:
     def start(kind: str, topic: str, reliability: str, **more: Any) -> subprocess.Popen[str]:
         options = {"durability": "VOLATILE", "asked": reliability, "count": 1, "size": 100} | more
-        arguments = [kind, topic, reliability, *map(str, options.values())]
-        environment = {**os.environ, "ROS_DOMAIN_ID": str(domain)}
-        process = subprocess.Popen(
-            [sys.executable, "-c", PUBLISHER, *arguments],
-            env=environment, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True,
-        )  # fmt: skip
-        started.append(process)
-        return process
+        return start_python("-c", PUBLISHER, kind, topic, reliability, *options.values())
 
-    yield start
-    for process in started:
-        process.communicate()
+    return start
 
 
 def watch(node: Node, topics: list[SensorTopic], until: Callable[[list[str]], Any]) -> list[str]:
@@ -196,14 +183,8 @@ def test_an_invalid_qos_override_is_named_with_the_valid_values(make_node, domai
 def test_packed_images_are_heard_where_nobody_sends_plain_ones(node: Node, publish: Start):
     heard: list[Any] = []
     plain = SensorTopic(node, Image, "depth/image_rect", heard.append)
-    packed = SensorTopic(
-        node,
-        CompressedImage,
-        "depth/image_rect/compressedDepth",
-        heard.append,
-        instead_of=plain,
-        ending="/compressedDepth",
-    )
+    name, ending = "depth/image_rect/compressedDepth", "/compressedDepth"
+    packed = SensorTopic(node, CompressedImage, name, heard.append, instead_of=plain, ending=ending)
     publish("CompressedImage", "/depth/image_rect/compressedDepth", "RELIABLE", count=3)
     watch(node, [plain, packed], lambda told: len(heard) == 3)
     assert all(isinstance(message, CompressedImage) for message in heard)

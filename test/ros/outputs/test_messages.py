@@ -19,26 +19,17 @@ from scipy.spatial.transform import Rotation
 from sensor_msgs.msg import CameraInfo, Image
 from std_msgs.msg import Header
 from std_srvs.srv import Trigger
+from trimesh.transformations import translation_matrix
 from visualization_msgs.msg import Marker, MarkerArray
 
-from graspd_core import hand_mesh, load_hand
+from graspd_core import Grasp, GraspResult, Outcome, Posture, TrialResult, Verdict, hand_mesh, load_hand
 from graspd_core.hands.model import Primitive
 from graspd_core.paths import config_dir
-from graspd_core.types import (
-    ROBUSTNESS,
-    Contact,
-    Grasp,
-    GraspMetrics,
-    GraspResult,
-    Outcome,
-    Posture,
-    Timing,
-    TrialResult,
-    Verdict,
-)
-from graspd_ros.convert import matrix_of_pose, moved_result
+from graspd_core.types import ROBUSTNESS, Contact, GraspMetrics, Timing
+from graspd_ros.convert import array_of, matrix_of_pose, moved_result
 from graspd_ros.outputs.messages import COLOURS, IDS_OF_A_GRASP, PARTS, Pace, array_message, ending_of, result_markers
 from graspd_ros.outputs.responses import presentable
+from graspd_ros.request_planner import Planned
 
 FEW = {"num_grasps": 2, "preset": "fast", "time_budget": 100.0}
 LONG = {"num_grasps": 64, "preset": "accurate", "time_budget": 600.0}
@@ -48,10 +39,6 @@ HAND_LENGTH = 0.25
 
 pytestmark = pytest.mark.timeout(300)
 HAND = load_hand("allegro_right")
-
-
-def place(pose: Pose) -> np.ndarray:
-    return np.array([pose.position.x, pose.position.y, pose.position.z])
 
 
 def test_a_request_keeps_its_id_tells_progress_and_gets_one_full_answer(client, node):
@@ -69,7 +56,7 @@ def test_a_request_keeps_its_id_tells_progress_and_gets_one_full_answer(client, 
     assert len(verified) == 2
     best = answer.grasps[0]
     assert (best.id, best.rank, best.hand, best.base_link) == ("mine-1/0", 0, "allegro_right", "base_link")
-    assert np.linalg.norm(place(best.grasp_pose) - [1.0, 0.0, 0.0]) < HAND_LENGTH
+    assert np.linalg.norm(array_of(best.grasp_pose.position) - [1.0, 0.0, 0.0]) < HAND_LENGTH
     assert np.linalg.norm([best.contacts[0].position.x - 1.0, best.contacts[0].position.y]) < RADIUS + 0.01
     for joints in (best.pregrasp_joints, best.grasp_joints, best.squeeze_joints):
         assert len(joints.name) == len(joints.position) == 16
@@ -158,7 +145,7 @@ def test_the_newest_cloud_is_grasped_on_demand(client, node, make_cloud, seen_ba
     answer = client.answer("new")
     assert answer.status in (GraspArray.SUCCEEDED, GraspArray.PARTIAL)
     assert answer.header == cloud.header
-    assert np.linalg.norm(place(answer.grasps[0].grasp_pose) - BALL) < HAND_LENGTH
+    assert np.linalg.norm(array_of(answer.grasps[0].grasp_pose.position) - BALL) < HAND_LENGTH
 
 
 def depth_of_ball(client) -> tuple[Image, CameraInfo]:
@@ -194,7 +181,7 @@ def test_depth_images_become_views_and_views_a_grasp(client, node):
     answer = client.answer("views")
     assert answer.status in (GraspArray.SUCCEEDED, GraspArray.PARTIAL), answer.message
     assert answer.header == image.header
-    assert np.linalg.norm(place(answer.grasps[0].grasp_pose) - BALL) < HAND_LENGTH
+    assert np.linalg.norm(array_of(answer.grasps[0].grasp_pose.position) - BALL) < HAND_LENGTH
     assert client.call(Trigger, "reset_views").message == "dropped 2 views"
     client.send_request(id="none", source=GraspRequest.VIEWS)
     assert client.answer("none").error_code == "NO_CLOUD"
@@ -227,17 +214,16 @@ def test_a_grasp_that_is_less_sure_is_told_with_the_next_view_and_not_presented(
     posture = Posture(np.zeros(3), np.array([1.0, 0.0, 0.0, 0.0]), np.zeros(len(hand.joint_names)))
     trials = (TrialResult("hold", True, 0.0, 0.0), TrialResult(ROBUSTNESS, False, 0.0, 0.0, "fails with 3"))
     grasp = Grasp(posture, posture, posture, trials=trials, probability=0.51)
-    view, T_table_camera = np.eye(4), np.eye(4)
-    view[2, 3], T_table_camera[0, 3] = 0.5, 1.0
+    view, T_table_camera = translation_matrix([0.0, 0.0, 0.5]), translation_matrix([1.0, 0.0, 0.0])
     result = GraspResult(Outcome.TOO_FEW, (grasp,), Timing(), 0, "closed_form", next_view=view)
     assert presentable(result) is None
-    ending = ending_of(moved_result(result, T_table_camera))
+    ending = ending_of(Planned(moved_result(result, T_table_camera)))
     message = array_message(ending, "mine", Header(frame_id="table"), 1.0, hand, Pace())
     assert message.status == GraspArray.PARTIAL
     (told,) = message.grasps
     assert (told.verdict, told.probability, told.reason) == (GraspMessage.UNVERIFIED, 0.51, "fails with 3")
     assert message.next_view.header.frame_id == "table"
-    assert place(message.next_view.pose) == pytest.approx([1.0, 0.0, 0.5])
+    assert array_of(message.next_view.pose.position) == pytest.approx([1.0, 0.0, 0.5])
 
 
 def grasp(verdict: Verdict = Verdict.VERIFIED, seed: int = 0) -> Grasp:
@@ -263,7 +249,7 @@ def of(found: list[Marker], namespace: str) -> list[Marker]:
 
 def support(marker: Marker, direction: np.ndarray) -> float:
     """How far a solid reaches along a direction, as RViz draws it [m]."""
-    T, half = matrix_of_pose(marker.pose), np.array([marker.scale.x, marker.scale.y, marker.scale.z]) / 2
+    T, half = matrix_of_pose(marker.pose), array_of(marker.scale) / 2
     local = T[:3, :3].T @ direction
     if marker.type == Marker.CUBE:
         reach = np.abs(local) @ half

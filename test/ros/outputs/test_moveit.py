@@ -14,6 +14,7 @@ from moveit_msgs.msg import AttachedCollisionObject, CollisionObject
 from moveit_msgs.msg import Grasp as MoveItGrasp
 from sensor_msgs.msg import JointState
 from std_msgs.msg import Header
+from trimesh.transformations import translation_matrix
 
 from graspd_core import make_shape
 from graspd_core.errors import ConfigError
@@ -74,7 +75,7 @@ def test_every_field_is_filled_as_moveit_reads_it():
     assert ours == message(), "what it is made from stays as it is"
 
 
-def test_what_is_held_hangs_on_the_base_link_with_its_weight():
+def test_what_is_held_hangs_on_the_base_link_with_its_weight(monkeypatch: pytest.MonkeyPatch):
     # A box whose corner is 1 cm from the origin, and a hand that looks at it along a turned axis.
     box = make_shape("box")
     grasp, ours = made(), message()
@@ -97,8 +98,9 @@ def test_what_is_held_hangs_on_the_base_link_with_its_weight():
     corners = placed @ T[:3, :3].T + T[:3, 3]
     for end in (np.min, np.max):
         np.testing.assert_allclose(end(corners, 0), end(box.vertices, 0), atol=1e-9)
+    monkeypatch.setitem(sys.modules, "moveit_msgs.msg", ModuleType("old"))
     with pytest.raises(MoveItMissing, match="AttachedCollisionObject is not installed"):
-        attached_object(ours, held_hull(box, grasp.grasp), HAND, messages=ModuleType("old"))
+        attached_object(ours, held_hull(box, grasp.grasp), HAND)
 
 
 def test_the_pose_is_that_of_the_arms_last_link():
@@ -116,22 +118,16 @@ def test_a_hand_that_closes_late_waits_where_the_grasp_says():
     joints = np.linspace(HAND.lower, HAND.upper, 3)[1]
     ours.arrival_pose, ours.mount_link = deepcopy(ours.grasp_pose), "tool0"
     ours.arrival_pose.position.z = 0.221
-    ours.mount_grasp_pose = pose_of_matrix(matrix_of_pose(ours.grasp_pose) @ pose_matrix_of(0.0, 0.0, -0.1))
+    ours.mount_grasp_pose = pose_of_matrix(matrix_of_pose(ours.grasp_pose) @ translation_matrix([0.0, 0.0, -0.1]))
     # All movable joints, in whatever order: those of the trajectory are picked by name.
     ours.arrival_joints = JointState(name=list(HAND.joint_names)[::-1], position=joints[::-1].tolist())
     theirs: Any = moveit_grasp(ours, **UP, touch=("can",))
     np.testing.assert_allclose(theirs.pre_grasp_posture.points[0].positions, joints)
     assert list(theirs.grasp_posture.points[-1].positions) == list(ours.trajectory.points[-1].positions)
-    waits = matrix_of_pose(ours.arrival_pose) @ pose_matrix_of(0.0, 0.0, -0.1)
+    waits = matrix_of_pose(ours.arrival_pose) @ translation_matrix([0.0, 0.0, -0.1])
     np.testing.assert_allclose(matrix_of_pose(theirs.grasp_pose.pose), waits, atol=1e-12)
     assert theirs.pre_grasp_approach.desired_distance == pytest.approx(0.079)
     assert list(theirs.allowed_touch_objects) == ["can"]
-
-
-def pose_matrix_of(*place: float) -> np.ndarray:
-    T = np.eye(4)
-    T[:3, 3] = place
-    return T
 
 
 def test_the_pose_of_a_mounted_hand_is_that_of_the_link_that_carries_it():

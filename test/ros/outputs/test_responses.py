@@ -20,21 +20,9 @@ from hypothesis import strategies as st
 from rclpy.serialization import deserialize_message, serialize_message
 from visualization_msgs.msg import MarkerArray
 
-from graspd_core import Scene, load_hand
+from graspd_core import Grasp, GraspResult, Outcome, Posture, Progress, Scene, TrialResult, Verdict, load_hand
 from graspd_core.errors import MeshError
-from graspd_core.types import (
-    Contact,
-    Grasp,
-    GraspMetrics,
-    GraspResult,
-    Outcome,
-    Posture,
-    Progress,
-    Stage,
-    Timing,
-    TrialResult,
-    Verdict,
-)
+from graspd_core.types import Contact, GraspMetrics, Stage, Timing
 from graspd_ros.convert import pose_of_posture
 from graspd_ros.outputs import messages, responses
 from graspd_ros.outputs.responses import Health, Responses, health_message, resident_memory

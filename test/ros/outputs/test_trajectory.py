@@ -24,15 +24,7 @@ from graspd_core.hands.model import HandModel, Mount
 from graspd_core.perception.scene import object_parts
 from graspd_core.verify.world import PROTOCOLS, build_world
 from graspd_ros.convert import matrix_of, matrix_of_pose
-from graspd_ros.outputs.messages import (
-    UNMEASURED,
-    Pace,
-    arm_trajectory,
-    base_poses,
-    grasp_message,
-    posture_times,
-    trajectory_of,
-)
+from graspd_ros.outputs.messages import Pace, arm_trajectory, base_poses, grasp_message, posture_times, trajectory_of
 
 HAND = load_hand("allegro_right")
 SHARES = st.lists(st.floats(0.0, 1.0), min_size=HAND.num_joints, max_size=HAND.num_joints)
@@ -257,7 +249,7 @@ def test_the_message_of_a_grasp_has_it_only_where_there_is_an_arm():
     assert made.gate_points[-1] == len(made.arm.points) - 1 == len(made.hand.points) - 1
     assert list(made.hand.joint_names) == list(hand.joint_names)
     assert seconds(made.arm) == seconds(made.hand)
-    assert made.mass == UNMEASURED
+    assert made.mass == -1.0
     assert grasp_message(grasp, 0, "id", Header(), hand, Pace(), mass=0.3).execution.mass == 0.3
     bare = grasp_message(Grasp(grasp.pregrasp, grasp.grasp, grasp.squeeze), 0, "id", Header(), hand, Pace())
     assert list(bare.arm_stages) == []
