@@ -370,11 +370,7 @@ def test_no_file_outside_the_packages_is_too_long():
     [
         ("graspd_core/mesh/sdf.py", "from graspd_core.hands.model import HandModel", "hands.model"),
         ("graspd_core/optimize/graspd2022/graspd2022.py", "from ...planning import rounds", "planning"),
-        (
-            "graspd_core/verify/metrics.py",
-            "def f():\n    from graspd_core.optimize.losses import g",
-            "optimize.losses",
-        ),
+        ("graspd_core/verify/metrics.py", "def f():\n    from graspd_core.optimize.losses import g", "optimize.losses"),
         ("graspd_core/verify/hold_trial.py", "from graspd_core import optimize", "optimize"),
         ("graspd_core/hands/model.py", "from graspd_core.planning.plan_grasps import plan_grasps", "planning"),
         ("graspd_core/io/bags.py", "from graspd_core.planning.plan_grasps import plan_grasps", "planning"),

@@ -38,7 +38,7 @@ MESSAGES = Path(__file__).with_name("messages.txt")
 # A text is a message by the name of the call, function or variable that it is in, or by its own words.
 TROUBLE = re.compile(
     r"(?i)warn|doubt|error|bad_|wrong|fault|refus|reason|why|hint|advice|remedy|told|torn|fail|lost|_log|changed"
-    r"|message|\btext\b|counts|looked_at|found\.append",
+    r"|message|\btext\b|counts|looked_at|found\.append"
 )
 TROUBLE_WORDS = re.compile(
     r"valid|did you mean|not installed|missing|; give|\bis no\b|^parameter |^(cloud|target|transform|\{[^{}]*\}): "

@@ -339,8 +339,6 @@ def test_what_is_no_bag_is_named(tmp_path, make, culprit):
 
 
 def test_a_bag_of_ros_1_is_named_by_every_command_with_what_converts_it(tmp_path, capsys):
-    from graspd_core.cli import main
-
     (tmp_path / "old.bag").write_bytes(b"#ROSBAG V2.0\n")
     for words in (["replay"], ["synthesize"], ["reconstruct", "--out", str(tmp_path / "m.ply")]):
         assert main([words[0], str(tmp_path / "old.bag"), *words[1:]]) == 2

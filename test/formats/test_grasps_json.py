@@ -62,9 +62,7 @@ def result() -> GraspResult:
         trials=(TrialResult("hold", True, 0.01, 0.1),),
     )
     lost = replace(
-        held,
-        metrics=None,
-        trials=(TrialResult("hold", False, float("inf"), float("inf"), "the simulation diverged"),),
+        held, metrics=None, trials=(TrialResult("hold", False, float("inf"), float("inf"), "the simulation diverged"),)
     )
     timing = Timing(load=0.5, first_verified=2.5, total=3.0)
     return GraspResult(Outcome.TOO_FEW, (held, lost), timing, 7, "closed_form", warnings=("open mesh",))

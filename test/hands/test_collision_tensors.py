@@ -14,14 +14,7 @@ from scipy.spatial.transform import Rotation
 from torch import Tensor
 from torch.autograd import gradcheck
 
-from graspd_core.hands.kinematics import (
-    Kinematics,
-    forward,
-    make_kinematics,
-    place_points,
-    placement,
-    point_jacobian,
-)
+from graspd_core.hands.kinematics import Kinematics, forward, make_kinematics, place_points, placement, point_jacobian
 from graspd_core.hands.library import load_hand
 from graspd_core.hands.link_distance import (
     CollisionTensors,

@@ -98,7 +98,6 @@ def test_a_description_overrides_what_it_names(tmp_path: Path) -> None:
 @pytest.mark.slow
 @pytest.mark.parametrize("name", HANDS)
 def test_a_guessed_hand_holds_a_box(name: str) -> None:
-
     hand = load_hand(config_dir() / "hands" / f"{name}.urdf")
     result = plan_grasps(load_scene("shape:box"), hand, count=1, seed=0, preset="fast", deadline=100.0)
     assert result.outcome is Outcome.SUCCEEDED
@@ -349,7 +348,6 @@ def test_joints_that_carry_the_palm_leave_its_normal_alone(tmp_path: Path) -> No
 @pytest.mark.parametrize("shape", ["box", "sphere", "cylinder"])
 @pytest.mark.parametrize("name", GRIPPERS)
 def test_a_guessed_gripper_holds(name: str, shape: str, tmp_path: Path) -> None:
-
     hand = load_hand(write(GRIPPERS[name]().urdf, tmp_path))
     result = plan_grasps(load_scene(f"shape:{shape}"), hand, count=8, seed=0, preset="fast")
     # One motor for all three fingers lets a ball turn in nearly every grasp.

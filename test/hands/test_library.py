@@ -94,11 +94,7 @@ def test_unknown_hand_lists_the_known_ones_and_a_description_that_is_no_mapping_
 @pytest.mark.parametrize(
     ("old", "new", "message"),
     [
-        (
-            "approach: [1.0, 0.0, 0.0]",
-            "approche: [1, 0, 0]",
-            r":\d+: unknown key 'approche'; did you mean 'approach'",
-        ),
+        ("approach: [1.0, 0.0, 0.0]", "approche: [1, 0, 0]", r":\d+: unknown key 'approche'; did you mean 'approach'"),
         ("  link: base_link", "  lnik: base_link", r"yaml:\d+: unknown key 'lnik'; did you mean 'link'"),
         ("  link: base_link", "  link: link_3.0", r"yaml:\d+: palm.link: 'link_3.0' is not fixed to the base"),
         ("joint_1.0: 0.35", "joint_1.0: 2.5", r"yaml:\d+: open.joint_1.0: 2.5 is outside the limits \[-0.196, 1.61\]"),

@@ -97,14 +97,7 @@ def test_the_loss_is_that_of_the_poses_returned(problem, starts):
     assert len(solution.loss) == 3
     p = solution.poses
     with torch.no_grad():
-        terms = evaluate(
-            problem,
-            p,
-            torch.zeros_like(solution.loss),
-            CONFIG.delta_end,
-            fine=True,
-            sharp=True,
-        )
+        terms = evaluate(problem, p, torch.zeros_like(solution.loss), CONFIG.delta_end, fine=True, sharp=True)
     # Same numbers through the same code: rounding only.
     assert weighted(terms, CONFIG.polish_weights).tolist() == pytest.approx(solution.loss.tolist(), rel=1e-9)
 

@@ -13,15 +13,7 @@ from small_problem import small_problem
 
 from graspd_core import PlanConfig, Scene, draw_starts, hand_names, load_hand, load_scene
 from graspd_core.config import ProblemConfig
-from graspd_core.hands.kinematics import (
-    RETREAT,
-    forward,
-    hand_mesh,
-    in_base,
-    link_poses,
-    make_kinematics,
-    place_points,
-)
+from graspd_core.hands.kinematics import RETREAT, forward, hand_mesh, in_base, link_poses, make_kinematics, place_points
 from graspd_core.hands.link_distance import solid_distance
 from graspd_core.mesh.sdf import sample_sdf
 from graspd_core.optimize.candidates import PlannerInput, find_candidates

@@ -14,12 +14,7 @@ from graspd_core.io.messages import pixels_from_message, points_from_message
 from graspd_core.mesh.mesh_files import surface_samples
 from graspd_core.mesh.shapes import make_shape
 from graspd_core.perception.cloud.camera import PinholeCamera, cloud_from_depth
-from graspd_core.perception.cloud.point_cloud import (
-    PointCloud,
-    clean_cloud,
-    least_axes,
-    transform_cloud,
-)
+from graspd_core.perception.cloud.point_cloud import PointCloud, clean_cloud, least_axes, transform_cloud
 from graspd_core.perception.reconstruct.reconstruct import reconstruct
 from graspd_core.perception.scene_from_views import scene_from_views
 from graspd_core.perception.segment.segment import segment

@@ -100,11 +100,7 @@ def test_the_surface_goes_through_its_points(shape, worst_mm):
 
 
 @settings(max_examples=20, deadline=None)
-@given(
-    st.floats(0.02, 0.05),
-    st.tuples(*[st.floats(-0.2, 0.2)] * 3),
-    st.integers(0, 2**16),
-)
+@given(st.floats(0.02, 0.05), st.tuples(*[st.floats(-0.2, 0.2)] * 3), st.integers(0, 2**16))
 def test_near_a_sphere_the_field_is_the_distance_and_far_from_it_has_its_sign(radius, centre, seed):
     normals = np.random.default_rng(seed).normal(size=(6000, 3))
     normals /= np.linalg.norm(normals, axis=1, keepdims=True)

@@ -230,11 +230,7 @@ def test_where_the_base_stands_in_its_file_is_kept(folder: Path) -> None:
     [
         ("<freejoint/>", '<include file="x.xml"/>', "<include file='x.xml'>: no such file beside changed.xml"),
         ("<freejoint/>", '<include file="changed.xml"/>', "<include file='changed.xml'>: included twice"),
-        (
-            "<equality>",
-            '<equality><connect body1="a" body2="b" anchor="0 0 0"/>',
-            "write <joint joint1 joint2 pol",
-        ),
+        ("<equality>", '<equality><connect body1="a" body2="b" anchor="0 0 0"/>', "write <joint joint1 joint2 pol"),
         ('<body name="tip"', '<replicate count="9"/><body name="tip"', "body 'a2': <replicate> is not read"),
         ("</worldbody>", '<body name="mug"/></worldbody>', "the world has 2 bodies: palm, mug; valid: one"),
         ('type="slide"', 'type="ball"', "joint 's1' is of type 'ball'; known: hinge, slide"),

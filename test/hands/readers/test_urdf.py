@@ -279,11 +279,7 @@ def test_errors_name_the_line_of_the_file(tmp_path: Path, before: str) -> None:
 
 @pytest.mark.parametrize(
     "text",
-    [
-        "<!--" * 200_000,
-        "<?xml " * 200_000,
-        "<?xml encoding='punycode'?>" + "a" * 500_000 + "-" + "a" * 2_000_000,
-    ],
+    ["<!--" * 200_000, "<?xml " * 200_000, "<?xml encoding='punycode'?>" + "a" * 500_000 + "-" + "a" * 2_000_000],
     ids=["comments", "headers", "encoding"],
 )
 def test_a_file_made_to_take_long_is_refused_soon(tmp_path: Path, text: str) -> None:
