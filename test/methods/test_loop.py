@@ -116,8 +116,7 @@ def test_joint_limits_hold_exactly(problem, starts):
     wild = replace(CONFIG, joint_rate=1.0)
     at_limit = replace(starts, joints=problem.hand.upper.expand_as(starts.joints).clone())
     solution = minimise(ClosedForm(wild, STARTS), problem, at_limit, Hooks())
-    assert (solution.poses.joints >= problem.hand.lower).all()
-    assert (solution.poses.joints <= problem.hand.upper).all()
+    assert ((problem.hand.lower <= solution.poses.joints) & (solution.poses.joints <= problem.hand.upper)).all()
     assert ((solution.poses.joints == problem.hand.lower) | (solution.poses.joints == problem.hand.upper)).any()
     assert solution.poses.quaternion.norm(dim=-1).tolist() == pytest.approx([1.0] * STARTS, abs=1e-12)
 
