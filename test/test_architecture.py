@@ -10,6 +10,7 @@ import tokenize
 from collections import Counter
 from collections.abc import Iterable
 from dataclasses import dataclass
+from functools import cache
 from pathlib import Path
 
 import pytest
@@ -255,13 +256,16 @@ def semicolons(source: str) -> int:
     return found
 
 
-def sources() -> list[Path]:
-    return sorted(path for package in PACKAGES for path in (ROOT / package).rglob("*.py"))
+@cache
+def sources() -> dict[str, str]:
+    """The text of every module of the packages, by its path below the root."""
+    paths = sorted(path for package in PACKAGES for path in (ROOT / package).rglob("*.py"))
+    return {str(path.relative_to(ROOT)): path.read_text() for path in paths}
 
 
 def test_the_sources_keep_the_rules():
-    paths = {str(path.relative_to(ROOT)): path.read_text() for path in sources()}
-    found = [line for path, source in paths.items() for line in breaches(path, source) + length_faults(path, source)]
+    modules = sources().items()
+    found = [line for path, source in modules for line in breaches(path, source) + length_faults(path, source)]
     assert not found, "\n".join(found)
 
 
@@ -273,20 +277,14 @@ def test_the_checker_sees_a_file_of_a_wrong_length():
 
 
 def test_folders_stay_small_and_names_are_the_fields():
-    paths = {str(path.relative_to(ROOT)): path.read_text() for path in sources()}
-    assert crowded_folders(paths) == []
-    assert [line for path, source in paths.items() for line in metaphors(path, source)] == []
+    assert crowded_folders(sources()) == []
+    assert [line for path, source in sources().items() for line in metaphors(path, source)] == []
 
 
 def test_the_checker_sees_a_crowded_folder():
-    assert crowded_folders([f"graspd_core/mesh/m{i}.py" for i in range(MAX_FILES + 1)]) == [
-        "graspd_core/mesh: 26 files, more than 25"
-    ]
-    fine = [f"graspd_core/mesh/m{i}.py" for i in range(MAX_FILES)] + [
-        "graspd_core/mesh/__init__.py",
-        "graspd_ros/m1.py",
-    ]
-    assert crowded_folders(fine) == []
+    crowd = [f"graspd_core/mesh/m{i}.py" for i in range(MAX_FILES + 1)]
+    assert crowded_folders(crowd) == ["graspd_core/mesh: 26 files, more than 25"]
+    assert crowded_folders([*crowd[1:], "graspd_core/mesh/__init__.py", "graspd_ros/m1.py"]) == []
 
 
 @pytest.mark.parametrize("package", MAX_PACKAGE_LINES)
@@ -312,9 +310,10 @@ def test_the_checker_sees_a_metaphor():
 
 
 def test_the_prose_is_plain():
-    pages = [*ROOT.glob("*.md"), *ROOT.glob("docs/**/*.md"), *(ROOT / "benchmarks").glob("*.py"), *sources()]
-    assert len(pages) > 200
-    found = [line for page in pages for line in private_phrases(str(page.relative_to(ROOT)), page.read_text())]
+    pages = [*ROOT.glob("*.md"), *ROOT.glob("docs/**/*.md"), *(ROOT / "benchmarks").glob("*.py")]
+    texts = sources() | {str(page.relative_to(ROOT)): page.read_text() for page in pages}
+    assert len(texts) > 200
+    found = [line for path, text in texts.items() for line in private_phrases(path, text)]
     assert not found, "\n".join(found)
 
 
@@ -325,7 +324,7 @@ def test_the_checker_sees_a_private_phrase():
 
 
 def test_docstrings_hold_no_semicolon():
-    assert [str(path.relative_to(ROOT)) for path in sources() if semicolons(path.read_text())] == []
+    assert [path for path, source in sources().items() if semicolons(source)] == []
 
 
 def test_the_checker_sees_a_semicolon():
@@ -334,10 +333,7 @@ def test_the_checker_sees_a_semicolon():
 
 
 def test_functions_stay_small():
-    large = {
-        k: v for path in sources() for k, v in large_functions(str(path.relative_to(ROOT)), path.read_text()).items()
-    }
-    assert large == {}
+    assert [large for path, source in sources().items() if (large := large_functions(path, source))] == []
 
 
 @pytest.mark.parametrize(
@@ -370,11 +366,7 @@ def test_no_file_outside_the_packages_is_too_long():
     [
         ("graspd_core/mesh/sdf.py", "from graspd_core.hands.model import HandModel", "hands.model"),
         ("graspd_core/optimize/graspd2022/graspd2022.py", "from ...planning import rounds", "planning"),
-        (
-            "graspd_core/verify/metrics.py",
-            "def f():\n    from graspd_core.optimize.losses import g",
-            "optimize.losses",
-        ),
+        ("graspd_core/verify/metrics.py", "def f():\n    from graspd_core.optimize.losses import g", "optimize.losses"),
         ("graspd_core/verify/hold_trial.py", "from graspd_core import optimize", "optimize"),
         ("graspd_core/hands/model.py", "from graspd_core.planning.plan_grasps import plan_grasps", "planning"),
         ("graspd_core/io/bags.py", "from graspd_core.planning.plan_grasps import plan_grasps", "planning"),

@@ -109,8 +109,7 @@ sys.exit(main(["synthesize", sys.argv[1], "-n", "1", "--preset", "fast", "--out"
 
 
 @pytest.mark.parametrize(
-    ("source", "status", "error"),
-    [("ball.stl", 0, ""), ("ball.npy", 2, NO_OPEN3D), ("ball.xyz", 2, NO_OPEN3D)],
+    ("source", "status", "error"), [("ball.stl", 0, ""), ("ball.npy", 2, NO_OPEN3D), ("ball.xyz", 2, NO_OPEN3D)]
 )
 def test_a_mesh_needs_no_open3d_and_a_cloud_names_its_extra(source: str, status: int, error: str, tmp_path: Path):
     ball = graspd_core.make_shape("sphere")

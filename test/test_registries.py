@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from expected import some
 from std_msgs.msg import Header
 
 from graspd_bench import tables
@@ -53,13 +54,11 @@ def message(grasp: Grasp, hand: Any) -> Any:
 def test_a_metric_is_one_row(grasp, hand, target, monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setitem(METRICS, "height", HEIGHT)
     measured = replace(grasp, metrics=measure(make_metrics_context(target, hand), grasp.grasp))
-    assert measured.metrics is not None
-    assert measured.metrics["height"] == 0.25
+    assert some(measured.metrics)["height"] == 0.25
     written = document(measured, target, hand)
     assert written["grasps"][0]["metrics"]["height_mm"] == 250.0
     (read,) = grasps_of(written)
-    assert read.metrics is not None
-    assert read.metrics["height"] == 0.25
+    assert some(read.metrics)["height"] == 0.25
     assert {metric.name: metric.value for metric in message(measured, hand).metrics}["height"] == 0.25
     event = result_event(GraspResult(Outcome.SUCCEEDED, (measured,), Timing(), 0, "closed_form"))
     assert event["best"]["metrics"]["height_mm"] == 250.0

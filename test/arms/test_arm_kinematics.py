@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 import torch
 import yaml
+from expected import refused
 from hypothesis import given
 from hypothesis import strategies as st
 
@@ -44,19 +45,9 @@ def random_arm(count: int, seed: int) -> Arm:
         slides, last = rng.random() < 0.25, k == count
         kind = "fixed" if last else "prismatic" if slides else "revolute"
         middle, half = (rng.uniform(-1, 1), rng.uniform(0.3, 3)) if not slides else (0.2, 0.2)
-        joints.append(
-            JointSpec(
-                f"j{k}",
-                f"l{k}",
-                f"l{k + 1}",
-                kind,
-                turns[k],
-                rng.uniform(-0.4, 0.4, 3),
-                np.zeros(3) if last else axis / np.linalg.norm(axis),
-                middle - half,
-                middle + half,
-            )
-        )
+        place, about = rng.uniform(-0.4, 0.4, 3), np.zeros(3) if last else axis / np.linalg.norm(axis)
+        ends = f"j{k}", f"l{k}", f"l{k + 1}"
+        joints.append(JointSpec(*ends, kind, turns[k], place, about, middle - half, middle + half))
     chain = assemble(Path("random"), "random", [LinkSpec(f"l{k}") for k in range(count + 2)], joints, {})
     middle = 0.5 * (chain.lower + chain.upper)
     return Arm("random", chain, count + 1, chain.lower, chain.upper, middle, capsules_about(()))
@@ -140,8 +131,7 @@ def test_from_nearby_the_tip_comes_back_within_the_limits(joints: int, seed: int
     # Computed in float32, of lengths of metres.
     assert (wrong[reached, :3].norm(dim=-1) < POSITION_TOLERANCE + 2e-6).all()
     assert (wrong[reached, 3:].norm(dim=-1) < ROTATION_TOLERANCE + 2e-6).all()
-    assert (q >= torch.as_tensor(arm.lower)).all()
-    assert (q <= torch.as_tensor(arm.upper)).all()
+    assert ((torch.as_tensor(arm.lower) <= q) & (q <= torch.as_tensor(arm.upper))).all()
     # Where an arm is singular, steps along what it cannot do are slow: it is near by then.
     assert (torch.hypot(wrong[:, :3].norm(dim=-1), RADIAN * wrong[:, 3:].norm(dim=-1)) < 5e-3).all()
 
@@ -262,9 +252,8 @@ def test_a_base_that_is_the_world_keeps_the_place_of_what_stands_in_it(tmp_path:
     ],
 )
 def test_a_wrong_description_is_refused_in_one_line(tmp_path: Path, keys: dict[str, object], told: str):
-    with pytest.raises(GraspdError, match=told) as caught:
+    with refused(GraspdError, match=told):
         load_arm(write(tmp_path, **keys))
-    assert "\n" not in str(caught.value)
 
 
 def test_an_arm_that_could_hit_nothing_or_has_a_joint_that_follows_is_refused(tmp_path: Path):

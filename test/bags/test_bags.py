@@ -16,6 +16,7 @@ from bag_writer import (
     transforms_message,
     write_bag,
 )
+from expected import refused
 
 from graspd_bench.rendering.render import look_at, render_depth
 from graspd_core.cli import main
@@ -276,10 +277,8 @@ def test_the_topic_is_the_one_that_is_meant(tmp_path, topics, options, chosen):
 )
 def test_a_topic_that_is_missing_or_ambiguous_is_named(tmp_path, topics, options, culprit):
     path = bag_of(tmp_path / "bag", *topics)
-    with pytest.raises(BagError) as refused:
+    with refused(BagError, culprit):
         list(read_frames(path, **options))
-    assert culprit in str(refused.value)
-    assert "\n" not in str(refused.value)
 
 
 def test_a_frame_that_only_a_refused_transform_names_is_told_with_the_fault(tmp_path, capsys):
@@ -312,10 +311,8 @@ def cut(path: Path, share: float) -> None:
 def test_a_bag_that_was_cut_short_is_named(tmp_path, storage, share):
     write_bag(tmp_path / "bag", flown_records([(0.4, 0, 0.2), (0, 0.4, 0.2)]), storage=storage)
     cut(tmp_path / "bag", share)
-    with pytest.raises(BagError) as refused:
+    with refused(BagError, str(tmp_path / "bag")):
         list(read_frames(tmp_path / "bag"))
-    assert str(tmp_path / "bag") in str(refused.value)
-    assert "\n" not in str(refused.value)
 
 
 @pytest.mark.parametrize(
@@ -332,15 +329,11 @@ def test_a_bag_that_was_cut_short_is_named(tmp_path, storage, share):
 )
 def test_what_is_no_bag_is_named(tmp_path, make, culprit):
     make(tmp_path / "bag")
-    with pytest.raises(BagError) as refused:
+    with refused(BagError, culprit):
         bag_topics(tmp_path / "bag")
-    assert culprit in str(refused.value)
-    assert "\n" not in str(refused.value)
 
 
 def test_a_bag_of_ros_1_is_named_by_every_command_with_what_converts_it(tmp_path, capsys):
-    from graspd_core.cli import main
-
     (tmp_path / "old.bag").write_bytes(b"#ROSBAG V2.0\n")
     for words in (["replay"], ["synthesize"], ["reconstruct", "--out", str(tmp_path / "m.ply")]):
         assert main([words[0], str(tmp_path / "old.bag"), *words[1:]]) == 2

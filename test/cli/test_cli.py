@@ -15,6 +15,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from bag_writer import Record, camera_info_message, cloud_message, depth_message, transforms_message, write_bag
+from expected import some
 
 from graspd_bench.rendering.render import look_at, render_depth
 from graspd_bench.rendering.tabletop import ring_poses, tabletop, views_of
@@ -82,19 +83,14 @@ def test_a_bad_option_is_named_in_one_line(capsys: pytest.CaptureFixture[str], o
 
 
 @pytest.mark.parametrize("option", ["--out", "--html", "--picture"])
-def test_an_unwritable_result_is_refused_before_the_run(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str], option: str, monkeypatch: pytest.MonkeyPatch
-):
+def test_an_unwritable_result_is_refused_before_the_run(tmp_path, capsys, monkeypatch, option: str):
     monkeypatch.setattr(pipeline, "plan_grasps", lambda *_, **__: pytest.fail("the run was started"))
     (tmp_path / "file").write_text("here")
     (tmp_path / "folder.png").mkdir()
-    for path, culprit in (
-        (tmp_path / "folder.png", "is a directory"),
-        (tmp_path / "file" / "a.png", "cannot be written"),
-    ):
-        assert main(["synthesize", "shape:box", option, str(path)]) == EXIT_BAD_INPUT
+    for path, culprit in (("folder.png", "is a directory"), ("file/a.png", "cannot be written")):
+        assert main(["synthesize", "shape:box", option, str(tmp_path / path)]) == EXIT_BAD_INPUT
         line = the_line(capsys)
-        assert str(path) in line
+        assert str(tmp_path / path) in line
         assert culprit in line
 
 
@@ -176,9 +172,7 @@ def test_a_scene_file_sets_the_reconstruction(tmp_path: Path, capsys: pytest.Cap
         assert "scene.yaml:1: reconstruction: unknown key 'most_faces'; did you mean 'max_faces'?" in the_line(capsys)
 
 
-def test_an_arm_that_reaches_is_written_and_one_that_does_not_is_told(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-):
+def test_an_arm_that_reaches_is_written_and_one_that_does_not_is_told(tmp_path: Path, capsys):
     asked = ["synthesize", "shape:box", "-n", "1", "--hand", "barrett_like", "--verify", "none", "--arm", "panda_like"]
     assert main([*asked, "--arm-base", "-0.5", "0", "-0.1", "--out", str(tmp_path / "g.json")]) == EXIT_OK
     assert all(grasp.arm is not None for grasp in load_grasps(tmp_path / "g.json"))
@@ -212,9 +206,7 @@ def test_the_summary_lists_three_grasps_and_counts_the_others():
         (Outcome.CANCELLED, EXIT_INTERRUPTED),
     ],
 )
-def test_every_outcome_has_its_status(
-    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], outcome: Outcome, status: int
-):
+def test_every_outcome_has_its_status(monkeypatch, capsys, outcome: Outcome, status: int):
     ended = GraspResult(outcome, (), Timing(), 0, "closed_form")
     monkeypatch.setattr(pipeline, "plan_grasps", lambda *_, **__: ended)
     assert main(["synthesize", "shape:box"]) == status
@@ -275,8 +267,7 @@ def test_an_interrupt_in_a_process_of_its_own(tmp_path: Path, number: signal.Sig
     command = [*GRASPD, "synthesize", "shape:box", "-n", "32", "--preset", "accurate", "--out", str(out)]
     command += ["--mass", "0.1"]
     process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
-    assert process.stderr is not None
-    assert "optimise" in process.stderr.readline()
+    assert "optimise" in some(process.stderr).readline()
     os.kill(process.pid, number)
     output, errors = process.communicate()
     assert process.returncode == EXIT_INTERRUPTED, errors
@@ -518,9 +509,7 @@ def test_a_library_is_built_gone_on_with_and_listed(tmp_path: Path, capsys: pyte
     assert "bad.obj" in told.err
 
 
-def test_a_library_of_a_hand_that_cannot_lift_the_assumed_mass_is_gone_on_with(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-):
+def test_a_library_of_a_hand_that_cannot_lift_the_assumed_mass_is_gone_on_with(tmp_path: Path, capsys):
     """The grasps are stored at the mass that the hand lifts. A second build plans none of them again."""
     for name in ("parallel_gripper.yaml", "parallel_gripper.urdf"):
         (tmp_path / name).write_text((config_dir() / "hands" / name).read_text())
@@ -562,8 +551,6 @@ def test_an_object_that_would_go_by_the_name_of_another_is_refused(tmp_path: Pat
 def test_what_cannot_be_done_is_told_in_one_line(tmp_path: Path, monkeypatch, capsys, words: list[str], told: str):
     monkeypatch.chdir(tmp_path)
     Path("other.grasps").write_text("some other file\n" * 100)
-    assert main(["library", *words]) == 2
-    error = capsys.readouterr().err
-    assert told in error
-    assert error.count("\n") == 1
+    assert main(["library", *words]) == EXIT_BAD_INPUT
+    assert told in the_line(capsys)
     assert not Path("new.grasps").exists()

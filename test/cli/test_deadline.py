@@ -11,6 +11,7 @@ import time
 from pathlib import Path
 
 import pytest
+from expected import some
 
 from graspd_core.cli.running import EXIT_TOO_FEW, Deadline, DeadlinePassed, process_began
 
@@ -90,8 +91,7 @@ def test_work_in_time_and_work_without_a_deadline_are_left_alone():
             done = sum(range(1000))
         assert done == 499500
         assert (deadline.left() is None) == (seconds is None)
-    left = Deadline(1.0, time.perf_counter() - 5.0).left()
-    assert left is not None
+    left = some(Deadline(1.0, time.perf_counter() - 5.0).left())
     assert left > 0
 
 

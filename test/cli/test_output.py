@@ -168,9 +168,7 @@ def test_a_wait_is_shown_on_a_terminal_only(capsys: pytest.CaptureFixture[str]):
         (["reconstruct", "--out", "clo"], ["cloud.npy"]),
     ],
 )
-def test_bash_completes_what_was_begun(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str], words: list[str], offered: list[str]
-):
+def test_bash_completes_what_was_begun(tmp_path: Path, capsys, words: list[str], offered: list[str]):
     pytest.importorskip("shtab")
     assert main(["completion", "bash"]) == EXIT_OK
     (tmp_path / "cloud.npy").touch()

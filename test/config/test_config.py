@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 import yaml
+from expected import refused
 
 from graspd_bench.rendering.depth_noise import NONE
 from graspd_bench.rendering.tabletop import ring_poses, tabletop, views_of
@@ -86,11 +87,8 @@ def test_a_preset_file_changes_only_what_it_names(tmp_path: Path):
 def test_a_bad_preset_file_is_named(tmp_path: Path, text: str, culprits: list[str]):
     path = tmp_path / "bad.yaml"
     path.write_text(text)
-    with pytest.raises(ConfigError) as caught:
+    with refused(ConfigError, "bad.yaml", *culprits):
         load_preset(str(path))
-    message = str(caught.value)
-    assert "\n" not in message
-    assert all(part in message for part in ["bad.yaml", *culprits]), message
 
 
 @pytest.mark.parametrize("name", ["resolution", "method", "closed_form.weights.posture"])
@@ -108,9 +106,8 @@ def test_a_file_that_is_no_text_is_named(tmp_path: Path):
 
 @pytest.mark.parametrize("name", ["best", "missing.yaml"])
 def test_an_unknown_preset_lists_the_known(name: str):
-    with pytest.raises(ConfigError) as caught:
+    with refused(ConfigError, name, "fast", "balanced", "accurate"):
         load_preset(name)
-    assert all(known in str(caught.value) for known in (name, "fast", "balanced", "accurate"))
 
 
 def test_places_are_read_with_their_signs():
@@ -187,11 +184,8 @@ def test_the_documented_settings_are_those_of_the_code():
     ],
 )
 def test_a_bad_file_is_named(tmp_path: Path, text: str, culprits: list[str]):
-    with pytest.raises(ConfigError) as caught:
+    with refused(ConfigError, "scene.yaml", *culprits):
         load_scene_config(written(tmp_path, text))
-    message = str(caught.value)
-    assert "\n" not in message
-    assert all(part in message for part in ["scene.yaml", *culprits]), message
 
 
 def recorded(config: Any, prefix: str, read: set[str]) -> Any:

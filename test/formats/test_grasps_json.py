@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 import pytest
 import trimesh
+from expected import refused, some
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
@@ -62,9 +63,7 @@ def result() -> GraspResult:
         trials=(TrialResult("hold", True, 0.01, 0.1),),
     )
     lost = replace(
-        held,
-        metrics=None,
-        trials=(TrialResult("hold", False, float("inf"), float("inf"), "the simulation diverged"),),
+        held, metrics=None, trials=(TrialResult("hold", False, float("inf"), float("inf"), "the simulation diverged"),)
     )
     timing = Timing(load=0.5, first_verified=2.5, total=3.0)
     return GraspResult(Outcome.TOO_FEW, (held, lost), timing, 7, "closed_form", warnings=("open mesh",))
@@ -156,8 +155,7 @@ def test_files_of_version_1_are_read():
         trials = [[t.name, t.passed, t.displacement, t.rotation, t.reason] for t in grasp.trials]
         assert [grasp.verdict, grasp.reason, trials] == found
     assert wild.metrics is None
-    assert held.metrics is not None
-    assert {name: value for name, value in held.metrics.items() if value is not None} == pytest.approx({
+    assert {name: value for name, value in some(held.metrics).items() if value is not None} == pytest.approx({
         "contact_area": 2e-4, "intersection_volume": 1e-6, "penetration": 0.0015, "self_penetration": 0.0005,
         "epsilon": 0.25, "volume": 1.5, "robustness": 0.75,
     })  # fmt: skip
@@ -194,10 +192,8 @@ def test_a_verdict_that_its_trials_do_not_support_is_refused(document):
 def test_other_files_are_refused(tmp_path: Path, text: str, culprit: str):
     path = tmp_path / "odd.json"
     path.write_text(text)
-    with pytest.raises(FormatError) as caught:
+    with refused(FormatError, culprit, "odd.json"):
         load_document(path)
-    assert culprit in str(caught.value)
-    assert "odd.json" in str(caught.value)
 
 
 @pytest.mark.parametrize("key", ["position", "verdict", "squeeze_joint_positions", "metrics", "trials"])

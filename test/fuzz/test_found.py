@@ -54,8 +54,16 @@ def refusal(fuzz: ModuleType, name: str, data: bytes, folder: Path) -> str:
     return told
 
 
-PLY = "ply\nformat {} 1.0\nelement vertex 2\nproperty float x\nproperty float y\nproperty {} z\nend_header\n"
-PCD = "# .PCD\nFIELDS x y z\nSIZE 4 4 4\nTYPE F F F\nCOUNT 1 1 1\nWIDTH {n}\nHEIGHT 1\nPOINTS {n}\nDATA {data}\n"
+def ply(kind: str, z: str, data: bytes) -> bytes:
+    """A cloud of two points by its header."""
+    head = f"ply\nformat {kind} 1.0\nelement vertex 2\nproperty float x\nproperty float y\nproperty {z} z\nend_header\n"
+    return head.encode() + data
+
+
+def pcd(points: int, kind: str, data: bytes = b"", *, size: str = "4", form: str = "F", count: str = "1") -> bytes:
+    """A cloud of so many points by its header, with other entries for z."""
+    head = f"# .PCD\nFIELDS x y z\nSIZE 4 4 {size}\nTYPE F F {form}\nCOUNT 1 1 {count}\n"
+    return f"{head}WIDTH {points}\nHEIGHT 1\nPOINTS {points}\nDATA {kind}\n".encode() + data
 
 
 @pytest.mark.parametrize(
@@ -68,31 +76,19 @@ PCD = "# .PCD\nFIELDS x y z\nSIZE 4 4 4\nTYPE F F F\nCOUNT 1 1 1\nWIDTH {n}\nHEI
         (array("'<f4'", "(1000000000000, 3)"), "not readable as numbers"),
         (archive(flags=1), "is encrypted"),
         (archive(method=99), "compression method is not supported"),
-        (PLY.format("ascii", "float").encode() + b"0 0 1\n0 0", "cut short: 1 of 2 points"),
-        (PLY.format("binary_little_endian", "float").encode() + bytes(13), "cut short: 1 of 2 points"),
-        (PLY.format("ascii", "list uchar float").encode() + b"0 0 1\n0 0 1\n", "'vertex' has a list"),
-        (PLY.format("ascii", "string").encode() + b"0 0 1\n0 0 1\n", "'property string z' is not understood"),
-        (PCD.format(n=2, data="ascii").encode() + b"0 0 1\n", "cut short: 1 of 2 points"),
-        (PCD.format(n=10**9, data="ascii").encode() + b"0 0 1\n", "cut short: 1 of 1000000000 points"),
-        (PCD.format(n=10**9, data="binary").encode() + bytes(24), "cut short: 2 of 1000000000 points"),
-        (
-            PCD.format(n=10**9, data="binary_compressed").encode() + bytes(24),
-            "promises 12000000000 bytes of points, its data promises 0",
-        ),
-        (
-            PCD.replace("1 1 1", "1 1 100000000").format(n=1, data="binary_compressed").encode(),
-            "promises 400000008 bytes of points, its data promises 0",
-        ),
-        (PCD.replace("4 4 4", "4 4 5").format(n=1, data="binary").encode() + bytes(24), "not a readable pcd cloud"),
-        (
-            PCD.replace("F F F", "F F " + 5000 * "1").format(n=1, data="binary").encode() + bytes(12),
-            "is unknown; valid: F, I, U",
-        ),
-        (
-            PCD.format(n=1, data="binary_compressed").encode() + struct.pack("<II", 8, 24) + bytes(8),
-            "12 bytes of points, its data promises 8",
-        ),
-        (PCD.format(n=1, data="packed").encode() + bytes(12), "its DATA 'packed' is unknown; valid: ascii, binary"),
+        (ply("ascii", "float", b"0 0 1\n0 0"), "cut short: 1 of 2 points"),
+        (ply("binary_little_endian", "float", bytes(13)), "cut short: 1 of 2 points"),
+        (ply("ascii", "list uchar float", b"0 0 1\n0 0 1\n"), "'vertex' has a list"),
+        (ply("ascii", "string", b"0 0 1\n0 0 1\n"), "'property string z' is not understood"),
+        (pcd(2, "ascii", b"0 0 1\n"), "cut short: 1 of 2 points"),
+        (pcd(10**9, "ascii", b"0 0 1\n"), "cut short: 1 of 1000000000 points"),
+        (pcd(10**9, "binary", bytes(24)), "cut short: 2 of 1000000000 points"),
+        (pcd(10**9, "binary_compressed", bytes(24)), "promises 12000000000 bytes of points, its data promises 0"),
+        (pcd(1, "binary_compressed", count="100000000"), "promises 400000008 bytes of points, its data promises 0"),
+        (pcd(1, "binary", bytes(24), size="5"), "not a readable pcd cloud"),
+        (pcd(1, "binary", bytes(12), form=5000 * "1"), "is unknown; valid: F, I, U"),
+        (pcd(1, "binary_compressed", struct.pack("<II", 8, 24) + bytes(8)), "12 bytes of points, its data promises 8"),
+        (pcd(1, "packed", bytes(12)), "its DATA 'packed' is unknown; valid: ascii, binary"),
         (b"# 7\nFIELDS x y z\n", "its header has no SIZE"),
     ],
     ids=str,

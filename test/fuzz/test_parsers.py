@@ -16,14 +16,13 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from graspd_core import Scene, TriangleMesh, load_scene, make_shape, scene_from_views
+from graspd_core import PointCloud, Scene, TriangleMesh, load_scene, make_shape, scene_from_views
 from graspd_core.errors import CloudError, ConfigError, FormatError, MeshError
 from graspd_core.io.grasps_json import grasps_of
 from graspd_core.mesh.mesh_files import check_mesh
 from graspd_core.mesh.sdf import sample_sdf
 from graspd_core.optimize.plan_config import PlanConfig, plan_config, to_mapping
 from graspd_core.perception.cloud.cloud_files import load_views
-from graspd_core.perception.cloud.point_cloud import PointCloud
 
 # GRASPD_FUZZ=50 tries fifty times as many examples, others each time; without it they are the same on every machine.
 LONGER = int(os.environ.get("GRASPD_FUZZ", "1"))

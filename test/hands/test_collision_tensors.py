@@ -8,21 +8,14 @@ from functools import partial
 import numpy as np
 import pytest
 import torch
+from expected import some
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 from torch import Tensor
 from torch.autograd import gradcheck
 
-from graspd_core.hands.kinematics import (
-    Kinematics,
-    forward,
-    make_kinematics,
-    place_points,
-    placement,
-    point_jacobian,
-)
-from graspd_core.hands.library import load_hand
+from graspd_core.hands.kinematics import Kinematics, forward, make_kinematics, place_points, placement, point_jacobian
 from graspd_core.hands.link_distance import (
     CollisionTensors,
     make_collision_tensors,
@@ -34,11 +27,6 @@ from graspd_core.hands.model import HandModel, Primitive, PrimitiveKind
 from graspd_core.hands.readers.urdf import read_urdf
 from graspd_core.mesh.convex_parts import hull_surface
 from graspd_core.se3 import SE3
-
-
-@pytest.fixture(scope="module")
-def hand() -> HandModel:
-    return load_hand("allegro_right", candidates=40)
 
 
 @pytest.fixture(scope="module")
@@ -173,8 +161,7 @@ def test_golden_distance(name, point, expected):
 def test_gradient_has_no_nan_on_centre_and_axis(name):
     points = torch.tensor([[0.0, 0.0, 0.0], [0.0, 0.0, 0.1], [0.0, 0.0, 0.2], [0.0, 0.0, 0.9]], requires_grad=True)
     KERNELS[name](points).sum().backward()
-    assert points.grad is not None
-    assert torch.isfinite(points.grad).all()
+    assert torch.isfinite(some(points.grad)).all()
 
 
 @pytest.mark.parametrize("name", KERNELS)
@@ -217,18 +204,13 @@ SLIDER = """<robot name="slider">
 
 
 @pytest.fixture(scope="module")
-def allegro() -> HandModel:
-    return load_hand("allegro_right")
-
-
-@pytest.fixture(scope="module")
 def slider(tmp_path_factory: pytest.TempPathFactory) -> HandModel:
     path = tmp_path_factory.mktemp("slider") / "slider.urdf"
     path.write_text(SLIDER)
     return read_urdf(path)
 
 
-@pytest.fixture(scope="module", params=["allegro", "slider"])
+@pytest.fixture(scope="module", params=["hand", "slider"])
 def moving(request: pytest.FixtureRequest) -> HandModel:
     return request.getfixturevalue(request.param)
 
@@ -245,17 +227,17 @@ def test_gradients_by_finite_differences(moving: HandModel) -> None:
 
 @settings(max_examples=20, deadline=None)
 @given(seed=st.integers(0, 2**31))
-def test_link_poses_are_rigid_and_placing_agrees_with_them(allegro: HandModel, seed: int) -> None:
+def test_link_poses_are_rigid_and_placing_agrees_with_them(hand: HandModel, seed: int) -> None:
     rng = np.random.default_rng(seed)
-    q = _random_q(allegro, 3, seed)
-    points, links = rng.normal(size=(30, 3)), rng.integers(0, allegro.num_links, 30)
-    kinematics = make_kinematics(allegro, dtype=torch.float64)
+    q = _random_q(hand, 3, seed)
+    points, links = rng.normal(size=(30, 3)), rng.integers(0, hand.num_links, 30)
+    kinematics = make_kinematics(hand, dtype=torch.float64)
     poses = forward(kinematics, torch.as_tensor(q))
     rotations, translations = poses.rotation, poses.translation
     eye = torch.eye(3, dtype=torch.float64).expand_as(rotations)
     torch.testing.assert_close(rotations @ rotations.mT, eye, atol=1e-12, rtol=0)
     expected = (rotations[:, links] @ torch.as_tensor(points)[None, :, :, None]).squeeze(-1)
-    given = allegro.num_links, torch.as_tensor(points), torch.as_tensor(links)
+    given = hand.num_links, torch.as_tensor(points), torch.as_tensor(links)
     turned = place_points(placement(*given, directions=True), poses)
     torch.testing.assert_close(turned, expected, atol=1e-12, rtol=0)
     moved = place_points(placement(*given), poses)
@@ -276,14 +258,14 @@ def test_point_jacobian_is_the_derivative(moving: HandModel) -> None:
     np.testing.assert_allclose(point_jacobian(moving, q, points, links), np.asarray(expected), atol=1e-12)
 
 
-def test_a_hand_is_laid_out_once_and_let_go_again(allegro: HandModel) -> None:
-    assert make_kinematics(allegro) is make_kinematics(allegro, torch.device("cpu"), torch.float32)
-    assert make_kinematics(allegro) is not make_kinematics(allegro, dtype=torch.float64)
-    solids = [make_collision_tensors(allegro, device, torch.float32) for device in ("cpu", torch.device("cpu"))]
+def test_a_hand_is_laid_out_once_and_let_go_again(hand: HandModel) -> None:
+    assert make_kinematics(hand) is make_kinematics(hand, torch.device("cpu"), torch.float32)
+    assert make_kinematics(hand) is not make_kinematics(hand, dtype=torch.float64)
+    solids = [make_collision_tensors(hand, device, torch.float32) for device in ("cpu", torch.device("cpu"))]
     assert solids[0] is solids[1]
-    first = weakref.ref(copy := replace(allegro))
-    assert make_kinematics(copy) is not make_kinematics(allegro)
-    for copy in (replace(allegro) for _ in range(20)):
+    first = weakref.ref(copy := replace(hand))
+    assert make_kinematics(copy) is not make_kinematics(hand)
+    for copy in (replace(hand) for _ in range(20)):
         make_kinematics(copy)
     gc.collect()
     assert first() is None

@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 import torch
 import trimesh
+from expected import some
 
 from graspd_core import Outcome, load_scene, plan_grasps
 from graspd_core.hands.kinematics import link_poses
@@ -61,8 +62,7 @@ def fine_leap(folder: Path, fineness: int) -> Path:
             file = f"{name}_{side}.stl"
             rounded(half, fineness).apply_translation(middle).export(folder / file)
             shapes += f'<collision><geometry><mesh filename="{file}"/></geometry></collision>'
-        link = re.search(rf'<link name="{name}">.*?</link>', text, re.DOTALL)
-        assert link is not None
+        link = some(re.search(rf'<link name="{name}">.*?</link>', text, re.DOTALL))
         bare = re.sub(r"<collision>.*?</collision>", "", link[0], flags=re.DOTALL)
         text = text.replace(link[0], bare.replace("</link>", shapes + "</link>"))
     path = folder / "leap.urdf"
@@ -112,8 +112,7 @@ def bareness(hand: HandModel) -> float:
 
 
 @pytest.mark.parametrize(
-    ("make", "bare"),
-    [(lambda folder: fine_leap(folder, 1), 0.03), (lambda folder: cut_up(folder, (5, 5, 4)), 0.02)],
+    ("make", "bare"), [(lambda folder: fine_leap(folder, 1), 0.03), (lambda folder: cut_up(folder, (5, 5, 4)), 0.02)]
 )
 def test_a_crowded_hand_has_as_many_spheres_as_any(make: Callable[[Path], Path], bare: float, tmp_path: Path) -> None:
     hand = read_hand_file(make(tmp_path))
@@ -203,7 +202,6 @@ def test_distances_to_very_many_solids_are_those_to_each(tmp_path: Path) -> None
 @pytest.mark.timeout(900)
 @pytest.mark.parametrize("make", [lambda folder: fine_leap(folder, 4), lambda folder: cut_up(folder, (5, 5, 4))])
 def test_a_crowded_hand_holds_a_box(make: Callable[[Path], Path], tmp_path: Path) -> None:
-
     hand = load_hand(make(tmp_path))
     result = plan_grasps(load_scene("shape:box"), hand, count=1, seed=0, preset="fast")
     assert result.outcome is Outcome.SUCCEEDED

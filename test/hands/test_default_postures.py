@@ -98,7 +98,6 @@ def test_a_description_overrides_what_it_names(tmp_path: Path) -> None:
 @pytest.mark.slow
 @pytest.mark.parametrize("name", HANDS)
 def test_a_guessed_hand_holds_a_box(name: str) -> None:
-
     hand = load_hand(config_dir() / "hands" / f"{name}.urdf")
     result = plan_grasps(load_scene("shape:box"), hand, count=1, seed=0, preset="fast", deadline=100.0)
     assert result.outcome is Outcome.SUCCEEDED
@@ -147,21 +146,22 @@ def joint(
     ends: tuple[str, str],
     place: str,
     axis: Vector,
-    limits: tuple[float, float],
+    limits: tuple[float, float] | None,
     follows: tuple[str, float] | None = None,
 ) -> str:
-    """The joint that moves the second of two links against the first, named after it; `follows`: leader, multiplier."""
+    """The joint that moves the second of two links against the first, named after it; without limits it is fixed.
+
+    `follows` has leader and multiplier.
+    """
+    links = f'<parent link="{ends[0]}"/><child link="{ends[1]}"/>{place}'
+    if limits is None:
+        return f'<joint name="j_{ends[1]}" type="fixed">{links}</joint>'
     kind, force = ("prismatic", 60) if abs(limits[1] - limits[0]) < 0.1 else ("revolute", 3)
     mimic = f'<mimic joint="{follows[0]}" multiplier="{follows[1]}"/>' if follows else ""
     return (
-        f'<joint name="j_{ends[1]}" type="{kind}"><parent link="{ends[0]}"/><child link="{ends[1]}"/>{place}'
-        f'<axis xyz="{axis[0]} {axis[1]} {axis[2]}"/>{mimic}'
+        f'<joint name="j_{ends[1]}" type="{kind}">{links}<axis xyz="{axis[0]} {axis[1]} {axis[2]}"/>{mimic}'
         f'<limit lower="{limits[0]}" upper="{limits[1]}" effort="{force}" velocity="1"/></joint>'
     )
-
-
-def fixed(ends: tuple[str, str], place: str) -> str:
-    return f'<joint name="j_{ends[1]}" type="fixed"><parent link="{ends[0]}"/><child link="{ends[1]}"/>{place}</joint>'
 
 
 def robotiq() -> Gripper:
@@ -176,10 +176,7 @@ def robotiq() -> Gripper:
         text += bar(f"base_{i}", (0, -0.005, 0), (0, 0.01, 0)) + bar(f"first_{i}", (0, 0, 0), (0, 0.05, 0.028))
         text += bar(f"second_{i}", (0, 0, 0), (0, 0.039, 0)) + bar(f"tip_{i}", (0, 0, 0), (0, 0.035, 0))
         place, scissor = origin((x, 0.0214, side), (0, turn, 0)), (0, 1 - 2 * i, 0)
-        if i < 2:
-            text += joint(("palm", f"base_{i}"), place, scissor, (-0.1784, 0.192))
-        else:
-            text += fixed(("palm", "base_2"), place)
+        text += joint(("palm", f"base_{i}"), place, scissor, (-0.1784, 0.192) if i < 2 else None)
         text += joint((f"base_{i}", f"first_{i}"), origin((0, 0, 0)), (-1, 0, 0), (0.0495, 1.2218))
         text += joint((f"first_{i}", f"second_{i}"), origin((0, 0.05, 0.028), (0.52, 0, 0)), (-1, 0, 0), (0.0, 1.5708))
         text += joint((f"second_{i}", f"tip_{i}"), origin((0, 0.039, 0)), (-1, 0, 0), (-0.6632, 1.0471))
@@ -195,15 +192,10 @@ def sdh() -> Gripper:
     places = ((-0.033, -0.019), (0.033, -0.019), (0.0, 0.038))
     for i, (x, y) in enumerate(places):
         text += bar(f"base_{i}", (0, 0, -0.01), (0, 0, 0.005), (0.026, 0.026))
-        text += bar(f"first_{i}", (0, 0, 0), (0, 0, 0.0865), (0.026, 0.026)) + bar(
-            f"tip_{i}", (0, 0, 0), (0, 0, 0.0685)
-        )
-        place = origin((x, y, 0.0986), (0, 0, np.pi if i == 2 else 0))
-        if i < 2:
-            limits = (0.0, 1.5708) if i == 1 else (-1.5708, 0.0)
-            text += joint(("palm", f"base_{i}"), place, (0, 0, 1), limits, None if i == 0 else ("j_base_0", -1.0))
-        else:
-            text += fixed(("palm", "base_2"), place)
+        text += bar(f"first_{i}", (0, 0, 0), (0, 0, 0.0865), (0.026, 0.026))
+        text += bar(f"tip_{i}", (0, 0, 0), (0, 0, 0.0685))
+        place, limits = origin((x, y, 0.0986), (0, 0, np.pi if i == 2 else 0)), ((-1.5708, 0.0), (0.0, 1.5708), None)[i]
+        text += joint(("palm", f"base_{i}"), place, (0, 0, 1), limits, ("j_base_0", -1.0) if i == 1 else None)
         text += joint((f"base_{i}", f"first_{i}"), origin((0, 0, 0)), (-1, 0, 0), (-1.5708, 1.5708))
         text += joint((f"first_{i}", f"tip_{i}"), origin((0, 0, 0.0865)), (-1, 0, 0), (-1.5708, 1.5708))
     pair = (0, -1, 0)
@@ -230,17 +222,12 @@ def one_motor() -> Gripper:
     for i, y in enumerate((-0.0365, 0.0365, 0.0)):
         x, turn, sign = (-0.045, 0.0, 1) if i < 2 else (0.045, np.pi, -1)
         text += bar(f"base_{i}", (0, 0, 0.01), (0, 0, -0.005))
-        if i < 2:
-            limits = (-0.3, 1.2) if i == 0 else (-1.2, 0.3)
-            swivel = ("j_base_0", -1.0) if i else None
-            text += joint(("palm", f"base_{i}"), origin((x, y, 0)), (0, 0, 1), limits, swivel)
-        else:
-            place = origin((x, y, 0), (0, 0, turn))
-            text += fixed(("palm", "base_2"), place)
+        place, limits = origin((x, y, 0), (0, 0, turn)), ((-0.3, 1.2), (-1.2, 0.3), None)[i]
+        text += joint(("palm", f"base_{i}"), place, (0, 0, 1), limits, ("j_base_0", -1.0) if i == 1 else None)
         text += bar(f"first_{i}", (0, 0, 0), (0, 0, -0.066)) + bar(f"tip_{i}", (0, 0, 0), (0, 0, -0.05))
         limits = (-0.7, 0.8) if sign > 0 else (-0.8, 0.7)
         leads = ("j_first_0", float(sign)) if i else None
-        text += joint((f"base_{i}", f"first_{i}"), origin((0, 0, 0), (0, 0, 0)), (0, -sign, 0), limits, leads)
+        text += joint((f"base_{i}", f"first_{i}"), origin((0, 0, 0)), (0, -sign, 0), limits, leads)
         bent = origin((0, 0, -0.066), (0, -0.5, 0))
         text += joint((f"first_{i}", f"tip_{i}"), bent, (0, -1, 0), (-0.5, 0.6), ("j_first_0", 0.6))
     return Gripper(text, (0, 0, -1), (0, 0, 0), ((-1, 0, 0), (-1, 0, 0), (1, 0, 0)), (0, 0, -0.05))
@@ -349,7 +336,6 @@ def test_joints_that_carry_the_palm_leave_its_normal_alone(tmp_path: Path) -> No
 @pytest.mark.parametrize("shape", ["box", "sphere", "cylinder"])
 @pytest.mark.parametrize("name", GRIPPERS)
 def test_a_guessed_gripper_holds(name: str, shape: str, tmp_path: Path) -> None:
-
     hand = load_hand(write(GRIPPERS[name]().urdf, tmp_path))
     result = plan_grasps(load_scene(f"shape:{shape}"), hand, count=8, seed=0, preset="fast")
     # One motor for all three fingers lets a ball turn in nearly every grasp.

@@ -18,10 +18,10 @@ from graspd_core.perception.cloud.camera import PinholeCamera, camera_rays
 from graspd_core.perception.cloud.cloud_files import CLOUD_ENDINGS, is_cloud_file, load_views
 from graspd_core.transforms import SECOND
 
+Maker = Callable[[Path], Path]
 CAMERA = PinholeCamera(320, 240, 308.0, 308.0, 159.5, 119.5)
 MATRIX = np.array([[CAMERA.fx, 0, CAMERA.cx], [0, CAMERA.fy, CAMERA.cy], [0, 0, 1]])
 POSE = ring_poses(1, elevation=0.6, azimuth=-1.2)[0]
-GITHUB = "https://github.com/"
 FRAME, OTHER_FRAME, STAMP = "camera_optical_frame", "other_optical_frame", 1_700_000_000 * SECOND
 
 
@@ -43,14 +43,14 @@ class Situation:
         name: of the situation.
         make: writes the input into a folder and returns its path.
         expect: the object's volume [m³], or the words of a refusal as a regular expression.
-        thread: where somebody had it, below `GITHUB`; empty where it is of this project's own trials.
+        thread: where somebody had it on GitHub; empty where it is of this project's own trials.
         options: of the command line; the library's arguments follow from them.
         warns: words of a warning.
         near: share of the volume that the answer may be off, for one view guesses the back.
     """
 
     name: str
-    make: Callable[[Path], Path]
+    make: Maker
     expect: float | str
     thread: str = ""
     options: dict[str, Any] = field(default_factory=dict)
@@ -105,58 +105,53 @@ def sheet_in_world() -> TriangleMesh:
     return TriangleMesh(in_world(mesh.vertices[seen]), (np.cumsum(seen) - 1)[mesh.faces])
 
 
-def mesh_file(name: str, mesh: TriangleMesh) -> Callable[[Path], Path]:
+def written(name: str, write: Callable[[Path], Any]) -> Maker:
+    """What makes an input: it calls `write` with the path of a file in the folder that it is given."""
+
     def make(folder: Path) -> Path:
-        save_mesh(folder / name, mesh)
+        write(folder / name)
         return folder / name
 
     return make
 
 
-def array_file(name: str, make_arrays: Callable[[], Any]) -> Callable[[Path], Path]:
-    def make(folder: Path) -> Path:
-        arrays = make_arrays()
-        if name.endswith(".npz"):
-            np.savez(folder / name, **arrays)
-        else:
-            np.save(folder / name, arrays)
-        return folder / name
-
-    return make
+def mesh_file(name: str, mesh: TriangleMesh) -> Maker:
+    return written(name, lambda path: save_mesh(path, mesh))
 
 
-def bytes_file(name: str, make_bytes: Callable[[], bytes]) -> Callable[[Path], Path]:
-    def make(folder: Path) -> Path:
-        (folder / name).write_bytes(make_bytes())
-        return folder / name
-
-    return make
+def content(name: str, make_bytes: Callable[[], bytes]) -> Maker:
+    return written(name, lambda path: path.write_bytes(make_bytes()))
 
 
-def ply(points: np.ndarray, extra: str = "", promised: int | None = None) -> bytes:
-    """Write a binary cloud. `extra` names more properties, of floats."""
+def array(points: np.ndarray) -> Maker:
+    return written("a.npy", lambda path: np.save(path, points))
+
+
+def archive(**arrays: np.ndarray) -> Maker:
+    return written("a.npz", lambda path: np.savez(path, allow_pickle=False, **arrays))
+
+
+def ply(points: np.ndarray, extra: str = "", promised: int | None = None) -> Maker:
+    """A binary cloud. `extra` names more properties, of floats."""
     properties = "".join(f"property float {name}\n" for name in ("x", "y", "z", *extra.split()))
     count = len(points) if promised is None else promised
     head = f"ply\nformat binary_little_endian 1.0\nelement vertex {count}\n{properties}end_header\n"
-    return head.encode() + points.astype("<f4").tobytes()
+    return content("a.ply", lambda: head.encode() + points.astype("<f4").tobytes())
 
 
-def pcd(points: np.ndarray, viewpoint: str = "0 0 0 1 0 0 0") -> bytes:
-    head = "VERSION .7\nFIELDS x y z\nSIZE 4 4 4\nTYPE F F F\nCOUNT 1 1 1\n"
-    head += f"WIDTH {len(points)}\nHEIGHT 1\nVIEWPOINT {viewpoint}\nPOINTS {len(points)}\nDATA binary\n"
-    return head.encode() + points.astype("<f4").tobytes()
+def pcd_head(count: int, **entries: str) -> bytes:
+    """The header of a cloud of x, y and z in float32, with other entries as given."""
+    head = {"VERSION": ".7", "FIELDS": "x y z", "SIZE": "4 4 4", "TYPE": "F F F", "COUNT": "1 1 1", "WIDTH": str(count)}
+    head |= {"HEIGHT": "1", "VIEWPOINT": "0 0 0 1 0 0 0", "POINTS": str(count), "DATA": "binary"} | entries
+    return "".join(f"{key} {value}\n" for key, value in head.items()).encode()
+
+
+def pcd(points: np.ndarray, **entries: str) -> Maker:
+    return content("a.pcd", lambda: pcd_head(len(points), **entries) + points.astype("<f4").tobytes())
 
 
 def rows_of(shape: str = "bottle") -> np.ndarray:
     return grid_of(shape).reshape(-1, 3)
-
-
-def zeroed() -> np.ndarray:
-    return np.nan_to_num(rows_of())
-
-
-def infinite() -> np.ndarray:
-    return np.where(np.isfinite(rows_of()), rows_of(), -np.inf)
 
 
 def only_object() -> np.ndarray:
@@ -180,7 +175,7 @@ def millimetres() -> np.ndarray:
     return (1000 * depth_of()[0]).astype(np.uint16)
 
 
-def cloud(points: np.ndarray, **changes: Any) -> Callable[[Path], Path]:
+def cloud(points: np.ndarray, **changes: Any) -> Maker:
     """A recording of a PointCloud2 with other values in some of its fields."""
     return bag(lambda stamp: replace(cloud_message(points, FRAME, stamp), **changes))
 
@@ -203,31 +198,26 @@ def text(points: np.ndarray, *columns: float) -> bytes:
     return "".join(f"{x:.5f} {y:.5f} {z:.5f} {more}\n" for x, y, z in points).encode()
 
 
-def padded_pcd() -> bytes:
+def padded_pcd() -> Maker:
     """A binary pcd whose fields `_` are gaps, as PCL writes structures that are aligned."""
-    points, head = rows_of(), pcd(np.zeros((0, 3))).decode().replace("WIDTH 0", "WIDTH 76800")
-    head = head.replace("POINTS 0", "POINTS 76800").replace("FIELDS x y z", "FIELDS x y z _ rgb _")
-    head = head.replace("SIZE 4 4 4", "SIZE 4 4 4 1 4 1").replace("TYPE F F F", "TYPE F F F U F U")
-    data = np.zeros((len(points), 8), "<f4")
-    data[:, :3] = points
-    return head.replace("COUNT 1 1 1", "COUNT 1 1 1 4 1 12").encode() + data.tobytes()
+    rows = np.zeros((76800, 8), "<f4")
+    rows[:, :3] = rows_of()
+    return pcd(rows, FIELDS="x y z _ rgb _", SIZE="4 4 4 1 4 1", TYPE="F F F U F U", COUNT="1 1 1 4 1 12")
 
 
-def text_pcd() -> bytes:
+def text_pcd() -> Maker:
     points = only_finite(rows_of())
-    head = pcd(np.zeros((0, 3))).decode().replace("FIELDS x y z", "FIELDS x y z rgb").replace("binary", "ascii")
-    for name, more in (("SIZE 4 4 4", "4"), ("TYPE F F F", "F"), ("COUNT 1 1 1", "1")):
-        head = head.replace(name, f"{name} {more}")
-    head = head.replace("WIDTH 0", f"WIDTH {len(points)}").replace("POINTS 0", f"POINTS {len(points)}")
-    return head.encode() + text(points, 1.648931e-38)
+    head = pcd_head(len(points), FIELDS="x y z rgb", SIZE="4 4 4 4", TYPE="F F F F", COUNT="1 1 1 1", DATA="ascii")
+    return content("a.pcd", lambda: head + text(points, 1.648931e-38))
 
 
-def text_ply(kind: str = "double", colour: bool = True, gaps: bool = False) -> bytes:
+def text_ply(kind: str = "double", colour: bool = True, gaps: bool = False) -> Maker:
     points = rows_of() if gaps else only_finite(rows_of())
     head = f"ply\nformat ascii 1.0\nelement vertex {len(points)}\n"
     head += "".join(f"property {kind} {name}\n" for name in "xyz")
     head += "".join(f"property uchar {name}\n" for name in ("red", "green", "blue")) if colour else ""
-    return (head + "end_header\n").encode() + text(points, *((9, 8, 7) if colour else ()))
+    head += "end_header\n"
+    return content("a.ply", lambda: head.encode() + text(points, *((9, 8, 7) if colour else ())))
 
 
 def quads() -> bytes:
@@ -252,9 +242,7 @@ def sheared() -> np.ndarray:
     return pose
 
 
-def bag(
-    make_message: Callable[[int], Any], topic: str = "points", matrix: np.ndarray = MATRIX
-) -> Callable[[Path], Path]:
+def bag(make_message: Callable[[int], Any], topic: str = "points", matrix: np.ndarray = MATRIX) -> Maker:
     """A recording of one message, and of its camera beside a depth image."""
 
     def make(folder: Path) -> Path:

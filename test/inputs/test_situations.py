@@ -6,6 +6,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from expected import refused
 from inputs_made import Situation, camera_place, recorded
 from situations import FILE_ONLY, MESHES, MESSAGES, SITUATIONS
 
@@ -43,14 +44,13 @@ def test_the_table_names_each_situation_once_and_where_most_of_them_came_up():
     assert len({row.name for row in SITUATIONS}) == len(SITUATIONS) >= 63
     assert {row.name for row in FILES} > FILE_ONLY
     assert sum(bool(row.thread) for row in SITUATIONS) >= 50
-    assert all(re.fullmatch(r"[\w.-]+/[\w.-]+/(issues|pull)/\d+", row.thread) for row in SITUATIONS if row.thread)
+    assert all(re.fullmatch(r"[\w.-]+/[\w.-]+#\d+", row.thread) for row in SITUATIONS if row.thread)
 
 
 @pytest.mark.parametrize("row", REFUSED, ids=name_of)
 def test_the_library_refuses_it_by_name(row: Situation, tmp_path: Path):
-    with pytest.raises(GraspdError, match=str(row.expect)) as refusal:
+    with refused(GraspdError, match=str(row.expect)):
         load_scene(row.make(tmp_path), resolution=16, **arguments(row))
-    assert "\n" not in str(refusal.value)
 
 
 @pytest.mark.parametrize("row", REFUSED, ids=name_of)

@@ -4,6 +4,7 @@ from dataclasses import asdict, replace
 
 import pytest
 import torch
+from expected import some
 
 from graspd_core import draw_starts, hand_names, load_hand
 from graspd_core.config import ProblemConfig
@@ -13,18 +14,13 @@ from graspd_core.optimize.kernel import builds
 from graspd_core.optimize.kernel_problem import KernelProblem
 from graspd_core.optimize.loop import moved_along, pack, unpack
 from graspd_core.optimize.losses import hard_contact
-from graspd_core.optimize.problem import Problem, Terms, build_problem, evaluate, least_distance
+from graspd_core.optimize.problem import Terms, build_problem, evaluate, least_distance
 
 DELTA = 0.006
 # Exploring, refining among sharp points, polishing.
 LOOKS = ({}, {"sharp": True}, {"sharp": True, "fine": True})
 # Each term with a weight that makes its gradient count.
 WEIGHTS = LossWeights(3.0, 1.0, 1.0, 1.0, 0.02, 1.0)
-
-
-def compiled_of(problem: Problem) -> KernelProblem:
-    assert problem.compiled is not None
-    return problem.compiled
 
 
 def evaluate_compiled(
@@ -57,7 +53,7 @@ def test_it_agrees_with_torch(problem_of, rows_of, hand, scene, look):
     x = rows_of(hand, scene, problem)
     # A radius at which no candidate lies exactly on the padded surface: there a gradient may be either side's.
     radius = torch.linspace(0.0, 0.011, len(x))
-    loss, gradient, terms = evaluate_compiled(compiled_of(problem), x, radius, DELTA, WEIGHTS, **look)
+    loss, gradient, terms = evaluate_compiled(some(problem.compiled), x, radius, DELTA, WEIGHTS, **look)
     expected = by_torch(problem, x, radius, **look)
     for name, value in expected._asdict().items():
         mine = getattr(terms, name)
@@ -78,7 +74,7 @@ def test_a_link_without_coarse_candidates_is_in_no_group(hands, scenes, rows_of,
     settings = ProblemConfig(candidates=8, patch_size=patch_size)
     problem = build_problem(scenes["box"], hands["allegro_right"], settings, seed=0)
     x, radius = rows_of("allegro_right", "box", problem), torch.full((12,), 0.003)
-    distance = evaluate_compiled(compiled_of(problem), x, radius, DELTA, WEIGHTS, fine=True)[2].distance
+    distance = evaluate_compiled(some(problem.compiled), x, radius, DELTA, WEIGHTS, fine=True)[2].distance
     assert distance.tolist() == pytest.approx(by_torch(problem, x, radius, fine=True).distance.tolist(), rel=1e-4)
 
 
@@ -86,7 +82,7 @@ def test_a_link_without_coarse_candidates_is_in_no_group(hands, scenes, rows_of,
 def test_the_gradient_is_that_of_the_value(problem_of, rows_of, scene):
     """Central differences of the kernel itself, along random directions; kinks are left out by the median."""
     problem = problem_of("barrett_like", scene)
-    compiled, x = compiled_of(problem), rows_of("barrett_like", scene, problem)
+    compiled, x = some(problem.compiled), rows_of("barrett_like", scene, problem)
     radius = torch.full((len(x),), 0.004)
 
     def value(rows: torch.Tensor) -> torch.Tensor:
@@ -106,7 +102,7 @@ def test_contact_without_a_width_has_no_slope_of_its_own(problem_of, rows_of):
     problem = problem_of("allegro_right", "box")
     x, radius = rows_of("allegro_right", "box", problem), torch.full((12,), 0.0031)
     only = LossWeights(1.0, 0.0, 0.0, 0.0, 0.0, 0.0)
-    _, gradient, terms = evaluate_compiled(compiled_of(problem), x, radius, DELTA, only, soft=False)
+    _, gradient, terms = evaluate_compiled(some(problem.compiled), x, radius, DELTA, only, soft=False)
     expected = by_torch(problem, x, radius, activate=hard_contact).wrench_resistance
     assert terms.wrench_resistance.tolist() == pytest.approx(expected.tolist(), rel=1e-4)
     slope = gradient_of(problem, x, radius, only, activate=hard_contact)
@@ -121,7 +117,7 @@ def test_every_build_gives_the_same_up_to_rounding(problem_of, rows_of, monkeypa
         if not builds.BUILDS[name] - builds._instructions():
             monkeypatch.setenv("GRASPD_KERNEL", name)
             assert builds.kernel().name == name
-            found[name] = evaluate_compiled(compiled_of(problem), x, radius, DELTA, WEIGHTS, **LOOKS[2])[0].tolist()
+            found[name] = evaluate_compiled(some(problem.compiled), x, radius, DELTA, WEIGHTS, **LOOKS[2])[0].tolist()
     assert len(found) > 1 or "v3" not in found
     for loss in found.values():
         assert loss == pytest.approx(found["baseline"], rel=1e-4)
@@ -133,7 +129,7 @@ def test_least_distance(problem_of, rows_of):
     poses = moved_along(unpack(x), -problem.hand.pivot)
     expected = least_distance(problem, poses)
     found = torch.empty(len(x))
-    compiled_of(problem).call("graspd_least_distance", len(x), x, found)
+    some(problem.compiled).call("graspd_least_distance", len(x), x, found)
     assert found.tolist() == pytest.approx(expected.tolist(), abs=1e-6)
 
 
@@ -142,7 +138,7 @@ def test_least_distance(problem_of, rows_of):
 def test_what_is_not_a_number_stays_with_its_row(problem_of, rows_of, bad, where):
     problem = problem_of("allegro_right", "crowded")
     x, radius, weights = rows_of("allegro_right", "crowded", problem), torch.full((12,), 0.003), WEIGHTS
-    clean = evaluate_compiled(compiled_of(problem), x, radius, DELTA, weights, **LOOKS[2])
+    clean = evaluate_compiled(some(problem.compiled), x, radius, DELTA, weights, **LOOKS[2])
     if where == "pose":
         x = x.clone()
         x[5, 0] = bad
@@ -155,7 +151,7 @@ def test_what_is_not_a_number_stays_with_its_row(problem_of, rows_of, bad, where
         broken = grid.field.clone()
         broken[0, 10, 10, 10] = bad
         problem = replace(problem, object=replace(problem.object, sdf=replace(grid, field=broken)))
-    loss, gradient, _ = evaluate_compiled(compiled_of(problem), x, radius, DELTA, weights, **LOOKS[2])
+    loss, gradient, _ = evaluate_compiled(some(problem.compiled), x, radius, DELTA, weights, **LOOKS[2])
     if where in ("pose", "radius"):
         others = torch.arange(12) != 5
         assert torch.equal(loss[others], clean[0][others])
@@ -195,7 +191,7 @@ def test_hands_of_one_moving_link_and_of_a_hundred_links(tmp_path, scenes, links
     starts = draw_starts(scenes["box"], hand, 6, 0, "cpu", torch.float32)
     x, radius = pack(moved_along(starts, problem.hand.pivot)), torch.linspace(0.001, 0.006, 6)
     for look in LOOKS:
-        _, gradient, terms = evaluate_compiled(compiled_of(problem), x, radius, DELTA, WEIGHTS, **look)
+        _, gradient, terms = evaluate_compiled(some(problem.compiled), x, radius, DELTA, WEIGHTS, **look)
         expected = by_torch(problem, x, radius, **look)
         assert terms.penetration.tolist() == pytest.approx(expected.penetration.tolist(), rel=1e-3, abs=1e-4)
         slope = gradient_of(problem, x, radius, WEIGHTS, **look)

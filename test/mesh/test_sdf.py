@@ -6,6 +6,7 @@ from functools import partial
 import numpy as np
 import pytest
 import torch
+from expected import some
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from made_meshes import box_of
@@ -173,8 +174,7 @@ def test_precisions_agree_and_nothing_is_nan_at_nodes_centre_and_border(box):
     nodes = torch.stack([box.origin, box.origin + 2 * box.half, torch.zeros(3).double()]).requires_grad_()
     distance, normal = sample_sdf(box, nodes)
     (distance.sum() + normal.sum()).backward()
-    assert nodes.grad is not None
-    assert torch.isfinite(nodes.grad).all()
+    assert torch.isfinite(some(nodes.grad)).all()
 
 
 def test_the_mug_is_hollow_and_its_handle_is_joined():

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from made_meshes import box_of
+from made_meshes import box_between, box_of
 from scipy.spatial import ConvexHull
 from shape_volumes import shape_volume
 
@@ -21,11 +21,8 @@ from graspd_core.types import TriangleMesh, joined
 
 
 def block(size, centre=(0, 0, 0)) -> TriangleMesh:
-    """A box of twelve faces."""
-    corners = np.stack(np.meshgrid(*[(-0.5, 0.5)] * 3, indexing="ij"), -1).reshape(-1, 3)
-    quads = [(0, 1, 3, 2), (4, 6, 7, 5), (0, 4, 5, 1), (2, 3, 7, 6), (0, 2, 6, 4), (1, 5, 7, 3)]
-    faces = [t for a, b, c, d in quads for t in ((a, b, c), (a, c, d))]
-    return TriangleMesh(corners * size + np.asarray(centre, float), np.array(faces))
+    half = 0.5 * np.array(size)
+    return box_between(centre - half, centre + half)
 
 
 def cup(handle_gap: float) -> TriangleMesh:

@@ -7,6 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
+from expected import some
 from hypothesis import given
 from hypothesis import strategies as st
 from made_meshes import box_of
@@ -25,7 +26,7 @@ from graspd_bench.baselines.annealing import (
 )
 from graspd_bench.baselines.random_closure import RandomClosureConfig, advance, draw_approaches, touching_groups
 from graspd_bench.baselines.random_closure import plan as plan_closure
-from graspd_core import HandModel, PlanConfig, draw_starts, hand_names, load_hand, load_scene
+from graspd_core import HandModel, PlanConfig, Problem, draw_starts, hand_names, load_hand, load_scene
 from graspd_core.config import ProblemConfig
 from graspd_core.hands.kinematics import forward
 from graspd_core.optimize.candidates import PlannerInput, PlannerOutput, find_candidates
@@ -33,7 +34,6 @@ from graspd_core.optimize.grasp_postures import ContactSet, hand_distance
 from graspd_core.optimize.loop import Hooks, Poses, minimise
 from graspd_core.optimize.losses import disturbance_directions
 from graspd_core.optimize.obstacle_distance import obstacle_gaps
-from graspd_core.optimize.problem import Problem
 from graspd_core.perception.scene import Scene, build_scene
 from graspd_core.se3 import rotation_from_quaternion
 from graspd_core.types import Plane
@@ -154,8 +154,7 @@ def test_annealing_lowers_the_energy_and_never_enters_the_object(hand, scenes, p
     found = solution.poses[legal]
     distance = hand_distance(problem, found.base, found.joints)
     assert distance.min() >= 0
-    assert (found.joints >= problem.hand.lower).all()
-    assert (found.joints <= problem.hand.upper).all()
+    assert ((problem.hand.lower <= found.joints) & (found.joints <= problem.hand.upper)).all()
 
 
 def task_of(scene, hand, **hooks) -> PlannerInput:
@@ -283,8 +282,7 @@ def test_obstacles_are_kept_clear_of(hand, scenes):
     low = float(scene.object.mesh.vertices[:, 2].min())
     task = closure_task(replace(scene, support=Plane(np.array([0.0, 0.0, 1.0]), low)), hand, count=3)
     found, obstacles = plan_closure(task), task.problem.obstacles
-    assert obstacles is not None
-    gaps = obstacle_gaps(obstacles, found.poses.base, forward(task.problem.hand.kinematics, found.poses.joints))
+    gaps = obstacle_gaps(some(obstacles), found.poses.base, forward(task.problem.hand.kinematics, found.poses.joints))
     assert len(gaps) >= 1
     assert gaps.min() >= 0
 
@@ -363,8 +361,7 @@ def test_no_link_of_a_real_hand_sinks_in_and_every_joint_stops_for_a_reason(hand
     joints = state.poses.joints
     gaps = link_gaps(problem, state.poses, closing.sphere_links)
     assert gaps[:, 0].min() >= 0
-    assert (joints >= problem.hand.lower).all()
-    assert (joints <= problem.hand.upper).all()
+    assert ((problem.hand.lower <= joints) & (joints <= problem.hand.upper)).all()
     # A joint that a contact stopped moves a link that touches: half a millimetre is many times the last, halved step.
     arrived = state.stopped & (closing.rate != 0.0) & (joints != closing.target)
     touching = (gaps[:, 0] < 5e-4) | (gaps[:, 1] < -5e-4)

@@ -7,6 +7,7 @@ from pathlib import Path
 
 import pytest
 import torch
+from expected import some
 from torch import Tensor
 
 from graspd_core.optimize import losses
@@ -43,10 +44,7 @@ LOSSES: dict[str, tuple[Callable[[Tensor], Tensor], Tensor]] = {
     "penetration": (lambda x: losses.penetration(x, x.new_full((4,), 2e-3)), draw(4, 9, low=-0.01, high=1.9e-3)),
     "penetration by radius": (lambda x: losses.penetration(x - 1.0, x[:, 0]), draw(4, 9, low=0.01, high=0.02)),
     # Spheres of 15 mm within a box of 20 mm: every checked pair overlaps.
-    "self_collision": (
-        lambda x: losses.self_collision(x.unflatten(1, (6, 3)), *spheres()),
-        draw(4, 18, high=0.015),
-    ),
+    "self_collision": (lambda x: losses.self_collision(x.unflatten(1, (6, 3)), *spheres()), draw(4, 18, high=0.015)),
     "posture": (lambda x: losses.posture(x, *limits()), draw(4, 5, low=-0.9, high=0.4)),
     "soft_contact": (
         lambda x: losses.soft_contact(x, x.new_full((4,), RADIUS), DELTA).sum(-1),
@@ -91,8 +89,7 @@ def test_gradients_of_the_whole_evaluation(hand, scenes, problem_of, slope_error
     for number, term in enumerate(TERMS):
         if term in ("self_collision", "posture") and variables != slice(7, None):
             continue
-        value = terms_at(problem, x, fine)[number]
-        assert value is not None
+        value = some(terms_at(problem, x, fine)[number])
         assert (value.abs() > 0).any(), term
         errors = slope_errors(
             lambda y, n=number: terms_at(problem, y, fine)[n], x, step=1e-8, directions=6, variables=variables

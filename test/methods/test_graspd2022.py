@@ -274,8 +274,7 @@ def test_the_search_obeys_limits_and_stop(hand, scenes):
     task = PlannerInput(scenes["sphere"], hand, 2, 1, config, Hooks())
     found = plan(task)
     assert len(found.poses.translation) == 2
-    assert (found.poses.joints >= task.problem.hand.lower).all()
-    assert (found.poses.joints <= task.problem.hand.upper).all()
+    assert ((task.problem.hand.lower <= found.poses.joints) & (found.poses.joints <= task.problem.hand.upper)).all()
     polls = iter([False, True])
     stopped = plan(replace(task, hooks=Hooks(stop=polls.__next__)))
     assert stopped.interrupted == "cancelled"

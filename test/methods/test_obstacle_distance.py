@@ -6,6 +6,7 @@ from functools import partial
 import numpy as np
 import pytest
 import torch
+from expected import some
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from made_meshes import box_between
@@ -13,15 +14,7 @@ from small_problem import small_problem
 
 from graspd_core import PlanConfig, Scene, draw_starts, hand_names, load_hand, load_scene
 from graspd_core.config import ProblemConfig
-from graspd_core.hands.kinematics import (
-    RETREAT,
-    forward,
-    hand_mesh,
-    in_base,
-    link_poses,
-    make_kinematics,
-    place_points,
-)
+from graspd_core.hands.kinematics import RETREAT, forward, hand_mesh, in_base, link_poses, make_kinematics, place_points
 from graspd_core.hands.link_distance import solid_distance
 from graspd_core.mesh.sdf import sample_sdf
 from graspd_core.optimize.candidates import PlannerInput, find_candidates
@@ -66,8 +59,7 @@ def lowest(hand, posture: Posture, plane: Plane) -> float:
 def test_an_obstacle_near_the_middle_of_a_large_face_is_in_reach(hand):
     # A bar of 1.2 m has vertices only at its ends, farther from the wall than the hand reaches.
     scene = beside(load_scene(box_between((-0.02, -0.6, -0.02), (0.02, 0.6, 0.02)), mass=0.3), 0.05)
-    obstacles = make_obstacle_tensors(scene, hand, "cpu", DOUBLE)
-    assert obstacles is not None
+    obstacles = some(make_obstacle_tensors(scene, hand, "cpu", DOUBLE))
     assert len(obstacles.sdfs) == 1
 
 
@@ -80,8 +72,7 @@ def test_depth_in_a_half_space_is_that_of_the_hands_meshes(hand, scenes, seed: i
     quaternion /= np.linalg.norm(quaternion)
     joints = hand.lower + (hand.upper - hand.lower) * rng.random(hand.num_joints)
     posture = Posture(rng.normal(size=3) * 0.1, quaternion, joints)
-    obstacles = make_obstacle_tensors(replace(scenes["box"], support=plane), hand, "cpu", DOUBLE)
-    assert obstacles is not None
+    obstacles = some(make_obstacle_tensors(replace(scenes["box"], support=plane), hand, "cpu", DOUBLE))
     base = SE3(rotation_from_quaternion(torch.as_tensor(quaternion)), torch.as_tensor(posture.position))[None]
     links = forward(small_problem(scenes["box"], hand).hand.kinematics, torch.as_tensor(joints)[None])
     gaps = obstacle_gaps(obstacles, base, links)
@@ -91,8 +82,7 @@ def test_depth_in_a_half_space_is_that_of_the_hands_meshes(hand, scenes, seed: i
 
 def test_gaps_up_to_the_widest_are_exact_and_wider_ones_are_known_to_be(hand, scenes):
     scene = beside(scenes["box"], 0.05)
-    obstacles = make_obstacle_tensors(scene, hand, "cpu", DOUBLE)
-    assert obstacles is not None
+    obstacles = some(make_obstacle_tensors(scene, hand, "cpu", DOUBLE))
     starts = draw_starts(scenes["box"], hand, 6, 0, "cpu", DOUBLE)
     links = forward(small_problem(scene, hand).hand.kinematics, starts.joints)
     base = starts.base
@@ -116,16 +106,14 @@ def test_the_hand_keeps_the_margin_of_the_support(hand, scenes):
     starts = draw_starts(scene, hand, 4, 0, "cpu", DOUBLE)
     gaps = []
     for one in (raised, margin):
-        obstacles = make_obstacle_tensors(one, hand, "cpu", DOUBLE)
-        assert obstacles is not None
+        obstacles = some(make_obstacle_tensors(one, hand, "cpu", DOUBLE))
         gaps.append(gap_on_path(obstacles, small_problem(one, hand).hand.kinematics, starts, starts))
     assert torch.equal(*gaps)
 
 
 def test_the_least_gap_is_the_least_of_all_gaps(hand, scenes):
     scene = on_table(beside(scenes["box"], 0.06))
-    obstacles = make_obstacle_tensors(scene, hand, "cpu", DOUBLE)
-    assert obstacles is not None
+    obstacles = some(make_obstacle_tensors(scene, hand, "cpu", DOUBLE))
     rng = np.random.default_rng(2)
     joints = hand.lower + (hand.upper - hand.lower) * rng.random((300, hand.num_joints))
     turns = rng.normal(size=(300, 4))
@@ -169,8 +157,7 @@ def test_gradients_of_the_obstacle_term(hand, scenes, slope_errors, kind: str, f
 
     def term(y: torch.Tensor) -> torch.Tensor:
         look = partial(evaluate, fine=fine, sharp=fine)
-        obstacle = look(built, unpack(y), y.new_zeros(len(y)), 0.01).obstacle
-        assert obstacle is not None
+        obstacle = some(look(built, unpack(y), y.new_zeros(len(y)), 0.01).obstacle)
         return obstacle
 
     reaching = term(x) > 0
@@ -222,17 +209,15 @@ def test_starts_lie_above_the_table_and_could_have_come_there(hand, scenes, name
 
 def test_no_candidate_reaches_through_the_table_or_a_wall(hand, scenes):
     scene = beside(on_table(scenes["box"]), 0.09)
-    assert scene.support is not None
     short = ClosedFormConfig(explore_steps=15, refine_steps=10, polish_steps=15)
     config = PlanConfig(settings=short, problem=ProblemConfig(candidates=60, fine_candidates=120))
     found = find_candidates(PlannerInput(scene, hand, count=6, seed=0, config=config, hooks=Hooks()))
     assert found.grasps
-    obstacles = make_obstacle_tensors(scene, hand, "cpu", DOUBLE)
-    assert obstacles is not None
+    obstacles = some(make_obstacle_tensors(scene, hand, "cpu", DOUBLE))
     kinematics = small_problem(scene, hand).hand.kinematics
     for grasp in found.grasps:
         for posture in (grasp.pregrasp, grasp.grasp):
-            assert lowest(hand, posture, scene.support) > -0.0016
+            assert lowest(hand, posture, some(scene.support)) > -0.0016
         ends = [
             Poses(*(torch.as_tensor(x)[None] for x in (p.position, grasp.grasp.quaternion_wxyz, p.joint_positions)))
             for p in (grasp.pregrasp, grasp.grasp)

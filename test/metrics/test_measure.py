@@ -1,6 +1,5 @@
 """Metrics of boxes and hands that can be worked out on paper: contact, penetration, overlap, wrench hull, copies."""
 
-from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
@@ -8,6 +7,7 @@ import numpy as np
 import pytest
 import torch
 import trimesh
+from expected import some
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from made_meshes import box_of, taken
@@ -75,10 +75,7 @@ def gripper(tmp_path_factory: pytest.TempPathFactory) -> HandModel:
     return load(GRIPPER, tmp_path_factory.mktemp("gripper"))
 
 
-@pytest.fixture(scope="session")
-def box() -> TriangleMesh:
-    """60 x 60 x 90 mm, centred."""
-    return make_shape("box")
+BOX = make_shape("box")  # 60 x 60 x 90 mm, centred
 
 
 def as_object(mesh: TriangleMesh) -> ObjectModel:
@@ -86,14 +83,9 @@ def as_object(mesh: TriangleMesh) -> ObjectModel:
     return build_scene(mesh, mass=0.1, resolution=8).object
 
 
-@pytest.fixture(scope="session")
-def at() -> Callable[..., Posture]:
+def at(position: tuple[float, float, float], joints: tuple[float, ...], wxyz=(1.0, 0.0, 0.0, 0.0)) -> Posture:
     """A posture from a position [m] and joint values."""
-
-    def build(position: tuple[float, float, float], joints: tuple[float, ...], wxyz=(1.0, 0.0, 0.0, 0.0)) -> Posture:
-        return Posture(np.array(position, dtype=float), np.array(wxyz, dtype=float), np.array(joints, dtype=float))
-
-    return build
+    return Posture(np.array(position, dtype=float), np.array(wxyz, dtype=float), np.array(joints, dtype=float))
 
 
 # The block's surface is 2·(40·30 + 30·20 + 20·40) = 5200 mm², seen by some 4000 samples: an area of A mm² is counted
@@ -106,8 +98,8 @@ def area_noise(area: float) -> float:
 
 
 @pytest.mark.parametrize("depth", [0.005, 0.012])
-def test_a_block_sunk_into_a_flat_face(depth, block, box, at):
-    context = make_metrics_context(as_object(box), block)
+def test_a_block_sunk_into_a_flat_face(depth, block):
+    context = make_metrics_context(as_object(BOX), block)
     placed = placed_hand(context, at((0.05 - depth, 0, 0), (0.0,)))
     # The whole end of 30 x 20 mm lies `depth` below the face; Embree counts in float32.
     assert penetration(context, placed) == pytest.approx(depth, abs=1e-7)
@@ -123,8 +115,8 @@ def test_a_block_sunk_into_a_flat_face(depth, block, box, at):
 
 
 @pytest.mark.parametrize("gap", [0.001, 0.003])
-def test_a_block_before_a_face_touches_only_within_two_millimetres(gap, block, box, at):
-    context = make_metrics_context(as_object(box), block)
+def test_a_block_before_a_face_touches_only_within_two_millimetres(gap, block):
+    context = make_metrics_context(as_object(BOX), block)
     placed = placed_hand(context, at((0.05 + gap, 0, 0), (0.0,)))
     assert penetration(context, placed) == 0.0
     assert intersection_volume(context, placed) == 0.0
@@ -136,14 +128,14 @@ def test_a_block_before_a_face_touches_only_within_two_millimetres(gap, block, b
 
 @settings(max_examples=10)
 @given(depth=st.floats(1e-5, 0.002), across=st.floats(-0.001, 0.001))
-def test_a_flat_overlap_counts_however_thin_it_is(depth, across, block, box, at):
-    context = make_metrics_context(as_object(box), block)
+def test_a_flat_overlap_counts_however_thin_it_is(depth, across, block):
+    context = make_metrics_context(as_object(BOX), block)
     placed = placed_hand(context, at((0.05 - depth, across, across), (0.0,)))
     # But for a rim of cells that the sides cut.
     assert intersection_volume(context, placed) == pytest.approx(depth * 0.03 * 0.02, rel=0.1)
 
 
-def test_the_overlap_with_a_thin_rod_is_counted_deep_inside_the_hand(block, at):
+def test_the_overlap_with_a_thin_rod_is_counted_deep_inside_the_hand(block):
     # Three millimetres square, right through the block's 20 mm: most of it is far from the hand's surface.
     context = make_metrics_context(as_object(box_of((0.0015, 0.0015, 0.045))), block)
     placed = placed_hand(context, at((0.0005, 0.0005, 0), (0.0,)))
@@ -151,8 +143,8 @@ def test_the_overlap_with_a_thin_rod_is_counted_deep_inside_the_hand(block, at):
     assert intersection_volume(context, placed) == pytest.approx(3 * 3 * 20 * MM3, rel=0.15)
 
 
-def test_a_slanted_overlap_is_within_the_cells_error(block, box, at):
-    context = make_metrics_context(as_object(box), block)
+def test_a_slanted_overlap_is_within_the_cells_error(block):
+    context = make_metrics_context(as_object(BOX), block)
     # About z by 45°: a corner of the block goes in. Depth t of a right-angled edge over 20 mm: t² · 20 mm.
     turn = np.deg2rad(45.0)
     corner = np.array([-0.02 * np.cos(turn) - 0.015 * np.sin(turn), 0, 0])
@@ -165,8 +157,8 @@ def test_a_slanted_overlap_is_within_the_cells_error(block, box, at):
     assert penetration(context, placed) == pytest.approx(depth, abs=0.0005)
 
 
-def test_fingers_that_pass_through_each_other(gripper, box, at):
-    context = make_metrics_context(as_object(box), gripper)
+def test_fingers_that_pass_through_each_other(gripper):
+    context = make_metrics_context(as_object(BOX), gripper)
     far = (0.0, 0.0, 1.0)
     # Inner faces are 45 mm − q from the middle: at 46 mm each is 2 mm inside the other finger.
     assert self_penetration(context, placed_hand(context, at(far, (0.046, 0.046)))) == pytest.approx(0.002, abs=1e-9)
@@ -187,18 +179,18 @@ SOLIDS = """<robot name="solids"><link name="base">
 
 
 @pytest.mark.parametrize("where", [(0.0, 0.0, 0.0), (0.02, 0.01, -0.05), (0.025, 0.025, 0.0)])
-def test_what_solids_of_every_kind_share_with_an_object_is_that_of_small_voxels(where, box, at, tmp_path):
+def test_what_solids_of_every_kind_share_with_an_object_is_that_of_small_voxels(where, tmp_path):
     trimesh.creation.icosphere(subdivisions=1, radius=0.015).export(tmp_path / "lump.stl")
     (tmp_path / "hand.urdf").write_text(SOLIDS)
     hand = load_hand(tmp_path / "hand.urdf", candidates=8)
     assert sorted(primitive.kind for primitive in hand.primitives) == ["box", "capsule", "cylinder", "hull", "sphere"]
-    context = make_metrics_context(as_object(box), hand)
+    context = make_metrics_context(as_object(BOX), hand)
     placed = placed_hand(context, at(where, (0.4,), (0.9, 0.1, -0.2, 0.3)))
     # The hand reaches from −20 mm to 100 mm along z, and 50 mm to either side.
     across, along = np.arange(-100, 100) + 0.5, np.arange(-40, 200) + 0.5
     voxels = np.stack(np.meshgrid(across, across, along, indexing="ij"), -1).reshape(-1, 3) * 0.0005
     points = voxels @ placed.rotations[0].T + placed.translations[0]
-    points = points[(np.abs(points) < box.vertices.max(0)).all(1)]
+    points = points[(np.abs(points) < BOX.vertices.max(0)).all(1)]
     shared = np.zeros(len(points), dtype=bool)
     for link in range(hand.num_links):
         local = (points - placed.translations[link]) @ placed.rotations[link]
@@ -208,7 +200,7 @@ def test_what_solids_of_every_kind_share_with_an_object_is_that_of_small_voxels(
 
 
 @pytest.mark.parametrize("holes", [0, 60])
-def test_the_kernel_measures_as_python_does(holes, at, tmp_path, monkeypatch):
+def test_the_kernel_measures_as_python_does(holes, tmp_path, monkeypatch):
     # The bowl is one solid of 4,864 faces. Beside a hole, the winding number passes through one half.
     trimesh.creation.icosphere(subdivisions=1, radius=0.015).export(tmp_path / "lump.stl")
     (tmp_path / "hand.urdf").write_text(SOLIDS)
@@ -282,14 +274,8 @@ def test_figures_do_not_depend_on_the_frame() -> None:
     assert figures[0].intersection_volume == pytest.approx(figures[1].intersection_volume, rel=0.02)
 
 
-def some(value: float | None) -> float:
-    """A metric that was measured."""
-    assert value is not None
-    return value
-
-
-def test_a_gripper_about_a_box_closes_and_one_finger_does_not(gripper, box, at):
-    context = make_metrics_context(as_object(box), gripper)
+def test_a_gripper_about_a_box_closes_and_one_finger_does_not(gripper):
+    context = make_metrics_context(as_object(BOX), gripper)
     # Inner faces 45 mm − q from the middle: at 14.5 mm half a millimetre from the box's 30 mm.
     both = measure(context, at((0, 0, -0.05), (0.0145, 0.0145)))
     assert both["contact_links"] == 2
@@ -303,20 +289,20 @@ def test_a_gripper_about_a_box_closes_and_one_finger_does_not(gripper, box, at):
     assert one["epsilon"] == 0.0
 
 
-def test_nothing_touched_is_all_zero(gripper, box, at):
-    metrics = measure(make_metrics_context(as_object(box), gripper), at((0, 0, 1.0), (0.0, 0.0)))
+def test_nothing_touched_is_all_zero(gripper):
+    metrics = measure(make_metrics_context(as_object(BOX), gripper), at((0, 0, 1.0), (0.0, 0.0)))
     assert all(value in (0.0, None) for value in metrics.values())
 
 
-def test_the_same_posture_measures_the_same_by_any_judge(gripper, box, at):
+def test_the_same_posture_measures_the_same_by_any_judge(gripper):
     posture = at((0.003, 0.001, -0.05), (0.016, 0.015))
-    contexts = [make_metrics_context(as_object(box), gripper) for _ in range(2)]
+    contexts = [make_metrics_context(as_object(BOX), gripper) for _ in range(2)]
     assert measure(contexts[0], posture) == measure(contexts[0], posture) == measure(contexts[1], posture)
 
 
 @settings(max_examples=8)
 @given(seed=st.integers(0, 2**31))
-def test_moving_object_and_hand_together_changes_nothing(seed, gripper, box, at):
+def test_moving_object_and_hand_together_changes_nothing(seed, gripper):
     rotation = random_rotations(1, torch.Generator().manual_seed(seed), torch.float64)[0].numpy()
     shift = np.random.default_rng(seed).uniform(-0.5, 0.5, 3)
     # Not flush with anything, so that no sample or voxel sits on a border.
@@ -326,9 +312,9 @@ def test_moving_object_and_hand_together_changes_nothing(seed, gripper, box, at)
         quaternion_from_rotation(torch.as_tensor(rotation)).numpy(),
         posture.joint_positions,
     )
-    here = measure(make_metrics_context(as_object(box), gripper), posture)
+    here = measure(make_metrics_context(as_object(BOX), gripper), posture)
     there = measure(
-        make_metrics_context(as_object(TriangleMesh(box.vertices @ rotation.T + shift, box.faces)), gripper), moved
+        make_metrics_context(as_object(TriangleMesh(BOX.vertices @ rotation.T + shift, BOX.faces)), gripper), moved
     )
     assert there["contact_links"] == here["contact_links"]
     # Sums over samples and voxels: a few of thousands may change sides by float32 distances.
@@ -339,16 +325,16 @@ def test_moving_object_and_hand_together_changes_nothing(seed, gripper, box, at)
     assert there["epsilon"] == pytest.approx(here["epsilon"], rel=0.09)
 
 
-def test_normals_point_out_on_either_side_of_the_surface(gripper, box):
-    context = make_metrics_context(as_object(box), gripper)
+def test_normals_point_out_on_either_side_of_the_surface(gripper):
+    context = make_metrics_context(as_object(BOX), gripper)
     points = np.array([[0.031, 0, 0], [0.029, 0, 0], [0, -0.031, 0.01], [0, 0, 0.046], [0.03, 0.01, 0.01]])
     expected = np.array([[1, 0, 0], [1, 0, 0], [0, -1, 0], [0, 0, 1], [1, 0, 0]])
     # Differences of float32 distances (1e-8 m) over 0.4 mm.
     assert surface_normals(context.query, points) == pytest.approx(expected, abs=1e-4)
 
 
-def test_wider_contacts_about_a_box(gripper, box, at):
-    context = make_metrics_context(as_object(box), gripper)
+def test_wider_contacts_about_a_box(gripper):
+    context = make_metrics_context(as_object(BOX), gripper)
     assert len(context.surface.points) >= 2000
     # Inner faces half a millimetre off. Within 5 mm of the box's planes: the inner faces, 4.5 mm of the sides about
     # them, nothing of the palm, whose face is 5 mm below the box's.
@@ -359,14 +345,14 @@ def test_wider_contacts_about_a_box(gripper, box, at):
     assert metrics["contact_area_10mm"] == pytest.approx(2 * (0.03 * 0.06 + 0.18 * 0.0095) + strip, rel=0.08)
 
 
-def test_area_over_volume_of_a_block_sunk_into_a_face(block, box, at):
-    metrics = measure(make_metrics_context(as_object(box), block), at((0.045, 0, 0), (0.0,)))
+def test_area_over_volume_of_a_block_sunk_into_a_face(block):
+    metrics = measure(make_metrics_context(as_object(BOX), block), at((0.045, 0, 0), (0.0,)))
     # 5 mm deep over 30 x 20 mm; a band of 4 mm about a perimeter of 100 mm is within 2 mm of the face.
     assert metrics["contact_per_volume"] == pytest.approx(0.1 * 0.004 / (0.005 * 0.03 * 0.02), rel=0.2)
 
 
-def test_more_contacts_only_widen_the_wrench_hull(gripper, box, at):
-    context, posture = make_metrics_context(as_object(box), gripper), at((0, 0, -0.05), (0.0145, 0.0145))
+def test_more_contacts_only_widen_the_wrench_hull(gripper):
+    context, posture = make_metrics_context(as_object(BOX), gripper), at((0, 0, -0.05), (0.0145, 0.0145))
     few, many = (measure(context, posture, max_contacts=count) for count in (8, 32))
     # Farthest points are nested: the first eight are among the first 32. Joggled by 1e-10.
     assert some(many["epsilon"]) >= some(few["epsilon"]) - 1e-8
@@ -413,9 +399,9 @@ FRICTION = 0.6
 NORMAL, TANGENT = 1 / np.sqrt(1 + FRICTION**2), FRICTION / np.sqrt(1 + FRICTION**2)
 
 
-def disc(radius: float = 1.0) -> np.ndarray:
+def disc() -> np.ndarray:
     angles = 2 * np.pi * np.arange(3) / 3
-    return radius * np.column_stack([np.cos(angles), np.sin(angles), np.zeros(3)])
+    return np.column_stack([np.cos(angles), np.sin(angles), np.zeros(3)])
 
 
 def plates() -> tuple[np.ndarray, np.ndarray]:

@@ -4,6 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from expected import some
 
 from graspd_bench.rendering.depth_noise import DEFAULT
 from graspd_bench.rendering.tabletop import CAMERA, ring_poses, tabletop, views_of
@@ -40,8 +41,7 @@ def first(views: tuple[PointCloud, ...]) -> tuple[ThingPlan, ...]:
 def test_the_first_verified_grasp_ends_the_search_and_all_things_are_told(first: tuple[ThingPlan, ...]):
     assert len(first) == 2
     best = first[0]
-    assert best.grasp is not None
-    assert best.grasp.verdict is Verdict.VERIFIED
+    assert some(best.grasp).verdict is Verdict.VERIFIED
     assert best.surety > 1.0
     assert best.reason == ""
     # The price is that of one thing wherever the first has a grasp.
@@ -61,8 +61,7 @@ def test_a_verified_grasp_of_unknown_probability_ends_the_search_too(views):
 def test_without_a_verified_grasp_the_search_ends_after_some_objects(views, enough: int):
     found = plan_any_thing(views, HAND, enough=enough, verify="none", **ASKED)
     assert [thing.looked_at for thing in found].count(True) == enough
-    assert found[0].grasp is not None
-    assert found[0].grasp.verdict is Verdict.UNVERIFIED
+    assert some(found[0].grasp).verdict is Verdict.UNVERIFIED
 
 
 def test_what_failed_comes_last_and_is_given_up_after_some_tries(views, first):
@@ -75,15 +74,13 @@ def test_what_failed_comes_last_and_is_given_up_after_some_tries(views, first):
 
 
 def test_one_result_answers_for_all_things(views, first):
-    assert first[0].result is not None
-    assert result_of_things(first) is first[0].result
+    assert result_of_things(first) is some(first[0].result)
     # A grasp that failed nobody knows where is left out, and makes no object come later.
     loose = Failure(None, first[0].grasp.grasp)
     again = plan_any_thing(views, HAND, failures=[loose], verify="none", most=1, **ASKED)
     assert [thing.reason for thing in again][1:] == [NOT_LOOKED_AT]
     np.testing.assert_array_equal(again[0].points, first[0].points)
-    best = again[0].grasp
-    assert best is not None
+    best = some(again[0].grasp)
     assert unlike([best], [first[0].grasp.grasp])
     # The deadline is that of the whole search, so that the second object is not begun.
     late = plan_any_thing(views, HAND, deadline=1e-3, **ASKED)
@@ -110,8 +107,7 @@ def test_a_grasp_like_one_that_was_lost_is_not_given_again(views: tuple[PointClo
     assert first[0].grasp.verdict is Verdict.VERIFIED
     assert again[0].grasp.verdict is Verdict.UNVERIFIED
     assert "an earlier grasp of this object failed" in again[0].reason
-    assert again[0].grasp.probability is not None
-    assert 0 < again[0].grasp.probability <= DOUBTED_SHARE
+    assert 0 < some(again[0].grasp.probability) <= DOUBTED_SHARE
     # A grasp that no robot executed says nothing about the scene.
     spared = plan_any_thing(views, HAND, failures=[replace(lost, executed=False), *out], **ASKED)
     assert spared[0].grasp is not None
@@ -141,8 +137,7 @@ def test_nothing_on_the_table_is_no_thing_and_an_empty_cloud_is_told(views: tupl
 
 
 def test_what_is_known_to_stand_there_is_no_thing(views: tuple[PointCloud, ...], first: tuple[ThingPlan, ...]):
-    assert first[0].scene is not None
-    known = {"known": [first[0].scene.object.mesh]}
+    known = {"known": [some(first[0].scene).object.mesh]}
     left = plan_any_thing(views, HAND, solids=known, failures=[Failure(first[1].place)] * 4, **ASKED)
     assert [thing.reason for thing in left] == [OUT_OF_TRIES]
     np.testing.assert_array_equal(left[0].points, first[1].points)

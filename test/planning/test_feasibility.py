@@ -7,17 +7,14 @@ import pytest
 import trimesh
 from made_meshes import box_of
 
-from graspd_core import HandModel, Scene, hand_names, load_hand, load_scene, plan_grasps
+from graspd_core import Scene, hand_names, load_hand, load_scene, plan_grasps
 from graspd_core.mesh.shapes import SHAPES, make_shape
 from graspd_core.planning.feasibility import out_of_reach, reach_of, why_trials_failed
-from graspd_core.types import Contact, Outcome, Plane, Stage, TrialResult, TriangleMesh, Verdict
+from graspd_core.types import Contact, Outcome, Plane, Stage, TrialResult, TriangleMesh, Verdict, joined
 
 
 def scene_of(*meshes: TriangleMesh, friction: float = 0.6) -> Scene:
-    starts = np.cumsum([0, *(len(mesh.vertices) for mesh in meshes)])
-    faces = [mesh.faces + start for mesh, start in zip(meshes, starts[:-1], strict=True)]
-    whole = TriangleMesh(np.concatenate([mesh.vertices for mesh in meshes]), np.concatenate(faces))
-    return load_scene(whole, resolution=8, friction=friction)
+    return load_scene(joined(*meshes), resolution=8, friction=friction)
 
 
 def crate(wall: float) -> tuple[TriangleMesh, ...]:
@@ -34,11 +31,6 @@ HOLDABLE = {
     "open crate": crate(0.005),
     "cube with a handle": (box_of((0.5, 0.5, 0.5)), box_of((0.01, 0.06, 0.03), (0.53, 0.0, 0.0))),
 }
-
-
-@pytest.fixture(scope="module")
-def hand() -> HandModel:
-    return load_hand("allegro_right", candidates=120)
 
 
 @pytest.fixture(scope="module")

@@ -10,6 +10,7 @@ from itertools import pairwise
 import numpy as np
 import pytest
 import torch
+from expected import some
 from hypothesis import given
 from hypothesis import strategies as st
 
@@ -66,6 +67,13 @@ def seen_from(shift: tuple[float, float, float] = (0.0, 0.0, 0.0)) -> Scene:
     views = views_of(tabletop("cylinder"), CAMERA, ring_poses(1, elevation=0.8))
     moved = [PointCloud(view.points + shift, view.viewpoint + np.array(shift)) for view in views]
     return scene_from_views(moved, mass=0.1)
+
+
+@cache
+def worlds_of_seen() -> TrialContext:
+    """What grasps of the hand are tried with on the cylinder seen by one camera."""
+    seen = seen_from()
+    return build_worlds(seen, load_hand("allegro_right"), object_parts(seen.object), PROTOCOLS["standard"])
 
 
 @cache
@@ -146,11 +154,9 @@ def test_every_other_shape_that_there_is_must_hold():
         (items,) = under(passed).stages
         asked = RobustnessChecks((replace(stage, items=items.items, may_fail=0),), PASSED)
         assert try_robustness(asked, GRASP, lambda: False)[0].passed == verified
-    seen, hand = seen_from(), load_hand("allegro_right")
-    others = begin_other_worlds(Run(time.perf_counter(), 0.0, None, None), seen, hand, PROTOCOLS["standard"], SURE)
-    worlds = build_worlds(seen, hand, object_parts(seen.object), PROTOCOLS["standard"])
-    asked = robustness_checks_of(seen, others, worlds, SURE)
-    assert asked is not None
+    run = Run(time.perf_counter(), 0.0, None, None)
+    others = begin_other_worlds(run, seen_from(), load_hand("allegro_right"), PROTOCOLS["standard"], SURE)
+    asked = some(robustness_checks_of(seen_from(), others, worlds_of_seen(), SURE))
     assert (asked.stages[1].least, asked.stages[1].may_fail) == (OTHER_SHAPES, 0)
 
 
@@ -226,8 +232,7 @@ def test_a_shape_that_was_begun_with_the_scene_is_not_made_again(monkeypatch):
 
 
 def test_no_shape_is_begun_where_none_is_needed():
-    evidence = seen_all_round().evidence
-    assert evidence is not None
+    evidence = some(seen_all_round().evidence)
     for doubted, probability in ((evidence, SURE), (replace(evidence, hidden=True), MASS_KNOWN.places)):
         begin_other_shapes(probability, seen_all_round().object, doubted)
         assert not hypotheses._begun(doubted)
@@ -261,8 +266,7 @@ def test_three_shapes_are_begun_and_others_once_they_are_asked_for(monkeypatch):
     assert first.begin().result() is None
     assert [other.begin().result() for other in others] == [world, world]
     assert sorted(made) == ["", "mirror", "revolution"]
-    heavier = last.altered(2.0).begin().result()
-    assert heavier is not None
+    heavier = some(last.altered(2.0).begin().result())
     assert heavier.model.body_mass[heavier.object_body] == 2.0
     assert last.begin().result() is world
     assert made[3:] == ["extrusion"]
@@ -273,11 +277,10 @@ def test_three_shapes_are_begun_and_others_once_they_are_asked_for(monkeypatch):
 def test_no_more_is_in_doubt_than_the_probability_asks_for(assumed):
     shares, seen = MASS_ASSUMED if assumed else MASS_KNOWN, seen_from()
     seen, hand = replace(seen, object=replace(seen.object, mass_assumed=assumed)), load_hand("allegro_right")
-    worlds = build_worlds(seen, hand, object_parts(seen.object), PROTOCOLS["standard"])
     for probability, stages in ((0.0, None), (shares.likeliest, None), (shares.places, 1), (shares.shapes, 2)):
         run = Run(time.perf_counter(), 0.0, None, None)
         others = begin_other_worlds(run, seen, hand, PROTOCOLS["standard"], probability)
-        asked = robustness_checks_of(seen, others, worlds, probability)
+        asked = robustness_checks_of(seen, others, worlds_of_seen(), probability)
         assert (None if asked is None else len(asked.stages)) == stages
         assert bool(others) == (stages == 2)
         if asked is not None:
@@ -288,9 +291,7 @@ def test_no_more_is_in_doubt_than_the_probability_asks_for(assumed):
 
 
 def test_at_less_than_the_assumed_mass_a_grasp_is_less_sure():
-    seen, hand = seen_from(), load_hand("allegro_right")
-    seen = replace(seen, object=replace(seen.object, mass_assumed=True))
-    worlds = build_worlds(seen, hand, object_parts(seen.object), PROTOCOLS["standard"])
+    seen, worlds = replace(seen_from(), object=replace(seen_from().object, mass_assumed=True)), worlds_of_seen()
     ahead = verification.Prefetched(begin_in_thread("worlds", lambda: worlds), (LaterWorld(lambda: None),))
     context = verification.VerificationContext(worlds, None)
     heavy = seen.object.mass
@@ -298,14 +299,12 @@ def test_at_less_than_the_assumed_mass_a_grasp_is_less_sure():
     assert half.trials.alone.model.body_mass[half.trials.alone.object_body] == 0.4 * heavy
     share = share_as_light(0.7, 1.0)
     assert LEAST_LIGHT < share < 1.0
-    assert half.checks is not None
-    own = less_sure(half.checks, 0.7 * heavy, heavy)
+    own = less_sure(some(half.checks), 0.7 * heavy, heavy)
     assert own.probability == pytest.approx(share * MASS_KNOWN.shapes)
     assert own.stages[0].though_failed == pytest.approx(share * MASS_KNOWN.fails_places)
     # Most objects of this volume are heavier than a tenth of the heavy end: no grasp is verified.
     tenth = verification.lighter(seen, ahead, context, CertaintyConfig(), 0.08 * heavy, 0.1 * heavy)
-    assert tenth.checks is not None
-    result, probability = try_robustness(less_sure(tenth.checks, 0.1 * heavy, heavy), GRASP, lambda: False)
+    result, probability = try_robustness(less_sure(some(tenth.checks), 0.1 * heavy, heavy), GRASP, lambda: False)
     assert not result.passed
     assert "too many objects of this volume weigh more" in result.reason
     assert probability == pytest.approx(share_as_light(0.1, 1.0) * MASS_KNOWN.likeliest)
@@ -317,8 +316,7 @@ def test_at_less_than_the_assumed_mass_a_grasp_is_less_sure():
 
 
 def test_a_grasp_is_as_sure_as_objects_are_lighter_than_its_own_payload():
-    seen, hand = seen_from(), load_hand("allegro_right")
-    worlds = build_worlds(seen, hand, object_parts(seen.object), PROTOCOLS["standard"])
+    worlds = worlds_of_seen()
     grasps = tuple(replace(grasp, trials=()) for grasp in planned().tried if grasp.verdict is not Verdict.FAILED)
     mass = verification.VerificationContext(worlds, None).mass
     payloads = {id(g.grasp): payload(worlds.alone, g, worlds.protocol, least=mass, held=True) for g in grasps}
@@ -367,15 +365,12 @@ def test_rounds_end_if_no_grasp_lifts_most_such_objects(preset, assumed, most):
     # A given mass is never lowered.
     assert (found.mass is not None) == assumed
     assert (found.mass or 0.0) < light_end(heavy)
-    assert found.context is not None
     # A further round would try grasps at the least mass that counts.
-    assert found.context.mass == pytest.approx(light_end(heavy) if assumed else heavy)
+    assert some(found.context).mass == pytest.approx(light_end(heavy) if assumed else heavy)
 
 
 def test_what_is_tried_at_less_mass_begins_with_the_strongest():
-    seen, hand = seen_from(), load_hand("allegro_right")
-    worlds = build_worlds(seen, hand, object_parts(seen.object), PROTOCOLS["standard"])
-    context, grasps = verification.VerificationContext(worlds, None), planned().tried[:4]
+    context, grasps = verification.VerificationContext(worlds_of_seen(), None), planned().tried[:4]
     lifted = verification.payloads(context, grasps, lambda: False)
     alone = [verification.payloads(context, [grasp], lambda: False)[0] for grasp in grasps]
     # Of what is no stronger than one before nothing is told. A payload is known to a tenth.
@@ -394,8 +389,7 @@ def test_of_one_view_a_verified_grasp_is_as_sure_as_asked_for():
     for grasp in result.tried:
         if grasp.verdict is Verdict.UNVERIFIED:
             assert not grasp.usable
-            assert grasp.probability is not None
-            assert grasp.probability < SURE
+            assert some(grasp.probability) < SURE
     order = [grasp.verdict for grasp in result.tried]
     assert order == sorted(order, key=[Verdict.VERIFIED, Verdict.UNVERIFIED, Verdict.FAILED].index)
 
@@ -437,8 +431,7 @@ def test_given_grasps_of_a_view_pass_the_same_checks_as_planned_ones():
     again = verification.verify_grasps(seen, hand, given, measure=False)
     told = [[(grasp.verdict, grasp.reason, grasp.probability) for grasp in grasps] for grasps in (again, given)]
     assert told[0] == told[1]
-    assert seen.evidence is not None
-    doubted = replace(seen, evidence=replace(seen.evidence, doubts=("are its numbers metres?",)))
+    doubted = replace(seen, evidence=replace(some(seen.evidence), doubts=("are its numbers metres?",)))
     (grasp,) = verification.verify_grasps(doubted, hand, given[:1])
     assert (grasp.verdict, grasp.reason) == (Verdict.UNVERIFIED, "are its numbers metres?")
 

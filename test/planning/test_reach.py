@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from expected import some
 
 from graspd_core import HandModel, Reach, Scene, load_arm, load_grasps, load_hand, load_preset, plan_grasps, save_result
 from graspd_core.arms.arm import arm_links, tip_hand
@@ -37,10 +38,9 @@ def on_table(at: np.ndarray) -> Scene:
 
 
 def reach_of(scene: Scene, away: float, at: np.ndarray | None = None) -> Reach:
-    assert scene.support is not None
     x, y, _ = np.zeros(3) if at is None else at
     quarter = (float(np.cos(np.pi / 4)), 0.0, 0.0, float(np.sin(np.pi / 4)))
-    return Reach(load_arm("panda_like"), (x - away, y + 0.1, scene.support.offset), quarter)
+    return Reach(load_arm("panda_like"), (x - away, y + 0.1, some(scene.support).offset), quarter)
 
 
 def planned(scene: Scene, hand: HandModel, reach: Reach, count: int = 2) -> GraspResult:
@@ -55,9 +55,8 @@ def check_arms(result: GraspResult, hand: HandModel, reach: Reach) -> None:
     )
     assert result.tried
     for grasp in result.tried:
-        assert grasp.arm is not None
         for stage in ("pregrasp", "grasp"):
-            links = arm_links(reach.arm, torch.as_tensor(grasp.arm.at(stage))[None])
+            links = arm_links(reach.arm, torch.as_tensor(some(grasp.arm).at(stage))[None])
             carried = base.compose(links[0, reach.arm.tip].compose(tip_hand(reach.arm, hand)))
             posture = getattr(grasp, stage)
             turned = rotation_from_quaternion(torch.as_tensor(posture.quaternion_wxyz))
@@ -108,8 +107,7 @@ def test_an_object_far_away_is_told_at_once(hand: HandModel, table: Scene):
 
 @pytest.mark.parametrize(("name", "below", "link"), [("ur5e_like", 0.12, "upper_arm"), ("panda_like", 0.3, "link_2")])
 def test_an_arm_whose_every_posture_is_in_the_table_is_told_at_once(hand: HandModel, table: Scene, name, below, link):
-    assert table.support is not None
-    reach = Reach(load_arm(name), (-0.5, 0.1, table.support.offset - below))
+    reach = Reach(load_arm(name), (-0.5, 0.1, some(table.support).offset - below))
     result = planned(table, hand, reach)
     assert result.outcome is Outcome.NO_CANDIDATES
     told = f"every posture of {name} has {link} in the table; the table is {below:.2f} m above the arm's base"

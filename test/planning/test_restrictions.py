@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 import torch
 
-from graspd_core import HandModel, Scene, draw_starts, load_scene, plan_grasps
+from graspd_core import HandModel, Scene, draw_starts, load_preset, load_scene, override, plan_grasps
 from graspd_core.errors import ConfigError
 from graspd_core.optimize.restrictions import (
     UNRESTRICTED,
@@ -102,10 +102,7 @@ def test_what_is_refused_is_not_tried_and_is_counted(scene, hand):
 @pytest.mark.parametrize("support", [None, Plane(np.array([0.0, 0.0, 1.0]), -0.05)], ids=["free", "on a table"])
 @pytest.mark.parametrize("method", ["closed_form", "annealing", "graspd2022", "random_closure"])
 def test_every_method_ends_where_a_restriction_leaves_nothing(scene, hand, method, support):
-    from graspd_core import load_preset, override
-
     scene = replace(scene, support=support)
-
     preset = override(load_preset("fast"), {"method": method, "rounds.most": 1})
     if method == "random_closure":
         preset = override(preset, {"random_closure.rounds": 1})

@@ -24,10 +24,6 @@ from graspd_core.verify.verification import VerificationContext, rank_by_robustn
 from graspd_core.verify.world import PROTOCOLS
 
 
-def a_run() -> Run:
-    return Run(time.perf_counter(), None, None, None)
-
-
 def never() -> bool:
     return False
 
@@ -128,7 +124,7 @@ def test_verdicts_and_order_do_not_depend_on_the_number_of_threads(candidates, t
     outcomes = []
     for number in (1, 2, 3):
         torch.set_num_threads(number)
-        run = a_run()
+        run = Run(time.perf_counter(), None, None, None)
         tried = run_trials(run, context, grasps, 3, 0)
         ranked = rank_by_robustness(run, context, tried.grasps, RobustConfig(trials=2, hold_time=0.2), 0)
         assert any(grasp.verdict is Verdict.VERIFIED for grasp in tried.grasps)

@@ -6,6 +6,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from expected import refused, some
 from PIL import Image
 
 from graspd_bench.rendering.tabletop import depth_views, ring_poses, tabletop
@@ -66,8 +67,7 @@ def test_every_kind_of_file_shows_the_same(depth, camera: Path, tmp_path: Path, 
     view, wanted = load_depth_view(image, camera, unit), cloud_from_depth(depth, CAMERA, POSE)
     assert np.allclose(view.points, wanted.points, atol=1e-6)
     assert np.allclose(view.viewpoint, POSE[:3, 3])
-    assert view.forward is not None
-    assert np.allclose(view.forward, POSE[:3, 2])
+    assert np.allclose(some(view.forward), POSE[:3, 2])
 
 
 @pytest.mark.parametrize("unit", [0.00025, "mm, 0 invalid", "um"])
@@ -114,9 +114,8 @@ def test_a_camera_that_says_something_else_is_named(tmp_path: Path, keys: dict[s
     if told is None:
         assert load_depth_camera(path)[0] == CAMERA
         return
-    with pytest.raises(CloudError, match=rf"camera.json: .*{told}") as caught:
+    with refused(CloudError, match=rf"camera.json: .*{told}"):
         load_depth_camera(path)
-    assert "\n" not in str(caught.value)
 
 
 @pytest.mark.parametrize(

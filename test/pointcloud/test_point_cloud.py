@@ -5,6 +5,7 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from expected import refused
 from hypothesis import given
 from hypothesis import strategies as st
 
@@ -171,10 +172,8 @@ def test_one_coordinate_that_is_not_finite_drops_the_point():
 def test_contradictions_are_named(change, culprit):
     good = message_of(np.ones((2, 3, 3)), ["<f4"] * 3, 24, 0)
     made = {key: fields_of(value) if key == "fields" else value for key, value in change.items()}
-    with pytest.raises(CloudError) as refused:
+    with refused(CloudError, culprit):
         points_from_message(SimpleNamespace(**{**vars(good), **made}))
-    assert culprit in str(refused.value)
-    assert "\n" not in str(refused.value)
 
 
 @pytest.mark.parametrize(("code", "step"), [("<f4", 12), ("<f4", 32), (">f4", 16), ("<f8", 24)])

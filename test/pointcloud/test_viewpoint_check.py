@@ -7,6 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from expected import some
 
 from graspd_bench.rendering.depth_noise import DEFAULT
 from graspd_bench.rendering.tabletop import depth_views, ring_poses, tabletop
@@ -82,8 +83,7 @@ def test_an_object_alone_from_all_round_needs_no_camera():
     ball = surface_samples(make_shape("sphere"), 3000, seed=0)[0] + [0.0, 0.0, 0.5]
     cloud = PointCloud(ball, np.zeros(3))
     assert fits_nowhere(cloud)
-    evidence = scene_from_views([cloud], alone=True).evidence
-    assert evidence is not None
+    evidence = some(scene_from_views([cloud], alone=True).evidence)
     assert evidence.doubts == ()
     with pytest.raises(CloudError, match=r"did not stand at the origin of its frame: .*sensor_frame or view_point"):
         check_viewpoint(cloud, cloud)
@@ -97,8 +97,7 @@ def test_a_whole_object_is_taken_with_its_walls_and_without_a_doubt(shape: str, 
     mesh = make_shape(shape)
     points = surface_samples(mesh, 3000, seed=0)[0] + place
     whole = scene_from_views([PointCloud(points, np.zeros(3))], alone=alone)
-    assert whole.evidence is not None
-    assert whole.evidence.doubts == ()
+    assert some(whole.evidence).doubts == ()
     # The mug's walls are 4 mm thick, as far as its points are apart.
     assert mass_properties(whole.object.mesh)[0] == pytest.approx(mass_properties(mesh)[0], rel=0.1)
 
@@ -106,8 +105,7 @@ def test_a_whole_object_is_taken_with_its_walls_and_without_a_doubt(shape: str, 
 def test_a_ball_whose_camera_is_exactly_its_middle_is_taken():
     half = np.random.default_rng(0).normal(size=(1500, 3))
     half *= 0.04 / np.linalg.norm(half, axis=1, keepdims=True)
-    evidence = scene_from_views([PointCloud(np.concatenate([half, -half]), np.zeros(3))]).evidence
-    assert evidence is not None
+    evidence = some(scene_from_views([PointCloud(np.concatenate([half, -half]), np.zeros(3))]).evidence)
     assert evidence.doubts == ()
 
 
@@ -130,8 +128,7 @@ def test_a_scene_in_another_unit_is_refused_or_doubted(factor, doubt):
     depth = depth_views(scene, CAMERA, [T], DEFAULT, seed=3)[0][0]
     with nullcontext() if doubt else pytest.raises(CloudError, match="are the coordinates in metres"):
         seen = scene_from_views([cloud_from_depth(factor * depth, CAMERA)])
-        assert seen.evidence is not None
-        assert doubt in " ".join(seen.evidence.doubts)
+        assert doubt in " ".join(some(seen.evidence).doubts)
         assert any(doubt in told and "no grasp counts as verified" in told for told in seen.object.warnings)
 
 
@@ -152,8 +149,7 @@ def test_a_thing_without_its_table_is_doubted_from_right_behind():
     mirrored = PointCloud(thing, 2 * thing.mean(0) - place)
     assert "the object is hollow, or seen from the back of its surface" in check_viewpoint(mirrored, mirrored)
     # A second cloud of the same camera confirms nothing.
-    evidence = scene_from_views([mirrored, mirrored], alone=True).evidence
-    assert evidence is not None
+    evidence = some(scene_from_views([mirrored, mirrored], alone=True).evidence)
     assert "the object is hollow" in " ".join(evidence.doubts)
 
 
@@ -232,7 +228,6 @@ def test_views_of_which_one_has_a_wrong_pose_are_doubted(shift, doubt):
     depths = [depth for depth, _ in depth_views(tabletop("bottle"), CAMERA, poses, DEFAULT)]
     poses[2][:3, 3] += shift
     views = [cloud_from_depth(depth, CAMERA, pose) for depth, pose in zip(depths, poses, strict=True)]
-    evidence = scene_from_views(views).evidence
-    assert evidence is not None
+    evidence = some(scene_from_views(views).evidence)
     told = " ".join(evidence.doubts)
     assert re.search(doubt, told) if doubt else not told

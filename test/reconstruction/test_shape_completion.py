@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from expected import some
 from hypothesis import given
 from hypothesis import strategies as st
 
@@ -64,8 +65,7 @@ def test_the_support_is_no_place_for_an_object():
 @pytest.mark.parametrize("view", [CYLINDER, BALL], ids=["cylinder", "ball"])
 def test_a_revolution_is_found_and_lies_on_the_body(view):
     seen, free_space, step = looked_at(view)
-    turned = find_revolution(seen, free_space, step)
-    assert turned is not None
+    turned = some(find_revolution(seen, free_space, step))
     assert turned.wrong < 0.01
     assert turned.share > 0.9
     height = SPHERE_RADIUS if view is BALL else CYLINDER_HALF
@@ -191,8 +191,7 @@ def test_half_a_ball_seen_from_any_side_has_its_back():
     normals = rng.standard_normal((6000, 3))
     normals /= np.linalg.norm(normals, axis=1)[:, None]
     normals = normals[normals[:, 2] > 0.15]
-    found = find_revolution(Surfels(0.03 * normals, normals), FreeSpace((), standing=False), 1.2e-3)
-    assert found is not None
+    found = some(find_revolution(Surfels(0.03 * normals, normals), FreeSpace((), standing=False), 1.2e-3))
     assert found.surfels.points[:, 2].min() < -0.025
 
 
@@ -243,8 +242,7 @@ def test_nothing_else_may_be_true_of_what_was_seen_all_round():
 
 def test_the_next_view_looks_at_the_far_side_from_above_the_table(half_seen):
     assert half_seen.evidence.hidden
-    pose = next_view(half_seen.evidence, half_seen.mesh, np.zeros(3))
-    assert pose is not None
+    pose = some(next_view(half_seen.evidence, half_seen.mesh, np.zeros(3)))
     eye, forward = pose[:3, 3], pose[:3, 2]
     centre = np.array([0.0, 0.0, BOX_HALF[2]])
     assert np.linalg.det(pose[:3, :3]) == pytest.approx(1.0)
@@ -263,6 +261,4 @@ def test_the_next_view_goes_where_the_object_goes(half_seen):
     shift = np.array([1.0, -2.0, 3.0])
     assert half_seen.evidence.hidden
     here, there = (next_view(half_seen.evidence, half_seen.mesh, s) for s in (np.zeros(3), shift))
-    assert here is not None
-    assert there is not None
-    assert there[:3, 3] - here[:3, 3] == pytest.approx(shift)
+    assert some(there)[:3, 3] - some(here)[:3, 3] == pytest.approx(shift)

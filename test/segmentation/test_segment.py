@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from expected import some
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from made_meshes import box_between
@@ -102,13 +103,10 @@ def three() -> tuple[PointCloud, Segmentation]:
 def test_moving_the_whole_scene_moves_the_answer(three, seed, x, y):
     view, first = three
     turn, shift = Rotation.random(rng=np.random.default_rng(seed)).as_matrix(), np.array([x, y, 0.3])
-    assert view.forward is not None
-    moved = PointCloud(view.points @ turn.T + shift, turn @ view.viewpoint + shift, turn @ view.forward)
+    moved = PointCloud(view.points @ turn.T + shift, turn @ view.viewpoint + shift, turn @ some(view.forward))
     second = segment([moved])
     back = (second.views[0].points - shift) @ turn
-    assert first.support is not None
-    assert second.support is not None
-    assert second.support.normal @ turn == pytest.approx(first.support.normal, abs=2e-3)
+    assert some(second.support).normal @ turn == pytest.approx(some(first.support).normal, abs=2e-3)
     # Voxels lie elsewhere, so that a few points at edges and near the support change sides.
     one, other = ({tuple(np.round(p, 6)) for p in points} for points in (first.views[0].points, back))
     assert len(one & other) > 0.98 * len(one | other)
@@ -143,8 +141,7 @@ def test_walls_and_floors_are_not_what_it_stands_on():
     for meshes in ([*scene.meshes, walls[0]], [*scene.meshes, *walls], [*scene.meshes, floor]):
         view, _ = seen(meshes, noise=LEVELS["default"])
         found = segment([view])
-        assert found.support is not None
-        assert found.support.normal == pytest.approx([0, 0, 1], abs=0.01)
+        assert some(found.support).normal == pytest.approx([0, 0, 1], abs=0.01)
         assert share_near(found.views[0].points, scene.truth, 0.009) > 0.99
 
 
@@ -154,8 +151,7 @@ def test_what_is_seen_from_straight_above_stands_on_the_table(shape, noise):
     stage = tabletop(shape)
     views = views_of(stage, CAMERA, ring_poses(1, elevation=np.deg2rad(88.0)), LEVELS[noise])
     found = segment(views)
-    assert found.support is not None
-    assert found.support.offset == pytest.approx(0, abs=0.002)
+    assert some(found.support).offset == pytest.approx(0, abs=0.002)
     assert found.obstacles == ()
 
 

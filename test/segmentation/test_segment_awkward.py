@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from expected import some
 
 from graspd_bench.rendering.depth_noise import LEVELS, NONE, DepthNoise
 from graspd_bench.rendering.tabletop import CAMERA as D415
@@ -65,16 +66,14 @@ def test_an_object_alone_among_zeros_is_cleaned_as_without_them():
 
 def test_the_lower_level_of_a_stepped_table_is_what_the_object_stands_on():
     found = segment(beside_a_step("box"))
-    assert found.support is not None
-    assert found.support.offset == pytest.approx(0.0, abs=0.002)
+    assert some(found.support).offset == pytest.approx(0.0, abs=0.002)
     assert found.views[0].points[:, 2].min() < 0.01
 
 
 def test_an_object_at_the_border_of_the_picture_is_doubted():
     scene = scene_from_views(half_out_of_view("box"))
     told = "the object reaches the border of the image, and may extend beyond it"
-    assert scene.evidence is not None
-    assert scene.evidence.doubts == (told,)
+    assert some(scene.evidence).doubts == (told,)
     assert f"cloud: {told}; no grasp counts as verified" in scene.object.warnings
     # The second view shows the whole outline.
     assert segment([*half_out_of_view("box"), view_of_box()]).cut == ""

@@ -125,11 +125,7 @@ def test_jitter_that_hides_the_drift_of_a_few_steps_cancels_over_more_of_them():
 
 @pytest.mark.parametrize("bad", [np.nan, np.inf])
 def test_what_is_not_finite_is_never_known(bad):
-    for lost in (
-        replace(REST, center=(bad, 0.0, 0.0)),
-        replace(REST, speed=bad),
-        replace(REST, spin=bad),
-    ):
+    for lost in (replace(REST, center=(bad, 0.0, 0.0)), replace(REST, speed=bad), replace(REST, spin=bad)):
         assert not answer_known(FIRM, STANDARD, [REST, REST, lost], (0.0, 0.0), 100)
     assert not answer_known(FIRM, STANDARD, [REST, REST, REST], (bad, 0.0), 100)
     assert not answer_known(FIRM, STANDARD, [REST, REST, REST], (0.0, bad), 100)

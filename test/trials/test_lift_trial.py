@@ -51,6 +51,11 @@ def table(hand, cube) -> World:
     return build_world(hand, cube, (cube.mesh,), STANDARD, TABLE)
 
 
+@pytest.fixture(scope="module")
+def context(hand, world, table) -> TrialContext:
+    return TrialContext(hand, STANDARD, world, table)
+
+
 def test_the_retreat_lies_straight_back(hand, closing):
     pregrasp = closing(*GOOD).pregrasp
     assert retreat_posture(hand, pregrasp).position == pytest.approx([0, 0, -0.145])
@@ -154,14 +159,13 @@ def test_a_lift_can_be_stopped(table, hand, closing):
     assert lift == replace(lift, passed=False, reason="stopped before the trial ended")
 
 
-def test_a_verdict_needs_every_trial(table, hand, cube, closing):
+def test_a_verdict_needs_every_trial(context, closing):
     held, lifted = TrialResult("hold", True, 0.0, 0.0), TrialResult("lift", True, 0.0, 0.0)
     grasp = closing(*GOOD)
     assert grasp.verdict is Verdict.UNVERIFIED
     assert replace(grasp, trials=(held,)).verdict is Verdict.VERIFIED
     assert replace(grasp, trials=(held, lifted)).verdict is Verdict.VERIFIED
     # This one holds in free space and reaches through the table.
-    context = TrialContext(hand, STANDARD, build_world(hand, cube, (cube.mesh,), STANDARD), table)
     tried = replace(grasp, trials=grasp_trials(context, grasp))
     assert [(trial.name, trial.passed) for trial in tried.trials] == [("hold", True), ("lift", False)]
     assert (tried.verdict, tried.reason) == (Verdict.FAILED, tried.trials[1].reason)
@@ -169,13 +173,6 @@ def test_a_verdict_needs_every_trial(table, hand, cube, closing):
     assert [trial.name for trial in grasp_trials(replace(context, around=None), grasp)] == ["hold"]
     (lost,) = grasp_trials(context, closing(*GOOD, height=-0.145))
     assert (lost.name, lost.passed) == ("hold", False)
-
-
-@pytest.fixture(scope="module")
-def context(gripper, cube) -> TrialContext:
-    hand = replace(gripper, approach=np.array([0.0, 0.0, 1.0]))
-    alone = build_world(hand, cube, (cube.mesh,), STANDARD)
-    return TrialContext(hand, STANDARD, alone, build_world(hand, cube, (cube.mesh,), STANDARD, TABLE))
 
 
 @pytest.mark.parametrize("squeeze", [(0.04, 0.04), (0.0262, 0.0262), (0.02, 0.02)])

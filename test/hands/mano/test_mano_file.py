@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 import torch
 import trimesh
+from expected import refused
 from hypothesis import given
 from inputs_made import Evil
 from scipy.sparse import csr_matrix
@@ -105,9 +106,8 @@ def test_a_malicious_file_is_refused_and_runs_nothing(model: dict[str, Any], tmp
         for protocol in (0, 2, 4):
             path = tmp_path / f"{name}.pkl"
             path.write_bytes(pickle.dumps({**model, "bs_style": payload}, protocol=protocol))
-            with pytest.raises(HandError, match=rf"{name}.pkl: asks for .*({culprit}).*refused") as caught:
+            with refused(HandError, match=rf"{name}.pkl: asks for .*({culprit}).*refused"):
                 load_hand(path)
-            assert "\n" not in str(caught.value)
     assert not witness.exists()
 
 
@@ -142,9 +142,8 @@ def test_a_malicious_file_is_refused_and_runs_nothing(model: dict[str, Any], tmp
 def test_a_broken_file_is_refused_in_one_line(tmp_path: Path, content: bytes) -> None:
     path = tmp_path / "broken.pkl"
     path.write_bytes(content)
-    with pytest.raises(HandError, match=r"broken.pkl: ") as caught:
+    with refused(HandError, match=r"broken.pkl: "):
         read_mano(path)
-    assert "\n" not in str(caught.value)
 
 
 def test_nothing_admitted_is_a_real_class_or_function() -> None:

@@ -7,9 +7,11 @@ from typing import Any
 
 import numpy as np
 import pytest
+from expected import refused
 from hypothesis import HealthCheck, Phase, given, settings
 from hypothesis import strategies as st
 
+from graspd_core import TriangleMesh, save_mesh
 from graspd_core.errors import HandError
 from graspd_core.hands.kinematics import link_poses
 from graspd_core.hands.library import hand_hash, load_hand, read_hand_file
@@ -107,15 +109,8 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A package with the wedge as obj, stl and dae."""
     folder = tmp_path_factory.mktemp("zoo")
     (folder / "package.xml").write_text("<package><name>zoo</name></package>")
-    faces = "".join(f"f {a + 1} {b + 1} {c + 1}\n" for a, b, c in FACES)
-    (folder / "wedge.obj").write_text("".join(f"v {x} {y} {z}\n" for x, y, z in WEDGE) + faces)
-    loops = "".join(
-        "facet normal 0 0 0\nouter loop\n"
-        + "".join("vertex {} {} {}\n".format(*WEDGE[i]) for i in face)
-        + "endloop\nendfacet\n"
-        for face in FACES
-    )
-    (folder / "wedge.stl").write_text(f"solid wedge\n{loops}endsolid wedge\n")
+    for ending in ("obj", "stl"):
+        save_mesh(folder / f"wedge.{ending}", TriangleMesh(WEDGE, np.array(FACES)))
     numbers, indices = " ".join(map(str, WEDGE.ravel())), " ".join(str(i) for face in FACES for i in face)
     (folder / "wedge.dae").write_text(DAE.format(numbers=numbers, indices=indices))
     return folder
@@ -230,11 +225,7 @@ def test_where_the_base_stands_in_its_file_is_kept(folder: Path) -> None:
     [
         ("<freejoint/>", '<include file="x.xml"/>', "<include file='x.xml'>: no such file beside changed.xml"),
         ("<freejoint/>", '<include file="changed.xml"/>', "<include file='changed.xml'>: included twice"),
-        (
-            "<equality>",
-            '<equality><connect body1="a" body2="b" anchor="0 0 0"/>',
-            "write <joint joint1 joint2 pol",
-        ),
+        ("<equality>", '<equality><connect body1="a" body2="b" anchor="0 0 0"/>', "write <joint joint1 joint2 pol"),
         ('<body name="tip"', '<replicate count="9"/><body name="tip"', "body 'a2': <replicate> is not read"),
         ("</worldbody>", '<body name="mug"/></worldbody>', "the world has 2 bodies: palm, mug; valid: one"),
         ('type="slide"', 'type="ball"', "joint 's1' is of type 'ball'; known: hinge, slide"),
@@ -272,10 +263,8 @@ def test_where_the_base_stands_in_its_file_is_kept(folder: Path) -> None:
 )
 def test_what_is_not_read_is_named(folder: Path, old: str, new: str, message: str) -> None:
     assert old in MJCF
-    with pytest.raises(HandError, match=message) as caught:
+    with refused(HandError, start=str(folder / "changed.xml"), match=message):
         _read(folder, MJCF.replace(old, new, 1))
-    assert str(caught.value).startswith(str(folder / "changed.xml"))
-    assert "\n" not in str(caught.value)
 
 
 # Trees are small as drawn, and shrinking one takes minutes.

@@ -1,10 +1,12 @@
 """Each URDF loads as its author meant it, coupled joints included, or is refused by one line that names the element."""
 
 import json
+import re
 from pathlib import Path
 
 import numpy as np
 import pytest
+from expected import refused
 
 from graspd_core.errors import HandError
 from graspd_core.hands.kinematics import link_poses
@@ -22,6 +24,14 @@ LOOP = '<link name="x"/><link name="y"/>' + "".join(
     f'<joint name="{one}" type="continuous"><parent link="{one}"/><child link="{other}"/></joint>'
     for one, other in ("xy", "yx")
 ) + "</robot>"  # fmt: skip
+
+END = "</robot>"
+STUCK = (
+    '<link name="x"/><joint name="stuck" type="revolute"><parent link="palm"/><child link="x"/>'
+    "<limit {}/></joint></robot>"
+)
+HUNG = '<link name="{0}"/><joint name="w" type="{1}"><parent link="{0}"/><child link="palm"/></joint></robot>'
+DROPPED = "link '{}' and {} joint 'w' above the base 'palm' were dropped"
 
 
 def _read(tmp_path: Path, text: str | bytes) -> HandModel:
@@ -84,28 +94,17 @@ def test_sloppy_xml_is_read(tmp_path: Path, text: bytes) -> None:
         ("<collision>", "<visual>", r"the <visual> is used: palm"),
         ('type="revolute"', 'type="continuous"', r"joint 'hinge' has no limits: restricted to \[-3.14, 3.14\] rad"),
         ('upper="1"', 'upper="1e9"', r"joint 'hinge' has no limits: restricted to \[-0.5, "),
+        (END, HUNG.format("world", "fixed"), DROPPED.format("world", "fixed")),
+        (END, HUNG.format("up", "floating"), DROPPED.format("up", "floating")),
         (
-            "</robot>",
-            '<link name="world"/><joint name="w" type="fixed"><parent link="world"/><child link="palm"/></joint>'
-            "</robot>",
-            r"link 'world' and fixed joint 'w' above the base 'palm' were dropped",
+            END,
+            STUCK.format('lower=".3" upper=".3"'),
+            "joint 'stuck' cannot move: its limits coincide; taken as fixed",
         ),
         (
-            "</robot>",
-            '<link name="up"/><joint name="w" type="floating"><parent link="up"/><child link="palm"/></joint></robot>',
-            r"link 'up' and floating joint 'w' above the base 'palm' were dropped",
-        ),
-        (
-            "</robot>",
-            '<link name="x"/><joint name="stuck" type="revolute"><parent link="palm"/><child link="x"/>'
-            '<limit lower="0.3" upper="0.3"/></joint></robot>',
-            r"joint 'stuck' cannot move: its limits coincide; taken as fixed",
-        ),
-        (
-            "</robot>",
-            '<link name="x"/><joint name="stuck" type="revolute"><parent link="palm"/><child link="x"/>'
-            '<limit effort="3" velocity="1"/></joint></robot>',
-            r"joint 'stuck' cannot move: its limits coincide at 0, which is what a <limit> without lower and upper",
+            END,
+            STUCK.format('effort="3" velocity="1"'),
+            "joint 'stuck' cannot move: its limits coincide at 0, which is what a <limit> without lower and upper",
         ),
     ],
 )
@@ -114,8 +113,7 @@ def test_what_is_mended_leaves_a_warning(tmp_path: Path, old: str, new: str, war
     hand = _read(tmp_path, text)
     assert (hand.base_link, hand.joint_names) == ("palm", ("hinge",))
     assert np.isfinite([hand.lower, hand.upper]).all()
-    with pytest.raises(AssertionError, match=warning):
-        raise AssertionError("\n".join(hand.warnings))
+    assert re.search(warning, "\n".join(hand.warnings))
 
 
 def test_a_welded_joint_stays_where_its_limits_put_it(tmp_path: Path) -> None:
@@ -264,10 +262,8 @@ def test_what_cannot_be_used_is_named(tmp_path: Path, old: str, new: str, messag
     if message is None:
         assert _read(tmp_path, text).slides.all()
         return
-    with pytest.raises(HandError, match=message) as caught:
+    with refused(HandError, start=str(tmp_path / "tiny.urdf"), match=message):
         _read(tmp_path, text)
-    assert str(caught.value).startswith(str(tmp_path / "tiny.urdf"))
-    assert "\n" not in str(caught.value)
 
 
 @pytest.mark.parametrize("before", ["", "<?xml version='1.0'?>\n", "<!-- a\nb --><?xml version='1.0'?>\n\n", "\n \n"])
@@ -279,11 +275,7 @@ def test_errors_name_the_line_of_the_file(tmp_path: Path, before: str) -> None:
 
 @pytest.mark.parametrize(
     "text",
-    [
-        "<!--" * 200_000,
-        "<?xml " * 200_000,
-        "<?xml encoding='punycode'?>" + "a" * 500_000 + "-" + "a" * 2_000_000,
-    ],
+    ["<!--" * 200_000, "<?xml " * 200_000, "<?xml encoding='punycode'?>" + "a" * 500_000 + "-" + "a" * 2_000_000],
     ids=["comments", "headers", "encoding"],
 )
 def test_a_file_made_to_take_long_is_refused_soon(tmp_path: Path, text: str) -> None:

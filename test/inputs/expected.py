@@ -1,0 +1,26 @@
+"""What tests of many folders expect: an error of one line, a value that is there."""
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from typing import TypeVar
+
+import pytest
+
+T = TypeVar("T")
+
+
+@contextmanager
+def refused(error: type[Exception], *told: str, start: str = "", match: str | None = None) -> Iterator[None]:
+    """Expect an error of one line that has these texts, begins with one, and that a regular expression matches."""
+    with pytest.raises(error, match=match) as caught:
+        yield
+    line = str(caught.value)
+    assert "\n" not in line, line
+    assert line.startswith(start), line
+    assert [text for text in told if text not in line] == [], line
+
+
+def some(value: T | None) -> T:
+    """Return a value that is not None, for pyright too."""
+    assert value is not None
+    return value
