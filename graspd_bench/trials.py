@@ -116,10 +116,6 @@ def _place_links(world: FrozenWorld, data: Any, posture: Posture) -> None:
     data.mocap_quat[:] = quaternion_from_rotation(base.rotation @ links.rotation).numpy()
 
 
-# mujoco is a compiled module without stubs.
-# pyright: reportAttributeAccessIssue=false
-
-
 DROP_GRAVITY, DURATION = 9.8, 2.0
 # Gravity along one direction ends at this displacement [m]. It is also the result if the hand fails to close.
 LOST = 0.1
@@ -181,10 +177,6 @@ def _end(states: list[ObjectState], checks: int) -> Float[np.ndarray, "3"] | Non
     left = (checks - len(states)) / _WINDOW
     end, before = last + left * (last - middle), middle + (left + 1) * (middle - first)
     return end if _SAFETY * np.linalg.norm(end - before) < TOLERANCE else None
-
-
-# mujoco is a compiled module without stubs.
-# pyright: reportAttributeAccessIssue=false
 
 
 _FLOOR, _WALL = "floor", "wall"

@@ -146,10 +146,6 @@ def _text(values: Float[np.ndarray, "n"]) -> str:
     return " ".join(repr(float(value)) for value in values)
 
 
-# pybullet is a compiled module without stubs.
-# pyright: reportAttributeAccessIssue=false, reportCallIssue=false
-
-
 # Least principal moment of an object per kilogram [m²]: the moment of a ball of 0.5 mm radius.
 _LEAST_MOMENT = 1e-7
 # Settings of the displacement trial.

@@ -16,7 +16,7 @@ from typing import Any
 
 import numpy as np
 
-from graspd_bench.measurement import TRIALS, Tried, requested_trials
+from graspd_bench.measurement import TRIALS, requested_trials
 from graspd_bench.study import PROTOCOL_MASS, ObjectCase, Record, Request, Sections, raw_grasps
 from graspd_core.errors import ConfigError
 from graspd_core.hands.library import load_hand
@@ -131,7 +131,7 @@ def tried(scene: Scene, hand: HandModel, grasps: Sequence[Grasp], trials: Sequen
     context, parts = make_metrics_context(scene.object, hand), object_parts(scene.object)
     results: list[dict[str, Any]] = [{"metrics": dict(measure(context, grasp.grasp))} for grasp in grasps]
     for name in trials if grasps else ():
-        trial = TRIALS[name](Tried(hand, scene.object, parts))
+        trial = TRIALS[name](hand, scene.object, parts)
         for grasp, result in zip(grasps, results, strict=True):
             result[name] = trial(grasp)
     return results
