@@ -69,10 +69,7 @@ def bullet_hold_trial(world: BulletWorld, grasp: Grasp, protocol: Protocol) -> T
         depth = _start_penetration(run)
         if depth > protocol.max_start_penetration:
             return TrialResult(_NAME, False, 0.0, 0.0, f"the pregrasp penetrates the object by {depth * 1e3:.1f} mm")
-        for stage, start, end in (
-            ("closing", grasp.pregrasp, grasp.grasp),
-            ("squeezing", grasp.grasp, grasp.squeeze),
-        ):
+        for stage, start, end in (("closing", grasp.pregrasp, grasp.grasp), ("squeezing", grasp.grasp, grasp.squeeze)):
             reason = _move(run, start, end)
             if reason:
                 return _result(run, f"{reason} while {stage}")

@@ -59,10 +59,7 @@ class TabletopScene:
 
 
 def tabletop(
-    shape: str | TriangleMesh,
-    *,
-    yaw: float = 0.0,
-    obstacles: Sequence[tuple[str | TriangleMesh, float, float]] = (),
+    shape: str | TriangleMesh, *, yaw: float = 0.0, obstacles: Sequence[tuple[str | TriangleMesh, float, float]] = ()
 ) -> TabletopScene:
     """Put an object on the table. Return the scene.
 

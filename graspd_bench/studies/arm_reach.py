@@ -239,10 +239,7 @@ def measure_arm(arm: Arm, poses: int) -> Record:
     target = arm_links(arm, q)[:, arm.tip]
     start_table(arm)
     library = _library(arm) if importlib.util.find_spec("pytorch_kinematics") else None
-    return {
-        "own": _measured(lambda tip: _own(arm, tip), target),
-        "library": library and _measured(library, target),
-    }
+    return {"own": _measured(lambda tip: _own(arm, tip), target), "library": library and _measured(library, target)}
 
 
 def _measured(solver: Callable[[SE3], Bool[Tensor, "batch"]], target: SE3) -> Record:

@@ -205,11 +205,7 @@ def test_a_comparison_says_what_it_is_of_and_names_nothing_that_is_absent(tmp_pa
     own = [record("balanced", **all_held), record("mine", **all_held, cpu={"optimise": 2.02, "standard": 3.0})]
     drawn = charts.draw_charts([*own, record("robust")], tmp_path / "chart")
     chart, short = (drawn[name].with_suffix(".svg").read_text() for name in ("speed", "short"))
-    for text in (
-        "allegro_right; box",
-        "n = 4 grasps a preset; bars: quartiles over grasps",
-        "closed form",
-    ):
+    for text in ("allegro_right; box", "n = 4 grasps a preset; bars: quartiles over grasps", "closed form"):
         assert text in chart
     assert "<!-- ablation -->" not in chart
     percents = [float(text) for text in re.findall(r"<!-- ([\d.]+) -->", chart)]
