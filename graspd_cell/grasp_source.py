@@ -24,8 +24,6 @@ from graspd_core.planning.any_thing import OUT_OF_TRIES, Failure, ThingPlan, pla
 from graspd_core.planning.plan_grasps import warm_up
 from graspd_core.types import Grasp, Plane, TriangleMesh, Verdict
 
-__all__ = ["Failure", "GraspSource", "InProcessGrasps", "Offer", "cloud_of"]
-
 
 @dataclass(frozen=True, eq=False)
 class Offer:
