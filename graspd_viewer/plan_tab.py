@@ -201,12 +201,8 @@ class PlanTab:
 
     def plan(self) -> None:
         """Start a run with the values of the widgets. Do nothing if a run is in progress."""
-        self.begin(lambda _: self._plan_and_show(self._request()))
-
-    def begin(self, work: Callable[[StopHook], None]) -> None:
-        """Start a thread that calls `work`. Its argument tells if `work` must stop. Do nothing during a run."""
         if self._busy.acquire(blocking=False):
-            self._start(work)
+            self._start(lambda _: self._plan_and_show(self._request()))
 
     def replace(self, work: Callable[[StopHook], None]) -> None:
         """Stop the run in progress. When it has ended, start a thread that calls `work`. Only the newest waits."""
