@@ -163,10 +163,9 @@ def _refuse(options: argparse.Namespace) -> None:
         raise ConfigError(f"--count: {options.count}; valid: 1 to {MOST_THINGS}")
     if not 0 <= options.seed < 2**31:
         raise ConfigError(f"--seed: {options.seed}; valid: 0 to 2^31 - 1")
-    if options.attempts is not None and options.attempts < 1:
-        raise ConfigError(f"--attempts: {options.attempts}; valid: 1 or more")
-    if options.picks is not None and options.picks < 1:
-        raise ConfigError(f"--picks: {options.picks}; valid: 1 or more")
+    for name, value in (("attempts", options.attempts), ("picks", options.picks)):
+        if value is not None and value < 1:
+            raise ConfigError(f"--{name}: {value}; valid: 1 or more")
     if options.picks is not None and (options.view or options.film):
         raise ConfigError("--picks cannot be combined with --view or --film; remove one of them")
     if not 0 < options.speed < float("inf"):
