@@ -75,22 +75,10 @@ def run(options: argparse.Namespace) -> int:
     after = words.index("dexgraspbench") + 1 if "dexgraspbench" in words else len(words)
     checkout = "".join(words[after : after + 1])
     del words[after : after + 1]
-    request = Request(
-        presets=tuple(options.presets),
-        objects=tuple(options.objects),
-        cases=tuple(options.cases),
-        seeds=tuple(options.seeds),
-        count=options.count,
-        hand=options.hand,
-        trials=tuple(name for name in options.trials.split(",") if name),
-        quick=options.quick,
-        imported=options.imported,
-        joint_order=tuple(name for name in options.joint_order.split(",") if name),
-        checkout=checkout,
-        python=options.python,
-        armature=options.armature,
-        grasps=options.grasps,
-    )
+    several = {name: tuple(getattr(options, name)) for name in ("presets", "objects", "cases", "seeds")}
+    listed = {name: tuple(filter(None, getattr(options, name).split(","))) for name in ("trials", "joint_order")}
+    names = ("count", "hand", "quick", "imported", "python", "armature", "grasps")
+    request = Request(**several, **listed, **{name: getattr(options, name) for name in names}, checkout=checkout)
     studies = studies_of([*words, *options.suite] or ["imported" if options.imported else "main"])
     old_code = options.any_code or options.no_run
     plan = make_plan(studies, request, options.out, any_code=old_code, failed=options.no_run)

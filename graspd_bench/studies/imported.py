@@ -9,6 +9,7 @@ our planner does not find. Shares refer to all imported grasps of an object, or 
 from __future__ import annotations
 
 import hashlib
+from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -147,10 +148,7 @@ def imported_sections(records: Sequence[Record], chart: Path | None) -> Sections
     if len(records) > 1:
         groups.append(("**all**", list(records)))
     body = [_row(name, some, source, trials, len(headings)) for name, some in groups for source in SOURCES]
-    whys: dict[str, int] = {}
-    for record in records:
-        for why, count in record["refused"].items():
-            whys[why] = whys.get(why, 0) + count
+    whys = sum((Counter(record["refused"]) for record in records), Counter[str]())
     refused = "; ".join(f"{count} refused: {why}" for why, count in whys.items())
     note = "Shares are of all grasps of an object, also refused grasps and those not found. Other numbers are medians."
     warnings = [f"{_name(record['object'])}: {record['frame_doubt']}." for record in records if _doubted(record)]
