@@ -272,7 +272,7 @@ class Picker:
         mover = self._mover(world, self._hand_now())
         mover = replace(mover, carried=held_balls(mover, here, thing))
         up = straight(mover, here, np.array([0.0, 0.0, 0.1]))
-        risen = thing + np.array([0.0, 0.0, mover.height(up[-1]) - mover.height(here)])
+        risen = thing + np.array([0.0, 0.0, tip_pose(mover, up[-1])[2, 3] - tip_pose(mover, here)[2, 3]])
         goal = release_posture(mover, up[-1], risen, self._layout.place, self._picked)
         if goal is None:
             raise NoMotionError(
@@ -343,7 +343,6 @@ class Picker:
         return local @ tip[:3, :3].T + tip[:3, 3]
 
     def _without_thing(self, taking: _Taking) -> SeenWorld:
-        """Return the obstacles without the points of the held object."""
         assert taking.offer.surface is not None
         own = KDTree(surface_samples(taking.offer.surface, 1500, 0)[0])
         points = taking.world.points

@@ -37,14 +37,9 @@ from graspd_viewer.session import Session, make_session, seen_points
 UNITS = {"m": 1.0, "cm": 1e-2, "mm": 1e-3}
 # Sides from which the hand may come, with the direction in which it then moves, in the object's frame.
 APPROACHES = {
-    "any side": None,
-    "above": (0.0, 0.0, -1.0),
-    "below": (0.0, 0.0, 1.0),
-    "+x": (-1.0, 0.0, 0.0),
-    "-x": (1.0, 0.0, 0.0),
-    "+y": (0.0, -1.0, 0.0),
-    "-y": (0.0, 1.0, 0.0),
-}
+    "any side": None, "above": (0.0, 0.0, -1.0), "below": (0.0, 0.0, 1.0),
+    "+x": (-1.0, 0.0, 0.0), "-x": (1.0, 0.0, 0.0), "+y": (0.0, -1.0, 0.0), "-y": (0.0, 1.0, 0.0),
+}  # fmt: skip
 ENDINGS = tuple(sorted({*MESH_ENDINGS, *CLOUD_ENDINGS}))
 MOST_GRASPS = 64
 
