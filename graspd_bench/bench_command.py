@@ -24,23 +24,15 @@ def add_command(commands: Any) -> None:
     parser.set_defaults(run=run)
     parser.add_argument("studies", nargs="*", metavar="STUDY", help="main (default), all, or a name of docs/bench.md")
     parser.add_argument("--suite", action="append", default=[], metavar="STUDY", help="another way to give STUDY")
-    parser.add_argument("--presets", nargs="+", default=(), metavar="PRESET", help="default: all built-in presets")
+    several: dict[str, Any] = {"nargs": "+", "default": ()}
+    parser.add_argument("--presets", **several, metavar="PRESET", help="default: all built-in presets")
     add_plugin_option(parser)
     parser.add_argument(
-        "--objects",
-        nargs="+",
-        default=(),
-        metavar="OBJECT",
-        help="shape:NAME, meshes in metres or folders; default: all shapes",
+        "--objects", **several, metavar="OBJECT", help="shape:NAME, meshes in metres or folders; default: all shapes"
     )
-    parser.add_argument(
-        "--cases",
-        nargs="+",
-        default=(),
-        metavar="CASE",
-        help="cases to run. stress: names or families, maps: names, cell: sizes or ARM+HAND",
-    )
-    parser.add_argument("--seeds", nargs="+", type=int, default=(), metavar="N", help="default: by study")
+    cases = "cases to run. stress: names or families, maps: names, cell: sizes or ARM+HAND"
+    parser.add_argument("--cases", **several, metavar="CASE", help=cases)
+    parser.add_argument("--seeds", **several, type=int, metavar="N", help="default: by study")
     parser.add_argument("--count", type=int, default=None, help="grasps of a case (default: by study and method)")
     parser.add_argument("--hand", default="", metavar="NAME|PATH", help="default: allegro_right")
     parser.add_argument("--trials", default="", metavar="A,B", help="trials of raw grasps (listed in docs/bench.md)")

@@ -135,7 +135,7 @@ def run_case(case: Case, preset: str = "balanced") -> StressEnding:
         return StressEnding(
             case.name,
             GRASP if verified else result.outcome.name,
-            _printed(result, folder),
+            "; ".join((result.message, *result.warnings)).replace(f"{folder}/", ""),
             loaded - began,
             planned - loaded,
             peak_mb(),
@@ -145,10 +145,6 @@ def run_case(case: Case, preset: str = "balanced") -> StressEnding:
             _finite(result),
             None if case.truth is None else _hold_truly(result, scene, hand, case.truth()),
         )
-
-
-def _printed(result: GraspResult, folder: str) -> str:
-    return "; ".join((result.message, *result.warnings)).replace(f"{folder}/", "")
 
 
 def _hold_again(case: Case, result: GraspResult, scene: Scene, hand: Any, folder: Path, preset: str) -> int:
