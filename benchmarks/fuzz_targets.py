@@ -17,22 +17,8 @@ from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
+import fuzz_seeds as seeds
 import numpy as np
-from fuzz_seeds import (
-    DAES,
-    DESCRIPTIONS,
-    DOCUMENTS,
-    GRIPPER,
-    LAYOUT_HEAD,
-    MJCFS,
-    PRESETS,
-    URDFS,
-    bags,
-    clouds,
-    layouts,
-    messages,
-    pickles,
-)
 
 # Greatest length of an error message [characters]. In a longer message a user would not find the fault.
 LONGEST = 2000
@@ -112,7 +98,7 @@ def _gripper() -> Any:
 
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "gripper.urdf"
-        path.write_text(GRIPPER)
+        path.write_text(seeds.GRIPPER)
         return read_hand_file(path)
 
 
@@ -176,13 +162,13 @@ def _layout(path: Path) -> Any:
     """Read points from a file with a `LAYOUT_HEAD` and the data of a PointCloud2."""
     from graspd_core.io.messages import points_from_message
 
-    data = path.read_bytes().ljust(LAYOUT_HEAD.size, b"\0")
-    width, height, point, row, big, *places = LAYOUT_HEAD.unpack_from(data)
+    data = path.read_bytes().ljust(seeds.LAYOUT_HEAD.size, b"\0")
+    width, height, point, row, big, *places = seeds.LAYOUT_HEAD.unpack_from(data)
     fields = [
         SimpleNamespace(name=name, offset=places[2 * i], datatype=places[2 * i + 1]) for i, name in enumerate("xyz")
     ]
     sizes = {"width": width, "height": height, "point_step": point, "row_step": row, "is_bigendian": bool(big & 1)}
-    points = points_from_message(SimpleNamespace(data=data[LAYOUT_HEAD.size :], fields=fields, **sizes))
+    points = points_from_message(SimpleNamespace(data=data[seeds.LAYOUT_HEAD.size :], fields=fields, **sizes))
     assert 0 < len(points) <= width * height, f"{len(points)} points"
     finite(points)
     return points
@@ -247,40 +233,40 @@ TARGETS: dict[str, Target] = {
     target.name: target
     for target in (
         Target(
-            "urdf", _hand, "urdf", lambda: URDFS, _errors("HandError"),
+            "urdf", _hand, "urdf", lambda: seeds.URDFS, _errors("HandError"),
             (*_NUMBERS, "<mimic joint=", "<limit lower=", "continuous", "prismatic", "floating", "<mesh filename="),
         ),
         Target(
-            "mjcf", _hand, "xml", lambda: MJCFS, _errors("HandError"),
+            "mjcf", _hand, "xml", lambda: seeds.MJCFS, _errors("HandError"),
             (*_NUMBERS, "polycoef=", "eulerseq=", "childclass=", "<freejoint/>", "quat=", "xyaxes=", "fromto="),
         ),
         Target(
-            "description", _description, "yaml", lambda: DESCRIPTIONS, _errors("HandError"),
+            "description", _description, "yaml", lambda: seeds.DESCRIPTIONS, _errors("HandError"),
             (*_NUMBERS, *_YAML, "palm:", "!!timestamp", ".nan"),
         ),
         Target(
-            "preset", _preset, "yaml", lambda: PRESETS, _errors("ConfigError"),
+            "preset", _preset, "yaml", lambda: seeds.PRESETS, _errors("ConfigError"),
             (*_NUMBERS, *_YAML, "closed_form:", ".inf", "null"),
         ),
         Target(
-            "document", _document, "json", lambda: DOCUMENTS, _errors("FormatError"),
+            "document", _document, "json", lambda: seeds.DOCUMENTS, _errors("FormatError"),
             (*_NUMBERS, '"grasps"', '"hand"', "null", "true", "[[", '"mimic"', "NaN", '"verified"', '{"hold":'),
         ),
         Target(
-            "mano", _mano, "pkl", pickles, _errors("HandError"),
+            "mano", _mano, "pkl", seeds.pickles, _errors("HandError"),
             ("cnumpy\nndarray\n", "cnumpy\ndtype\n", "cchumpy.ch\nCh\n", "(", "tR", "}", "\x8a\xff", "\x8d", "2"),
             16384,
         ),
         Target(
-            "dae", _dae, "dae", lambda: DAES, (ValueError,),
+            "dae", _dae, "dae", lambda: seeds.DAES, (ValueError,),
             (*_NUMBERS, "offset=", "stride=", "<vcount>", "<p>", "<instance_node url=", "<matrix>", "<rotate>"),
         ),
         Target(
-            "cloud", _cloud, "npy", clouds, _errors("CloudError"),
+            "cloud", _cloud, "npy", seeds.clouds, _errors("CloudError"),
             (*_NUMBERS, "POINTS ", "WIDTH ", "VIEWPOINT ", "DATA ascii", "element vertex ", "element face 1"),
         ),
-        Target("layout", _layout, "bin", layouts, _errors("CloudError")),
-        Target("message", _message, "bin", messages, _errors("CloudError", "TransformError", "FormatError")),
-        Target("bag", _bag, "mcap", bags, _errors("BagError", "CloudError", "TransformError"), (), 65536),
+        Target("layout", _layout, "bin", seeds.layouts, _errors("CloudError")),
+        Target("message", _message, "bin", seeds.messages, _errors("CloudError", "TransformError", "FormatError")),
+        Target("bag", _bag, "mcap", seeds.bags, _errors("BagError", "CloudError", "TransformError"), (), 65536),
     )
 }  # fmt: skip

@@ -17,6 +17,7 @@ import tempfile
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import replace
+from functools import cache
 from pathlib import Path
 
 # One thread. The variable must be set before torch is imported.
@@ -24,10 +25,11 @@ os.environ.update(OMP_NUM_THREADS="1")
 
 import numpy as np
 
-from graspd_core import GraspLibrary, Scene, load_hand, load_preset, load_scene, plan_grasps
+from graspd_core import Grasp, GraspLibrary, Scene, load_hand, load_preset, load_scene, plan_grasps
 from graspd_core.library.grasp_library import entry_of
 from graspd_core.library.known_grasps import Physics, entry_by_name, library_result
 from graspd_core.mesh.shapes import SHAPES
+from graspd_core.runtime.worker_process import resident_mb
 
 PHYSICS = Physics(mass=0.1, friction=0.6)
 STEPS = (100, 1000)
@@ -64,23 +66,18 @@ def fill(library: GraspLibrary, objects: int, hand_name: str, count: int) -> Non
     there = library.names()
     shapes = sorted(SHAPES)
     for number in range(len(there), objects):
-        scene = planned_scene(shapes[number % len(shapes)])
-        if scene not in PLANNED:
-            PLANNED[scene] = plan_grasps(scene, hand, count=count, preset=config).tried
+        scene, grasps = planned(shapes[number % len(shapes)], hand_name, count)
         scale = float(random.uniform(0.7, 1.3))
         copy = {"name": f"object{number}", "scale": scale, "mesh_sha256": f"{number:064}"}
         entry = replace(entry_of(scene.object, hand, "standard"), **copy)
-        library.add(entry, scene.object, hand, config, PLANNED[scene])
+        library.add(entry, scene.object, hand, config, grasps)
 
 
-SCENES: dict[str, Scene] = {}
-PLANNED: dict[Scene, Sequence] = {}
-
-
-def planned_scene(shape: str) -> Scene:
-    if shape not in SCENES:
-        SCENES[shape] = load_scene(f"shape:{shape}")
-    return SCENES[shape]
+@cache
+def planned(shape: str, hand_name: str, count: int) -> tuple[Scene, Sequence[Grasp]]:
+    """Return a shape's scene, and the grasps that are planned for it."""
+    scene = load_scene(f"shape:{shape}")
+    return scene, plan_grasps(scene, load_hand(hand_name), count=count, preset="fast").tried
 
 
 def measure_look_ups(library: GraspLibrary, hand_name: str, count: int) -> None:
@@ -91,7 +88,7 @@ def measure_look_ups(library: GraspLibrary, hand_name: str, count: int) -> None:
     hand, names = load_hand(hand_name), library.names()
     drawn = np.random.default_rng(0).choice(names, 1000)
     tell("look-up, warm", [timed(lambda name=name: look_up(library, hand, name, count)) for name in drawn])
-    print(f"  memory of this process afterwards: {memory(os.getpid()):.0f} MB")
+    print(f"  memory of this process afterwards: {resident_mb(os.getpid()):.0f} MB")
 
 
 def look_up(library: GraspLibrary, hand, name: str, count: int):
@@ -113,12 +110,6 @@ def timed(work: Callable[[], object]) -> float:
 def tell(what: str, seconds: Sequence[float]) -> None:
     p50, p99 = np.percentile(seconds, [50, 99]) * 1e3
     print(f"  {what}: p50 {p50:.1f} ms, p99 {p99:.1f} ms ({len(seconds)} times)", flush=True)
-
-
-def memory(process: int) -> float:
-    """Return the resident memory of a process [MB]."""
-    pages = int(Path(f"/proc/{process}/statm").read_text().split()[1])
-    return pages * os.sysconf("SC_PAGE_SIZE") / 1e6
 
 
 def measure_node(library: GraspLibrary, hand_name: str, count: int) -> None:
@@ -156,7 +147,7 @@ def measure_node(library: GraspLibrary, hand_name: str, count: int) -> None:
         print(f"  node, cold: first request {timed(lambda: ask('first', 'object7')) * 1e3:.1f} ms")
         drawn = np.random.default_rng(1).choice(library.names(), 500)
         tell("node, warm", [timed(lambda i=i, name=name: ask(f"r{i}", str(name))) for i, name in enumerate(drawn)])
-        print(f"  memory of the node afterwards: {memory(process.pid):.0f} MB")
+        print(f"  memory of the node afterwards: {resident_mb(process.pid):.0f} MB")
     finally:
         node.destroy_node()
         rclpy.shutdown()

@@ -3,7 +3,8 @@
     python benchmarks/viewer.py [--minutes 10] [--grasps grasps.json] [--pace 0.5] [--clicks-only]
 
 The program needs viser, playwright and the system's package of Chromium, like test/viewer. Without a graphics card the
-browser draws in software on the server's cores, so the frame rate is a lower bound. Memory is resident memory.
+browser draws in software on the server's cores, so the frame rate is a lower bound. Memory is resident
+memory, and counts for each process that shares it.
 """
 
 from __future__ import annotations
@@ -25,6 +26,7 @@ from typing import Any
 os.environ.update(OMP_NUM_THREADS="1")
 
 import numpy as np
+import psutil
 import torch
 from playwright.sync_api import Error, sync_playwright
 
@@ -33,6 +35,7 @@ sys.path.insert(0, str(Path(__file__).parents[1] / "test" / "viewer"))
 from conftest import FLAGS  # pyright: ignore
 
 from graspd_core import load_hand, load_preset, load_scene, plan_grasps, save_result
+from graspd_core.runtime.worker_process import resident_mb
 from graspd_viewer.session import make_session, open_grasps
 from graspd_viewer.viewer import Viewer
 
@@ -79,7 +82,9 @@ def main() -> None:
     viewer.close()
     time.sleep(1.0)
     left = [thread.name for thread in set(threading.enumerate()) - before]
-    print(f"threads left behind: {left or 'none'}; child processes: {children() or 'none'}")
+    print(
+        f"threads left behind: {left or 'none'}; child processes: {[process.pid for process in children()] or 'none'}"
+    )
 
 
 def planned(count: int) -> Path:
@@ -182,50 +187,23 @@ def clicked(viewer: Viewer, page: Any, minutes: float, pace: float) -> None:
 
 
 def _tell_memory(clicks: int) -> None:
-    server, browser = resident(os.getpid()), browser_memory()
-    print(
-        f"{time.strftime('%H:%M:%S')}, after {clicks} clicks: server {server:.0f} MB, browser {browser:.0f} MB",
-        flush=True,
-    )
+    server, browser = resident_mb(os.getpid()), sum(resident_mb(process.pid) for process in children())
+    when = f"{time.strftime('%H:%M:%S')}, after {clicks} clicks"
+    print(f"{when}: server {server:.0f} MB, browser {browser:.0f} MB", flush=True)
 
 
-def resident(process: int) -> float:
-    """Return the resident memory of a process [MB], or 0 if the process has ended."""
-    try:
-        return int(Path(f"/proc/{process}/statm").read_text().split()[1]) * os.sysconf("SC_PAGE_SIZE") / 1e6
-    except OSError:
-        return 0.0
-
-
-def children() -> list[int]:
-    """Return the process ids of all descendants of this process."""
-    parents = {}
-    for stat in Path("/proc").glob("[0-9]*/stat"):
-        try:
-            parents[int(stat.parent.name)] = int(stat.read_text().rpartition(")")[2].split()[1])
-        except (OSError, ValueError):
-            continue
-    found, ahead = [], [os.getpid()]
-    while ahead:
-        parent = ahead.pop()
-        below = [process for process, above in parents.items() if above == parent]
-        found, ahead = found + below, ahead + below
-    return found
+def children() -> list[psutil.Process]:
+    """Return all descendants of this process."""
+    return psutil.Process().children(recursive=True)
 
 
 def browser_cpu() -> float:
     """Return the CPU time of all running descendants of this process [s]."""
-    ticks = 0
+    seconds = 0.0
     for process in children():
-        with contextlib.suppress(OSError):
-            fields = Path(f"/proc/{process}/stat").read_text().rpartition(")")[2].split()
-            ticks += int(fields[11]) + int(fields[12])
-    return ticks / os.sysconf("SC_CLK_TCK")
-
-
-def browser_memory() -> float:
-    """Return the resident memory of all descendants of this process [MB]. Shared memory counts for each process."""
-    return sum(map(resident, children()))
+        with contextlib.suppress(psutil.Error):
+            seconds += sum(process.cpu_times()[:2])
+    return seconds
 
 
 if __name__ == "__main__":

@@ -24,23 +24,15 @@ def add_command(commands: Any) -> None:
     parser.set_defaults(run=run)
     parser.add_argument("studies", nargs="*", metavar="STUDY", help="main (default), all, or a name of docs/bench.md")
     parser.add_argument("--suite", action="append", default=[], metavar="STUDY", help="another way to give STUDY")
-    parser.add_argument("--presets", nargs="+", default=(), metavar="PRESET", help="default: all built-in presets")
+    several: dict[str, Any] = {"nargs": "+", "default": ()}
+    parser.add_argument("--presets", **several, metavar="PRESET", help="default: all built-in presets")
     add_plugin_option(parser)
     parser.add_argument(
-        "--objects",
-        nargs="+",
-        default=(),
-        metavar="OBJECT",
-        help="shape:NAME, meshes in metres or folders; default: all shapes",
+        "--objects", **several, metavar="OBJECT", help="shape:NAME, meshes in metres or folders; default: all shapes"
     )
-    parser.add_argument(
-        "--cases",
-        nargs="+",
-        default=(),
-        metavar="CASE",
-        help="cases to run. stress: names or families, maps: names, cell: sizes or ARM+HAND",
-    )
-    parser.add_argument("--seeds", nargs="+", type=int, default=(), metavar="N", help="default: by study")
+    cases = "cases to run. stress: names or families, maps: names, cell: sizes or ARM+HAND"
+    parser.add_argument("--cases", **several, metavar="CASE", help=cases)
+    parser.add_argument("--seeds", **several, type=int, metavar="N", help="default: by study")
     parser.add_argument("--count", type=int, default=None, help="grasps of a case (default: by study and method)")
     parser.add_argument("--hand", default="", metavar="NAME|PATH", help="default: allegro_right")
     parser.add_argument("--trials", default="", metavar="A,B", help="trials of raw grasps (listed in docs/bench.md)")
@@ -75,22 +67,10 @@ def run(options: argparse.Namespace) -> int:
     after = words.index("dexgraspbench") + 1 if "dexgraspbench" in words else len(words)
     checkout = "".join(words[after : after + 1])
     del words[after : after + 1]
-    request = Request(
-        presets=tuple(options.presets),
-        objects=tuple(options.objects),
-        cases=tuple(options.cases),
-        seeds=tuple(options.seeds),
-        count=options.count,
-        hand=options.hand,
-        trials=tuple(name for name in options.trials.split(",") if name),
-        quick=options.quick,
-        imported=options.imported,
-        joint_order=tuple(name for name in options.joint_order.split(",") if name),
-        checkout=checkout,
-        python=options.python,
-        armature=options.armature,
-        grasps=options.grasps,
-    )
+    several = {name: tuple(getattr(options, name)) for name in ("presets", "objects", "cases", "seeds")}
+    listed = {name: tuple(filter(None, getattr(options, name).split(","))) for name in ("trials", "joint_order")}
+    names = ("count", "hand", "quick", "imported", "python", "armature", "grasps")
+    request = Request(**several, **listed, **{name: getattr(options, name) for name in names}, checkout=checkout)
     studies = studies_of([*words, *options.suite] or ["imported" if options.imported else "main"])
     old_code = options.any_code or options.no_run
     plan = make_plan(studies, request, options.out, any_code=old_code, failed=options.no_run)

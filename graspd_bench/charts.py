@@ -283,24 +283,15 @@ def _draw_panel(axis: Any, points: Sequence[Point], panel: Panel) -> int:
     """Draw the points of a panel and their Pareto front. Return the number of points on the front."""
     place = {p.name: (p.x[1], p.y[1]) for p in points}
     for p in points:
-        (x, y), colour, parent = place[p.name], method_row(p.method).colour, parent_of(p.name)
+        (x, y), method, parent = place[p.name], method_row(p.method), parent_of(p.name)
+        colour = method.colour
         if parent in place:
             axis.plot(*zip(place[parent], (x, y), strict=True), color=colour, lw=0.8, ls=":", alpha=0.7, zorder=2)
         bars = {"xerr": _bars(*p.x), "yerr": _bars(*p.y)}
         axis.errorbar(x, y, **bars, fmt="none", ecolor=colour, elinewidth=1.0, alpha=0.45, zorder=3)
         filling = "white" if parent else colour
-        axis.plot(
-            x,
-            y,
-            method_row(p.method).marker,
-            color=colour,
-            ms=7,
-            mew=1.3,
-            mfc=filling,
-            ls="none",
-            zorder=5,
-            clip_on=False,
-        )
+        style = {"color": colour, "ms": 7, "mew": 1.3, "mfc": filling, "ls": "none", "zorder": 5}
+        axis.plot(x, y, method.marker, **style, clip_on=False)
     # A preset without any held grasp is drawn, but is not part of the front: its low penetration is no merit.
     spots = np.array([place[p.name] for p in points if p.held] or list(place.values()))
     front = spots[pareto_front(spots * [1.0, 1.0 if panel.less_is_better else -1.0])]

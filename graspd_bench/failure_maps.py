@@ -279,35 +279,22 @@ class Map:
 
 MAPS: Mapping[str, Map] = {
     "friction_mass": Map(
-        "friction and mass",
-        MapAxis("friction coefficient", (0.1, 0.2, 0.3, 0.6, 1.5)),
-        MapAxis("mass [kg]", (0.005, 0.03, 0.1, 0.3, 1.0, 2.0)),
-        ("cylinder", "mug"),
-        run_friction_mass,
-        together=True,
+        "friction and mass", MapAxis("friction coefficient", (0.1, 0.2, 0.3, 0.6, 1.5)),
+        MapAxis("mass [kg]", (0.005, 0.03, 0.1, 0.3, 1.0, 2.0)), ("cylinder", "mug"), run_friction_mass, together=True,
     ),
     "size": Map(
-        "size",
-        MapAxis("least width of the object / span of the hand", (0.025, 0.05, 0.1, 0.25, 0.4, 0.5)),
-        MapAxis("object", _SIZED),
-        _SIZED,
-        run_size,
+        "size", MapAxis("least width of the object / span of the hand", (0.025, 0.05, 0.1, 0.25, 0.4, 0.5)),
+        MapAxis("object", _SIZED), _SIZED, run_size,
     ),
     "view": Map(
-        "view",
-        MapAxis("elevation of the only camera [deg]", (15.0, 30.0, 50.0, 80.0)),
-        MapAxis("noise [times a D415's]", (0.0, 1.0, 2.0, 4.0)),
-        ("mug",),
-        run_view,
+        "view", MapAxis("elevation of the only camera [deg]", (15.0, 30.0, 50.0, 80.0)),
+        MapAxis("noise [times a D415's]", (0.0, 1.0, 2.0, 4.0)), ("mug",), run_view,
     ),
     "wall": Map(
-        "wall and grid",
-        MapAxis("resolution of the distance grid", (8.0, 16.0, 48.0, 96.0)),
-        MapAxis("wall of the cup [mm]", (0.3, 1.0, 3.0, 6.0)),
-        ("cup",),
-        run_wall,
+        "wall and grid", MapAxis("resolution of the distance grid", (8.0, 16.0, 48.0, 96.0)),
+        MapAxis("wall of the cup [mm]", (0.3, 1.0, 3.0, 6.0)), ("cup",), run_wall,
     ),
-}
+}  # fmt: skip
 
 
 def map_cases(request: Request) -> tuple[MapCase, ...]:

@@ -73,7 +73,6 @@ class Row:
 
     Attributes:
         count: number of requested grasps.
-        given: number of grasps found.
         held: number of grasps that passed the standard hold trial. 0 without this trial.
         spent: CPU time [s] of optimiser and standard hold trials, or of the whole run if verified grasps are planned.
         values: numbers by name, None if not measured. Medians over grasps (`_grasp_figures`), shares of requested
@@ -86,7 +85,6 @@ class Row:
     object: str
     method: str
     count: int
-    given: int
     held: int
     spent: float
     values: dict[str, float | None]
@@ -139,8 +137,8 @@ def _row(group: Sequence[Record], ran: Collection[str]) -> Row:
         values[f"first_{clock}"] = _median((r.get("first_verified") or {}).get(clock) for r in group)
     values["peak_mb"] = max((r["peak_mb"] for r in group), default=None)
     values["rounds"] = _median(float(r["rounds"]) if "rounds" in r else None for r in group)
-    one, given = group[0], sum(r["given"] for r in group)
-    return Row(one["name"], one["object"], one["method"], count, given, held, spent, values, quartiles)
+    one = group[0]
+    return Row(one["name"], one["object"], one["method"], count, held, spent, values, quartiles)
 
 
 def spread(rows: Iterable[Row], figure: str) -> Spread | None:

@@ -11,13 +11,12 @@ import sys
 import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from functools import partial
 from typing import Any, Literal
 
 import numpy as np
 
 from graspd_bench.bullet.bullet_hold import bullet_hold_trial
-from graspd_bench.bullet.bullet_world import build_bullet_world, bullet_available, bullet_displacement
+from graspd_bench.bullet.bullet_world import BulletWorld, build_bullet_world, bullet_available, bullet_displacement
 from graspd_bench.study import PROTOCOL_MASS, Case, Record, Request, raw_grasps
 from graspd_bench.trials import gravity_trial
 from graspd_core.errors import ConfigError, choices
@@ -34,60 +33,39 @@ from graspd_core.verify.hold_trial import TRIALS as NOISY_TRIALS
 from graspd_core.verify.hold_trial import hold_trial, noisy_share, pose_errors
 from graspd_core.verify.metrics import measure
 from graspd_core.verify.prepared_grasp import make_metrics_context
-from graspd_core.verify.world import PROTOCOLS, build_world
+from graspd_core.verify.world import PROTOCOLS, Protocol, World, build_world
 from graspd_dataset.run_records import Stopwatch, object_name
 
-# Runs one trial of a grasp. Returns the results of the trial by name.
-Trial = Callable[[Grasp], dict[str, Any]]
+Figures = dict[str, Any]
+# Makes a trial of one hand and object, given with its convex parts. The trial returns the results of a grasp by name.
+MakeTrial = Callable[[HandModel, ObjectModel, Sequence[TriangleMesh]], Callable[[Grasp], Figures]]
 
 
-@dataclass(frozen=True)
-class Tried:
-    """The input of a trial: the hand, the object, and the object's convex parts."""
-
-    hand: HandModel
-    target: ObjectModel
-    parts: Sequence[TriangleMesh]
-
-
-def _hold(name: str, tried: Tried) -> Trial:
+def _in_mujoco(figures: Callable[[World, Grasp, Protocol], Figures], name: str = "standard") -> MakeTrial:
     protocol = PROTOCOLS[name]
-    world = build_world(tried.hand, tried.target, tried.parts, protocol)
-    return lambda grasp: _figures(hold_trial(world, grasp, protocol))
+
+    def make(hand: HandModel, target: ObjectModel, parts: Sequence[TriangleMesh]) -> Callable[[Grasp], Figures]:
+        world = build_world(hand, target, parts, protocol)
+        return lambda grasp: figures(world, grasp, protocol)
+
+    return make
 
 
-def _noisy(tried: Tried) -> Trial:
-    protocol = PROTOCOLS["standard"]
-    world = build_world(tried.hand, tried.target, tried.parts, protocol)
-    errors = pose_errors(0, NOISY_TRIALS)
-    return lambda grasp: {"share": noisy_share(world, grasp, protocol, errors)}
+def _in_bullet(figures: Callable[[BulletWorld, Grasp], Figures]) -> MakeTrial:
+    def make(hand: HandModel, target: ObjectModel, parts: Sequence[TriangleMesh]) -> Callable[[Grasp], Figures]:
+        if not bullet_available():
+            return lambda grasp: {}
+        world = build_bullet_world(hand, target, parts)
+        return lambda grasp: figures(world, grasp)
+
+    return make
 
 
-def _gravity(tried: Tried) -> Trial:
-    protocol = PROTOCOLS["standard"]
-    world = build_world(tried.hand, tried.target, tried.parts, protocol)
-    return lambda grasp: {"displacement_cm": gravity_trial(world, grasp, protocol) * 100}
+def _hold(world: World, grasp: Grasp, protocol: Protocol) -> Figures:
+    return _figures(hold_trial(world, grasp, protocol))
 
 
-def _displacement(tried: Tried) -> Trial:
-    if not bullet_available():
-        return _nothing
-    world = build_bullet_world(tried.hand, tried.target, tried.parts)
-    return lambda grasp: {"displacement_cm": bullet_displacement(world, grasp.grasp) * 100}
-
-
-def _second(tried: Tried) -> Trial:
-    if not bullet_available():
-        return _nothing
-    world = build_bullet_world(tried.hand, tried.target, tried.parts)
-    return lambda grasp: _figures(bullet_hold_trial(world, grasp, PROTOCOLS["standard"]))
-
-
-def _nothing(grasp: Grasp) -> dict[str, Any]:
-    return {}
-
-
-def _figures(result: TrialResult) -> dict[str, Any]:
+def _figures(result: TrialResult) -> Figures:
     return {
         "passed": result.passed,
         "displacement_cm": result.displacement * 100,
@@ -96,13 +74,13 @@ def _figures(result: TrialResult) -> dict[str, Any]:
     }
 
 
-TRIALS: Mapping[str, Callable[[Tried], Trial]] = {
-    "standard": partial(_hold, "standard"),
-    "hard": partial(_hold, "hard"),
-    "sd": _displacement,
-    "gravity": _gravity,
-    "noisy": _noisy,
-    "bullet": _second,
+TRIALS: Mapping[str, MakeTrial] = {
+    "standard": _in_mujoco(_hold),
+    "hard": _in_mujoco(_hold, "hard"),
+    "sd": _in_bullet(lambda world, grasp: {"displacement_cm": bullet_displacement(world, grasp.grasp) * 100}),
+    "gravity": _in_mujoco(lambda *trial: {"displacement_cm": gravity_trial(*trial) * 100}),
+    "noisy": _in_mujoco(lambda *trial: {"share": noisy_share(*trial, errors=pose_errors(0, NOISY_TRIALS))}),
+    "bullet": _in_bullet(lambda world, grasp: _figures(bullet_hold_trial(world, grasp, PROTOCOLS["standard"]))),
 }
 # Default trials of a raw cell. The noisy trial takes eight times as long as another trial, so it is not among them.
 USUAL = ("standard", "hard", "sd", "gravity")
@@ -194,13 +172,13 @@ def run_raw(cell: Cell) -> dict[str, Any]:
     with stopwatch("optimise"):
         grasps = raw_grasps(scene, hand, cell.settings, cell.count, cell.seed)
     with stopwatch("parts"):
-        tried = Tried(hand, scene.object, object_parts(scene.object))
+        parts = object_parts(scene.object)
     results: list[dict[str, Any]] = [{"score": grasp.score, "links": len(grasp.contacts)} for grasp in grasps]
     # If there are no grasps, no trial is run.
     first: dict[str, float] | None = None
     for name in cell.trials if grasps else ():
         with stopwatch(f"world {name}"):
-            trial = TRIALS[name](tried)
+            trial = TRIALS[name](hand, scene.object, parts)
         for grasp, result in zip(grasps, results, strict=True):
             with stopwatch(name):
                 result[name] = trial(grasp)
@@ -219,7 +197,7 @@ def run_raw(cell: Cell) -> dict[str, Any]:
         "first_verified": first,
         "cpu": stopwatch.cpu,
         "wall": stopwatch.wall,
-        "parts": len(tried.parts),
+        "parts": len(parts),
         "grasps": results,
     }
 

@@ -110,15 +110,8 @@ def decades_suite(request: Request) -> tuple[Cell, ...]:
         for thing in find_objects(request.objects or _SWEEP_OBJECTS[:2])
         for _, preset, setting, values in DECADES
         for value in (values[:2] if request.quick else values)
-        for cell in _cells(
-            request,
-            "raw",
-            f"{setting}={value:g}",
-            override(load_preset(preset), {setting: value}),
-            thing,
-            count,
-            trials,
-        )
+        for config in (override(load_preset(preset), {setting: value}),)
+        for cell in _cells(request, "raw", f"{setting}={value:g}", config, thing, count, trials)
     )
 
 

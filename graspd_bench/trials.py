@@ -22,10 +22,10 @@ import numpy as np
 import torch
 from jaxtyping import Float
 
-from graspd_core.hands.kinematics import forward, make_kinematics
+from graspd_core.hands.kinematics import link_poses
 from graspd_core.hands.model import HandModel
 from graspd_core.perception.scene import ObjectModel, object_parts
-from graspd_core.se3 import SE3, quaternion_from_rotation, random_rotations, rotation_from_quaternion
+from graspd_core.se3 import quaternion_from_rotation, random_rotations, rotation_from_quaternion
 from graspd_core.types import Grasp, Plane, Posture, TriangleMesh
 from graspd_core.verify.early_stop import CHECK_EVERY, CREEPING, ObjectState
 from graspd_core.verify.hold_trial import DIRECTIONS, close_hand, diverged, moved, object_state
@@ -106,18 +106,10 @@ def displacement_trial(
 
 
 def _place_links(world: FrozenWorld, data: Any, posture: Posture) -> None:
-    place, quaternion, joints = (
-        torch.as_tensor(part, dtype=torch.float64)
-        for part in (posture.position, posture.quaternion_wxyz, posture.joint_positions)
-    )
-    links = forward(make_kinematics(world.hand, "cpu", torch.float64), joints[None])[0]
-    base = SE3(rotation_from_quaternion(quaternion), place)
-    data.mocap_pos[:] = base.apply(links.translation).numpy()
-    data.mocap_quat[:] = quaternion_from_rotation(base.rotation @ links.rotation).numpy()
-
-
-# mujoco is a compiled module without stubs.
-# pyright: reportAttributeAccessIssue=false
+    rotations, translations = link_poses(world.hand, posture.joint_positions)
+    base = rotation_from_quaternion(torch.as_tensor(posture.quaternion_wxyz).double()).numpy()
+    data.mocap_pos[:] = translations @ base.T + posture.position
+    data.mocap_quat[:] = quaternion_from_rotation(torch.as_tensor(base @ rotations)).numpy()
 
 
 DROP_GRAVITY, DURATION = 9.8, 2.0
@@ -181,10 +173,6 @@ def _end(states: list[ObjectState], checks: int) -> Float[np.ndarray, "3"] | Non
     left = (checks - len(states)) / _WINDOW
     end, before = last + left * (last - middle), middle + (left + 1) * (middle - first)
     return end if _SAFETY * np.linalg.norm(end - before) < TOLERANCE else None
-
-
-# mujoco is a compiled module without stubs.
-# pyright: reportAttributeAccessIssue=false
 
 
 _FLOOR, _WALL = "floor", "wall"

@@ -128,6 +128,7 @@ def _many_picks(options: argparse.Namespace, arm: Arm, hand: HandModel) -> int:
     """
     from graspd_cell.grasp_source import InProcessGrasps
     from graspd_cell.picker import Attempt, Cancelled, Ending, Picker, summary
+    from graspd_core.runtime.worker_process import resident_mb
 
     attempts, memory, ended = list[Attempt](), list[float](), Counter[str]()
     with Interrupt() as interrupt:
@@ -145,18 +146,13 @@ def _many_picks(options: argparse.Namespace, arm: Arm, hand: HandModel) -> int:
             except GraspdError as error:
                 ended["the arm stayed where it was"] += not isinstance(error, Cancelled)
                 print(f"bin {number}: {error}", flush=True)
-            memory.append(resident_mb())
+            memory.append(resident_mb(os.getpid()))
     ended += Counter(str(attempt.ending) for attempt in attempts)
     print("; ".join(f"{ending}: {count}" for ending, count in ended.most_common()))
     told = f"{memory[0]:.0f} MB after the first bin, {memory[-1]:.0f} MB after the last" if memory else "no bin"
     print(f"{summary(attempts)}; {len(memory)} bins; {told}", flush=True)
     answer({"attempts": attempts, "endings": ended, "memory_mb": memory})
     return EXIT_INTERRUPTED if interrupt.is_interrupted() else EXIT_OK
-
-
-def resident_mb() -> float:
-    """Return the resident memory of this process [MB]."""
-    return int(Path("/proc/self/statm").read_text().split()[1]) * os.sysconf("SC_PAGE_SIZE") / 1e6
 
 
 def _refuse(options: argparse.Namespace) -> None:
@@ -167,10 +163,9 @@ def _refuse(options: argparse.Namespace) -> None:
         raise ConfigError(f"--count: {options.count}; valid: 1 to {MOST_THINGS}")
     if not 0 <= options.seed < 2**31:
         raise ConfigError(f"--seed: {options.seed}; valid: 0 to 2^31 - 1")
-    if options.attempts is not None and options.attempts < 1:
-        raise ConfigError(f"--attempts: {options.attempts}; valid: 1 or more")
-    if options.picks is not None and options.picks < 1:
-        raise ConfigError(f"--picks: {options.picks}; valid: 1 or more")
+    for name, value in (("attempts", options.attempts), ("picks", options.picks)):
+        if value is not None and value < 1:
+            raise ConfigError(f"--{name}: {value}; valid: 1 or more")
     if options.picks is not None and (options.view or options.film):
         raise ConfigError("--picks cannot be combined with --view or --film; remove one of them")
     if not 0 < options.speed < float("inf"):

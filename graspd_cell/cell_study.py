@@ -314,12 +314,7 @@ def cell_summary(record: Record) -> str:
 
 STUDY = Study(
     "bins emptied in simulated cells by three arms and hands, from depth images to the other bin",
-    cell_cases,
-    run_cell,
-    cell_sections,
-    ("../graspd_cell/*.py", "rendering/*.py"),
-    ("presets", "objects", "cases", "seeds", "quick"),
-    cell_seconds,
-    summary=cell_summary,
-    usual=False,
-)
+    cell_cases, run_cell, cell_sections,
+    ("../graspd_cell/*.py", "rendering/*.py"), ("presets", "objects", "cases", "seeds", "quick"), cell_seconds,
+    summary=cell_summary, usual=False,
+)  # fmt: skip

@@ -9,19 +9,15 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
-import torch
 from jaxtyping import UInt8
 
 from graspd_bench.rendering.render import look_at, render_shaded, save_png
-from graspd_bench.rendering.tabletop import moved
 from graspd_cell.grasp_source import GraspSource, Offer, cloud_of
 from graspd_cell.robot import DepthView
 from graspd_cell.simulated_robot import SimulatedRobot
-from graspd_core.hands.kinematics import hand_mesh
 from graspd_core.hands.model import HandModel
 from graspd_core.planning.any_thing import Failure
-from graspd_core.se3 import rotation_from_quaternion
-from graspd_core.types import Posture, TriangleMesh
+from graspd_core.types import TriangleMesh
 
 if TYPE_CHECKING:
     from graspd_viewer.moving_parts import MovingParts
@@ -134,21 +130,14 @@ class LiveCell:
     def show_offer(self, hand: HandModel, view: DepthView, offer: Offer) -> None:
         """Show the camera's points and the hand at the chosen grasp, coloured by verdict."""
         from graspd_viewer.drawing import VERDICTS, Part
+        from graspd_viewer.grasp_page import placed_hand
 
         self.page.draw_points(cloud_of(view).points)
         parts = []
         if offer.grasp is not None:
-            mesh = posed_hand(hand, offer.grasp.grasp)
+            mesh = placed_hand(hand, offer.grasp.grasp)
             parts = [Part("chosen/hand", mesh, VERDICTS[offer.grasp.verdict], 0.4)]
         self.page.draw("chosen", parts)
-
-
-def posed_hand(hand: HandModel, posture: Posture) -> TriangleMesh:
-    """Return the surface of a hand at a posture, in the posture's frame [m]."""
-    pose = np.eye(4)
-    pose[:3, :3] = rotation_from_quaternion(torch.as_tensor(posture.quaternion_wxyz).double()).numpy()
-    pose[:3, 3] = posture.position
-    return moved(hand_mesh(hand, posture.joint_positions), pose)
 
 
 class ToldSource:

@@ -116,8 +116,6 @@ class TrajectoryController:
 
     def _ordered(self, motion: JointMotion) -> JointMotion:
         names = self.limits.names
-        if motion.names == names:
-            return motion
         if sorted(motion.names) != sorted(names):
             raise ConfigError(f"the motion has joints {', '.join(motion.names)}; valid: all of {', '.join(names)}")
         return motion.part(names)

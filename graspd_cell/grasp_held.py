@@ -37,19 +37,6 @@ _EFFORT_LEFT = 0.45
 
 
 @dataclass(frozen=True, eq=False)
-class Held:
-    """Decision whether an object is in the hand.
-
-    Attributes:
-        held: True if an object is in the hand.
-        reason: why no object is held. Empty if `held` is True.
-    """
-
-    held: bool
-    reason: str = ""
-
-
-@dataclass(frozen=True, eq=False)
 class Hold:
     """State of the hand after the squeeze.
 
@@ -74,31 +61,31 @@ def after_squeeze(hand: HandModel, grasp: Grasp, reading: JointReading) -> Hold:
     return Hold(np.abs(target - touch) * scale > _PRESSES, touch, target, own.positions, own.efforts)
 
 
-def grips(hold: Hold, hand: HandModel) -> Held:
-    """Decide from the reading after the squeeze whether the hand closed on an object."""
-    return _stopped(hold, hand, hold.positions, _MEETING)
+def why_not_gripped(hold: Hold, hand: HandModel) -> str:
+    """Return why the hand closed on no object, by the reading after the squeeze, or "" if it closed on one."""
+    return _why_empty(hold, hand, hold.positions, _MEETING)
 
 
-def still_holds(hold: Hold, hand: HandModel, reading: JointReading) -> Held:
-    """Decide from a later reading whether the object is still in the hand."""
+def why_lost(hold: Hold, hand: HandModel, reading: JointReading) -> str:
+    """Return why the object is no longer in the hand, by a later reading, or "" if the hand still holds it."""
     own, toward = reading.of(hand.joint_names), np.sign(hold.target - hold.touch)
     before, now = (np.maximum((toward * efforts)[hold.presses], 0.0).sum() for efforts in (hold.efforts, own.efforts))
     if before > 0 and now < _EFFORT_LEFT * before:
-        return Held(False, f"the joint efforts fell to {100 * now / before:.0f} % of the efforts after the squeeze")
-    return _stopped(hold, hand, own.positions, _MEETING_LATER)
+        return f"the joint efforts fell to {100 * now / before:.0f} % of the efforts after the squeeze"
+    return _why_empty(hold, hand, own.positions, _MEETING_LATER)
 
 
-def _stopped(hold: Hold, hand: HandModel, positions: Joints, meeting: float) -> Held:
-    """Decide whether an object is held. Beyond the fraction `meeting` of the squeeze, fingers must not touch."""
+def _why_empty(hold: Hold, hand: HandModel, positions: Joints, meeting: float) -> str:
+    """Return why no object is held, or "". Beyond the fraction `meeting` of the squeeze, fingers must not touch."""
     if not hold.presses.any():
-        return Held(True)
+        return ""
     way = (hold.target - hold.touch)[hold.presses]
     covered = float(np.median((positions - hold.touch)[hold.presses] / way))
     if covered > _ARRIVED:
-        return Held(False, f"the fingers closed on nothing: they covered {100 * covered:.0f} % of the squeeze")
+        return f"the fingers closed on nothing: they covered {100 * covered:.0f} % of the squeeze"
     if covered > meeting and fingers_meet(hand, hold.touch, positions):
-        return Held(False, "the fingers press on each other")
-    return Held(True)
+        return "the fingers press on each other"
+    return ""
 
 
 def fingers_meet(hand: HandModel, before: Joints, now: Joints) -> bool:

@@ -24,8 +24,6 @@ from graspd_core.planning.any_thing import OUT_OF_TRIES, Failure, ThingPlan, pla
 from graspd_core.planning.plan_grasps import warm_up
 from graspd_core.types import Grasp, Plane, TriangleMesh, Verdict
 
-__all__ = ["Failure", "GraspSource", "InProcessGrasps", "Offer", "cloud_of"]
-
 
 @dataclass(frozen=True, eq=False)
 class Offer:
@@ -130,14 +128,8 @@ def _offer(found: Sequence[ThingPlan], seconds: float) -> Offer:
     assert best.grasp is not None
     assert best.scene is not None
     assert best.result is not None
+    target, verified = best.scene.object, best.grasp.verdict is Verdict.VERIFIED
     return Offer(
-        best.grasp,
-        best.place,
-        best.scene.object.mesh,
-        best.result.mass or best.scene.object.mass,
-        best.grasp.verdict is Verdict.VERIFIED,
-        len(found),
-        best.reason,
-        failed,
+        best.grasp, best.place, target.mesh, best.result.mass or target.mass, verified, len(found), best.reason, failed,
         seconds=seconds,
-    )
+    )  # fmt: skip

@@ -121,9 +121,6 @@ def layout_of(arm: Arm) -> CellLayout:
     eye = target + np.array([*flat, _DISTANCE * np.sin(_ELEVATION)])
     start = arm.seed.copy()
     wanted = np.arctan2(place.center[1], place.center[0]) + _ASIDE
-    start[0] = arm.seed[0] + _wrapped(wanted - np.arctan2(tip[1], tip[0]))
+    # The shorter way round.
+    start[0] += (wanted - np.arctan2(tip[1], tip[0]) + np.pi) % (2 * np.pi) - np.pi
     return CellLayout(table, pick, place, CAMERAS["d415"].lens, look_at(eye, target), start)
-
-
-def _wrapped(angle: float) -> float:
-    return float((angle + np.pi) % (2 * np.pi) - np.pi)

@@ -253,10 +253,6 @@ class Mover:
         balls, carried = self._placed(q[None], self.carried)
         return balls[0], carried[0]
 
-    def height(self, q: Joints) -> float:
-        """Return the height of the tip in the base frame [m]."""
-        return float(self.shape.links(q[None])[1][0, self.shape.arm.tip, 2])
-
     def clearances(self, q: Path) -> Float[np.ndarray, "rows balls"]:
         """Return distances of the robot's balls to obstacles, then distances of the pairs of balls from `_own` [m].
 

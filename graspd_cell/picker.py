@@ -16,8 +16,8 @@ from jaxtyping import Float
 from scipy.spatial import KDTree
 
 from graspd_cell.carrying import dropped_box, held_balls, release_posture, straight, tip_pose
-from graspd_cell.grasp_held import Hold, after_squeeze, grips, still_holds
-from graspd_cell.grasp_source import Failure, GraspSource, Offer, cloud_of
+from graspd_cell.grasp_held import Hold, after_squeeze, why_lost, why_not_gripped
+from graspd_cell.grasp_source import GraspSource, Offer, cloud_of
 from graspd_cell.layout import Box, CellLayout
 from graspd_cell.motion import (
     ARM_DEEPEST,
@@ -39,6 +39,7 @@ from graspd_core.errors import GraspdError
 from graspd_core.hands.model import HandModel
 from graspd_core.mesh.mesh_files import surface_samples
 from graspd_core.perception.obstacles import held_hull
+from graspd_core.planning.any_thing import Failure
 
 
 class Ending(StrEnum):
@@ -203,17 +204,14 @@ class Picker:
     def _steps(self, taking: _Taking) -> tuple[Ending, str]:
         self.go_to_retreat(taking)
         self.close(taking)
-        gripped = self.squeeze(taking)
-        if not gripped.held:
-            return Ending.NOT_GRIPPED, gripped.reason
-        self.lift(taking)
+        if fault := self.squeeze(taking):
+            return Ending.NOT_GRIPPED, fault
+        self._follow_gate(taking.execution, "lifted")
         assert taking.hold is not None
-        held = still_holds(taking.hold, self._hand, self._robot.joints())
-        if not held.held:
-            return Ending.LOST_LIFTING, held.reason
-        lost = self.carry(taking)
-        if lost:
-            return Ending.LOST_CARRYING, lost
+        if fault := why_lost(taking.hold, self._hand, self._robot.joints()):
+            return Ending.LOST_LIFTING, fault
+        if fault := self.carry(taking):
+            return Ending.LOST_CARRYING, fault
         self.let_go(taking)
         return Ending.PICKED, ""
 
@@ -257,17 +255,13 @@ class Picker:
         self._follow_gate(taking.execution, "closed")
         taking.closed = self._robot.joints().time
 
-    def squeeze(self, taking: _Taking):
-        """Squeeze, and return whether the fingers closed on an object."""
+    def squeeze(self, taking: _Taking) -> str:
+        """Squeeze. Return why the fingers closed on no object, or "" if they closed on one."""
         self._follow_gate(taking.execution, "squeezed")
         self._wait(self._pace.settle)
         assert taking.offer.grasp is not None
         taking.hold = after_squeeze(self._hand, taking.offer.grasp, self._robot.joints())
-        return grips(taking.hold, self._hand)
-
-    def lift(self, taking: _Taking) -> None:
-        """Lift along graspd's path."""
-        self._follow_gate(taking.execution, "lifted")
+        return why_not_gripped(taking.hold, self._hand)
 
     def carry(self, taking: _Taking) -> str:
         """Carry the object above the place bin. Return why the object was lost, or "" if the hand still holds it."""
@@ -278,7 +272,7 @@ class Picker:
         mover = self._mover(world, self._hand_now())
         mover = replace(mover, carried=held_balls(mover, here, thing))
         up = straight(mover, here, np.array([0.0, 0.0, 0.1]))
-        risen = thing + np.array([0.0, 0.0, mover.height(up[-1]) - mover.height(here)])
+        risen = thing + np.array([0.0, 0.0, tip_pose(mover, up[-1])[2, 3] - tip_pose(mover, here)[2, 3]])
         goal = release_posture(mover, up[-1], risen, self._layout.place, self._picked)
         if goal is None:
             raise NoMotionError(
@@ -291,7 +285,7 @@ class Picker:
 
         def slipped() -> bool:
             nonlocal lost
-            lost = still_holds(hold, self._hand, self._robot.joints()).reason
+            lost = why_lost(hold, self._hand, self._robot.joints())
             return bool(lost) or self._cancelled()
 
         try:
@@ -300,7 +294,7 @@ class Picker:
             self._stop_if_cancelled()
             if not lost:
                 raise
-        return lost or still_holds(hold, self._hand, self._robot.joints()).reason
+        return lost or why_lost(hold, self._hand, self._robot.joints())
 
     def let_go(self, taking: _Taking) -> None:
         """Open the hand to the pregrasp. Store a box as an obstacle where the object was released."""
@@ -349,7 +343,6 @@ class Picker:
         return local @ tip[:3, :3].T + tip[:3, 3]
 
     def _without_thing(self, taking: _Taking) -> SeenWorld:
-        """Return the obstacles without the points of the held object."""
         assert taking.offer.surface is not None
         own = KDTree(surface_samples(taking.offer.surface, 1500, 0)[0])
         points = taking.world.points

@@ -10,7 +10,6 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from jaxtyping import Float
 
 from graspd_cell.world import ARM, HAND, PARTS, PICK_BIN, PLACE_BIN, TABLE, THING, CellWorld, Pose
 
@@ -114,12 +113,7 @@ def thing_in_hand(world: CellWorld, data: Any) -> int | None:
     return max((k for k in pressed if k not in resting), key=lambda k: pressed[k], default=None)
 
 
-def thing_poses(world: CellWorld, data: Any) -> list[Pose]:
-    """Return the poses of the objects in the base frame [m]."""
-    return [body_pose(data, int(body)) for body in world.thing_bodies]
-
-
-def body_pose(data: Any, body: int) -> Float[np.ndarray, "4 4"]:
+def body_pose(data: Any, body: int) -> Pose:
     """Return the pose of a body in the base frame [m]."""
     pose = np.eye(4)
     pose[:3, :3] = data.xmat[body].reshape(3, 3)

@@ -121,17 +121,13 @@ class JointMotion:
             return positions[0]
         span = times[after] - times[after - 1]
         a = (time - times[after - 1]) / span
+        here, there = positions[after - 1 : after + 1]
         if velocities is None:
-            return (1 - a) * positions[after - 1] + a * positions[after]
+            return (1 - a) * here + a * there
         # Values of the cubic Hermite basis.
         first, second = (1 + 2 * a) * (1 - a) ** 2, a**2 * (3 - 2 * a)
         rise, fall = a * (1 - a) ** 2 * span, -(a**2) * (1 - a) * span
-        return (
-            first * positions[after - 1]
-            + second * positions[after]
-            + rise * velocities[after - 1]
-            + fall * velocities[after]
-        )
+        return first * here + second * there + rise * velocities[after - 1] + fall * velocities[after]
 
     def _with_start(self, start: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray | None]:
         if self.times[0] == 0:

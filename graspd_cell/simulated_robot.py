@@ -6,14 +6,13 @@ from collections.abc import Callable, Sequence
 from typing import Any
 
 import numpy as np
-from jaxtyping import Float, Float32
 
 from graspd_bench.rendering.depth_noise import DEFAULT, DepthNoise, add_noise
 from graspd_bench.rendering.render import render_depth
 from graspd_bench.rendering.tabletop import moved
 from graspd_cell.controller import JointLimits, MotionState, Tolerances, TrajectoryController
 from graspd_cell.layout import Box
-from graspd_cell.referee import Referee, Report, body_pose, thing_poses
+from graspd_cell.referee import Referee, Report, body_pose
 from graspd_cell.robot import DepthView, JointMotion, JointReading, MotionAborted, never
 from graspd_cell.world import DAMPING_TIME, CellWorld, Pose, put_robot
 from graspd_core.hands.kinematics import primitive_mesh
@@ -70,23 +69,16 @@ class SimulatedRobot:
     def look(self) -> DepthView:
         """Return the next image of the camera."""
         self.wait(CAMERA_PERIOD)
-        return self.view_now()
-
-    def view_now(self) -> DepthView:
-        """Return a noisy image of the current state. No simulated time passes."""
         return self.view_of(self.meshes(), self.time)
 
     def view_of(self, meshes: Sequence[tuple[str, TriangleMesh]], time: float) -> DepthView:
         """Return a noisy image of `meshes`, base frame [m], with the stamp `time` [s]."""
-        camera = self.world.layout.camera
+        camera, pose = self.world.layout.camera, self.world.layout.T_base_camera
         self._images += 1
-        depth = add_noise(self._depth(meshes), camera, self._noise, 100_000 * self._seed + self._images)
+        true = render_depth(joined(*(mesh for _, mesh in meshes)), camera, pose)
+        depth = add_noise(true, camera, self._noise, 100_000 * self._seed + self._images)
         matrix = np.array([[camera.fx, 0.0, camera.cx], [0.0, camera.fy, camera.cy], [0.0, 0.0, 1.0]])
-        return DepthView(time, depth.astype(np.float32), matrix, self.world.layout.T_base_camera)
-
-    def true_depth(self) -> Float32[np.ndarray, "height width"]:
-        """Return the current depth image without noise [m]. Zero means no surface."""
-        return self._depth(self.meshes()).astype(np.float32)
+        return DepthView(time, depth.astype(np.float32), matrix, pose)
 
     def meshes(self) -> list[tuple[str, TriangleMesh]]:
         """Return name and current surface of every part and object, base frame [m]."""
@@ -171,7 +163,7 @@ class SimulatedRobot:
 
     def thing_poses(self) -> list[Pose]:
         """Return the true poses of the objects in the base frame [m]."""
-        return thing_poses(self.world, self._data)
+        return [body_pose(self._data, int(body)) for body in self.world.thing_bodies]
 
     def link_poses(self) -> dict[str, Pose]:
         """Return the poses of the links of arm and hand in the base frame [m]. The hand's keys begin with `hand/`."""
@@ -183,10 +175,6 @@ class SimulatedRobot:
             for name, body in zip(robot.link_names, bodies, strict=True):
                 found[f"{prefix}{name}"] = body_pose(self._data, int(body))
         return found
-
-    def _depth(self, meshes: Sequence[tuple[str, TriangleMesh]]) -> Float[np.ndarray, "height width"]:
-        layout = self.world.layout
-        return render_depth(joined(*(mesh for _, mesh in meshes)), layout.camera, layout.T_base_camera)
 
     def _positions(self, controller: TrajectoryController) -> np.ndarray:
         return self.joints().of(controller.limits.names).positions

@@ -21,7 +21,7 @@ from graspd_core.arms.arm import Arm, tip_hand
 from graspd_core.errors import ConfigError
 from graspd_core.hands.model import HandModel
 from graspd_core.se3 import quaternion_from_rotation
-from graspd_core.verify.world import PROTOCOLS, Friction, add_hand, add_object, set_physics
+from graspd_core.verify.world import PROTOCOLS, Friction, Protocol, add_hand, add_object, set_physics
 
 # mujoco is a compiled module without stubs.
 # pyright: reportAttributeAccessIssue=false
@@ -53,7 +53,7 @@ class CellWorld:
         joint_names: names of the arm's joints, then of the hand's actuated joints.
         joint_qpos, joint_dof, actuators: indices of these joints into `qpos`, `qvel` and `ctrl`.
         coupled_qpos: index into `qpos` of each joint in `hand.mimics`.
-        thing_qpos, thing_dof: first index of each object's free joint in `qpos` and `qvel`.
+        thing_qpos: first index of each object's free joint in `qpos`.
         thing_bodies: body ids of the objects.
         arm_bodies, hand_bodies: body ids of the links, in the order of the models.
         owner: owner of each geom by geom id: `NOTHING`, `ARM`, …, or `THING` + index of the object.
@@ -73,7 +73,6 @@ class CellWorld:
     actuators: Int[np.ndarray, "joints"]
     coupled_qpos: Int[np.ndarray, "coupled"]
     thing_qpos: Int[np.ndarray, "things"]
-    thing_dof: Int[np.ndarray, "things"]
     thing_bodies: Int[np.ndarray, "things"]
     arm_bodies: Int[np.ndarray, "arm_links"]
     hand_bodies: Int[np.ndarray, "hand_links"]
@@ -95,8 +94,6 @@ def build_cell(
     layout: CellLayout,
     things: Sequence[Thing] = (),
     poses: Sequence[Pose] = (),
-    *,
-    friction: float | None = None,
 ) -> CellWorld:
     """Compile a cell with objects at given poses.
 
@@ -105,7 +102,6 @@ def build_cell(
         layout: solids and camera around the arm.
         things: objects to add.
         poses: one pose per object in the base frame [m].
-        friction: sliding friction coefficient of all contacts. If None, the trials' value is used.
 
     Raises:
         ConfigError: no mount of the hand is described, or arm and hand share a joint name.
@@ -117,29 +113,26 @@ def build_cell(
     # Without this MuJoCo writes a log file into the working directory.
     mujoco.set_mju_user_warning(lambda message: None)
     protocol = PROTOCOLS["standard"]
-    slide, *rest = protocol.friction
-    rub: Friction = (slide if friction is None else friction, rest[0], rest[1])
     spec = mujoco.MjSpec()
     spec.compiler.degree = False
-    set_physics(spec.option, replace(protocol, friction=rub))
+    set_physics(spec.option, protocol)
     spec.option.gravity = [0.0, 0.0, -_GRAVITY]
     spec.memory = 2**28
     floor = spec.worldbody.add_geom(type=mujoco.mjtGeom.mjGEOM_PLANE, size=[0.0, 0.0, 1.0], pos=[0.0, 0.0, FLOOR])
-    floor.condim, floor.friction = 4, rub
-    _add_robot(spec, arm, hand, rub)
-    _add_solids(spec, layout, rub)
+    floor.condim, floor.friction = 4, protocol.friction
+    _add_robot(spec, arm, hand, protocol)
+    _add_solids(spec, layout, protocol.friction)
     for index, (thing, pose) in enumerate(zip(things, poses, strict=True)):
-        add_object(spec, thing.model, thing.parts, rub, name=f"thing {index}", pose=pose)
+        add_object(spec, thing.model, thing.parts, protocol.friction, name=f"thing {index}", pose=pose)
     world = _world_of(spec.compile(), arm, hand, layout, tuple(things))
     for one, other in _touching(world):
         spec.add_exclude(bodyname1=one, bodyname2=other)
     return replace(world, model=spec.compile())
 
 
-def _add_robot(spec: Any, arm: Arm, hand: HandModel, friction: Friction) -> None:
+def _add_robot(spec: Any, arm: Arm, hand: HandModel, protocol: Protocol) -> None:
     import mujoco
 
-    protocol = replace(PROTOCOLS["standard"], friction=friction)
     add_hand(spec, arm.chain, protocol)
     spec.body(f"link:{arm.chain.base_link}").mocap = False
     for name, effort in zip(arm.joint_names, arm.chain.effort, strict=True):
@@ -200,7 +193,6 @@ def _world_of(model: Any, arm: Arm, hand: HandModel, layout: CellLayout, things:
         actuators=np.array([model.actuator(name).id for name in inner], dtype=np.int64),
         coupled_qpos=rows("qposadr", [f"{_HAND}joint:{mimic.name}" for mimic in hand.mimics]),
         thing_qpos=rows("qposadr", free),
-        thing_dof=rows("dofadr", free),
         thing_bodies=thing_bodies,
         arm_bodies=arm_bodies,
         hand_bodies=hand_bodies,
@@ -212,9 +204,7 @@ def _world_of(model: Any, arm: Arm, hand: HandModel, layout: CellLayout, things:
     )  # fmt: skip
 
 
-def pile_cell(
-    arm: Arm, hand: HandModel, sources: Sequence[ThingSource], seed: int, *, friction: float | None = None
-) -> CellWorld:
+def pile_cell(arm: Arm, hand: HandModel, sources: Sequence[ThingSource], seed: int) -> CellWorld:
     """Compile a cell with objects dropped into the pick bin. The same seed gives the same poses."""
     layout, things, poses = layout_of(arm), list[Thing](), []
     for source in sources:
@@ -226,7 +216,7 @@ def pile_cell(
         pose = body.pose.copy()
         pose[:2, 3] += layout.pick.center
         poses.append(pose)
-    return build_cell(arm, hand, layout, things, poses, friction=friction)
+    return build_cell(arm, hand, layout, things, poses)
 
 
 def put_robot(world: CellWorld, data: Any, values: Float[np.ndarray, "joints"]) -> None:

@@ -166,12 +166,12 @@ def blocks_of(request: DatasetRequest) -> tuple[Block, ...]:
     config = load_preset(request.preset)
     hands = {name: hand_hash(name) for name in request.hands}
     preset = Path(request.preset).stem if request.preset.endswith((".yaml", ".yml")) else request.preset
-    counts = _split(request.per_object, request.block)
+    starts = range(0, request.per_object, request.block)
     return tuple(
         Block(found, hand, hashed, preset, config, request.verify, request.measure, request.seed + number, count)
         for found in _objects(request)
         for hand, hashed in hands.items()
-        for number, count in enumerate(counts)
+        for number, count in enumerate(min(request.block, request.per_object - start) for start in starts)
     )
 
 
@@ -181,10 +181,6 @@ def by_object(blocks: Sequence[Block]) -> list[tuple[DatasetObject, list[Block]]
     for block in blocks:
         groups.setdefault(block.object.key, (block.object, []))[1].append(block)
     return list(groups.values())
-
-
-def _split(total: int, most: int) -> list[int]:
-    return [min(most, total - begun) for begun in range(0, total, most)]
 
 
 def _objects(request: DatasetRequest) -> list[DatasetObject]:

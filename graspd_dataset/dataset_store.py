@@ -17,6 +17,7 @@ import hashlib
 import json
 import time
 from collections.abc import Callable, Mapping, Sequence
+from functools import partial
 from io import BytesIO
 from pathlib import Path, PurePosixPath
 from typing import Any, TypeVar
@@ -114,8 +115,7 @@ class DatasetStore:
 
     def read(self, path: str) -> bytes:
         if self.local is not None:
-            local = self.local / path
-            return self._once(path, local.read_bytes)
+            return self._once(path, (self.local / path).read_bytes)
         system, root = self._arrow()
 
         def read() -> bytes:
@@ -127,8 +127,7 @@ class DatasetStore:
     def write(self, path: str, content: bytes) -> None:
         """Write a file. An existing file of the same path is replaced."""
         if self.local is not None:
-            local = self.local / path
-            return self._once(path, lambda: save_bytes(local, content))
+            return self._once(path, partial(save_bytes, self.local / path, content))
         system, root = self._arrow()
 
         def write() -> None:
@@ -140,8 +139,7 @@ class DatasetStore:
     def remove(self, path: str) -> None:
         """Remove a file. Do nothing if there is no such file."""
         if self.local is not None:
-            local = self.local / path
-            return self._once(path, lambda: local.unlink(missing_ok=True))
+            return self._once(path, partial((self.local / path).unlink, missing_ok=True))
         system, root = self._arrow()
 
         def remove() -> None:

@@ -50,7 +50,6 @@ class Report:
         error: description of the failure.
         rows, verified: number of all candidates, and of verified candidates.
         failures: number of failed candidates for each kind of failure (`failure_kind`).
-        size: size of the block's file [bytes].
         cpu: CPU time of the child [s].
         peak_mb: peak memory of the child [MB].
         files: path and SHA-256 of each written file.
@@ -62,7 +61,6 @@ class Report:
     rows: int = 0
     verified: int = 0
     failures: dict[str, int] = field(default_factory=dict)
-    size: int = 0
     cpu: float = 0.0
     peak_mb: float = 0.0
     files: dict[str, str] = field(default_factory=dict)
@@ -146,7 +144,6 @@ def run_block(job: Job, hand: bytes, shared: bytes, store: DatasetStore, limits:
         rows=made.rows,
         verified=made.verified,
         failures=made.failures,
-        size=len(made.file),
         cpu=made.cpu,
         peak_mb=made.peak_mb,
         files={path: file_hash(made.file)},

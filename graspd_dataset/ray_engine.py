@@ -12,7 +12,6 @@ import tempfile
 import threading
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
-from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
@@ -30,6 +29,8 @@ _RETRIES = 4
 _LOOPBACK = "127.0.0.2"
 # Timeout for the connection to a cluster [s].
 _CONNECT = 10.0
+# Secret of every private Ray of this process.
+_TOKEN = secrets.token_hex(32)
 # Prefix of the name of a private Ray's folder. The id of this process follows.
 _FOLDER = "graspd-ray-"
 
@@ -45,14 +46,15 @@ def ray_running(address: str | None, workers: int | None, folder: Path | None = 
     """
     settings = {"RAY_USAGE_STATS_ENABLED": "0", "RAY_ACCEL_ENV_VAR_OVERRIDE_ON_ZERO": "0"}
     if address is None:
-        settings |= {"RAY_AUTH_MODE": "token", "RAY_AUTH_TOKEN": _token()}
+        settings |= {"RAY_AUTH_MODE": "token", "RAY_AUTH_TOKEN": _TOKEN}
         _remove_abandoned(folder or Path(tempfile.gettempdir()))
     before = {name: os.environ.get(name) for name in settings}
     os.environ.update(settings)
     # The name is short because the paths of sockets in the folder may have at most 107 characters.
     own = Path(tempfile.mkdtemp(prefix=f"{_FOLDER}{os.getpid()}-", dir=folder)) if address is None else None
     try:
-        ray = _ray()
+        with Extra("dataset"):
+            import ray
         _refuse_silent(address)
         options: dict[str, Any] = {"log_to_driver": False, "logging_level": "ERROR"}
         if own is not None:
@@ -98,22 +100,11 @@ def _refuse_silent(address: str | None) -> None:
         raise ConfigError(f"address: {address}: {error.strerror or error}; start Ray with: ray start --head") from None
 
 
-@lru_cache
-def _token() -> str:
-    return secrets.token_hex(32)
-
-
 def _remove_abandoned(folder: Path) -> None:
     for path in folder.glob(f"{_FOLDER}*-*"):
         process = path.name.removeprefix(_FOLDER).partition("-")[0]
         if process.isdigit() and not Path(f"/proc/{process}").exists() and Path("/proc/self").exists():
             shutil.rmtree(path, ignore_errors=True)
-
-
-def _ray() -> Any:
-    with Extra("dataset"):
-        import ray
-    return ray
 
 
 def pickled_hand(block: Block) -> bytes:

@@ -73,28 +73,20 @@ def arrow_schema() -> Any:
     """Return the pyarrow schema of a block's rows, one row per grasp."""
     import pyarrow as pa
 
-    vector = pa.list_(pa.float64(), 3)
+    text, number, vector = pa.string(), pa.float64(), pa.list_(pa.float64(), 3)
+    contact = {"link": text, "position": vector, "normal": vector}
+    trial = {"name": text, "passed": pa.bool_(), "displacement": number, "rotation": number, "reason": text}
     kinds = {
-        "string": pa.string(),
+        "string": text,
         "int32": pa.int32(),
         "int64": pa.int64(),
-        "double": pa.float64(),
+        "double": number,
         "double[3]": vector,
-        "double[4]": pa.list_(pa.float64(), 4),
-        "double[]": pa.list_(pa.float64()),
-        "string[]": pa.list_(pa.string()),
-        "contacts": pa.list_(pa.struct([("link", pa.string()), ("position", vector), ("normal", vector)])),
-        "trials": pa.list_(
-            pa.struct(
-                [
-                    ("name", pa.string()),
-                    ("passed", pa.bool_()),
-                    ("displacement", pa.float64()),
-                    ("rotation", pa.float64()),
-                    ("reason", pa.string()),
-                ]
-            )
-        ),
+        "double[4]": pa.list_(number, 4),
+        "double[]": pa.list_(number),
+        "string[]": pa.list_(text),
+        "contacts": pa.list_(pa.struct(contact.items())),
+        "trials": pa.list_(pa.struct(trial.items())),
     }
     return pa.schema([pa.field(column.name, kinds[column.kind]) for column in columns()])
 

@@ -36,6 +36,11 @@ NORMAL_LENGTH, FORCE_LENGTH, PUSH_LENGTH = 0.02, 0.004, (1.1, 0.7)
 _SHAFT, _SLICE = 0.0012, 96
 
 
+def css(colour: Colour) -> str:
+    """Return a colour as CSS."""
+    return f"rgb({', '.join(str(round(255 * channel)) for channel in colour)})"
+
+
 @dataclass(frozen=True)
 class Part:
     """Mesh of one colour (RGB, 0 to 1) in its own frame [m]."""

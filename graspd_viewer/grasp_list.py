@@ -11,7 +11,7 @@ from collections.abc import Sequence
 
 from graspd_core.types import Grasp, Verdict
 from graspd_core.verify.metrics import METRICS
-from graspd_viewer.drawing import FORCE, GUESSED, HAND, NORMAL, OBJECT, TURN, VERDICTS, WEAKEST
+from graspd_viewer.drawing import FORCE, GUESSED, HAND, NORMAL, OBJECT, TURN, VERDICTS, WEAKEST, css
 
 ALL = "all"
 # A grasp that holds on the likeliest shape of the object, but passes too few robustness checks to be verified.
@@ -81,7 +81,7 @@ def legend_html() -> str:
     """Return the legend of the scene's colours."""
     patches = (
         f"<span style='white-space:nowrap;margin-right:0.8em'>"
-        f"<span style='color:rgb({', '.join(str(round(255 * c)) for c in colour)})'>{mark}</span> {name}</span>"
+        f"<span style='color:{css(colour)}'>{mark}</span> {name}</span>"
         for name, colour, mark in _LEGEND
     )
     return f"{BLOCK}{' '.join(patches)}</div>"
@@ -105,9 +105,8 @@ def table_html(grasps: Sequence[Grasp], ranks: Sequence[int], chosen: int | None
 
 def figures_html(grasp: Grasp, rank: int) -> str:
     """Return HTML with all values of one grasp. Each value has its description as a tooltip."""
-    r, g, b = (round(255 * channel) for channel in VERDICTS[grasp.verdict])
     reason = f": {html.escape(grasp.reason)}" if grasp.reason else ""
-    head = f"<b>#{rank} <span style='color:rgb({r},{g},{b})'>{standing(grasp)}</span></b>{reason}"
+    head = f"<b>#{rank} <span style='color:{css(VERDICTS[grasp.verdict])}'>{standing(grasp)}</span></b>{reason}"
     figures = []
     if grasp.probability is not None:
         figures.append(_figure("probability", _likely(grasp, ""), _OTHER_FIGURES["probability"]))
@@ -136,10 +135,8 @@ def _figure(name: str, value: str, meaning: str) -> str:
 
 
 def _row(grasp: Grasp, rank: int, chosen: bool) -> str:
-    r, g, b = (round(255 * channel) for channel in VERDICTS[grasp.verdict])
+    colour = css(VERDICTS[grasp.verdict])
     values = [(METRICS[name], (grasp.metrics or {}).get(name)) for name in _COLUMNS]
     cells = "".join(f"<td>{'–' if v is None else format(v * row.scale, f'.{row.digits}f')}</td>" for row, v in values)
     back = "background:rgba(130,150,190,0.3)" if chosen else ""
-    return (
-        f"<tr style='{back}'><td>{rank}</td><td style='color:rgb({r},{g},{b})'>●{_likely(grasp, ' ')}</td>{cells}</tr>"
-    )
+    return f"<tr style='{back}'><td>{rank}</td><td style='color:{colour}'>●{_likely(grasp, ' ')}</td>{cells}</tr>"

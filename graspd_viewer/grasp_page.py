@@ -21,7 +21,7 @@ from graspd_core.mesh.topology import far_centre, moved_mesh
 from graspd_core.perception.scene import moved_grasp
 from graspd_core.se3 import perpendicular, rotation_from_quaternion
 from graspd_core.types import Grasp, Posture, TriangleMesh, Verdict
-from graspd_viewer.drawing import HAND, NORMAL, OBJECT, Colour, contact_parts, hand_parts, placed_links
+from graspd_viewer.drawing import HAND, NORMAL, OBJECT, Colour, contact_parts, css, hand_parts, placed_links
 from graspd_viewer.grasp_list import label
 
 PREGRASP: Colour = (0.62, 0.66, 0.72)
@@ -68,7 +68,7 @@ def save_view(
         "grasps": [{"label": label(grasp, rank)} for rank, grasp in shown],
         "views": [dict(zip(("eye", "target", "up"), _lists(best_view(mesh, one, up)), strict=True)) for one in hands],
         "legend": [
-            (kind, said, _css(colour), seen) for kind, said, colour, seen in _LEGEND if shown or kind == "object"
+            (kind, said, css(colour), seen) for kind, said, colour, seen in _LEGEND if shown or kind == "object"
         ],
     }
     title = html.escape(f"{name}, {hand.name}: {f'{shown[0][1].verdict} grasp' if shown else 'no grasp'}")
@@ -179,10 +179,6 @@ def placed_hand(hand: HandModel, posture: Posture) -> TriangleMesh:
 
 def _lists(vectors: Sequence[Float[np.ndarray, "3"]]) -> list[list[float]]:
     return [vector.tolist() for vector in vectors]
-
-
-def _css(colour: Colour) -> str:
-    return f"rgb({', '.join(str(round(255 * channel)) for channel in colour)})"
 
 
 _PAGE = (Path(__file__).parent / "grasp_page.html").read_text(encoding="utf-8")

@@ -21,9 +21,8 @@ _NONE = "no grasp"
 # sends at most 20 slider positions a second. The delay is half of this period, for a smoother motion.
 _HALF_PERIOD = 0.025
 _AXES = ("none", "x", "y", "z")
-# Groups of nodes that a visitor may hide, and whether they are visible at first.
-_SHOWN = {"contacts": True, "forces": True, "weakest": True, "around": True, "cloud": True, "object": True}
-_NAMES = {
+# Groups of nodes that a visitor may hide, and their labels.
+_GROUPS = {
     "contacts": "Contacts and normals (blue)", "forces": "Squeeze forces (red)",
     "weakest": "Weakest push (purple) and turn (yellow)", "around": "Support and neighbours",
     "cloud": "Cloud, as seen", "object": "Object",
@@ -58,7 +57,7 @@ class GraspTab:
         self._table = gui.add_html("")
         self._figures = gui.add_html("")
         with gui.add_folder("What is shown", expand_by_default=False):
-            self._boxes = {group: gui.add_checkbox(_NAMES[group], shown) for group, shown in _SHOWN.items()}
+            self._boxes = {group: gui.add_checkbox(name, True) for group, name in _GROUPS.items()}
             self._solid = gui.add_slider("Opacity", 0.1, 1.0, 0.05, 1.0)
             self._axis = gui.add_dropdown("Distance slice", _AXES, hint="blue inside, red outside, white the surface")
             self._share = gui.add_slider("Slice at", 0.0, 1.0, 0.01, 0.5)

@@ -37,14 +37,9 @@ from graspd_viewer.session import Session, make_session, seen_points
 UNITS = {"m": 1.0, "cm": 1e-2, "mm": 1e-3}
 # Sides from which the hand may come, with the direction in which it then moves, in the object's frame.
 APPROACHES = {
-    "any side": None,
-    "above": (0.0, 0.0, -1.0),
-    "below": (0.0, 0.0, 1.0),
-    "+x": (-1.0, 0.0, 0.0),
-    "-x": (1.0, 0.0, 0.0),
-    "+y": (0.0, -1.0, 0.0),
-    "-y": (0.0, 1.0, 0.0),
-}
+    "any side": None, "above": (0.0, 0.0, -1.0), "below": (0.0, 0.0, 1.0),
+    "+x": (-1.0, 0.0, 0.0), "-x": (1.0, 0.0, 0.0), "+y": (0.0, -1.0, 0.0), "-y": (0.0, 1.0, 0.0),
+}  # fmt: skip
 ENDINGS = tuple(sorted({*MESH_ENDINGS, *CLOUD_ENDINGS}))
 MOST_GRASPS = 64
 
@@ -201,12 +196,8 @@ class PlanTab:
 
     def plan(self) -> None:
         """Start a run with the values of the widgets. Do nothing if a run is in progress."""
-        self.begin(lambda _: self._plan_and_show(self._request()))
-
-    def begin(self, work: Callable[[StopHook], None]) -> None:
-        """Start a thread that calls `work`. Its argument tells if `work` must stop. Do nothing during a run."""
         if self._busy.acquire(blocking=False):
-            self._start(work)
+            self._start(lambda _: self._plan_and_show(self._request()))
 
     def replace(self, work: Callable[[StopHook], None]) -> None:
         """Stop the run in progress. When it has ended, start a thread that calls `work`. Only the newest waits."""

@@ -11,8 +11,10 @@ import contextlib
 import io
 import json
 import socket
+import sys
 import threading
 import time
+import traceback
 from collections.abc import Callable
 from typing import Any
 from urllib.parse import urlsplit
@@ -72,6 +74,47 @@ class LatestJobs:
                 work()
             except Exception as error:
                 self._failed(error)
+
+
+HOST, PORT = "127.0.0.1", 8080
+
+
+class Page:
+    """Server of one page, and its drawing thread.
+
+    Args:
+        host, port: address to listen on. By default only this machine can connect. A used port is replaced by the next.
+
+    Raises:
+        ConfigError: the address cannot be listened on, or viser is not installed.
+    """
+
+    def __init__(self, host: str, port: int) -> None:
+        self._server = start_server(host, port)
+        self._host = host
+        self._jobs = LatestJobs(lambda error: traceback.print_exception(error, file=sys.stderr))
+
+    @property
+    def port(self) -> int:
+        """Return the port of the page."""
+        return self._server.get_port()
+
+    @property
+    def url(self) -> str:
+        """Return the address of the page."""
+        return f"http://{f'[{self._host}]' if ':' in self._host else self._host}:{self.port}"
+
+    def wait_for_visitor(self, patience: float, stop: Callable[[], bool] = lambda: False) -> None:
+        """Wait until a visitor opens the page, `patience` seconds have passed, or `stop` returns True."""
+        end = time.monotonic() + patience
+        while not self._server.get_clients() and time.monotonic() < end and not stop():
+            time.sleep(0.05)
+
+    def close(self) -> None:
+        """End the thread and the server."""
+        self._jobs.close()
+        with quiet():
+            self._server.stop()
 
 
 # Largest file that a visitor may upload [bytes], and greatest number of uploads of a visitor at a time.

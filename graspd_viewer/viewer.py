@@ -3,9 +3,6 @@
 from __future__ import annotations
 
 import html
-import sys
-import time
-import traceback
 from collections.abc import Callable
 from typing import Any
 
@@ -16,7 +13,7 @@ from graspd_viewer.grasp_tab import GraspTab
 from graspd_viewer.live_view import LiveView
 from graspd_viewer.plan_tab import PlanTab
 from graspd_viewer.scene_nodes import SceneNodes
-from graspd_viewer.server import LatestJobs, quiet, start_server
+from graspd_viewer.server import HOST, PORT, Page
 from graspd_viewer.session import Session
 
 _KEYS = """
@@ -44,32 +41,20 @@ grey. Verified hands turn green, failed hands turn red, and less sure hands stay
 """
 
 
-def _help() -> str:
-    figures = "\n".join(f"* *{row.title}*: {row.description}" for row in METRICS.values())
-    return f"{_KEYS}\n{figures}\n\nMore in docs/viewer.md, docs/metrics.md and docs/method.md of graspd."
+_FIGURES = "\n".join(f"* *{row.title}*: {row.description}" for row in METRICS.values())
+HELP = f"{_KEYS}\n{_FIGURES}\n\nMore in docs/viewer.md, docs/metrics.md and docs/method.md of graspd."
 
 
-HELP = _help()
-
-
-HOST, PORT = "127.0.0.1", 8080
-
-
-class Viewer:
+class Viewer(Page):
     """Web page that shows all visitors the same session: grasps, their hand and the object.
 
     Args:
-        host, port: address to listen on. By default only this machine can connect. A used port is replaced by the next.
+        host, port: see `Page`.
         plan: if True, the page has a tab where visitors plan.
-
-    Raises:
-        ConfigError: the address cannot be listened on, or viser is not installed.
     """
 
     def __init__(self, *, host: str = HOST, port: int = PORT, plan: bool = True) -> None:
-        self._server = start_server(host, port)
-        self._host = host
-        self._jobs = LatestJobs(_report)
+        super().__init__(host, port)
         self._nodes = SceneNodes(self._server)
         gui = self._server.gui
         self._theme(False)
@@ -92,26 +77,9 @@ class Viewer:
         def _(_event: Any) -> None:
             self._theme(bool(dark.value))
 
-    @property
-    def url(self) -> str:
-        """Return the address of the page."""
-        host = f"[{self._host}]" if ":" in self._host else self._host
-        return f"http://{host}:{self.port}"
-
-    @property
-    def port(self) -> int:
-        """Return the port of the page."""
-        return self._server.get_port()
-
     def show(self, session: Session) -> None:
         """Replace the shown session. Thread-safe."""
         self._jobs.submit("session", lambda: self._grasps.show(session))
-
-    def wait_for_visitor(self, patience: float) -> None:
-        """Wait until a visitor opens the page, or `patience` seconds have passed."""
-        end = time.monotonic() + patience
-        while not self._server.get_clients() and time.monotonic() < end:
-            time.sleep(0.05)
 
     def do(self, kind: str, work: Callable[[], None]) -> None:
         """Submit a job to the drawing thread. The job replaces a waiting job of the same kind."""
@@ -136,13 +104,7 @@ class Viewer:
         """Stop the run in progress, the threads and the server."""
         if self._planner is not None:
             self._planner.close()
-        self._jobs.close()
-        with quiet():
-            self._server.stop()
+        super().close()
 
     def _theme(self, dark: bool) -> None:
         self._server.gui.configure_theme(dark_mode=dark, show_logo=False, show_share_button=False)
-
-
-def _report(error: Exception) -> None:
-    traceback.print_exception(error, file=sys.stderr)

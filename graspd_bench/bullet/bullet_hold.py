@@ -69,10 +69,7 @@ def bullet_hold_trial(world: BulletWorld, grasp: Grasp, protocol: Protocol) -> T
         depth = _start_penetration(run)
         if depth > protocol.max_start_penetration:
             return TrialResult(_NAME, False, 0.0, 0.0, f"the pregrasp penetrates the object by {depth * 1e3:.1f} mm")
-        for stage, start, end in (
-            ("closing", grasp.pregrasp, grasp.grasp),
-            ("squeezing", grasp.grasp, grasp.squeeze),
-        ):
+        for stage, start, end in (("closing", grasp.pregrasp, grasp.grasp), ("squeezing", grasp.grasp, grasp.squeeze)):
             reason = _move(run, start, end)
             if reason:
                 return _result(run, f"{reason} while {stage}")
@@ -98,20 +95,13 @@ def _start(client: int, world: BulletWorld, posture: Posture, protocol: Protocol
     hand, joints = load_hand_urdf(client, world.hand, protocol.armature)
     # Bullet multiplies the sliding coefficients of a pair. It multiplies a body's spinning coefficient with the sliding
     # coefficient of the other body. With the values below, the hand's coefficients apply.
+    grip = {"lateralFriction": sliding, "spinningFriction": torsional, "jointDamping": 0.0}
     free = {"linearDamping": 0.0, "angularDamping": 0.0, "restitution": 0.0, "rollingFriction": 0.0}
     pybullet.changeDynamics(
         body, -1, lateralFriction=1.0, spinningFriction=0.0, collisionMargin=0.0, **free, physicsClientId=client
     )
     for link in range(-1, pybullet.getNumJoints(hand, physicsClientId=client)):
-        pybullet.changeDynamics(
-            hand,
-            link,
-            lateralFriction=sliding,
-            spinningFriction=torsional,
-            jointDamping=0.0,
-            **free,
-            physicsClientId=client,
-        )
+        pybullet.changeDynamics(hand, link, **grip, **free, physicsClientId=client)
     for joint, value in zip(joints, posture.joint_positions.tolist(), strict=True):
         pybullet.resetJointState(hand, joint, value, physicsClientId=client)
     run = _Run(client, world, protocol, body, hand, joints, np.zeros(2))

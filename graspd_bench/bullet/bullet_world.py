@@ -23,7 +23,7 @@ from jaxtyping import Float
 
 from graspd_bench.trials import FRICTION, GRAVITY, MASS, STEPS, TIMESTEP
 from graspd_core.errors import SimulatorError
-from graspd_core.hands.kinematics import forward, make_kinematics
+from graspd_core.hands.kinematics import link_poses
 from graspd_core.hands.model import HandModel, Primitive
 from graspd_core.perception.scene import ObjectModel
 from graspd_core.se3 import quaternion_from_rotation, rotation_from_quaternion
@@ -146,10 +146,6 @@ def _text(values: Float[np.ndarray, "n"]) -> str:
     return " ".join(repr(float(value)) for value in values)
 
 
-# pybullet is a compiled module without stubs.
-# pyright: reportAttributeAccessIssue=false, reportCallIssue=false
-
-
 # Least principal moment of an object per kilogram [m²]: the moment of a ball of 0.5 mm radius.
 _LEAST_MOMENT = 1e-7
 # Settings of the displacement trial.
@@ -270,13 +266,12 @@ def add_frozen_hand(client: int, hand: HandModel, posture: Posture) -> tuple[int
     """Add each collision primitive of the hand in `posture` as a fixed body of its own. Return the body ids."""
     import pybullet
 
-    kinematics = make_kinematics(hand, "cpu", torch.float64)
-    links = forward(kinematics, torch.as_tensor(posture.joint_positions, dtype=torch.float64)[None])[0]
+    rotations, translations = link_poses(hand, posture.joint_positions)
     base = rotation_from_quaternion(torch.as_tensor(posture.quaternion_wxyz, dtype=torch.float64)).numpy()
     bodies = []
     for primitive in hand.primitives:
-        link = base @ links.rotation[primitive.link].numpy()
-        origin = base @ links.translation[primitive.link].numpy() + posture.position
+        link = base @ rotations[primitive.link]
+        origin = base @ translations[primitive.link] + posture.position
         bodies.append(
             pybullet.createMultiBody(
                 baseMass=0.0,

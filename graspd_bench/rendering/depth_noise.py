@@ -76,32 +76,10 @@ LOW = DepthNoise(
     floor=1e-4, quadratic=1e-3, jitter=0.3, flying=0.1, edge_loss=0.1, loss=0.002, grazing=0.1, step=1e-4, nearest=0.2
 )
 DEFAULT = DepthNoise(
-    floor=3e-4,
-    quadratic=2.4e-3,
-    jitter=0.7,
-    flying=0.3,
-    edge_loss=0.3,
-    loss=0.01,
-    grazing=0.25,
-    baseline=0.055,
-    step=1e-3,
-    nearest=0.3,
-    farthest=2.0,
-)
-HIGH = DepthNoise(
-    floor=5e-4,
-    quadratic=5e-3,
-    white=0.1,
-    jitter=1.2,
-    flying=0.6,
-    edge_loss=0.3,
-    loss=0.04,
-    grazing=0.4,
-    baseline=0.055,
-    step=1e-3,
-    nearest=0.3,
-    farthest=2.0,
-)
+    floor=3e-4, quadratic=2.4e-3, jitter=0.7, flying=0.3, edge_loss=0.3, loss=0.01, grazing=0.25, baseline=0.055,
+    step=1e-3, nearest=0.3, farthest=2.0,
+)  # fmt: skip
+HIGH = replace(DEFAULT, floor=5e-4, quadratic=5e-3, white=0.1, jitter=1.2, flying=0.6, loss=0.04, grazing=0.4)
 LEVELS = {"none": NONE, "low": LOW, "default": DEFAULT, "high": HIGH}
 
 

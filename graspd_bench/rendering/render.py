@@ -5,13 +5,12 @@ Camera frames follow the optical convention: z forward, x right, y down.
 
 from __future__ import annotations
 
-import struct
-import zlib
 from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
 from jaxtyping import Float, Int, UInt8
+from PIL import Image
 
 from graspd_core.hands.kinematics import hand_mesh, link_poses
 from graspd_core.hands.model import HandModel
@@ -90,16 +89,8 @@ def render_shaded(
 
 
 def save_png(path: str | Path, image: UInt8[np.ndarray, "height width 3"]) -> None:
-    """Write an RGB picture as a PNG file with one IHDR chunk, one IDAT chunk of unfiltered rows, and IEND."""
-    height, width, _ = image.shape
-    rows = np.concatenate([np.zeros((height, 1), np.uint8), image.reshape(height, width * 3)], axis=1)
-
-    def chunk(kind: bytes, data: bytes) -> bytes:
-        return struct.pack(">I", len(data)) + kind + data + struct.pack(">I", zlib.crc32(kind + data))
-
-    header = struct.pack(">IIBBBBB", width, height, 8, 2, 0, 0, 0)
-    body = chunk(b"IHDR", header) + chunk(b"IDAT", zlib.compress(rows.tobytes())) + chunk(b"IEND", b"")
-    Path(path).write_bytes(b"\x89PNG\r\n\x1a\n" + body)
+    """Write an RGB picture as a PNG file."""
+    Image.fromarray(image).save(path, "PNG")
 
 
 def _cast(mesh: TriangleMesh, camera: PinholeCamera, T_world_camera: Float[np.ndarray, "4 4"]):

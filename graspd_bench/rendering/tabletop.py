@@ -59,10 +59,7 @@ class TabletopScene:
 
 
 def tabletop(
-    shape: str | TriangleMesh,
-    *,
-    yaw: float = 0.0,
-    obstacles: Sequence[tuple[str | TriangleMesh, float, float]] = (),
+    shape: str | TriangleMesh, *, yaw: float = 0.0, obstacles: Sequence[tuple[str | TriangleMesh, float, float]] = ()
 ) -> TabletopScene:
     """Put an object on the table. Return the scene.
 
@@ -79,7 +76,7 @@ def tabletop(
     others = []
     for other, x, y in obstacles:
         resting, T_world_other = _at_rest(other, 0.0)
-        others.append(moved(resting, _translation(x, y, 0.0) @ T_world_other))
+        others.append(moved(resting, _pose(np.eye(3), (x, y, 0.0)) @ T_world_other))
     return replace(on_table(moved(mesh, pose), others), T_world_object=pose)
 
 
@@ -98,10 +95,8 @@ def lowest_pose(mesh: TriangleMesh) -> Float[np.ndarray, "4 4"]:
     centre = mass_properties(mesh)[1]
     facets = ConvexHull(mesh.vertices).equations
     down = facets[np.argmax(facets[:, :3] @ centre + facets[:, 3]), :3]
-    pose = np.eye(4)
     turn = quaternion_between(down, np.array([0.0, 0.0, -1.0]), around=perpendicular(down))
-    pose[:3, :3] = rotation_from_quaternion(torch.as_tensor(turn)).numpy()
-    return _set_down(mesh, pose, centre)
+    return _set_down(mesh, rotation_from_quaternion(torch.as_tensor(turn)).numpy(), centre)
 
 
 def resting_pose(mesh: TriangleMesh, rng: np.random.Generator) -> Float[np.ndarray, "4 4"]:
@@ -124,11 +119,8 @@ def resting_pose(mesh: TriangleMesh, rng: np.random.Generator) -> Float[np.ndarr
         return lowest_pose(mesh)
     standing = np.flatnonzero(poses[:, 2, 2] > _UPRIGHT)
     upright = len(standing) > 0 and rng.random() < 0.5
-    pose = np.eye(4)
-    pose[:3, :3] = poses[standing[0] if upright else rng.choice(len(poses), p=shares / shares.sum())][:3, :3]
-    turn, a = np.eye(4), rng.uniform(0, 2 * np.pi)
-    turn[:2, :2] = [[np.cos(a), -np.sin(a)], [np.sin(a), np.cos(a)]]
-    return _set_down(mesh, turn @ pose, centre)
+    pose = poses[standing[0] if upright else rng.choice(len(poses), p=shares / shares.sum())][:3, :3]
+    return _set_down(mesh, _about_z(rng.uniform(0, 2 * np.pi)) @ pose, centre)
 
 
 def crowded(target: TriangleMesh, others: Sequence[TriangleMesh], rng: np.random.Generator) -> tuple[TriangleMesh, ...]:
@@ -143,7 +135,7 @@ def crowded(target: TriangleMesh, others: Sequence[TriangleMesh], rng: np.random
         about = KDTree(np.concatenate([surface_samples(mesh, 1500, 0)[0] for mesh in placed]))
         points = surface_samples(resting, 1500, 0)[0]
         reach = next(d for d in np.arange(0.0, 1.0, 0.005) if about.query(points + d * way)[0].min() > gap)
-        placed.append(moved(resting, _translation(*(reach * way))))
+        placed.append(moved(resting, _pose(np.eye(3), (reach * way).tolist())))
     return tuple(placed[1:])
 
 
@@ -204,23 +196,24 @@ def moved(mesh: TriangleMesh, transform: Float[np.ndarray, "4 4"]) -> TriangleMe
 def _at_rest(shape: str | TriangleMesh, yaw: float) -> tuple[TriangleMesh, Float[np.ndarray, "4 4"]]:
     mesh = make_shape(shape) if isinstance(shape, str) else shape
     if isinstance(shape, str) and shape not in LYING:
-        pose = _set_down(mesh, np.eye(4), mesh.vertices.mean(0))
+        pose = _set_down(mesh, np.eye(3), mesh.vertices.mean(0))
     else:
         pose = lowest_pose(mesh)
-    turn = np.eye(4)
-    turn[:2, :2] = [[np.cos(yaw), -np.sin(yaw)], [np.sin(yaw), np.cos(yaw)]]
-    return mesh, turn @ pose
+    return mesh, _pose(_about_z(yaw)) @ pose
 
 
-def _set_down(mesh: TriangleMesh, pose: Float[np.ndarray, "4 4"], centre: Float[np.ndarray, "3"]):
-    turned = mesh.vertices @ pose[:3, :3].T
-    x, y, _ = pose[:3, :3] @ centre
-    return _translation(-x, -y, -turned[:, 2].min()) @ pose
+def _set_down(mesh: TriangleMesh, turn: Float[np.ndarray, "3 3"], centre: Float[np.ndarray, "3"]):
+    x, y, _ = turn @ centre
+    return _pose(turn, (-x, -y, -(mesh.vertices @ turn.T)[:, 2].min()))
 
 
-def _translation(x: float, y: float, z: float) -> Float[np.ndarray, "4 4"]:
+def _about_z(angle: float) -> Float[np.ndarray, "3 3"]:
+    return np.array([[np.cos(angle), -np.sin(angle), 0], [np.sin(angle), np.cos(angle), 0], [0, 0, 1]])
+
+
+def _pose(turn: Float[np.ndarray, "3 3"], place: Sequence[float] = (0.0, 0.0, 0.0)) -> Float[np.ndarray, "4 4"]:
     pose = np.eye(4)
-    pose[:3, 3] = x, y, z
+    pose[:3, :3], pose[:3, 3] = turn, place
     return pose
 
 

@@ -27,6 +27,7 @@ from graspd_core.perception.cloud.point_cloud import PointCloud
 from graspd_core.perception.scene import Scene
 from graspd_core.perception.scene_from_views import scene_from_views
 from graspd_core.perception.segment.segment import Target
+from graspd_core.se3 import axis_rotation
 from graspd_core.types import TriangleMesh
 
 _SEED, _YAW = 11, 0.3
@@ -52,12 +53,8 @@ def _measured() -> Iterator[Case]:
         ("single-view", "one view of a box on a table", lambda: _views("box", 1), cuboid),
         ("single-view-mug", "one view of a mug, its inside unseen", lambda: _views("mug", 1), mug),
         ("single-view-bottle", "one view of a bottle", lambda: _views("bottle", 1), _true("bottle")),
-        (
-            "noisy-sensor",
-            "three views with three times the usual noise",
-            lambda: _views("l_block", 3, noise=HIGH),
-            block,
-        ),
+        ("noisy-sensor", "three views with three times the usual noise",
+         lambda: _views("l_block", 3, noise=HIGH), block),
         ("flying-pixels", "every edge smeared along its rays", _flying, cuboid),
         ("table-bleed", "a ring of table about the foot of a mug taken for mug", bled, mug),
         ("dropouts", "nine of ten points lost", lambda: _dropped(_views("box", 3), 0.9), cuboid),
@@ -75,7 +72,7 @@ def _measured() -> Iterator[Case]:
         ("same-view-thrice", "one message of a mug three times", lambda: thrice("mug"), mug),
         ("zero-filled", "two points of three are the camera's own place", lambda: zero_filled("box"), cuboid),
         ("tilted-table", "camera coordinates: the table tilts by 40°", _in_camera, _box_in_camera),
-    )
+    )  # fmt: skip
     return (_case(name, about, make, truth=truth) for name, about, make, truth in seen)
 
 
@@ -101,32 +98,16 @@ def _refused() -> Iterator[Case]:
 def _special() -> tuple[Case, ...]:
     """Return cases with special arguments of `scene_from_views`, special limits, or more than one valid ending."""
     return (
-        _case(
-            "lone-object",
-            "the object alone, nothing under it",
-            lambda: _alone("cylinder"),
-            alone=True,
-            truth=_true("cylinder"),
-        ),
-        _case(
-            "touching-masked",
-            "two things that touch, one of them masked",
-            _touching,
-            target=_mask,
-            truth=_true("box", 0.0),
-        ),
-        _case(
-            "half-out-of-view",
-            "the image ends in the middle of a box",
-            lambda: half_out_of_view("box"),
-            _FEW,
-            whole=False,
-            truth=_true("box"),
-        ),
+        _case("lone-object", "the object alone, nothing under it", lambda: _alone("cylinder"),
+              alone=True, truth=_true("cylinder")),
+        _case("touching-masked", "two things that touch, one of them masked", _touching,
+              target=_mask, truth=_true("box", 0.0)),
+        _case("half-out-of-view", "the image ends in the middle of a box", lambda: half_out_of_view("box"), _FEW,
+              whole=False, truth=_true("box")),
         _case("touching", "two things that touch, and no word which", _touching, (GRASP, *_FEW), whole=False),
         _case("touching-unequal", "a slab against a box, and no word which", unequal_pair, (GRASP, *_FEW), whole=False),
         _case("ten-million-points", "ten million points", _many, memory=3000.0, loading=30.0, truth=_true("box")),
-    )
+    )  # fmt: skip
 
 
 def _case(
@@ -202,18 +183,14 @@ def _repeated() -> Views:
 
 
 def _stepped() -> Views:
-    stage = tabletop("box", yaw=_YAW)
-    images = depth_views(stage, CAMERA, _POSES, DEFAULT, _SEED)
-    return [
-        cloud_from_depth(np.round(depth / 0.004) * 0.004, CAMERA, pose)
-        for (depth, _), pose in zip(images, _POSES, strict=True)
-    ]
+    images = depth_views(tabletop("box", yaw=_YAW), CAMERA, _POSES, DEFAULT, _SEED)
+    steps = (np.round(depth / 0.004) * 0.004 for depth, _ in images)
+    return [cloud_from_depth(depth, CAMERA, pose) for depth, pose in zip(steps, _POSES, strict=True)]
 
 
 def _misplaced() -> Views:
     first, second, third = _views("box", 3)
-    a = np.deg2rad(1.0)
-    turn = np.array([[np.cos(a), -np.sin(a), 0.0], [np.sin(a), np.cos(a), 0.0], [0.0, 0.0, 1.0]])
+    turn = axis_rotation(np.array([0.0, 0.0, 1.0]), np.deg2rad(1.0))
     return [first, second, replace(third, points=third.points @ turn.T + np.array([0.004, 0.0, 0.0]))]
 
 
@@ -241,13 +218,9 @@ def _box_in_camera() -> TriangleMesh:
 
 
 def _alone(shape: str) -> Views:
-    stage = tabletop(shape, yaw=_YAW)
-    images = depth_views(stage, CAMERA, _POSES, DEFAULT, _SEED)
-    views = views_of(stage, CAMERA, _POSES, DEFAULT, _SEED)
-    return [
-        replace(view, points=view.points[label[depth > 0] == 0])
-        for view, (depth, label) in zip(views, images, strict=True)
-    ]
+    images = depth_views(tabletop(shape, yaw=_YAW), CAMERA, _POSES, DEFAULT, _SEED)
+    alone = (np.where(label == 0, depth, 0.0) for depth, label in images)
+    return [cloud_from_depth(depth, CAMERA, pose) for depth, pose in zip(alone, _POSES, strict=True)]
 
 
 def _bare() -> Views:
@@ -322,7 +295,7 @@ def zero_filled(shape: str) -> Views:
 def unequal_pair() -> Views:
     """Return a view of a box that touches a slab. The slab is a third as high as the box."""
     stage = tabletop("box", obstacles=[(box((0.08, 0.05, 0.03), (0.0, 0.0, 0.0)), 0.0702, 0.0)])
-    return views_of(stage, CAMERA, ring_poses(1, elevation=0.9, azimuth=-1.57), DEFAULT, _SEED)
+    return views_of(stage, CAMERA, _SIDE, DEFAULT, _SEED)
 
 
 def _seen(stage: TabletopScene) -> Views:

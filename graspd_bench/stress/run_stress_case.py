@@ -39,7 +39,6 @@ class Case:
         scene: makes the input in a given folder and loads it as a user would. It may raise a GraspdError.
         expect: valid endings: "grasp", names of `Outcome` ("TOO_FEW"), or classes of errors ("MeshError").
         whole: whether the input has a graspable object. Summaries give the share with a verified grasp.
-        hand: name or path of the hand.
         deadline: time limit of planning [s].
         loading: time limit of loading [s].
         memory: limit of the process's peak memory, including libraries [MB].
@@ -54,7 +53,6 @@ class Case:
     scene: Callable[[Path], Scene]
     expect: tuple[str, ...] = (GRASP,)
     whole: bool = True
-    hand: str = "allegro_right"
     deadline: float = 20.0
     loading: float = 15.0
     memory: float = 2000.0
@@ -120,7 +118,7 @@ def run_case(case: Case, preset: str = "balanced") -> StressEnding:
     from graspd_core.hands.library import load_hand
     from graspd_core.planning.plan_grasps import plan_grasps
 
-    hand = load_hand(case.hand)
+    hand = load_hand("allegro_right")
     with tempfile.TemporaryDirectory() as folder:
         began = loaded = time.perf_counter()
         try:
@@ -137,7 +135,7 @@ def run_case(case: Case, preset: str = "balanced") -> StressEnding:
         return StressEnding(
             case.name,
             GRASP if verified else result.outcome.name,
-            _printed(result, folder),
+            "; ".join((result.message, *result.warnings)).replace(f"{folder}/", ""),
             loaded - began,
             planned - loaded,
             peak_mb(),
@@ -147,10 +145,6 @@ def run_case(case: Case, preset: str = "balanced") -> StressEnding:
             _finite(result),
             None if case.truth is None else _hold_truly(result, scene, hand, case.truth()),
         )
-
-
-def _printed(result: GraspResult, folder: str) -> str:
-    return "; ".join((result.message, *result.warnings)).replace(f"{folder}/", "")
 
 
 def _hold_again(case: Case, result: GraspResult, scene: Scene, hand: Any, folder: Path, preset: str) -> int:

@@ -9,6 +9,7 @@ from __future__ import annotations
 import importlib.util
 import re
 import time
+from collections import Counter
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -214,12 +215,11 @@ def _seconds(ones: Sequence[Record]) -> str:
 
 def _reasons(records: Sequence[Record]) -> str:
     """Return a sentence with the number of refused candidates for each kind of reason."""
-    kinds: dict[str, int] = {}
+    kinds = Counter[str]()
     for record in records:
         for reason, count in record["filtered"]["refused"].items():
-            kind = next((kind for word, kind in _KINDS.items() if word in reason), reason)
-            kinds[kind] = kinds.get(kind, 0) + count
-    counts = ", ".join(f"{count} {kind}" for kind, count in sorted(kinds.items(), key=lambda item: -item[1]))
+            kinds[next((kind for word, kind in _KINDS.items() if word in reason), reason)] += count
+    counts = ", ".join(f"{count} {kind}" for kind, count in kinds.most_common())
     return f"Refused before any trial: {counts or 'none'}."
 
 
@@ -239,10 +239,7 @@ def measure_arm(arm: Arm, poses: int) -> Record:
     target = arm_links(arm, q)[:, arm.tip]
     start_table(arm)
     library = _library(arm) if importlib.util.find_spec("pytorch_kinematics") else None
-    return {
-        "own": _measured(lambda tip: _own(arm, tip), target),
-        "library": library and _measured(library, target),
-    }
+    return {"own": _measured(lambda tip: _own(arm, tip), target), "library": library and _measured(library, target)}
 
 
 def _measured(solver: Callable[[SE3], Bool[Tensor, "batch"]], target: SE3) -> Record:

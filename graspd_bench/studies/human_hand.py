@@ -97,15 +97,9 @@ SOFTNESS = (0.0, 0.001)
 # Default preset and seeds.
 _PRESET, _SEEDS = "contact_rich", (0, 1, 2)
 _HEADINGS = [
-    "object, flesh gives",
-    "held, raw",
-    "contact area cm² within 2 mm (5, 10)",
-    "intersection cm³",
-    "CA/IV 1/cm",
-    "displacement cm",
-    "penetration mm",
-    "CPU s per grasp",
-]
+    "object, flesh gives", "held, raw", "contact area cm² within 2 mm (5, 10)", "intersection cm³", "CA/IV 1/cm",
+    "displacement cm", "penetration mm", "CPU s per grasp",
+]  # fmt: skip
 
 
 @dataclass(frozen=True)

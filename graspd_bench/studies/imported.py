@@ -9,6 +9,7 @@ our planner does not find. Shares refer to all imported grasps of an object, or 
 from __future__ import annotations
 
 import hashlib
+from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -16,7 +17,7 @@ from typing import Any
 
 import numpy as np
 
-from graspd_bench.measurement import TRIALS, Tried, requested_trials
+from graspd_bench.measurement import TRIALS, requested_trials
 from graspd_bench.study import PROTOCOL_MASS, ObjectCase, Record, Request, Sections, raw_grasps
 from graspd_core.errors import ConfigError
 from graspd_core.hands.library import load_hand
@@ -131,7 +132,7 @@ def tried(scene: Scene, hand: HandModel, grasps: Sequence[Grasp], trials: Sequen
     context, parts = make_metrics_context(scene.object, hand), object_parts(scene.object)
     results: list[dict[str, Any]] = [{"metrics": dict(measure(context, grasp.grasp))} for grasp in grasps]
     for name in trials if grasps else ():
-        trial = TRIALS[name](Tried(hand, scene.object, parts))
+        trial = TRIALS[name](hand, scene.object, parts)
         for grasp, result in zip(grasps, results, strict=True):
             result[name] = trial(grasp)
     return results
@@ -147,10 +148,7 @@ def imported_sections(records: Sequence[Record], chart: Path | None) -> Sections
     if len(records) > 1:
         groups.append(("**all**", list(records)))
     body = [_row(name, some, source, trials, len(headings)) for name, some in groups for source in SOURCES]
-    whys: dict[str, int] = {}
-    for record in records:
-        for why, count in record["refused"].items():
-            whys[why] = whys.get(why, 0) + count
+    whys = sum((Counter(record["refused"]) for record in records), Counter[str]())
     refused = "; ".join(f"{count} refused: {why}" for why, count in whys.items())
     note = "Shares are of all grasps of an object, also refused grasps and those not found. Other numbers are medians."
     warnings = [f"{_name(record['object'])}: {record['frame_doubt']}." for record in records if _doubted(record)]

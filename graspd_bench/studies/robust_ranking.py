@@ -82,9 +82,7 @@ def robust_sections(records: Sequence[Record], chart: Path | None) -> Sections:
         body.append([shape, *(f"{cost:.1f}" for cost in costs), *(f"{gain:.1%}" for gain in gains)])
     score, noise = (correlation(rows, key) for key in ("score", "ranked_by"))
     line = f"Rank correlation with the share held, within a plan, mean: score {score:.2f}, noise {noise:.2f}."
-    picture = None
-    if chart is not None:
-        picture = Picture("What ranking buys at each place", draw_robust(rows, chart.with_name("robust")))
+    picture = chart and Picture("What ranking buys at each place", draw_robust(rows, chart.with_name("robust")))
     return {"robust": [picture, markdown_table(headings, body), line]}
 
 

@@ -107,6 +107,11 @@ def run_seen(case: Seen) -> Record:
     return {"scene_s": scene_s, **reconstruction_error(scene, stage), **_grasps(case, scene, stage, hand)}
 
 
+def held_on_truth(record: Record) -> str:
+    """Return how many verified grasps hold on the true object, or why the view was refused, in a few words."""
+    return record.get("refused") or f"{record['held']} of {record['verified']} hold on the truth"
+
+
 def _stage(case: Seen) -> TabletopScene:
     """Return the object on a table. A crowded scene has one neighbour at its +x side and one at its -y side."""
     thing = case.object.removeprefix("shape:") if case.object.startswith("shape:") else load_mesh(case.object)

@@ -146,14 +146,7 @@ def _in_boxes(hand: HandModel, grasp: Grasp, goal: Steering) -> bool:
 def steered_sections(records: Sequence[Record], chart: Path | None) -> Sections:
     """Return a table with a row for each kind of constraint: success and CPU time with and without it, violations."""
     headings = ["constraint", "requests", "with a verified grasp", "without it", "grasps of those asked for"]
-    headings += [
-        "without it",
-        "CPU s, median",
-        "without it",
-        "beyond cone, at worst",
-        "beyond region",
-        "in boxes",
-    ]
+    headings += ["without it", "CPU s, median", "without it", "beyond cone, at worst", "beyond region", "in boxes"]
     body = [_row(wish, [r for r in records if wish in ("all", r["wish"])]) for wish in (*WISHES, "all")]
     return {"steered": [markdown_table(headings, [row for row in body if row])]}
 

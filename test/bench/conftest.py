@@ -20,29 +20,14 @@ def _record(name: str = "balanced", thing: str = "box", **changes: Any) -> dict[
         for passed, depth, sd in ((True, 1.0, 0.1), (True, 2.0, 0.3), (False, 3.0, 9.0))
     ]
     made = {
-        "kind": "raw",
-        "name": name,
-        "method": "closed_form",
-        "object": thing,
-        "hand": "allegro_right",
-        "seed": 0,
-        "count": 4,
-        "given": 3,
-        "held": 2,
-        "error": "",
-        "study": "main",
-        "label": f"raw {name} {thing} seed {changes.get('seed', 0)}",
-        "made": "2026-11-22",
-        "commit": "1234567",
-        "code": "0.1.0+abc",
-        "machine": "2 cores",
+        "kind": "raw", "name": name, "method": "closed_form", "object": thing, "hand": "allegro_right", "seed": 0,
+        "count": 4, "given": 3, "held": 2, "error": "", "study": "main",
+        "label": f"raw {name} {thing} seed {changes.get('seed', 0)}", "made": "2026-11-22", "commit": "1234567",
+        "code": "0.1.0+abc", "machine": "2 cores", "case_cpu": 12.0, "peak_mb": 600.0, "grasps": grasps,
         "cpu": {"scene": 1.0, "optimise": 2.0, "standard": 3.0, "hard": 4.0},
         "wall": {"scene": 2.0, "optimise": 4.0, "standard": 6.0, "hard": 8.0},
         "first_verified": {"cpu": 4.0, "wall": 8.0},
-        "case_cpu": 12.0,
-        "peak_mb": 600.0,
-        "grasps": grasps,
-    }
+    }  # fmt: skip
     return {**made, **changes}
 
 

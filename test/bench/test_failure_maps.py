@@ -11,27 +11,8 @@ from xml.etree import ElementTree
 import numpy as np
 import pytest
 
-from graspd_bench import charts
-from graspd_bench import charts as charts_style
-from graspd_bench import failure_maps as map_runs
-from graspd_bench.failure_maps import (
-    COUNT,
-    MAPS,
-    METHODS,
-    SEEDS,
-    MapAxis,
-    MapCase,
-    Shares,
-    cases_of,
-    draw_map,
-    hand_for,
-    map_cases,
-    map_sections,
-    reasons,
-    run_map,
-    run_on,
-    shares,
-)
+from graspd_bench import charts, failure_maps
+from graspd_bench.failure_maps import COUNT, MAPS, METHODS, MapAxis, MapCase, cases_of, draw_map, map_cases, shares
 from graspd_bench.figures import by_name, rows
 from graspd_bench.rendering.depth_noise import DEFAULT, NONE
 from graspd_bench.studies.robust_ranking import draw_robust
@@ -69,20 +50,20 @@ def test_jobs_cover_every_cell_once(name: str, method: str):
 def test_every_seed_has_every_case():
     asked = map_cases(Request(cases=("wall",)))
     once = [case for method in METHODS for case in cases_of("wall", method)]
-    assert Counter(asked) == Counter(replace(case, seed=seed) for case in once for seed in SEEDS)
+    assert Counter(asked) == Counter(replace(case, seed=seed) for case in once for seed in failure_maps.SEEDS)
     assert len({case.label for case in asked}) == len(asked)
     assert {case.seed for case in map_cases(Request(cases=("wall",), seeds=(5,)))} == {5}
 
 
 def test_a_real_case_leaves_a_record():
-    record = run_map(TINY)
+    record = failure_maps.run_map(TINY)
     (cell,) = record["cells"]
     assert cell["up"] == "sphere"
     assert cell["held"] + sum(cell["reasons"].values()) == TINY.count
 
 
 def test_a_refused_scene_loses_all_grasps_and_says_why():
-    done = run_on(map_runs.run_size, replace(TINY, thing="teapot", up=("a", "b")))
+    done = failure_maps.run_on(failure_maps.run_size, replace(TINY, thing="teapot", up=("a", "b")))
     assert [(cell.up, cell.held) for cell in done] == [("a", 0), ("b", 0)]
     for cell in done:
         ((reason, count),) = cell.reasons.items()
@@ -96,11 +77,11 @@ def test_shares_and_reasons_are_of_all_objects_together():
         {"across": 1.0, "count": 4, "cells": [{"up": 2.0, "held": 1, "reasons": {"fell": 2, "turned": 1}}]},
     ]
     assert shares(records) == {(1.0, 2.0): 5 / 8}
-    assert reasons(records) == Counter(fell=2, turned=1)
+    assert failure_maps.reasons(records) == Counter(fell=2, turned=1)
 
 
 def test_the_report_names_every_failure_and_draws_what_there_is(tmp_path: Path):
-    sections = map_sections(records_of("wall", "closed_form", COUNT - 1), tmp_path / "bench")
+    sections = failure_maps.map_sections(records_of("wall", "closed_form", COUNT - 1), tmp_path / "bench")
     assert list(sections) == ["map-wall", "map-failures"]
     assert (tmp_path / "map_wall.png").is_file()
     (table,) = sections["map-failures"]
@@ -128,7 +109,7 @@ def test_pictures_show_what_is_recorded_and_are_the_same_every_time(tmp_path: Pa
 
 
 def test_rows_of_which_nothing_is_known_are_left_out_and_a_map_without_any_is_drawn_empty(tmp_path: Path):
-    panels: dict[str, Shares] = {"some": {(x, "box"): 0.5 for x in MAPS["size"].across.places}}
+    panels: dict[str, failure_maps.Shares] = {"some": {(x, "box"): 0.5 for x in MAPS["size"].across.places}}
     draw_map(MAPS["size"], panels, tmp_path / "part")
     said = (tmp_path / "part.svg").read_text()
     assert "<!-- box -->" in said
@@ -140,14 +121,14 @@ def test_rows_of_which_nothing_is_known_are_left_out_and_a_map_without_any_is_dr
 def test_the_span_of_a_gripper_is_its_opening():
     # Jaws of 12 mm that open to 140 mm: from the middle of the one to that of the other.
     hand = load_hand("parallel_gripper")
-    assert map_runs.hand_span(hand) == pytest.approx(0.152, abs=0.003)
-    assert 0.25 < map_runs.hand_span(hand_for("allegro_right", 600)) < 0.45
+    assert failure_maps.hand_span(hand) == pytest.approx(0.152, abs=0.003)
+    assert 0.25 < failure_maps.hand_span(failure_maps.hand_for("allegro_right", 600)) < 0.45
 
 
 def test_noise_grows_from_none_over_a_camera_s_to_more():
-    assert map_runs.noise_at(0.0) == NONE
-    assert map_runs.noise_at(1.0) == DEFAULT
-    loud = map_runs.noise_at(4.0)
+    assert failure_maps.noise_at(0.0) == NONE
+    assert failure_maps.noise_at(1.0) == DEFAULT
+    loud = failure_maps.noise_at(4.0)
     assert loud.quadratic == 4 * DEFAULT.quadratic
     assert loud.flying == 1.0
     assert loud.grazing == DEFAULT.grazing
@@ -159,8 +140,8 @@ def test_another_mass_or_grid_leaves_the_shape_alone():
     assert heavy.mass == 2.0
     np.testing.assert_allclose(heavy.inertia, 20 * thing.inertia)
     assert heavy.sha256 == thing.sha256
-    cup = map_runs.cup(0.3)
-    coarse, fine = (map_runs.on_grid(cup, nodes) for nodes in (8, 32))
+    cup = failure_maps.cup(0.3)
+    coarse, fine = (failure_maps.on_grid(cup, nodes) for nodes in (8, 32))
     assert float(coarse.sdf.spacing) > 3.9 * float(fine.sdf.spacing)
     assert coarse.object is cup.object
 
@@ -205,11 +186,7 @@ def test_a_comparison_says_what_it_is_of_and_names_nothing_that_is_absent(tmp_pa
     own = [record("balanced", **all_held), record("mine", **all_held, cpu={"optimise": 2.02, "standard": 3.0})]
     drawn = charts.draw_charts([*own, record("robust")], tmp_path / "chart")
     chart, short = (drawn[name].with_suffix(".svg").read_text() for name in ("speed", "short"))
-    for text in (
-        "allegro_right; box",
-        "n = 4 grasps a preset; bars: quartiles over grasps",
-        "closed form",
-    ):
+    for text in ("allegro_right; box", "n = 4 grasps a preset; bars: quartiles over grasps", "closed form"):
         assert text in chart
     assert "<!-- ablation -->" not in chart
     percents = [float(text) for text in re.findall(r"<!-- ([\d.]+) -->", chart)]
@@ -223,11 +200,11 @@ def test_a_comparison_says_what_it_is_of_and_names_nothing_that_is_absent(tmp_pa
 
 
 def test_ticks_of_a_narrow_axis_stand_apart(tmp_path: Path):
-    with charts_style.figure(4.5, 4.5) as (made, axis):
+    with charts.figure(4.5, 4.5) as (made, axis):
         axis.plot([0.0266, 0.0284], [1.0, 2.0], "o")
         axis.set_xscale("log")
         axis.margins(0.18)
-        charts_style._few_ticks(axis.xaxis)
+        charts._few_ticks(axis.xaxis)
         made.canvas.draw()
         boxes = [t.get_window_extent() for t in axis.get_xticklabels(which="both") if t.get_text() and t.get_visible()]
     assert 2 <= len(boxes) <= 6
@@ -260,9 +237,9 @@ def test_the_chart_of_the_ranking_has_a_bar_for_each_shape_and_a_curve_for_each_
 
 def test_labels_keep_clear_of_each_other():
     points = [(1.0 + 0.01 * i, 1.0 + 0.02 * (i % 3)) for i in range(8)]
-    with charts_style.figure(4.5, 4.5) as (made, axis):
+    with charts.figure(4.5, 4.5) as (made, axis):
         axis.plot(*zip(*points, strict=True), "o")
-        charts_style.place_labels(axis, points, [f"a preset {i}" for i in range(8)], ["black"] * 8)
+        charts.place_labels(axis, points, [f"a preset {i}" for i in range(8)], ["black"] * 8)
         made.canvas.draw()
         boxes = [text.get_window_extent() for text in axis.texts]
     assert len(boxes) == 8

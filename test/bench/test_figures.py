@@ -9,7 +9,6 @@ from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
 from graspd_bench import tables
-from graspd_bench import tables as report
 from graspd_bench.figures import (
     by_name,
     comparison,
@@ -44,7 +43,7 @@ PLANNED = """\
 
 def test_a_grasp_that_was_not_found_counts_as_failed(record):
     (row,) = rows([record()])
-    assert (row.count, row.given, row.held) == (4, 3, 2)
+    assert (row.count, row.held) == (4, 2)
     assert row.values["standard"] == 0.5
     assert row.values["hard"] == 0.25
     assert row.values["noisy"] is None
@@ -105,7 +104,7 @@ def test_what_the_means_leave_out_is_said(record):
     full = [record(), record(thing="mug"), record("fast"), record("fast", thing="mug")]
     assert tables.missing(full) == ""
     assert tables.missing(full[:3]) == "Means are over 2 objects, but `fast` of 1 only."
-    raised = report.provenance("graspd bench main", [*full[:3], record("fast", thing="mug", error="died")])
+    raised = tables.provenance("graspd bench main", [*full[:3], record("fast", thing="mug", error="died")])
     assert raised.endswith("1 cases failed and are in no figure.")
 
 
@@ -164,11 +163,11 @@ def test_documents_get_their_sections_and_keep_the_rest(tmp_path: Path, record):
     document.write_text(
         f"{spoken_of}\n<!-- bench:begin -->\nold\n<!-- bench:end -->\nafter <!-- bench-ladder:begin --> none\n"
     )
-    sections = report.sourced(
+    sections = tables.sourced(
         "graspd bench main", [record()], tables.main_sections([record()], tmp_path / "figures" / "bench")
     )
     assert list(sections) == ["bench", "bench-all", "bench-objects"], "what has no figures has no section"
-    assert report.fill(document, sections) == ["bench"]
+    assert tables.fill(document, sections) == ["bench"]
     text = document.read_text()
     picture = "![Speed against accuracy](figures/bench_short.png)"
     assert text.startswith(f"{spoken_of}\n<!-- bench:begin -->\n{picture}\n\n| preset |")
@@ -180,9 +179,9 @@ def test_documents_get_their_sections_and_keep_the_rest(tmp_path: Path, record):
     assert "old" not in text
     document.write_text("no sections")
     with pytest.raises(ConfigError, match="none of the sections bench, bench-all"):
-        report.fill(document, sections)
+        tables.fill(document, sections)
     with pytest.raises(ConfigError, match="No such file"):
-        report.fill(tmp_path / "nowhere.md", {})
+        tables.fill(tmp_path / "nowhere.md", {})
 
 
 def test_a_comparison_shows_what_moved_and_only_that(record, planned):

@@ -8,18 +8,9 @@ import pytest
 
 from graspd_bench.result_store import head, write_record
 from graspd_bench.run_studies import Job, run_cases
+from graspd_bench.stress import stress_cases
 from graspd_bench.stress.run_stress_case import GRASP, StressEnding, faults, run_case
-from graspd_bench.stress.stress_cases import (
-    CASES,
-    StressRun,
-    ending_of,
-    run_stress,
-    stress_faults,
-    stress_patience,
-    stress_runs,
-    stress_table,
-    summary,
-)
+from graspd_bench.stress.stress_cases import CASES, StressRun, ending_of, stress_runs
 from graspd_bench.study import Request
 from graspd_core.cli import main
 from graspd_core.cli.running import EXIT_BAD_INPUT, EXIT_OK
@@ -67,7 +58,7 @@ def test_faults_are_named():
 @pytest.mark.timeout(120)
 def test_a_case_ends_in_a_process_of_its_own_and_leaves_nothing_on_disk(tmp_path, monkeypatch):
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
-    job = Job("stress", StressRun("too-wide", "fast"), run_stress, "here", alone=True)
+    job = Job("stress", StressRun("too-wide", "fast"), stress_cases.run_stress, "here", alone=True)
     ((_, record),) = run_cases([job], tmp_path / "out", 1)
     assert ending_of(record).ending in CASES["too-wide"].expect
     assert 100 < ending_of(record).memory < CASES["too-wide"].memory
@@ -78,25 +69,26 @@ def test_a_case_ends_in_a_process_of_its_own_and_leaves_nothing_on_disk(tmp_path
 def test_a_process_that_failed_is_an_ending_that_nobody_expects(failed: str, ending: str):
     record: dict[str, Any] = {"name": "open-box", "failed": failed, "error": "RuntimeError: gone"}
     assert ending_of(record) == StressEnding("open-box", ending, "RuntimeError: gone")
-    assert stress_faults(record)[0].startswith(f"ended in {ending}, not in grasp: RuntimeError")
+    assert stress_cases.stress_faults(record)[0].startswith(f"ended in {ending}, not in grasp: RuntimeError")
 
 
 def test_cases_are_chosen_by_name_and_family():
     assert [run.name for run in stress_runs(Request())] == list(CASES)
     assert {run.name for run in stress_runs(Request(cases=("hand", "empty")))} >= {"empty", "too-wide"}
-    assert stress_patience(StressRun("ten-million-points", "fast")) > stress_patience(StressRun("empty", "fast"))
+    many, none = (stress_cases.stress_patience(StressRun(name, "fast")) for name in ("ten-million-points", "empty"))
+    assert many > none
     with pytest.raises(ConfigError, match="unknown case 'broken'; valid: cloud, hand, mesh, numbers, physics, all-at"):
         stress_runs(Request(cases=("broken",)))
 
 
 def test_the_table_shows_what_came_of_each_case_and_the_summary_every_fault():
     wrong = StressEnding("nan-vertices", GRASP, "", 0.1, 30.0, 300.0, 2, 1, 0)
-    told = summary({BOX: GRASPED, NAN: wrong})
+    told = stress_cases.summary({BOX: GRASPED, NAN: wrong})
     assert told.startswith("Cases: 2. Faults: 4. mesh: 1 of 1 (100%) with something to grasp end in a verified grasp.")
     assert "2 of 3 verified grasps hold in a second trial." in told
     for fault in ("ended in grasp, not in MeshError", "planned 30.0 s at", "1 of 1 verified", "the message lacks"):
         assert f"* `nan-vertices`: {fault}" in told
-    table = stress_table({BOX: GRASPED, NAN: wrong})
+    table = stress_cases.stress_table({BOX: GRASPED, NAN: wrong})
     assert f"| `open-box` | {BOX.about} | grasp | 0.5 | 2.4 | 400 | 2/3 | 2 | – | open \\| closed |" in table
     assert "**grasp**" in table
 

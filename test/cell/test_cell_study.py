@@ -24,11 +24,8 @@ def test_cases_differ_and_no_thing_of_theirs_was_developed_on():
     small, whole = (cell_cases(Request(quick=quick)) for quick in (True, False))
     assert 0 < len(small) < len(whole)
     assert {(case.pair, case.size) for case in whole} == {(pair, size) for pair in PAIRS for size in SIZES}
-    assert (
-        len({case_key("cell", case) for case in whole})
-        == len({case_file("cell", case) for case in whole})
-        == len(whole)
-    )
+    for name_of in (case_key, case_file):
+        assert len({name_of("cell", case) for case in whole}) == len(whole)
     for case in whole:
         sources = case.sources()
         assert len(sources) == case.size
@@ -91,14 +88,8 @@ def _record(pair: str, **changed: object) -> Record:
         "verified": True, "probability": 0.9, "graspd_cpu": 1.0, "graspd_seconds": 1.5,
         "closing_seconds": 3.0, "seconds": 8.0,
     }  # fmt: skip
-    failed = {
-        **base,
-        "ending": "lost while lifting",
-        "target": "b",
-        "out": [],
-        "hard": {"hand on table": 60.0},
-        "probability": 0.6,
-    }
+    failed = {**base, "ending": "lost while lifting", "target": "b", "out": [], "probability": 0.6}
+    failed["hard"] = {"hand on table": 60.0}
     unreached = {**base, "ending": "no way for the arm", "target": "b", "out": [], "tries": 1, "closing_seconds": 0.0}
     return {
         "pair": pair,

@@ -8,17 +8,7 @@ import torch
 
 from graspd_cell.carrying import held_balls, release_posture, straight, tip_pose
 from graspd_cell.layout import Box, layout_of
-from graspd_cell.motion import (
-    Mover,
-    NoMotionError,
-    Speeds,
-    arm_shape,
-    dense,
-    find_path,
-    hand_balls,
-    seen_world,
-    timed,
-)
+from graspd_cell.motion import Mover, NoMotionError, Speeds, arm_shape, dense, find_path, hand_balls, seen_world, timed
 from graspd_core.arms.arm import arm_links, load_arm
 from graspd_core.hands.library import load_hand
 

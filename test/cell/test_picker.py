@@ -8,7 +8,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from graspd_cell.grasp_held import after_squeeze, grips, still_holds
+from graspd_cell.grasp_held import after_squeeze, why_lost, why_not_gripped
 from graspd_cell.grasp_source import EMPTY, InProcessGrasps, Offer
 from graspd_cell.picker import Cancelled, Ending, Picker
 from graspd_cell.robot import DepthView, JointMotion, JointReading
@@ -149,7 +149,7 @@ def test_fingers_that_close_on_nothing_or_on_each_other_are_told_from_fingers_th
         robot.follow(JointMotion(hand.joint_names, np.array([1.5]), goal, np.zeros_like(goal)), 5.0)
     robot.wait(0.5)
     hold = after_squeeze(hand, grasp, robot.joints())
-    assert not grips(hold, hand).held
+    assert why_not_gripped(hold, hand)
 
 
 def test_jaws_that_close_further_as_a_thing_turns_between_them_still_hold_it(robot_of: RobotOf):
@@ -164,9 +164,9 @@ def test_jaws_that_close_further_as_a_thing_turns_between_them_still_hold_it(rob
         return JointReading(0.0, hand.joint_names, touch + covered * (target - touch), (1 - covered) * (target - touch))
 
     hold = after_squeeze(hand, grasp, reading(0.0))
-    assert still_holds(hold, hand, reading(0.5)).held
-    assert still_holds(hold, hand, replace(reading(0.7), efforts=0.6 * (target - touch))).held
-    assert not still_holds(hold, hand, reading(0.95)).held
+    assert why_lost(hold, hand, reading(0.5)) == ""
+    assert why_lost(hold, hand, replace(reading(0.7), efforts=0.6 * (target - touch))) == ""
+    assert why_lost(hold, hand, reading(0.95))
 
 
 @pytest.mark.parametrize("after", [0.5, 2.5, 4.5, 6.5])

@@ -253,10 +253,7 @@ def test_a_block_without_a_candidate_is_a_block(copied: DatasetStore):
         (["sample", "a", "--out", "x.csv"], "ends with .parquet"),
         (["merge", "a"], "--out is missing"),
         (["shape:box", "--out", "nowhere://x"], "nowhere://x"),
-        (
-            ["shape:box", "--out", "x", "--address", "127.0.0.1:9"],
-            "127.0.0.1:9: Connection refused; start Ray",
-        ),
+        (["shape:box", "--out", "x", "--address", "127.0.0.1:9"], "127.0.0.1:9: Connection refused; start Ray"),
     ],
 )
 def test_wrong_words_are_one_line(words: list[str], told: str, graspd: Run, capsys, tmp_path, monkeypatch):

@@ -124,8 +124,7 @@ def test_every_shape_stands_on_the_table_above_the_origin(name):
 
 
 @pytest.mark.parametrize(
-    ("name", "height"),
-    [("capsule", 2 * CAPSULE_RADIUS), ("plate", 2 * PLATE_HALF[2]), ("hammer", 2 * HEAD_HALF[1])],
+    ("name", "height"), [("capsule", 2 * CAPSULE_RADIUS), ("plate", 2 * PLATE_HALF[2]), ("hammer", 2 * HEAD_HALF[1])]
 )
 def test_lowest_is_lying(name, height):
     resting = moved(make_shape(name), lowest_pose(make_shape(name)))
