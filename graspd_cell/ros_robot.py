@@ -159,6 +159,9 @@ class RosRobot:
         except (MotionAborted, RobotSilentError):
             self._cancel(sent)
             raise
+        # The last reading may be older than the results.
+        last = self._heard.joints_at
+        self._until(lambda: self._heard.joints_at > last, lambda: self._topics.joint_states)
         return self.joints()
 
     def wait(self, seconds: float) -> None:
