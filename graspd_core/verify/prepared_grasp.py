@@ -147,9 +147,9 @@ def contact_area(placed: PlacedHand, within: float = CONTACT_DISTANCE) -> float:
     return float(placed.areas[np.abs(placed.distance) <= within].sum())
 
 
-def contact_links(placed: PlacedHand, within: float = CONTACT_DISTANCE) -> int:
-    """Count the links that come within `within` [m] of the object or penetrate it."""
-    return len(np.unique(placed.links[touching(placed, within)]))
+def contact_links(placed: PlacedHand) -> int:
+    """Count the links that touch the object (`CONTACT_DISTANCE`) or penetrate it."""
+    return len(np.unique(placed.links[touching(placed)]))
 
 
 def touching(placed: PlacedHand, within: float = CONTACT_DISTANCE) -> Bool[np.ndarray, "samples"]:
@@ -359,8 +359,12 @@ class PreparedGrasp:
 
     context: MetricsContext
     posture: Posture
-    placed: PlacedHand
-    max_contacts: int
+    max_contacts: int = MAX_CONTACTS
+
+    @cached_property
+    def placed(self) -> PlacedHand:
+        """Samples of the hand at the posture, with each sample's distance to the object."""
+        return placed_hand(self.context, self.posture)
 
     @cached_property
     def wrench_hull(self) -> WrenchHull:
@@ -374,11 +378,6 @@ class PreparedGrasp:
     def shared_volume(self) -> float:
         """Volume of the hand's part inside the object [m³]."""
         return intersection_volume(self.context, self.placed)
-
-
-def prepare_grasp(context: MetricsContext, posture: Posture, max_contacts: int = MAX_CONTACTS) -> PreparedGrasp:
-    """Place the hand at a posture and compute the distance of each hand sample to the object."""
-    return PreparedGrasp(context, posture, placed_hand(context, posture), max_contacts)
 
 
 def surface_normals(query: CompiledQuery | DistanceQuery, points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 3"]:
