@@ -50,11 +50,22 @@ def remember(key: str, build: Callable[[], Arrays], valid: Callable[[Arrays], bo
         arrays = build()
         if path:
             _write(path, arrays)
+    supply({key: arrays})
+    return arrays
+
+
+def contents() -> dict[str, Arrays]:
+    """Return the arrays that this process has in memory, by key."""
     with _lock:
-        _memory[key] = arrays
+        return dict(_memory)
+
+
+def supply(arrays: dict[str, Arrays]) -> None:
+    """Add arrays to the memory of this process, for example arrays that another process has built."""
+    with _lock:
+        _memory.update(arrays)
         while len(_memory) > CAPACITY:
             _memory.popitem(last=False)
-    return arrays
 
 
 def forget() -> None:

@@ -18,9 +18,11 @@ import signal
 import subprocess
 import sys
 import threading
+import time
 import traceback
 from collections.abc import Callable, Iterable
 from multiprocessing.connection import Connection, Pipe
+from pathlib import Path
 from typing import Any, TypeVar
 
 # Parameter of glibc's mallopt for the greatest number of arenas, and the number of arenas.
@@ -48,7 +50,12 @@ def limit_malloc_arenas() -> None:
 T = TypeVar("T")
 
 # Program of the child. The child searches modules in the paths of this process.
-_CHILD = "import sys; sys.path[:] = {path!r}; from {module} import serve; serve({pipe}, {modules!r})"
+_CHILD = "import sys; sys.path[:] = {path!r}; from {module} import serve; serve({pipe}, {modules!r}, {parent})"
+
+# Interval at which `bounded` checks the child's time and memory [s].
+_POLL = 0.1
+# prctl(2): the signal that a process gets when the thread that started it ends.
+_PR_SET_PDEATHSIG = 1
 
 
 class WorkerProcess:
@@ -56,11 +63,12 @@ class WorkerProcess:
 
     The child first imports `modules`. Calls run one at a time. A dead child is replaced. Functions must be
     importable by name. Arguments, results and errors are pickled. If this process ends, the child finishes its call and
-    ends.
+    ends. With `killed_with_thread` (Linux only), the end of the starting thread kills the child, even during a call.
     """
 
-    def __init__(self, *modules: str) -> None:
+    def __init__(self, *modules: str, killed_with_thread: bool = False) -> None:
         self._modules = modules
+        self._parent = os.getpid() if killed_with_thread else 0
         self._lock = threading.Lock()
         self._start()
 
@@ -91,6 +99,38 @@ class WorkerProcess:
             raise answer
         return answer
 
+    def bounded(self, seconds: float, most_mb: float, work: Callable[..., T], *arguments: Any) -> T:
+        """Run `work` in the child, but kill the child if the call takes too long or too much memory.
+
+        Raises:
+            TimeoutError: the call did not end within `seconds`.
+            MemoryError: the child's resident memory exceeded `most_mb` [MB] (checked on systems with /proc).
+            ChildProcessError: the child died.
+        """
+        call = pickle.dumps((work, arguments, {}), pickle.HIGHEST_PROTOCOL)
+        with self._lock:
+            if self._process.poll() is not None:
+                self._start()
+            end = time.monotonic() + seconds
+            try:
+                self._pipe.send_bytes(call)
+                while not self._pipe.poll(_POLL):
+                    if time.monotonic() > end:
+                        raise TimeoutError(f"the call did not end within {seconds:g} s")
+                    if (held := resident_mb(self._process.pid)) > most_mb:
+                        raise MemoryError(f"its process used {held:.0f} MB, more than {most_mb:g} MB")
+                reply = self._pipe.recv_bytes()
+            except (EOFError, ConnectionError):
+                raise ChildProcessError(f"its process died with exit code {self._process.wait()}") from None
+            except BaseException:
+                self._process.kill()
+                self._process.wait()
+                raise
+        failed, answer = pickle.loads(reply)
+        if failed:
+            raise answer
+        return answer
+
     def close(self) -> None:
         """End the child."""
         self._pipe.close()
@@ -101,7 +141,8 @@ class WorkerProcess:
         # The child gets only its own end of the pipe, so that it reads an end of file when this process dies.
         self._pipe, theirs = Pipe()
         path = [entry for entry in sys.path if isinstance(entry, str)]
-        program = _CHILD.format(path=path, module=__name__, pipe=theirs.fileno(), modules=self._modules)
+        names = {"module": __name__, "modules": self._modules, "parent": self._parent}
+        program = _CHILD.format(path=path, pipe=theirs.fileno(), **names)
         # Ctrl-C reaches every process of the terminal, but the child must end with its parent only. Block the signal at
         # the child's start, because the child's imports take a second before the child could ignore the signal.
         before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
@@ -133,8 +174,22 @@ def run_isolated(work: Callable[..., T], *arguments: Any, **named: Any) -> T:
     return work(*arguments, **named) if _child is None else _child(work, *arguments, **named)
 
 
-def serve(number: int, modules: Iterable[str]) -> None:
-    """Import `modules`, then answer calls from the pipe with file descriptor `number` until the pipe is closed."""
+def resident_mb(process: int) -> float:
+    """Return the resident memory of a process [MB]. Return 0 if the process has ended or the system has no /proc."""
+    try:
+        pages = int(Path(f"/proc/{process}/statm").read_text().split()[1])
+    except (OSError, IndexError):
+        return 0.0
+    return pages * os.sysconf("SC_PAGE_SIZE") / 2**20
+
+
+def serve(number: int, modules: Iterable[str] = (), parent: int = 0) -> None:
+    """Import `modules`, then answer calls from the pipe with file descriptor `number` until the pipe is closed.
+
+    If `parent` is a process id, the end of that process kills this process.
+    """
+    if parent:
+        _end_with(parent)
     pipe = Connection(number)
     # Libraries read this variable at import. One thread is enough, because the parent uses the other cores.
     os.environ.setdefault("OMP_NUM_THREADS", "1")
@@ -156,6 +211,13 @@ def serve(number: int, modules: Iterable[str]) -> None:
             return
         del answer
         trim_heap()
+
+
+def _end_with(parent: int) -> None:
+    with contextlib.suppress(OSError, AttributeError):
+        ctypes.CDLL(None).prctl(_PR_SET_PDEATHSIG, signal.SIGKILL)
+    if os.getppid() != parent:
+        os._exit(1)
 
 
 def _answer(call: bytes) -> bytes:
