@@ -6,7 +6,6 @@ also runs in a subprocess, so that this process never loads rclpy.
 
 from __future__ import annotations
 
-import ctypes
 import importlib.util
 import subprocess
 import sys
@@ -34,6 +33,7 @@ _LIBRARIES = {
     "pyyaml": "yaml",
 }
 _LIBRARY = "import {module}; from importlib.metadata import version; print(version({name!r}))"
+_LOADED = "import ctypes; ctypes.CDLL({name!r}); print('found')"
 _TORCH = """
 import torch
 torch.linalg.inv(torch.eye(3))
@@ -91,19 +91,22 @@ class Check:
 
 def run_checks() -> list[Check]:
     """Check the installation and all dependencies of graspd. This takes a few seconds."""
+    clouds = importlib.util.find_spec("open3d") is not None
+    loaded = _SYSTEM_LIBRARIES.items() if clouds else ()
     probes = [
+        *((name, _LOADED.format(name=name), f"sudo apt-get install {package}", True) for name, package in loaded),
         ("torch", _TORCH, _SETUP, True),
         ("mujoco", _MUJOCO, _SETUP, True),
         ("compiled kernel", _KERNEL, f"torch replaces it and is 30 times slower: {_SETUP}", False),
         *((name, _LIBRARY.format(module=module, name=name), _SETUP, True) for name, module in _LIBRARIES.items()),
-        ("open3d", _LIBRARY.format(module="open3d", name="open3d"), _CLOUDS, _has_open3d()),
+        ("open3d", _LIBRARY.format(module="open3d", name="open3d"), _CLOUDS, clouds),
         ("hands", _HANDS, "check the files under config/hands, or unset GRASPD_CONFIG", True),
         ("pybullet", _BULLET, "only benchmarks need it: make setup, on Python 3.11", False),
         ("ROS 2 (rclpy)", _ROS, "only the node needs it: make setup (docs/ros.md)", False),
     ]
     with ThreadPoolExecutor(max_workers=2) as pool:
         probed = list(waiting(pool.map(lambda probe: try_code(*probe), probes), "check", len(probes)))
-    return [_check_python(), *_check_system_libraries(), *probed, _check_cache()]
+    return [_check_python(), *probed, _check_cache()]
 
 
 def try_code(name: str, code: str, hint: str, needed: bool) -> Check:
@@ -145,24 +148,6 @@ def _check_python() -> Check:
     version = ".".join(map(str, sys.version_info[:3]))
     ok = (3, 11) <= sys.version_info[:2] <= (3, 13)
     return Check("Python", ok, f"{version} at {sys.executable}", "use Python 3.11 to 3.13")
-
-
-def _has_open3d() -> bool:
-    return importlib.util.find_spec("open3d") is not None
-
-
-def _check_system_libraries() -> list[Check]:
-    checks: list[Check] = []
-    if not _has_open3d():
-        return checks
-    for library, package in _SYSTEM_LIBRARIES.items():
-        try:
-            ctypes.CDLL(library)
-        except OSError as error:
-            checks.append(Check(library, False, str(error), f"sudo apt-get install {package}"))
-        else:
-            checks.append(Check(library, True, "found"))
-    return checks
 
 
 def _check_cache() -> Check:

@@ -7,7 +7,7 @@ Quaternions are wxyz. The object frame is the frame of the mesh as loaded (after
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from enum import Enum, StrEnum
 
@@ -169,6 +169,15 @@ class Posture:
     position: Float[np.ndarray, "3"]
     quaternion_wxyz: Float[np.ndarray, "4"]
     joint_positions: Float[np.ndarray, "joints"]
+
+
+def stacked(
+    postures: Sequence[Posture],
+) -> tuple[Float[np.ndarray, "n 3"], Float[np.ndarray, "n 4"], Float[np.ndarray, "n joints"]]:
+    """Return positions [m], quaternions and joint values [rad] or [m] of postures as float64, one row each."""
+    rows = ((p.position, p.quaternion_wxyz, p.joint_positions) for p in postures)
+    positions, quaternions, joints = (np.stack(part).astype(float, copy=False) for part in zip(*rows, strict=True))
+    return positions, quaternions, joints
 
 
 # Named waypoints of an arm path, in this order.

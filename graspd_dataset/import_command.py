@@ -11,7 +11,7 @@ from graspd_core.cli.output import answer, busy, print_note
 from graspd_core.cli.running import EXIT_OK, EXIT_TOO_FEW
 from graspd_core.config import VERIFICATIONS
 from graspd_core.errors import ConfigError
-from graspd_core.types import GraspResult, Verdict
+from graspd_core.types import GraspResult, Timing, Verdict
 
 if TYPE_CHECKING:
     from graspd_core.hands.model import HandModel
@@ -82,7 +82,7 @@ def run(options: argparse.Namespace) -> int:
 def _result(scene: Scene, hand: HandModel, imported: Sequence[ImportedGrasp], config: Any, verify: str) -> GraspResult:
     """Complete the grasps of one object, and try them unless `verify` is "none". Verified grasps come first."""
     from graspd_core.planning.plan_grasps import on_surface
-    from graspd_core.verify.run_clock import result_of
+    from graspd_core.verify.run_clock import outcome_of
     from graspd_core.verify.verification import verify_grasps
     from graspd_dataset.complete_grasps import complete_grasps
 
@@ -97,11 +97,7 @@ def _result(scene: Scene, hand: HandModel, imported: Sequence[ImportedGrasp], co
     if moved:
         note = f"{len(moved)} squeezes move the base, by up to {max(moved) * 1000:.1f} mm"
         warnings.append(f"{note}; graspd keeps the base at the grasp's pose")
-    return result_of(
-        grasps,
-        len(imported),
-        method="imported",
-        message=f"{len(grasps)} of {len(imported)} imported grasps accepted; {good} verified, or untried with contacts",
-        warnings=tuple(warnings),
-        refused=completed.refused,
-    )
+    count = len(imported)
+    message = f"{len(grasps)} of {count} imported grasps accepted; {good} verified, or untried with contacts"
+    about = {"warnings": tuple(warnings), "refused": completed.refused, "count": count}
+    return GraspResult(outcome_of(grasps, count), grasps, Timing(), 0, "imported", message, **about)

@@ -19,7 +19,7 @@ from graspd_core.perception.scene import ObjectModel, Scene, sample_confidence
 from graspd_core.se3 import SE3, perpendicular, quaternion_from_rotation, rotation_from_quaternion
 from graspd_core.types import Contact, Grasp, Plane, Posture, Snapshot, TriangleMesh, Verdict, joined
 from graspd_core.verify.hold_trial import straight_path
-from graspd_core.verify.prepared_grasp import MetricsContext, prepare_grasp
+from graspd_core.verify.prepared_grasp import MetricsContext, PreparedGrasp
 
 Colour = tuple[float, float, float]
 OBJECT, GUESSED, HAND = (0.85, 0.55, 0.25), (0.80, 0.45, 0.65), (0.40, 0.50, 0.68)
@@ -176,7 +176,7 @@ def weakest_push(context: MetricsContext, grasp: Grasp) -> Float[np.ndarray, "6"
 
     Return None without force closure. Then the contacts do not resist some disturbances at all.
     """
-    return prepare_grasp(context, grasp.grasp).wrench_hull.weakest_push
+    return PreparedGrasp(context, grasp.grasp).wrench_hull.weakest_push
 
 
 STAGES = ("retreat", "pregrasp", "grasp", "squeeze")

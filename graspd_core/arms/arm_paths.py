@@ -23,7 +23,7 @@ from graspd_core.hands.kinematics import drawn_back
 from graspd_core.hands.model import HandModel
 from graspd_core.perception.scene import Scene
 from graspd_core.se3 import SE3, rotation_from_quaternion
-from graspd_core.types import ArmPath, Grasp, Posture
+from graspd_core.types import ArmPath, Grasp, stacked
 
 # Height of the lift after the grasp [m].
 LIFT = 0.1
@@ -44,7 +44,8 @@ def hand_paths(grasps: Sequence[Grasp], approach: Float[np.ndarray, "3"], up: Fl
         approach: unit direction in which the hand moves towards an object, hand frame.
         up: unit direction of the lift, scene frame.
     """
-    before, there = (_stacked([getattr(grasp, stage) for grasp in grasps]) for stage in ("pregrasp", "grasp"))
+    postures = ([grasp.pregrasp for grasp in grasps], [grasp.grasp for grasp in grasps])
+    before, there = ([torch.as_tensor(rows) for rows in stacked(some)] for some in postures)
     begun = drawn_back(before[0], rotation_from_quaternion(before[1]), torch.as_tensor(approach))
     # Both signs of a quaternion give the same rotation. The sign nearer to the pregrasp gives the shortest path.
     sign = torch.where((before[1] * there[1]).sum(-1, keepdim=True) < 0, -1.0, 1.0)
@@ -53,14 +54,6 @@ def hand_paths(grasps: Sequence[Grasp], approach: Float[np.ndarray, "3"], up: Fl
     turns = torch.stack([before[1], before[1], sign * there[1], sign * there[1]], 1)
     shares = torch.as_tensor(_SHARES)
     return SE3(rotation_from_quaternion(shares @ turns), shares @ corners)
-
-
-def _stacked(postures: Sequence[Posture]) -> tuple[Float[Tensor, "n 3"], Float[Tensor, "n 4"]]:
-    position, quaternion = (
-        torch.as_tensor(np.stack([getattr(posture, key) for posture in postures]), dtype=torch.float64)
-        for key in ("position", "quaternion_wxyz")
-    )
-    return position, quaternion
 
 
 # Greatest valid motion of a joint between two waypoints [rad] or [m].
@@ -126,7 +119,7 @@ def arm_paths(task: ArmTask, grasps: Sequence[Grasp]) -> list[ArmPath | str]:
 def _some_paths(task: ArmTask, grasps: Sequence[Grasp]) -> list[ArmPath | str]:
     paths = tip_poses(task, hand_paths(grasps, task.hand.approach, task.up))
     q, owner = _postures(task, paths[:, STAGE_ROWS[2]])
-    joints = torch.as_tensor(np.stack([grasp.pregrasp.joint_positions for grasp in grasps]))[owner]
+    joints = torch.as_tensor(stacked([grasp.pregrasp for grasp in grasps])[2])[owner]
     followed = _followed(task, paths[owner], q, joints)
     best = _best_of_each(followed, owner, len(grasps))
     reasons, names, chain = _why_lost(task, paths, followed, best), task.arm.joint_names, task.arm.chain

@@ -155,12 +155,9 @@ def lift_time(grasp: Grasp, mass: float | None, pace: ExecutionPace) -> float:
     return math.sqrt(PEAK_ACCELERATION * LIFT / min(max(spare, pace.gentlest), pace.strongest))
 
 
-def squeeze_efforts(
-    grasp: Grasp, hand: HandModel, settings: GraspStagesConfig | None = None
-) -> Float[np.ndarray, "joints"]:
+def squeeze_efforts(grasp: Grasp, hand: HandModel) -> Float[np.ndarray, "joints"]:
     """Return the joint efforts [N·m, N], within limits, for joints at the grasp with targets at the squeeze."""
-    settings = settings or GraspStagesConfig()
-    gain = np.where(hand.slides, settings.slide_stiffness, settings.stiffness)
+    gain = np.where(hand.slides, GraspStagesConfig.slide_stiffness, GraspStagesConfig.stiffness)
     return np.clip(gain * (grasp.squeeze.joint_positions - grasp.grasp.joint_positions), -hand.effort, hand.effort)
 
 

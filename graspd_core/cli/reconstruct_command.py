@@ -42,12 +42,11 @@ def run(options: argparse.Namespace) -> int:
     views = load_views(options.cloud, options)
     with busy("reconstruct"):
         whole, _, _, warnings = reconstruct_object(views, target_of(options), options.alone, settings)
-    mesh = whole.mesh
+    mesh, notes = whole.mesh, [*warnings, *whole.warnings]
     save_mesh(options.out, mesh)
-    for warning in (*warnings, *whole.warnings):
-        print_note(warning)
+    for note in notes:
+        print_note(note)
     extent = mesh.vertices.max(0) - mesh.vertices.min(0)
     print(f"{options.out}: {len(mesh.faces)} faces, {' x '.join(f'{e * 1e3:.0f}' for e in extent)} mm")
-    notes = [*warnings, *whole.warnings]
     answer({"file": options.out, "faces": len(mesh.faces), "extent": extent.tolist(), "warnings": notes})
     return EXIT_OK

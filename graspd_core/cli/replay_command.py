@@ -34,7 +34,6 @@ from graspd_core.cli.running import (
     DeadlinePassed,
     Interrupt,
 )
-from graspd_core.config import SceneConfig
 from graspd_core.errors import CloudError, ConfigError, GraspdError, NoObjectError
 from graspd_core.hands.model import HandModel
 from graspd_core.optimize.plan_config import PlanConfig
@@ -129,13 +128,15 @@ def _planned(
     Raises GraspdError: the views are unusable or show no usable object.
     """
     from graspd_core.io.grasps_json import result_document, save_result
+    from graspd_core.perception.scene_from_views import scene_from_views
     from graspd_core.planning.plan_grasps import plan_grasps
 
+    if job.refusal:
+        raise CloudError(job.refusal)
     began = time.perf_counter()
     deadline, about = Deadline(options.deadline, began), {}
     settings = request.pop("settings")
     if options.any:
-        _check_usable(job)
         with Reporter() as reporter:
             request |= {"preset": config, "progress": reporter}
             result, scene, about = plan_any_object(job.views, hand, options, deadline, source=job.label, **request)
@@ -143,7 +144,15 @@ def _planned(
     else:
         try:
             with deadline.cuts_short(), busy("load"):
-                scene = _scene_of(job, options, settings)
+                scene = scene_from_views(
+                    job.views,
+                    target=target_of(options),
+                    alone=options.alone,
+                    settings=settings,
+                    mass=options.mass,
+                    friction=options.friction,
+                    source=f"{options.bag}: {job.label}",
+                )
         except DeadlinePassed:
             return not_loaded(options, config, began)
         for warning in scene.object.warnings:
@@ -168,32 +177,7 @@ def _jobs(options: argparse.Namespace) -> Iterator[_Job]:
     for frame, seen in bag_views(options.bag, options):
         name = f"cloud_{frame.index:06d}"
         label = f"cloud {frame.index} at {frame.stamp // SECOND}.{frame.stamp % SECOND:09d} s"
-        if isinstance(seen, str):
-            yield _Job(name, label, refusal=seen)
-        else:
-            yield _Job(name, label, (seen,))
-
-
-def _scene_of(job: _Job, options: argparse.Namespace, settings: SceneConfig):
-    """Return the scene of a job's views. Raises GraspdError: the views show no usable object."""
-    from graspd_core.perception.scene_from_views import scene_from_views
-
-    _check_usable(job)
-    return scene_from_views(
-        job.views,
-        target=target_of(options),
-        alone=options.alone,
-        settings=settings,
-        mass=options.mass,
-        friction=options.friction,
-        source=f"{options.bag}: {job.label}",
-    )
-
-
-def _check_usable(job: _Job) -> None:
-    """Raise CloudError if the job's cloud is unusable."""
-    if job.refusal:
-        raise CloudError(job.refusal)
+        yield _Job(name, label, refusal=seen) if isinstance(seen, str) else _Job(name, label, (seen,))
 
 
 def _status(statuses: list[int]) -> int:

@@ -2,9 +2,6 @@
 
 from __future__ import annotations
 
-import typing
-from typing import Literal
-
 from graspd_core.config.mapping import from_mapping as from_mapping
 from graspd_core.config.planning_config import CertaintyConfig as CertaintyConfig
 from graspd_core.config.planning_config import GraspStagesConfig as GraspStagesConfig
@@ -17,5 +14,4 @@ from graspd_core.config.scene_config import SceneConfig as SceneConfig
 from graspd_core.config.scene_config import SegmentationConfig as SegmentationConfig
 from graspd_core.config.scene_config import load_scene_config as load_scene_config
 
-Verify = Literal["standard", "hard", "full", "hard_full", "none"]
-VERIFICATIONS: tuple[str, ...] = typing.get_args(Verify)
+VERIFICATIONS = ("standard", "hard", "full", "hard_full", "none")

@@ -5,7 +5,7 @@ from __future__ import annotations
 import dataclasses
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, Literal
+from typing import Literal
 
 from graspd_core.config.mapping import from_mapping, yaml_values
 from graspd_core.errors import ConfigError
@@ -154,15 +154,13 @@ def load_scene_config(path: str | Path) -> SceneConfig:
 def _refuse_values(config: SceneConfig) -> None:
     for part in dataclasses.fields(config):
         for name, value in dataclasses.asdict(getattr(config, part.name)).items():
-            _refuse(f"{part.name}.{name}", value, _MINIMA.get(name, 0))
+            least = _MINIMA.get(name, 0)
+            if isinstance(value, int | float) and not isinstance(value, bool) and (value < least or value <= 0):
+                valid = f"at least {least}" if least else "above zero"
+                raise ConfigError(f"{part.name}.{name}: {value!r} must be {valid}")
     low, high = config.segmentation.roi_low, config.segmentation.roi_high
     if low and high and not all(a < b for a, b in zip(low, high, strict=True)):
         raise ConfigError(f"segmentation.roi_low: {low} must be below roi_high={high} on every axis")
     seen, guessed = config.reconstruction.seen_distance, config.reconstruction.guessed_distance
     if seen >= guessed:
         raise ConfigError(f"reconstruction.seen_distance: {seen:g} must be below guessed_distance={guessed:g}")
-
-
-def _refuse(where: str, value: Any, least: int) -> None:
-    if isinstance(value, int | float) and not isinstance(value, bool) and (value < least or value <= 0):
-        raise ConfigError(f"{where}: {value!r} must be {f'at least {least}' if least else 'above zero'}")

@@ -26,17 +26,8 @@ from graspd_core.transforms import SECOND, TransformBuffer
 
 # The camera looks along an axis if the mean cosine between the axis and the directions to the points is at least this.
 _AHEAD = 0.8
-# Type numbers of sensor_msgs/PointField, with their names and NumPy types.
-FIELD_TYPES = {
-    1: ("INT8", "i1"),
-    2: ("UINT8", "u1"),
-    3: ("INT16", "i2"),
-    4: ("UINT16", "u2"),
-    5: ("INT32", "i4"),
-    6: ("UINT32", "u4"),
-    7: ("FLOAT32", "f4"),
-    8: ("FLOAT64", "f8"),
-}
+# Types of sensor_msgs/PointField, by ascending number from 1.
+_FIELD_TYPES = ("INT8", "UINT8", "INT16", "UINT16", "INT32", "UINT32", "FLOAT32", "FLOAT64")
 # About this many numbers of a cloud are checked for the byte order.
 _SOME_NUMBERS = 5000
 # The data of a `compressedDepth` image begins with its format as int32 and two quantisation numbers as float32. Then a
@@ -115,10 +106,10 @@ def _place_of(message: Any, name: str) -> tuple[np.dtype, int]:
     if name not in fields:
         raise CloudError(f"the cloud has no field {name!r}; it has: {', '.join(fields) or 'none'}")
     offset, number = fields[name].offset, fields[name].datatype
-    kind, code = FIELD_TYPES.get(number, (str(number), ""))
+    kind = dict(enumerate(_FIELD_TYPES, 1)).get(number, str(number))
     if not kind.startswith("FLOAT"):
         raise CloudError(f"field {name!r} is {kind}; it must be FLOAT32 or FLOAT64")
-    dtype = np.dtype((">" if message.is_bigendian else "<") + code)
+    dtype = np.dtype(kind.lower()).newbyteorder(">" if message.is_bigendian else "<")
     if offset + dtype.itemsize > message.point_step:
         raise CloudError(
             f"field {name!r} ends at byte {offset + dtype.itemsize}, beyond point_step={message.point_step}"

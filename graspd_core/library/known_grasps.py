@@ -12,6 +12,7 @@ import time
 from collections import Counter
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -41,9 +42,9 @@ from graspd_core.optimize.restrictions import BoundRestrictions, Restriction, re
 from graspd_core.perception.scene import Scene, moved_grasp, near_scene
 from graspd_core.planning.plan_grasps import SEEDS, check_request, plan_grasps
 from graspd_core.se3 import SE3, rotation_from_quaternion
-from graspd_core.types import Grasp, GraspResult, Outcome, Posture, StopHook, Timing, Verdict
+from graspd_core.types import Grasp, GraspResult, Outcome, StopHook, Timing, Verdict, stacked
 from graspd_core.verify.lift_trial import LiftSettings
-from graspd_core.verify.run_clock import result_of
+from graspd_core.verify.run_clock import outcome_of
 from graspd_core.verify.trial_registry import grasp_trials
 from graspd_core.verify.verification import trial_context
 
@@ -239,7 +240,7 @@ def library_result(library: GraspLibrary, grasps: Sequence[Grasp], count: int, s
     """Return the result of a request for `count` grasps, answered with `grasps` of a library in `seconds` [s]."""
     timing = Timing(first_verified=seconds if grasps else None, total=seconds)
     message = f"{len(grasps)} grasps of the library {library.path.name}"
-    return result_of(grasps, count, method="library", timing=timing, message=message)
+    return GraspResult(outcome_of(grasps, count), tuple(grasps), timing, 0, "library", message, count=count)
 
 
 def known_or_planned(
@@ -355,16 +356,14 @@ def clearance(scene: Scene, hand: HandModel, grasps: Sequence[Grasp]) -> Float[n
     obstacles = make_obstacle_tensors(scene, hand, "cpu", torch.float64)
     if obstacles is None or not grasps:
         return np.full(len(grasps), np.inf)
-
-    turns = _rows([grasp.grasp.quaternion_wxyz for grasp in grasps])
-
-    def ends(name: str) -> Poses:
-        postures: list[Posture] = [getattr(grasp, name) for grasp in grasps]
-        return Poses(_rows([p.position for p in postures]), turns, _rows([p.joint_positions for p in postures]))
-
+    before, there, after = (
+        Poses(*map(torch.as_tensor, stacked(postures)))
+        for postures in zip(*((grasp.pregrasp, grasp.grasp, grasp.squeeze) for grasp in grasps), strict=True)
+    )
+    # The base keeps the rotation of the grasp.
+    before, after = (replace(poses, quaternion=there.quaternion) for poses in (before, after))
     kinematics = make_kinematics(hand, dtype=torch.float64)
-    moves = [("pregrasp", "grasp"), ("grasp", "squeeze")]
-    gaps = [gap_on_path(obstacles, kinematics, ends(a), ends(b), NEAR) for a, b in moves]
+    gaps = [gap_on_path(obstacles, kinematics, a, b, NEAR) for a, b in pairwise((before, there, after))]
     return torch.stack(gaps).amin(0).numpy()
 
 
@@ -376,10 +375,10 @@ def lift_clearance(scene: Scene, hand: HandModel, grasps: Sequence[Grasp]) -> Fl
     balls = (np.concatenate(pair) for pair in zip(extreme_points(hand), collision_spheres(hand), strict=True))
     # Order of both: centres, radii, links.
     centers, radii, links = map(torch.as_tensor, balls)
-    rotation = rotation_from_quaternion(_rows([grasp.squeeze.quaternion_wxyz for grasp in grasps]))
-    base = SE3(rotation, _rows([grasp.squeeze.position for grasp in grasps]))
-    poses = forward(make_kinematics(hand, dtype=torch.float64), _rows([g.squeeze.joint_positions for g in grasps]))
-    fingers = base.apply(place_points(placement(hand.num_links, centers, links), poses))
+    positions, quaternions, joints = map(torch.as_tensor, stacked([grasp.squeeze for grasp in grasps]))
+    rotation = rotation_from_quaternion(quaternions)
+    poses = forward(make_kinematics(hand, dtype=torch.float64), joints)
+    fingers = SE3(rotation, positions).apply(place_points(placement(hand.num_links, centers, links), poses))
     target = torch.as_tensor(surface_samples(scene.object.mesh, _LIFTED_POINTS, 0)[0])
     # Without a support the hand moves back against the approach, as in the lift trial.
     back = -(rotation @ torch.as_tensor(hand.approach))
@@ -389,7 +388,3 @@ def lift_clearance(scene: Scene, hand: HandModel, grasps: Sequence[Grasp]) -> Fl
             hands = (sample_sdf(sdf, fingers + shift)[0] - radii).amin(-1)
             least = torch.minimum(least, torch.minimum(hands, sample_sdf(sdf, target + shift)[0].amin(-1)))
     return least.numpy()
-
-
-def _rows(values: Sequence[np.ndarray]) -> torch.Tensor:
-    return torch.as_tensor(np.stack(values)).double()

@@ -191,11 +191,9 @@ def _is_solid(points: Float[np.ndarray, "_ 3"], solids: Mapping[str, Sequence[Tr
 def _in_order(
     things: Sequence[Float[np.ndarray, "_ 3"]], failures: Sequence[Failure]
 ) -> list[tuple[Float[np.ndarray, "_ 3"], list[Failure]]]:
+    known = [(failure, failure.place) for failure in failures if failure.place is not None]
     rows = [
-        (
-            points,
-            [f for f in failures if f.place is not None and np.linalg.norm(points.mean(0) - f.place) < _SAME_PLACE],
-        )
+        (points, [failure for failure, place in known if np.linalg.norm(points.mean(0) - place) < _SAME_PLACE])
         for points in things
     ]
     return sorted(rows, key=lambda row: (len(row[1]), -float(row[0][:, 2].max())))

@@ -14,11 +14,11 @@ from collections.abc import Sequence
 from functools import lru_cache
 
 import numpy as np
-import torch
 from jaxtyping import Float
 from scipy.spatial import KDTree
+from scipy.spatial.distance import cdist, pdist
 
-from graspd_core.hands.kinematics import forward, make_kinematics
+from graspd_core.hands.kinematics import in_base, link_poses
 from graspd_core.hands.model import HandModel
 from graspd_core.mesh.mesh_files import surface_samples
 from graspd_core.mesh.topology import packed_rows, scaled_normals
@@ -93,13 +93,11 @@ def kind_of(reason: str) -> str:
 @lru_cache(maxsize=8)
 def reach_of(hand: HandModel) -> tuple[float, float]:
     """Return the open hand's greatest distance between two contact candidates, and between two fingertips [m]."""
-    poses = forward(make_kinematics(hand, dtype=torch.float64), torch.as_tensor(hand.open_posture)[None])
-    links = poses[0, torch.as_tensor(hand.candidate_link)]
-    points = (links.rotation @ torch.as_tensor(hand.candidate_points)[..., None]).squeeze(-1) + links.translation
+    points = in_base(link_poses(hand, hand.open_posture), hand.candidate_points, hand.candidate_link)
     groups = hand.link_group[hand.candidate_link]
-    tips = [points[torch.as_tensor(groups == group)] for group in hand.fingertip_groups]
-    gaps = [float(torch.cdist(a, b).min()) for k, a in enumerate(tips) for b in tips[:k] if len(a) and len(b)]
-    return float(torch.cdist(points, points).max()), max(gaps, default=0.0)
+    tips = [points[groups == group] for group in hand.fingertip_groups]
+    gaps = [cdist(a, b).min() for k, a in enumerate(tips) for b in tips[:k] if len(a) and len(b)]
+    return float(pdist(points).max(initial=0.0)), float(max(gaps, default=0.0))
 
 
 def _surface(scene: Scene) -> tuple[Float[np.ndarray, "n 3"], Float[np.ndarray, "n 3"]]:

@@ -38,7 +38,7 @@ from graspd_core.types import (
     WatchHook,
 )
 from graspd_core.verify.limits import LEAST_PAYLOAD
-from graspd_core.verify.run_clock import Run, result_of
+from graspd_core.verify.run_clock import Run, outcome_of
 from graspd_core.verify.verification import payloads, prefetch, rank_by_robustness
 
 # Greatest number of grasps of a request, and number of valid seeds.
@@ -118,19 +118,14 @@ def plan_grasps(
     scene, hand, message, rounds = _prepared(run, scene, hand, config, verify, bound)
     prefetched = prefetch(run, scene, hand, verify, config.certainty) if rounds and verify != "none" else None
     found = run_rounds(run, scene, hand, rounds, prefetched, bound.moved(run.origin), measure=measure, **request)
-    result = result_of(
-        [moved_grasp(grasp, run.origin) for grasp in on_surface(scene, _ranked(run, found, config, seed))],
-        count,
-        method=config.method,
-        seed=seed,
-        timing=_timing(run, scene, found),
-        ended_early=run.ended_early,
-        warnings=(*scene.object.warnings, *hand.named_warnings, *_lifted_less(scene, found.mass)),
-        refused=found.refused,
-    )
-    reason = "" if run.over() else _why_few(run, scene, bound, found, result)
+    tried = tuple(moved_grasp(grasp, run.origin) for grasp in on_surface(scene, _ranked(run, found, config, seed)))
+    warnings = (*scene.object.warnings, *hand.named_warnings, *_lifted_less(scene, found.mass))
     masses = {"mass": found.mass, "tried_mass": found.mass or scene.object.mass}
-    result = replace(result, message=message or reason or result.outcome.value, support=support, **masses)
+    about: dict[str, Any] = {"support": support, "refused": found.refused, "count": count, **masses}
+    outcome, timing = outcome_of(tried, count, run.ended_early), _timing(run, scene, found)
+    result = GraspResult(outcome, tried, timing, seed, config.method, warnings=warnings, **about)
+    reason = "" if run.over() else _why_few(run, scene, bound, found, result)
+    result = replace(result, message=message or reason or result.outcome.value)
     run.report(Stage.DONE, 1, 1, 0.0, found.good)
     return result if found.good else _less_sure(scene, run.origin, result)
 

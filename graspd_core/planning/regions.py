@@ -18,7 +18,7 @@ from graspd_core.hands.model import HandModel
 from graspd_core.optimize.obstacle_distance import extreme_points_of_solids, hand_reach
 from graspd_core.perception.scene import Obstacle, Scene, make_obstacle
 from graspd_core.se3 import SE3, rotation_from_quaternion
-from graspd_core.types import Posture, TriangleMesh
+from graspd_core.types import Posture, TriangleMesh, stacked
 
 # A short sequence of numbers: a tuple, a list or an array.
 Numbers = Sequence[float | int] | np.ndarray
@@ -164,12 +164,10 @@ def _placed_solids(
     solids = extreme_points_of_solids(hand)
     most = max(len(points) for points, _, _ in solids)
     local = np.stack([np.vstack([points, np.repeat(points[:1], most - len(points), 0)]) for points, _, _ in solids])
-    joints = torch.as_tensor(np.stack([p.joint_positions for p in postures])).double()
+    positions, quaternions, joints = map(torch.as_tensor, stacked(postures))
     links = forward(make_kinematics(hand, dtype=torch.float64), joints)[:, torch.as_tensor([s[2] for s in solids])]
     inside = torch.einsum("bsij,skj->bski", links.rotation, torch.as_tensor(local)) + links.translation[:, :, None]
-    turns = rotation_from_quaternion(torch.as_tensor(np.stack([p.quaternion_wxyz for p in postures])).double())
-    base = SE3(turns, torch.as_tensor(np.stack([p.position for p in postures])).double())
-    placed = base.apply(inside.flatten(1, 2)).reshape(inside.shape)
+    placed = SE3(rotation_from_quaternion(quaternions), positions).apply(inside.flatten(1, 2)).reshape(inside.shape)
     return placed.numpy(), np.array([radius for _, radius, _ in solids])
 
 

@@ -16,9 +16,9 @@ import tempfile
 import threading
 import zipfile
 from collections import OrderedDict
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
-from typing import Any
+from typing import IO, Any
 
 import numpy as np
 
@@ -122,23 +122,11 @@ def _read(path: Path) -> Arrays | None:
 
 
 def _write(path: Path, arrays: Arrays) -> None:
-    temporary = None
-    try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        with tempfile.NamedTemporaryFile(dir=path.parent, suffix=".part", delete=False) as file:
-            temporary = Path(file.name)
+    with contextlib.suppress(OSError):
+        with _written_whole(path) as file:
             np.savez(file, allow_pickle=False, **arrays)
-        # Renaming is atomic, so another process sees the complete file or none.
-        temporary.replace(path)
         if next(_written) % LOOK_EVERY == 0:
             _prune(path.parent)
-    except OSError:
-        pass
-    finally:
-        # Ctrl-C or a deadline may also end the work above. After the renaming, there is no such file.
-        if temporary:
-            with contextlib.suppress(OSError):
-                temporary.unlink(missing_ok=True)
 
 
 def _prune(directory: Path) -> None:
@@ -162,13 +150,22 @@ def _prune(directory: Path) -> None:
 
 def save_bytes(path: Path, content: bytes) -> None:
     """Write a file atomically. Make missing directories."""
+    with _written_whole(path) as file:
+        file.write(content)
+        os.chmod(file.name, 0o644)
+
+
+@contextlib.contextmanager
+def _written_whole(path: Path) -> Iterator[IO[bytes]]:
+    """Yield a temporary file that becomes `path`. If the work inside fails, nothing is left of it."""
     path.parent.mkdir(parents=True, exist_ok=True)
-    handle, temporary = tempfile.mkstemp(dir=path.parent, prefix=path.name)
+    with tempfile.NamedTemporaryFile(dir=path.parent, suffix=".part", delete=False) as made:
+        temporary = Path(made.name)
     try:
-        with os.fdopen(handle, "wb") as file:
-            file.write(content)
-        os.chmod(temporary, 0o644)
-        os.replace(temporary, path)
+        with temporary.open("wb") as file:
+            yield file
+        # Renaming is atomic, so another process sees the complete file or none.
+        temporary.replace(path)
     except BaseException:
-        os.unlink(temporary)
+        temporary.unlink(missing_ok=True)
         raise

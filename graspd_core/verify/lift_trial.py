@@ -82,28 +82,21 @@ def lift_trial(
     """
     import mujoco
 
+    begin, worst = retreat_posture(hand, grasp.pregrasp, settings.retreat), np.zeros(2)
     try:
-        return _lift(world, hand, grasp, protocol, settings, stop)
+        with trial_data(world) as data:
+            reason = posture_fault(world, data, grasp, protocol)
+            commanded = (begin, grasp.pregrasp, grasp.grasp)
+            reason = reason or reach_through(world, data, commanded, settings.max_reach_through)
+            if not reason:
+                set_hand_pose(world, data, begin)
+                reason = _raise(world, data, begin, grasp, protocol, settings, worst=worst, stop=stop)
+            if not reason:
+                steps = round(settings.hold_time / protocol.timestep)
+                reason = _said(step_until_known(world, data, protocol, worst, steps, stop=stop), "while held up")
     except mujoco.FatalError as error:
         return TrialResult("lift", False, 0.0, 0.0, gave_up(error))
-
-
-def _lift(
-    world: World, hand: HandModel, grasp: Grasp, protocol: Protocol, settings: LiftSettings, stop: Callable[[], bool]
-) -> TrialResult:
-    with trial_data(world) as data:
-        begin = retreat_posture(hand, grasp.pregrasp, settings.retreat)
-        reason = posture_fault(world, data, grasp, protocol)
-        reason = reason or reach_through(world, data, (begin, grasp.pregrasp, grasp.grasp), settings.max_reach_through)
-        if reason:
-            return TrialResult("lift", False, 0.0, 0.0, reason)
-        set_hand_pose(world, data, begin)
-        worst = np.zeros(2)
-        reason = _raise(world, data, begin, grasp, protocol, settings, worst=worst, stop=stop)
-        if not reason:
-            steps = round(settings.hold_time / protocol.timestep)
-            reason = _said(step_until_known(world, data, protocol, worst, steps, stop=stop), "while held up")
-        return TrialResult("lift", not reason, float(worst[0]), float(worst[1]), reason)
+    return TrialResult("lift", not reason, float(worst[0]), float(worst[1]), reason)
 
 
 def _raise(

@@ -83,12 +83,12 @@ def payload(
     return most
 
 
-def least_friction(world: World, grasp: Grasp, protocol: Protocol, *, stop: StopHook = lambda: False) -> float:
+def least_friction(world: World, grasp: Grasp, protocol: Protocol) -> float:
     """Return the least sliding friction at which the grasp passes the hold trial. At most the protocol's friction."""
 
     def holds(fraction: float) -> bool:
         slippery = at_friction(protocol, Protocol.friction[0] / fraction)
-        return hold_trial(altered(world, friction=slippery.friction), grasp, slippery, stop=stop).passed
+        return hold_trial(altered(world, friction=slippery.friction), grasp, slippery).passed
 
     return protocol.friction[0] / _greatest(holds, 1.0, 1 / _LEAST_SHARE)
 

@@ -23,7 +23,6 @@ from graspd_core.verify.prepared_grasp import (
     contact_depth,
     contact_links,
     penetration,
-    prepare_grasp,
     self_penetration,
 )
 
@@ -138,7 +137,7 @@ def measure(context: MetricsContext, posture: Posture, *, max_contacts: int = MA
 
     ε and volume use at most `max_contacts` contacts. A metric that another step measures is None.
     """
-    grasp = prepare_grasp(context, posture, max_contacts)
+    grasp = PreparedGrasp(context, posture, max_contacts)
     values = {name: row.measure(grasp) if row.measure else None for name, row in METRICS.items()}
     return GraspMetrics({name: None if value is None else float(value) for name, value in values.items()})
 

@@ -9,26 +9,18 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from functools import cached_property, lru_cache
-from typing import Any
 
 import numpy as np
 import torch
 from jaxtyping import Bool, Float, Int
 
 from graspd_core.hands.kinematics import Kinematics, forward, make_kinematics
-from graspd_core.hands.link_distance import (
-    CollisionTensors,
-    bounds,
-    depth_inside,
-    hull_planes,
-    local_distance,
-    make_collision_tensors,
-)
+from graspd_core.hands.link_distance import bounds, depth_inside, primitive_sdf
 from graspd_core.hands.model import HandModel, Primitive
 from graspd_core.hands.surface_points import kept_dense_samples
 from graspd_core.mesh.mesh_files import surface_samples
 from graspd_core.mesh.sharp_features import crease_points, farthest_points, neighbours_together
-from graspd_core.mesh.surface_queries import DistanceQuery, is_inside, surface_distance
+from graspd_core.mesh.surface_queries import DistanceQuery
 from graspd_core.mesh.topology import packed_rows
 from graspd_core.optimize.kernel.builds import kernel
 from graspd_core.perception.scene import ObjectModel
@@ -77,7 +69,6 @@ class MetricsContext:
     Attributes:
         query: the object's mesh, prepared for distance queries.
         points: points on the object's surface and edges [m].
-        tree: `scipy.spatial.KDTree` of `points`.
         world: MuJoCo model of the hold trial. If it is None, the contact depth is not measured.
     """
 
@@ -86,18 +77,15 @@ class MetricsContext:
     surface: HandSurface
     query: CompiledQuery | DistanceQuery
     points: Float[np.ndarray, "points 3"]
-    tree: Any
     world: World | None = None
 
 
 def make_metrics_context(target: ObjectModel, hand: HandModel) -> MetricsContext:
     """Sample hand and object and prepare distance queries, once for all grasps of this object by this hand."""
-    from scipy.spatial import KDTree
-
     creases = crease_points(target.mesh, _SAMPLES // 4, _SEED)
     points = np.concatenate([surface_samples(target.mesh, _SAMPLES, _SEED)[0], creases])
     query = make_query(target.mesh)
-    return MetricsContext(target, hand, hand_surface(hand), query, points, KDTree(points))
+    return MetricsContext(target, hand, hand_surface(hand), query, points)
 
 
 @lru_cache(maxsize=8)
@@ -159,9 +147,9 @@ def contact_area(placed: PlacedHand, within: float = CONTACT_DISTANCE) -> float:
     return float(placed.areas[np.abs(placed.distance) <= within].sum())
 
 
-def contact_links(placed: PlacedHand, within: float = CONTACT_DISTANCE) -> int:
-    """Count the links that come within `within` [m] of the object or penetrate it."""
-    return len(np.unique(placed.links[touching(placed, within)]))
+def contact_links(placed: PlacedHand) -> int:
+    """Count the links that touch the object (`CONTACT_DISTANCE`) or penetrate it."""
+    return len(np.unique(placed.links[touching(placed)]))
 
 
 def touching(placed: PlacedHand, within: float = CONTACT_DISTANCE) -> Bool[np.ndarray, "samples"]:
@@ -169,10 +157,8 @@ def touching(placed: PlacedHand, within: float = CONTACT_DISTANCE) -> Bool[np.nd
     return placed.distance <= within
 
 
-# Width of the octree's smallest cells [m], and number of halvings: 16, 8, 4, 2 mm. The code counts in units of 2 mm.
-_CELL, _HALVINGS = 0.002, 3
-# Half the diagonal of a unit cube, with a margin for rounding.
-_HALF_DIAGONAL = 0.5 * np.sqrt(3.0) * 1.001
+# Width of the grid cells of the shared volume [m].
+_CELL = 0.002
 
 
 def penetration(context: MetricsContext, placed: PlacedHand) -> float:
@@ -180,24 +166,12 @@ def penetration(context: MetricsContext, placed: PlacedHand) -> float:
     worst = float(max(0.0, -placed.distance.min()))
     if isinstance(context.query, CompiledQuery):
         return max(worst, depth_in_hand(context.query, context.hand, placed.poses, context.points))
-    centers, radii = _link_balls(context.hand)
-    centers = np.einsum("nij,nj->ni", placed.rotations, centers) + placed.translations
-    for link, near in enumerate(context.tree.query_ball_point(centers, radii)):
-        local = (context.points[near] - placed.translations[link]) @ placed.rotations[link]
-        worst = max(worst, float(depth_inside(context.hand, link, local).max(initial=0.0)))
-    return worst
+    return max(worst, *(_depth_in_link(context, placed, link, context.points) for link in range(len(placed.rotations))))
 
 
-@lru_cache(maxsize=8)
-def _link_balls(hand: HandModel) -> tuple[Float[np.ndarray, "links 3"], Float[np.ndarray, "links"]]:
-    """Return centre (link frame) and radius of each link's bounding sphere [m]. Links without primitives have zeros."""
-    centers, radii = np.zeros((hand.num_links, 3)), np.zeros(hand.num_links)
-    for link, primitives in enumerate(hand.primitives_of):
-        if primitives:
-            low, high = zip(*map(bounds, primitives), strict=True)
-            low, high = np.min(low, axis=0), np.max(high, axis=0)
-            centers[link], radii[link] = (low + high) / 2, np.linalg.norm(high - low) / 2
-    return centers, radii
+def _depth_in_link(context: MetricsContext, placed: PlacedHand, link: int, points: Float[np.ndarray, "n 3"]) -> float:
+    local = (points - placed.translations[link]) @ placed.rotations[link]
+    return float(depth_inside(context.hand, link, local).max(initial=0.0))
 
 
 def arrival(context: MetricsContext, grasp: Grasp, support: Plane | None) -> Posture | None:
@@ -241,118 +215,47 @@ def contact_depth(context: MetricsContext, posture: Posture) -> float | None:
 
 def self_penetration(context: MetricsContext, placed: PlacedHand) -> float:
     """Return the greatest depth of a hand sample inside a link that is not adjacent to the sample's link [m]."""
-    hand, worst = context.hand, 0.0
+    hand = context.hand
     if isinstance(context.query, CompiledQuery):
         return depth_in_hand(context.query, hand, placed.poses, placed.points, placed.links)
-    centers, radii = _link_balls(hand)
-    centers = np.einsum("nij,nj->ni", placed.rotations, centers) + placed.translations
-    apart = np.linalg.norm(centers[:, None] - centers, axis=-1) - radii[:, None] - radii
-    # Links whose bounding spheres are apart cannot collide.
-    meet = (apart < 0) & ~hand.adjacent
-    for link in np.flatnonzero(meet.any(1)).tolist():
-        others = placed.points[meet[link][placed.links]]
-        others = others[np.linalg.norm(others - centers[link], axis=1) < radii[link]]
-        local = (others - placed.translations[link]) @ placed.rotations[link]
-        worst = max(worst, float(depth_inside(hand, link, local).max(initial=0.0)))
-    return worst
+    others = [placed.points[~hand.adjacent[link][placed.links]] for link in range(hand.num_links)]
+    return max(_depth_in_link(context, placed, link, points) for link, points in enumerate(others))
 
 
 def intersection_volume(context: MetricsContext, placed: PlacedHand) -> float:
     """Return the volume of the hand's part inside the object [m³], summed over 2 mm grid cells in the base frame.
 
-    An octree of each primitive finds the cells, so even small and thin overlaps are found. In each cell, hand and
-    object count as two facing half-spaces. This is exact for flat overlaps of any thickness. Volume that several
-    primitives share is counted once.
+    In each cell, hand and object count as two facing half-spaces. This is exact for flat overlaps of any thickness.
+    Volume that several primitives share is counted once.
     """
     if isinstance(context.query, CompiledQuery):
         return shared_volume(context.query, context.hand, placed.poses, _CELL)
-    solids = _placed_solids(context.hand, placed)
-    cells, which = _root_cells(solids, placed)
-    size = 2**_HALVINGS
-    while len(cells):
-        half_diagonal = _HALF_DIAGONAL * size * _CELL
-        centers = (cells + 0.5 * size) * _CELL @ placed.rotations[0].T + placed.translations[0]
-        kept = _near_box(context.query, centers, half_diagonal)
-        cells, which, centers = cells[kept], which[kept], centers[kept]
-        depth = -_solid_distance(solids, which, centers)
-        kept = depth > -half_diagonal
-        cells, which, centers, depth = cells[kept], which[kept], centers[kept], depth[kept]
-        # Overlapping primitives share cells. Count each cell once.
-        _, first, same = np.unique(packed_rows(cells), return_index=True, return_inverse=True)
-        if size == 1:
-            deepest = np.full(len(first), -np.inf)
-            np.maximum.at(deepest, same, depth)
-            depths = deepest, -signed_distance(context.query, centers[first])
-            in_hand, in_object = (np.clip(0.5 + depth / _CELL, 0.0, 1.0) for depth in depths)
-            return float(np.maximum(in_hand + in_object - 1.0, 0.0).sum()) * _CELL**3
-        kept = surface_distance(context.query.surface, centers[first]) < half_diagonal
-        kept[~kept] = is_inside(context.query.tree, centers[first[~kept]])
-        kept = kept[same]
-        size //= 2
-        cells, which = _halve(cells[kept], size), np.repeat(which[kept], 8)
-    return 0.0
+    found = [_cells_of(primitive, placed) for primitive in context.hand.primitives]
+    cells, depth = (np.concatenate(parts) for parts in zip(*found, strict=True))
+    _, first, same = np.unique(packed_rows(cells), return_index=True, return_inverse=True)
+    deepest = np.full(len(first), -np.inf)
+    np.maximum.at(deepest, same, depth)
+    centers = (cells[first] + 0.5) * _CELL @ placed.rotations[0].T + placed.translations[0]
+    depths = deepest, -signed_distance(context.query, centers, reach=_CELL)
+    in_hand, in_object = (np.clip(0.5 + depth / _CELL, 0.0, 1.0) for depth in depths)
+    return float(np.maximum(in_hand + in_object - 1.0, 0.0).sum()) * _CELL**3
 
 
-def _near_box(query: DistanceQuery, points: Float[np.ndarray, "n 3"], margin: float) -> Bool[np.ndarray, "n"]:
-    return np.all((points > query.tree.low - margin) & (points < query.tree.high + margin), axis=1)
-
-
-@dataclass(frozen=True, eq=False)
-class _PlacedSolids:
-    """A hand's primitives at a grasp, hulls last, with their poses in the object frame [m].
-
-    `smooth` holds the primitives that are not hulls, for distance queries.
-    """
-
-    primitives: tuple[Primitive, ...]
-    rotations: Float[np.ndarray, "solids 3 3"]
-    translations: Float[np.ndarray, "solids 3"]
-    smooth: CollisionTensors
-
-
-def _placed_solids(hand: HandModel, placed: PlacedHand) -> _PlacedSolids:
-    primitives = tuple(sorted(hand.primitives, key=lambda primitive: primitive.kind == "hull"))
-    rotations = np.array([placed.rotations[p.link] @ p.rotation for p in primitives]).reshape(-1, 3, 3)
-    origins = [placed.rotations[p.link] @ p.translation + placed.translations[p.link] for p in primitives]
-    smooth = make_collision_tensors(hand, "cpu", torch.float64)
-    return _PlacedSolids(primitives, rotations, np.reshape(origins, (-1, 3)), smooth)
-
-
-def _root_cells(
-    solids: _PlacedSolids, placed: PlacedHand
-) -> tuple[Int[np.ndarray, "cells 3"], Int[np.ndarray, "cells"]]:
-    """Return the coarsest octree cells around the primitives, base frame. The primitive index of each cell ascends."""
-    size, base, cells = 2**_HALVINGS, placed.rotations[0], [np.zeros((0, 3), dtype=np.int64)]
-    for primitive in solids.primitives:
-        low, high = bounds(primitive)
-        rotation = base.T @ placed.rotations[primitive.link]
-        center = (placed.translations[primitive.link] - placed.translations[0]) @ base + rotation @ (low + high) / 2
-        reach = np.abs(rotation) @ (high - low) / 2
-        ends = np.floor((center - reach) / (size * _CELL)), np.ceil((center + reach) / (size * _CELL))
-        cells.append(size * _lattice(*(end.astype(np.int64) for end in ends)))
-    return np.concatenate(cells), np.repeat(np.arange(len(solids.primitives)), [len(some) for some in cells[1:]])
-
-
-def _solid_distance(
-    solids: _PlacedSolids, which: Int[np.ndarray, "n"], points: Float[np.ndarray, "n 3"]
-) -> Float[np.ndarray, "n"]:
-    """Return each point's signed distance [m] to its primitive, a lower bound for hulls. The indices `which` ascend."""
-    local = np.einsum("nji,nj->ni", solids.rotations[which], points - solids.translations[which])
-    hulls = int(np.searchsorted(which, len(solids.smooth.link)))
-    smooth = local_distance(solids.smooth, torch.as_tensor(local[:hulls]), torch.as_tensor(which[:hulls])).numpy()
-    parts = [smooth]
-    for hull in np.unique(which[hulls:]):
-        normals, offsets = hull_planes(solids.primitives[hull])
-        parts.append((local[which == hull] @ normals.T - offsets).max(1))
-    return np.concatenate(parts)
-
-
-def _halve(cells: Int[np.ndarray, "cells 3"], size: int) -> Int[np.ndarray, "children 3"]:
-    return (cells[:, None] + size * _lattice(np.zeros(3, dtype=int), np.full(3, 2))).reshape(-1, 3)
-
-
-def _lattice(low: Int[np.ndarray, "3"], high: Int[np.ndarray, "3"]) -> Int[np.ndarray, "n 3"]:
-    return np.stack(np.meshgrid(*map(np.arange, low, high), indexing="ij"), -1).reshape(-1, 3)
+def _cells_of(
+    primitive: Primitive, placed: PlacedHand
+) -> tuple[Int[np.ndarray, "cells 3"], Float[np.ndarray, "cells"]]:
+    """Return the grid cells that a primitive may fill in part, and the depth of their centres inside it [m]."""
+    low, high = bounds(primitive)
+    rotation = placed.rotations[0].T @ placed.rotations[primitive.link]
+    origin = (placed.translations[primitive.link] - placed.translations[0]) @ placed.rotations[0]
+    center, reach = origin + rotation @ (low + high) / 2, np.abs(rotation) @ (high - low) / 2
+    ends = np.floor((center - reach) / _CELL), np.ceil((center + reach) / _CELL)
+    axes = [np.arange(start, end, dtype=np.int64) for start, end in zip(*ends, strict=True)]
+    cells = np.stack(np.meshgrid(*axes, indexing="ij"), -1).reshape(-1, 3)
+    local = torch.as_tensor(((cells + 0.5) * _CELL - origin) @ rotation)
+    depth = -primitive_sdf(primitive, local).numpy()
+    kept = depth > -_CELL / 2
+    return cells[kept], depth[kept]
 
 
 CONE_EDGES = 8
@@ -456,8 +359,12 @@ class PreparedGrasp:
 
     context: MetricsContext
     posture: Posture
-    placed: PlacedHand
-    max_contacts: int
+    max_contacts: int = MAX_CONTACTS
+
+    @cached_property
+    def placed(self) -> PlacedHand:
+        """Samples of the hand at the posture, with each sample's distance to the object."""
+        return placed_hand(self.context, self.posture)
 
     @cached_property
     def wrench_hull(self) -> WrenchHull:
@@ -471,11 +378,6 @@ class PreparedGrasp:
     def shared_volume(self) -> float:
         """Volume of the hand's part inside the object [m³]."""
         return intersection_volume(self.context, self.placed)
-
-
-def prepare_grasp(context: MetricsContext, posture: Posture, max_contacts: int = MAX_CONTACTS) -> PreparedGrasp:
-    """Place the hand at a posture and compute the distance of each hand sample to the object."""
-    return PreparedGrasp(context, posture, placed_hand(context, posture), max_contacts)
 
 
 def surface_normals(query: CompiledQuery | DistanceQuery, points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 3"]:

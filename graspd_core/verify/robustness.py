@@ -41,8 +41,8 @@ from graspd_core.verify.world import Protocol, World, altered, at_friction, buil
 Item = TypeVar("Item")
 Result = TypeVar("Result")
 
-# Interval at which the stop hook is polled while waiting for a result [s].
-_POLL_RESULTS = 0.02
+# Interval at which stop hooks and deadlines are polled while waiting for a result or a world [s].
+POLL = 0.02
 
 
 def begin_in_thread(name: str, work: Callable[[], Result]) -> Future[Result]:
@@ -90,7 +90,7 @@ def results_in_order(
                 waiting.append(pool.submit(work, item, lambda: closed.is_set() or known_over()))
             if not waiting:
                 return
-            while not wait([waiting[0]], timeout=_POLL_RESULTS).done:
+            while not wait([waiting[0]], timeout=POLL).done:
                 if over():
                     closed.set()
             yield waiting.popleft().result()
@@ -109,8 +109,6 @@ _PLACES, _PLACES_SEED = 3, 0x706C616365
 _LEAST_PLACES, OTHER_SHAPES = 2, 3
 # Number of nodes of another shape's distance grid along an axis. The shape is guessed, so a finer grid would not help.
 _RESOLUTION = 24
-# Interval at which the stop hook is polled while waiting for a world [s].
-_POLL = 0.02
 # Name of the threads that build other shapes.
 _SHAPES = "graspd-shapes"
 
@@ -325,7 +323,7 @@ def _hold_in(
     begun = other.begin()
     if not begun.done():
         waited_for.set()
-    while not wait([begun], timeout=_POLL).done:
+    while not wait([begun], timeout=POLL).done:
         if stop():
             return None
     world = begun.result()

@@ -21,13 +21,14 @@ from graspd_core.config import VERIFICATIONS, CertaintyConfig, RobustConfig
 from graspd_core.errors import ConfigError, short_repr
 from graspd_core.hands.model import HandModel
 from graspd_core.perception.scene import Scene, moved_grasp, near_scene, object_parts
-from graspd_core.types import Grasp, GraspMetrics, Snapshot, Stage, StopHook, Verdict
+from graspd_core.types import Grasp, GraspMetrics, Snapshot, Stage, StopHook, Verdict, stacked
 from graspd_core.verify import metrics
 from graspd_core.verify.hold_trial import noisy_share, pose_errors
 from graspd_core.verify.limits import FINENESS, LEAST_PAYLOAD, least_friction, payload
 from graspd_core.verify.metrics import measure
 from graspd_core.verify.prepared_grasp import MetricsContext, make_metrics_context
 from graspd_core.verify.robustness import (
+    POLL,
     CheckStage,
     HoldUnder,
     LaterWorld,
@@ -46,8 +47,6 @@ from graspd_core.verify.run_clock import Run
 from graspd_core.verify.trial_registry import TrialContext, build_worlds, grasp_trials
 from graspd_core.verify.world import PROTOCOLS, altered, at_friction
 
-# Interval at which stop hook and deadline are polled while waiting for the worlds [s].
-_POLL = 0.02
 # Only one object at a time is cut into convex parts.
 _CUTTING = threading.Lock()
 # Sorting uses this robustness for verified grasps whose robustness was not measured.
@@ -121,7 +120,7 @@ def make_trial_context(
     friction: bool = False,
 ) -> VerificationContext | None:
     """Wait for the worlds and return the context of the trials. Return None if the run ends first."""
-    while not run.over() and not wait([prefetched.worlds], timeout=_POLL).done:
+    while not run.over() and not wait([prefetched.worlds], timeout=POLL).done:
         pass
     if run.over() or (worlds := prefetched.worlds.result()) is None:
         return None
@@ -201,12 +200,6 @@ class TriedGrasps:
     first: float | None = None
 
 
-def candidates_seen(candidates: tuple[Grasp, ...]) -> Snapshot:
-    """Return a snapshot of the candidates, in which all candidates are unverified."""
-    hands = [(g.grasp.position, g.grasp.quaternion_wxyz, g.grasp.joint_positions) for g in candidates]
-    return Snapshot(*map(np.stack, zip(*hands, strict=True)), verdicts=(Verdict.UNVERIFIED,) * len(candidates))
-
-
 def run_trials(
     run: Run, context: VerificationContext, candidates: tuple[Grasp, ...], count: int, before: int
 ) -> TriedGrasps:
@@ -222,7 +215,9 @@ def run_trials(
     # If there is a doubt, no grasp can be verified. Then `count` grasps whose only fault is the doubt are enough.
     doubts = context.checks.doubts[:1] if context.checks is not None else ()
     first = None
-    seen = None if run.watch is None else candidates_seen(candidates)
+    seen = None
+    if run.watch is not None:
+        seen = Snapshot(*stacked([one.grasp for one in candidates]), (Verdict.UNVERIFIED,) * len(candidates))
     # The first answer comes sooner if the best candidate runs several robustness checks in parallel.
     alone = context.checks is not None and not before
     # No trial gives more than one verified grasp.
@@ -277,7 +272,7 @@ def _best_first(
 ) -> Grasp:
     """Try a candidate. Candidates other than `best` first wait until `best` is done or waits for a world."""
     if grasp is not best:
-        while not checks.waited_for.wait(_POLL) and not stop():
+        while not checks.waited_for.wait(POLL) and not stop():
             pass
         return _all_trials(context, one_by_one, grasp, stop)
     try:

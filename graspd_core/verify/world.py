@@ -86,14 +86,7 @@ def add_object(
     for index, part in enumerate(parts):
         mesh = f"part:{index}" if name == OBJECT else f"{name} part:{index}"
         add_mesh(spec, mesh, part.vertices, part.faces)
-        body.add_geom(
-            type=mujoco.mjtGeom.mjGEOM_MESH,
-            meshname=mesh,
-            condim=4,
-            friction=friction,
-            contype=1,
-            conaffinity=1,
-        )
+        body.add_geom(type=mujoco.mjtGeom.mjGEOM_MESH, meshname=mesh, condim=4, friction=friction)
 
 
 def add_support(spec: Any, hand: HandModel, parts: Sequence[TriangleMesh], friction: Friction, support: Plane) -> None:
@@ -353,17 +346,7 @@ def build_world(
     for index, obstacle in enumerate(obstacles):
         fixed.append(f"neighbour {index + 1}")
         add_obstacle(spec, fixed[-1], obstacle, target, protocol.friction)
-    return _world_of(spec.compile(), hand, target, fixed, None if support is None else support.normal)
-
-
-def _world_of(
-    model: Any,
-    hand: HandModel,
-    target: ObjectModel,
-    fixed: Sequence[str],
-    up: Float[np.ndarray, "3"] | None,
-) -> World:
-    """Return the world of a compiled model. `fixed` holds the geom names of the obstacles."""
+    model = spec.compile()
     return World(
         model=model,
         joint_addresses=_joint_addresses(model, hand.joint_names),
@@ -373,7 +356,7 @@ def _world_of(
         center_of_mass=target.center_of_mass,
         hand_geoms=tuple(i for i in range(model.ngeom) if model.body(model.geom_bodyid[i]).name.startswith("link:")),
         obstacles=tuple((int(model.geom(name).id), name) for name in fixed),
-        up=up,
+        up=None if support is None else support.normal,
         coupled_addresses=_joint_addresses(model, [mimic.name for mimic in hand.mimics]),
         mimics=hand.mimics,
         fingers=len(hand.fingertip_groups),
