@@ -56,16 +56,12 @@ class Kinematics:
     shift: Float[Tensor, "links"] | None = None
 
 
+# A hand is hashed by identity, so a copy made by `replace` is another hand. Hands are large, so the cache is small.
+@lru_cache(maxsize=8)
 def make_kinematics(
     hand: HandModel, device: torch.device | str = "cpu", dtype: torch.dtype = torch.float32
 ) -> Kinematics:
     """Return the constants that `forward` needs. The most recent results are cached."""
-    return _make_kinematics(hand, torch.device(device), dtype)
-
-
-# A hand is hashed by identity, so a copy made by `replace` is another hand. Hands are large, so the cache is small.
-@lru_cache(maxsize=8)
-def _make_kinematics(hand: HandModel, device: torch.device, dtype: torch.dtype) -> Kinematics:
     depth = link_depths(hand.link_parent)
     order = np.argsort(depth, kind="stable")
     position = np.argsort(order, kind="stable")
@@ -136,13 +132,6 @@ def place_points(matrix: Float[Tensor, "points columns"], links: SE3) -> Float[T
     # The sizes are explicit, because a size of −1 cannot be resolved for an empty batch.
     columns = poses.permute(1, 3, 0, 2).reshape(4 * poses.shape[1], 3 * batch)
     return (matrix @ columns).unflatten(1, (batch, 3)).transpose(0, 1)
-
-
-def placed_points(matrix: Float[Tensor, "points columns"]) -> tuple[Float[Tensor, "points 3"], Int[Tensor, "points"]]:
-    """Return the points of a `placement` in link frames [m], and their links."""
-    columns = matrix.unflatten(1, (-1, 4))
-    links = columns[..., 3].argmax(1)
-    return columns[torch.arange(len(links), device=links.device), links, :3], links
 
 
 def point_jacobian(
