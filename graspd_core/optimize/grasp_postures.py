@@ -16,16 +16,17 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from graspd_core.config import GraspStagesConfig
-from graspd_core.hands.kinematics import RETREAT, drawn_back, forward, place_points
+from graspd_core.hands.kinematics import RETREAT, drawn_back, forward
 from graspd_core.hands.link_distance import pair_distance, solid_distance
 from graspd_core.hands.self_collision import solid_overlaps
 from graspd_core.mesh.sdf import sample_sdf
 from graspd_core.optimize.kernel import builds as structs
-from graspd_core.optimize.loop import Distances, Joints, Poses, Rows, Values, adam_moments, pack
+from graspd_core.optimize.loop import Joints, Poses, Rows, Values, adam_moments, pack
 from graspd_core.optimize.obstacle_distance import RETREAT_SHARES, ObstacleTensors
 from graspd_core.optimize.problem import (
     HandPlacement,
     Problem,
+    hand_distance,
     hand_forward,
     obstacle_depth,
     self_collision,
@@ -315,12 +316,6 @@ def approach_depth(problem: Problem, obstacles: ObstacleTensors, pregrasp: Poses
     begun = [drawn_back(pregrasp.translation, rotation, obstacles.approach, RETREAT * s) for s in RETREAT_SHARES]
     nearest = [hand_distance(problem, SE3(rotation, at), pregrasp.joints).amin(-1) for at in begun]
     return (-torch.stack(nearest).amin(0)).clamp_min(0.0)
-
-
-def hand_distance(problem: Problem, base: SE3, joints: Joints) -> Distances:
-    """Return the signed distance of every coarse contact candidate to the object [m]."""
-    points = place_points(problem.hand.coarse.matrix, forward(problem.hand.kinematics, joints))
-    return sample_sdf(problem.object.sdf, base.apply(points))[0]
 
 
 @dataclass(frozen=True)
