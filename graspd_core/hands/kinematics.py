@@ -196,20 +196,17 @@ def link_depths(parent: Int[np.ndarray, "links"]) -> Int[np.ndarray, "links"]:
 
 def _coefficients(hand: HandModel) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
     """Return the four constant 3x4 matrices of each link (see `Kinematics`), in the hand's link order."""
-    count = hand.num_links
-    constant, sine, cosine, slide = (np.zeros((count, 3, 4)) for _ in range(4))
-    for link in range(count):
-        offset = hand.link_offset_rotation[link]
-        constant[link, :, :3] = offset
-        constant[link, :, 3] = hand.link_offset_translation[link]
-        axis = hand.joint_axis[link]
-        if hand.joint_kind[link] == "revolute":
-            cross = np.array([[0, -axis[2], axis[1]], [axis[2], 0, -axis[0]], [-axis[1], axis[0], 0]])
-            constant[link, :, :3] = offset @ (np.eye(3) + cross @ cross)
-            sine[link, :, :3] = offset @ cross
-            cosine[link, :, :3] = -offset @ cross @ cross
-        elif hand.joint_kind[link] == "prismatic":
-            slide[link, :, 3] = offset @ axis
+    offset, axis = hand.link_offset_rotation, hand.joint_axis[..., None]
+    turns, slides = (np.array(hand.joint_kind)[:, None, None] == kind for kind in ("revolute", "prismatic"))
+    cross = np.where(turns, np.cross(np.eye(3), hand.joint_axis[:, None]), 0.0)
+    still = np.zeros_like(axis)
+    parts = (
+        (offset @ (np.eye(3) + cross @ cross), hand.link_offset_translation[..., None]),
+        (offset @ cross, still),
+        (-offset @ cross @ cross, still),
+        (np.zeros_like(cross), np.where(slides, offset @ axis, still)),
+    )
+    constant, sine, cosine, slide = (np.concatenate(part, -1) for part in parts)
     return constant, sine, cosine, slide
 
 

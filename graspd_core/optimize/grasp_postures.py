@@ -222,17 +222,11 @@ def settle(problem: Problem, poses: Poses, stop: Callable[[], bool] = lambda: Fa
     The loss penalises object surface points inside the hand's primitives, and contact candidates inside the object.
     Candidates that touch the object are kept near it.
     """
-    if (compiled := problem.of_surface.compiled) is not None:
-        x = pack(poses).contiguous()
-        out = x.new_empty(len(x), x.shape[1] - 4)
-        compiled.call("graspd_settle", _SETTLING, len(x), x, out, watch=lambda _: stop())
-    else:
-        out = _settle(problem, poses, stop)
-    return Poses(out[:, :3], poses.quaternion, out[:, 3:])
-
-
-def _settle(problem: Problem, poses: Poses, stop: Callable[[], bool]) -> Rows:
     start = torch.cat([poses.translation, poses.joints], -1)
+    if (compiled := problem.of_surface.compiled) is not None:
+        x, out = pack(poses).contiguous(), torch.empty_like(start)
+        compiled.call("graspd_settle", _SETTLING, len(x), x, out, watch=lambda _: stop())
+        return Poses(out[:, :3], poses.quaternion, out[:, 3:])
     rates, cost = _rates_and_costs(problem, _SETTLING)
     with torch.no_grad():
         reached = sample_sdf(problem.object.sdf, hand_forward(problem, problem.hand.fine, poses).points)[0]
@@ -249,7 +243,8 @@ def _settle(problem: Problem, poses: Poses, stop: Callable[[], bool]) -> Rows:
             total = total + _SETTLING.self_collision * blocked
         return total + (cost * (x - start) ** 2).sum(-1)
 
-    return _descended(problem, start, loss, rates, _SETTLING.steps, stop)
+    out = _descended(problem, start, loss, rates, _SETTLING.steps, stop)
+    return Poses(out[:, :3], poses.quaternion, out[:, 3:])
 
 
 def _sunk_surface(on_surface: Problem, placed: HandPlacement, poses: Poses, x: Rows) -> Values:

@@ -154,8 +154,6 @@ def _hand(hand: HandTensors) -> tuple[dict[str, Structure], Arrays]:
 def _links(hand: HandTensors, arrays: Arrays) -> structs.Hand:
     model, k = hand.model, hand.kinematics
     count = model.num_links
-    moved = model.link_joint >= 0
-    kind = np.array([_KINDS[kind] if moves else 0 for kind, moves in zip(model.joint_kind, moved, strict=True)])
     order = k.order.numpy()
 
     def rows(values: Tensor | None) -> int:
@@ -167,7 +165,7 @@ def _links(hand: HandTensors, arrays: Arrays) -> structs.Hand:
         groups=len(hand.reach),
         parent=arrays.ints(model.link_parent),
         joint=arrays.ints(np.maximum(model.link_joint, 0)),
-        kind=arrays.ints(kind),
+        kind=arrays.ints(np.array([_KINDS[kind] for kind in model.joint_kind])),
         **{name: rows(getattr(k, name)) for name in ("constant", "sine", "cosine", "slide")},
         axis=arrays.floats(model.joint_axis),
         multiplier=arrays.floats(model.link_multiplier),

@@ -149,10 +149,7 @@ _MOST_FILES = 30
 class _Parts:
     """A file parsed (`spec`) and compiled (`model`) by MuJoCo, and the links and joints read so far.
 
-    Attributes:
-        meshes: mesh asset of each mesh geom, by MuJoCo's geom id.
-        labels: joint names by MuJoCo's joint id. Unnamed joints get a name.
-        shown: names of bodies whose visual geoms are used, because no geom of the body collides.
+    `meshes` and `labels` (names of joints) have MuJoCo's ids as keys. `shown` names bodies without colliding geoms.
     """
 
     path: Path
