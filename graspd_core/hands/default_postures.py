@@ -23,12 +23,11 @@ from graspd_core.hands.fingers import (
     palm_points,
     placed_tips,
     straight_joints,
-    units,
 )
 from graspd_core.hands.kinematics import forward, link_poses, make_kinematics, place_points, placement, point_jacobian
 from graspd_core.hands.model import HandModel
 from graspd_core.hands.self_collision import link_overlaps
-from graspd_core.hands.surface_points import dense_samples
+from graspd_core.hands.surface_points import dense_samples, units
 
 _STARTS, _TIP_SPREAD, _STEPS, _RATE = 24, 0.4, 100, 0.08
 # Weights of the costs in the search: fingertips all on one side of the ball, joints away from their rest posture, ball
@@ -198,7 +197,7 @@ def _along(hand: HandModel, fingers: Fingers) -> Float[np.ndarray, "3"]:
     ground = rows[: len(sizes)][sizes > max(0.3 * sizes[0], 1e-3)]
     upright = along - ground.T @ (ground @ along)
     if np.linalg.norm(upright) > 0.5:  # Over 30° from the plane or line of joints.
-        return units(upright, 0.0)
+        return units(upright)
     return along if along.any() else np.array([0.0, 0.0, 1.0])
 
 

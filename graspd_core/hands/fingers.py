@@ -10,7 +10,7 @@ from jaxtyping import Bool, Float, Int
 
 from graspd_core.hands.kinematics import LinkNumbers, LinkPoints, LinkPoses, in_base, link_poses, point_jacobian
 from graspd_core.hands.model import HandModel
-from graspd_core.hands.surface_points import surface_points
+from graspd_core.hands.surface_points import surface_points, units
 
 # In a human-like hand, the mean of the fingers' unit bending directions is longer than this. Three fingers against one
 # give 1/2. Three fingers around a circle, or two against one, give at most 1/3.
@@ -125,7 +125,7 @@ def _mates(
     few = mates.sum() <= (max(1, len(points) / 2) if len(points) > 1 else 0)
     if few or np.linalg.norm(sweep.mean(0)) <= _ALIKE:
         return np.zeros(len(points), dtype=bool), np.zeros(3)
-    return mates, units(sweep[mates].mean(0), 0.0)
+    return mates, units(sweep[mates].mean(0))
 
 
 def _stand_up(roots: Float[np.ndarray, "3 3"], pair: Float[np.ndarray, "2 3"]) -> bool:
@@ -171,9 +171,3 @@ def middle_joints(hand: HandModel, fingers: Fingers) -> Float[np.ndarray, "joint
     middle = 0.5 * (hand.lower + hand.upper)
     middle[fingers.wrist] = straight_joints(hand)[fingers.wrist]
     return middle
-
-
-def units(vectors: Float[np.ndarray, "*n 3"], least: float) -> Float[np.ndarray, "*n 3"]:
-    """Return unit vectors. A vector not longer than `least` gives zero."""
-    length = np.linalg.norm(vectors, axis=-1, keepdims=True)
-    return np.where(length > least, vectors / np.maximum(length, 1e-300), 0.0)

@@ -56,16 +56,12 @@ class Kinematics:
     shift: Float[Tensor, "links"] | None = None
 
 
+# A hand is hashed by identity, so a copy made by `replace` is another hand. Hands are large, so the cache is small.
+@lru_cache(maxsize=8)
 def make_kinematics(
     hand: HandModel, device: torch.device | str = "cpu", dtype: torch.dtype = torch.float32
 ) -> Kinematics:
     """Return the constants that `forward` needs. The most recent results are cached."""
-    return _make_kinematics(hand, torch.device(device), dtype)
-
-
-# A hand is hashed by identity, so a copy made by `replace` is another hand. Hands are large, so the cache is small.
-@lru_cache(maxsize=8)
-def _make_kinematics(hand: HandModel, device: torch.device, dtype: torch.dtype) -> Kinematics:
     depth = link_depths(hand.link_parent)
     order = np.argsort(depth, kind="stable")
     position = np.argsort(order, kind="stable")
@@ -138,13 +134,6 @@ def place_points(matrix: Float[Tensor, "points columns"], links: SE3) -> Float[T
     return (matrix @ columns).unflatten(1, (batch, 3)).transpose(0, 1)
 
 
-def placed_points(matrix: Float[Tensor, "points columns"]) -> tuple[Float[Tensor, "points 3"], Int[Tensor, "points"]]:
-    """Return the points of a `placement` in link frames [m], and their links."""
-    columns = matrix.unflatten(1, (-1, 4))
-    links = columns[..., 3].argmax(1)
-    return columns[torch.arange(len(links), device=links.device), links, :3], links
-
-
 def point_jacobian(
     hand: HandModel, q: JointValues, points: LinkPoints, links: LinkNumbers
 ) -> Float[np.ndarray, "points 3 joints"]:
@@ -207,20 +196,17 @@ def link_depths(parent: Int[np.ndarray, "links"]) -> Int[np.ndarray, "links"]:
 
 def _coefficients(hand: HandModel) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
     """Return the four constant 3x4 matrices of each link (see `Kinematics`), in the hand's link order."""
-    count = hand.num_links
-    constant, sine, cosine, slide = (np.zeros((count, 3, 4)) for _ in range(4))
-    for link in range(count):
-        offset = hand.link_offset_rotation[link]
-        constant[link, :, :3] = offset
-        constant[link, :, 3] = hand.link_offset_translation[link]
-        axis = hand.joint_axis[link]
-        if hand.joint_kind[link] == "revolute":
-            cross = np.array([[0, -axis[2], axis[1]], [axis[2], 0, -axis[0]], [-axis[1], axis[0], 0]])
-            constant[link, :, :3] = offset @ (np.eye(3) + cross @ cross)
-            sine[link, :, :3] = offset @ cross
-            cosine[link, :, :3] = -offset @ cross @ cross
-        elif hand.joint_kind[link] == "prismatic":
-            slide[link, :, 3] = offset @ axis
+    offset, axis = hand.link_offset_rotation, hand.joint_axis[..., None]
+    turns, slides = (np.array(hand.joint_kind)[:, None, None] == kind for kind in ("revolute", "prismatic"))
+    cross = np.where(turns, np.cross(np.eye(3), hand.joint_axis[:, None]), 0.0)
+    still = np.zeros_like(axis)
+    parts = (
+        (offset @ (np.eye(3) + cross @ cross), hand.link_offset_translation[..., None]),
+        (offset @ cross, still),
+        (-offset @ cross @ cross, still),
+        (np.zeros_like(cross), np.where(slides, offset @ axis, still)),
+    )
+    constant, sine, cosine, slide = (np.concatenate(part, -1) for part in parts)
     return constant, sine, cosine, slide
 
 

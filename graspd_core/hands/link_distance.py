@@ -42,10 +42,7 @@ def primitive_sdf(primitive: Primitive, points: _Places) -> _Distances:
         normals, offsets = (torch.as_tensor(a).to(points) for a in hull_planes(primitive))
         return (local @ normals.T - offsets).amax(-1)
     core, radius = core_of(primitive)
-    reach = local.abs()
-    if primitive.kind == "cylinder":
-        reach, core = torch.stack([safe_norm(reach[..., :2]), reach[..., 2]], -1), core[1:]
-    return corner_sdf(reach - reach.new_tensor(core)) - radius
+    return _distance(local, local.new_tensor(core), radius, torch.tensor(primitive.kind == "cylinder"))
 
 
 def core_of(primitive: Primitive) -> tuple[tuple[float, ...], float]:
@@ -173,6 +170,7 @@ class CollisionTensors:
     link: Int[Tensor, "solids"]
 
 
+@lru_cache(maxsize=8)
 def make_collision_tensors(
     hand: HandModel, device: torch.device | str, dtype: torch.dtype, *, filled: bool = False
 ) -> CollisionTensors:
@@ -180,13 +178,6 @@ def make_collision_tensors(
 
     The most recent results are cached.
     """
-    return _make_collision_tensors(hand, torch.device(device), dtype, filled)
-
-
-@lru_cache(maxsize=8)
-def _make_collision_tensors(
-    hand: HandModel, device: torch.device, dtype: torch.dtype, filled: bool
-) -> CollisionTensors:
     solids = [p for p in hand.primitives if filled or p.kind != "hull"]
     n, hull = len(solids), [p.kind == "hull" for p in solids]
     rows = np.reshape([[*p.rotation.flat, *p.translation, *core_of(p)[0], core_of(p)[1]] for p in solids], (n, 16))
@@ -257,7 +248,7 @@ def local_distance(solids: CollisionTensors, local: _Places, which: Int[Tensor, 
     return _distance(local, solids.core[which], solids.radius[which], solids.is_round[which])
 
 
-def _distance(local: _Places, core: Tensor, radius: Tensor, is_round: Tensor) -> _Distances:
+def _distance(local: _Places, core: Tensor, radius: Tensor | float, is_round: Tensor) -> _Distances:
     reach = local.abs()
     radial = safe_norm(reach[..., :2])
     x = torch.where(is_round > 0, radial, reach[..., 0])

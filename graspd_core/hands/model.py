@@ -218,12 +218,8 @@ class HandModel:
     @cached_property
     def slides(self) -> Bool[np.ndarray, "joints"]:
         """True for each actuated joint that is prismatic."""
-        slides = np.zeros(self.num_joints, dtype=bool)
-        coupled = {mimic.link for mimic in self.mimics}
-        for link, joint in enumerate(self.link_joint):
-            if joint >= 0 and link not in coupled:
-                slides[joint] = self.joint_kind[link] == "prismatic"
-        return slides
+        kinds = dict(zip(self.link_joint_names, self.joint_kind, strict=True))
+        return np.array([kinds[name] == "prismatic" for name in self.joint_names], dtype=bool)
 
     @cached_property
     def joint_scale(self) -> Float[np.ndarray, "joints"]:
@@ -235,12 +231,10 @@ class HandModel:
 
         No revolute joint is faster than `turning` [rad/s], no prismatic joint than `sliding` [m/s], coupled joints too.
         """
-        speeds = self.velocity.copy()
-        for joint, kind, ratio in zip(self.link_joint, self.joint_kind, self.link_multiplier, strict=True):
-            if joint >= 0:
-                speeds[joint] = min(
-                    speeds[joint], (sliding if kind == "prismatic" else turning) / max(abs(ratio), 1e-9)
-                )
+        speeds, moved = self.velocity.copy(), self.link_joint >= 0
+        own = np.where(np.array(self.joint_kind) == "prismatic", sliding, turning)
+        own = own / np.maximum(np.abs(self.link_multiplier), 1e-9)
+        np.minimum.at(speeds, self.link_joint[moved], own[moved])
         return speeds
 
 

@@ -39,14 +39,11 @@ def collision_spheres(
     hand: HandModel,
 ) -> tuple[Float[np.ndarray, "spheres 3"], Float[np.ndarray, "spheres"], Int[np.ndarray, "spheres"]]:
     """Return centres in link frames [m], radii [m] and links of at most `MOST_OF_HAND` spheres that fill the links."""
-    centers, radii, links = [], [], []
-    for primitive in hand.primitives:
-        at, radius = _fill(primitive)
-        at = at @ primitive.rotation.T + primitive.translation
-        centers.append(at)
-        radii.append(np.full(len(at), radius))
-        links.append(np.full(len(at), primitive.link))
-    center, radius, link = np.concatenate(centers), np.concatenate(radii), np.concatenate(links)
+    filled = [(*_fill(solid), solid) for solid in hand.primitives]
+    center = np.concatenate([at @ solid.rotation.T + solid.translation for at, _, solid in filled])
+    counts = [len(at) for at, _, _ in filled]
+    radius = np.repeat([radius for _, radius, _ in filled], counts)
+    link = np.repeat([solid.link for _, _, solid in filled], counts)
     groups = hand.link_group[link]
     if len(link) > MOST_OF_HAND or np.bincount(groups).max() > MOST_OF_GROUP:
         kept = _spread(in_base(link_poses(hand, hand.open_posture), center, link), radius, groups)

@@ -63,7 +63,7 @@ def feature_points(primitive: Primitive, spacing: float) -> tuple[Points, Points
         corner = np.zeros(len(points), dtype=bool)
     elif primitive.kind == "hull":
         points = primitive.vertices
-        normals = _unit(points - points.mean(0))
+        normals = units(points - points.mean(0))
         corner = np.ones(len(points), dtype=bool)
     else:
         points, normals, corner = np.zeros((0, 3)), np.zeros((0, 3)), np.zeros(0, dtype=bool)
@@ -81,8 +81,10 @@ def _to_link(primitive: Primitive, points: Points, normals: Points) -> tuple[Poi
     return points @ primitive.rotation.T + primitive.translation, normals @ primitive.rotation.T
 
 
-def _unit(vectors: Points) -> Points:
-    return vectors / np.maximum(np.linalg.norm(vectors, axis=-1, keepdims=True), 1e-12)
+def units(vectors: Float[np.ndarray, "*n 3"], least: float = 0.0) -> Float[np.ndarray, "*n 3"]:
+    """Return unit vectors. A vector not longer than `least` gives zero."""
+    length = np.linalg.norm(vectors, axis=-1, keepdims=True)
+    return np.where(length > least, vectors / np.maximum(length, 1e-300), 0.0)
 
 
 def _box(half: Float[np.ndarray, "3"], count: int, rng: np.random.Generator) -> tuple[Points, Points]:
@@ -122,12 +124,12 @@ def _hull(primitive: Primitive, count: int, rng: np.random.Generator) -> tuple[P
     a, b, c = (primitive.vertices[chosen[:, i]] for i in range(3))
     u, v = rng.uniform(size=(2, count, 1))
     u, v = np.where(u + v > 1, 1 - u, u), np.where(u + v > 1, 1 - v, v)
-    return a + u * (b - a) + v * (c - a), _unit(np.cross(b - a, c - a))
+    return a + u * (b - a) + v * (c - a), units(np.cross(b - a, c - a))
 
 
 def _box_edges(half: Float[np.ndarray, "3"], spacing: float) -> tuple[Points, Points, Bool[np.ndarray, "points"]]:
     corners = np.array(np.meshgrid([-1.0, 1.0], [-1.0, 1.0], [-1.0, 1.0])).reshape(3, 8).T
-    points, normals = [corners * half], [_unit(corners)]
+    points, normals = [corners * half], [units(corners)]
     for axis in range(3):
         inner = np.linspace(-1.0, 1.0, int(np.ceil(2 * half[axis] / spacing)) + 1)[1:-1]
         starts = corners[corners[:, axis] < 0]
@@ -136,7 +138,7 @@ def _box_edges(half: Float[np.ndarray, "3"], spacing: float) -> tuple[Points, Po
         outward = np.repeat(starts, len(inner), axis=0)
         outward[:, axis] = 0.0
         points.append(edge * half)
-        normals.append(_unit(outward))
+        normals.append(units(outward))
     corner = np.arange(sum(len(p) for p in points)) < 8
     return np.concatenate(points), np.concatenate(normals), corner
 
@@ -146,7 +148,7 @@ def _rims(radius: float, half: float, spacing: float) -> tuple[Points, Points]:
     around = np.column_stack([np.cos(turn), np.sin(turn), np.zeros(len(turn))])
     up = np.array([0.0, 0.0, 1.0])
     points = np.concatenate([radius * around + half * up, radius * around - half * up])
-    return points, _unit(np.concatenate([around + up, around - up]))
+    return points, units(np.concatenate([around + up, around - up]))
 
 
 # Fields of the hand model that do not influence the samples.
@@ -380,9 +382,8 @@ def _weights(hand: HandModel, pool: _Pool) -> tuple[Float[np.ndarray, "points"],
     closing = hand.open_posture + 0.02 * (hand.closed_posture - hand.open_posture)
     motion = in_base(link_poses(hand, closing), pool.points, pool.links) - placed
     motion[groups == hand.link_group[0]] = hand.palm_normal
-    motion /= np.maximum(np.linalg.norm(motion, axis=1, keepdims=True), 1e-9)
     outward = np.einsum("pij,pj->pi", rotations[pool.links], pool.normals)
-    facing = (outward * motion).sum(1)
+    facing = (outward * units(motion, 1e-9)).sum(1)
     weights = _BACK_WEIGHT + 0.5 * (1.0 - _BACK_WEIGHT) * (1.0 + facing)
     weights[(pool.areas == 0) & (facing > -0.1)] *= _EDGE_WEIGHT
     reach = np.linalg.norm(placed - origins[groups], axis=1)

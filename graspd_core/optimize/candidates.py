@@ -157,26 +157,6 @@ def finished(problem: Problem, hand: HandModel, some: Staged) -> list[Grasp]:
         depth = -gap_on_path(problem.obstacles, problem.hand.kinematics, some.opened, some.poses)
         knocks = approach_depth(problem, problem.obstacles, some.opened) > _DEEPEST
         scores = torch.where(depth > _DEEPEST, -torch.inf, scores - torch.where(knocks, _KNOCK_COST, 0.0))
-    return _grasps(hand, some, scores)
-
-
-def staged(
-    problem: Problem, hand: HandModel, poses: Poses, config: PlanConfig, stop: Callable[[], bool] = lambda: False
-) -> Staged:
-    """Reduce penetration (`settle`), then compute contacts, squeeze and pregrasp. The batch must fit in memory."""
-    poses = settle(problem, poses, stop)
-    contact_set = find_contacts(problem, poses, config.grasp_stages.touch_reach)
-    effort = torch.as_tensor(hand.effort).to(problem.hand.lower)
-    pressed = squeeze(problem, poses, contact_set, effort, config.grasp_stages)
-    opened, clearance = find_pregrasp(problem, poses, config.grasp_stages, stop)
-    overlap = torch.maximum(*(self_overlap(problem, at.joints) for at in (poses, opened)))
-    if problem.hand.has_hulls:
-        depths = [deepest_overlap(hand, at.joints.double().cpu().numpy()) for at in (poses, opened)]
-        overlap = torch.maximum(overlap, torch.as_tensor(np.maximum(*depths)).to(overlap))
-    return Staged(poses, opened, clearance, contact_set, pressed, overlap)
-
-
-def _grasps(hand: HandModel, some: Staged, scores: Tensor) -> list[Grasp]:
     poses, opened, found = some.poses, some.opened, some.contact_set
     quaternion = _numbers(poses.quaternion / poses.quaternion.norm(dim=-1, keepdim=True))
     active, distance = found.active.cpu().numpy(), found.distance.abs().cpu().numpy()
@@ -200,6 +180,22 @@ def _grasps(hand: HandModel, some: Staged, scores: Tensor) -> list[Grasp]:
         )
         grasps.append(Grasp(pregrasp=pregrasp, grasp=grasp, squeeze=squeezed, contacts=contacts, score=odds))
     return grasps
+
+
+def staged(
+    problem: Problem, hand: HandModel, poses: Poses, config: PlanConfig, stop: Callable[[], bool] = lambda: False
+) -> Staged:
+    """Reduce penetration (`settle`), then compute contacts, squeeze and pregrasp. The batch must fit in memory."""
+    poses = settle(problem, poses, stop)
+    contact_set = find_contacts(problem, poses, config.grasp_stages.touch_reach)
+    effort = torch.as_tensor(hand.effort).to(problem.hand.lower)
+    pressed = squeeze(problem, poses, contact_set, effort, config.grasp_stages)
+    opened, clearance = find_pregrasp(problem, poses, config.grasp_stages, stop)
+    overlap = torch.maximum(*(self_overlap(problem, at.joints) for at in (poses, opened)))
+    if problem.hand.has_hulls:
+        depths = [deepest_overlap(hand, at.joints.double().cpu().numpy()) for at in (poses, opened)]
+        overlap = torch.maximum(overlap, torch.as_tensor(np.maximum(*depths)).to(overlap))
+    return Staged(poses, opened, clearance, contact_set, pressed, overlap)
 
 
 def _numbers(values: Tensor) -> np.ndarray:

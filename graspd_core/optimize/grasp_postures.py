@@ -16,16 +16,17 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from graspd_core.config import GraspStagesConfig
-from graspd_core.hands.kinematics import RETREAT, drawn_back, forward, place_points
+from graspd_core.hands.kinematics import RETREAT, drawn_back, forward
 from graspd_core.hands.link_distance import pair_distance, solid_distance
 from graspd_core.hands.self_collision import solid_overlaps
 from graspd_core.mesh.sdf import sample_sdf
 from graspd_core.optimize.kernel import builds as structs
-from graspd_core.optimize.loop import Distances, Joints, Poses, Rows, Values, adam_moments, pack
+from graspd_core.optimize.loop import Joints, Poses, Rows, Values, adam_moments, pack
 from graspd_core.optimize.obstacle_distance import RETREAT_SHARES, ObstacleTensors
 from graspd_core.optimize.problem import (
     HandPlacement,
     Problem,
+    hand_distance,
     hand_forward,
     obstacle_depth,
     self_collision,
@@ -221,17 +222,11 @@ def settle(problem: Problem, poses: Poses, stop: Callable[[], bool] = lambda: Fa
     The loss penalises object surface points inside the hand's primitives, and contact candidates inside the object.
     Candidates that touch the object are kept near it.
     """
-    if (compiled := problem.of_surface.compiled) is not None:
-        x = pack(poses).contiguous()
-        out = x.new_empty(len(x), x.shape[1] - 4)
-        compiled.call("graspd_settle", _SETTLING, len(x), x, out, watch=lambda _: stop())
-    else:
-        out = _settle(problem, poses, stop)
-    return Poses(out[:, :3], poses.quaternion, out[:, 3:])
-
-
-def _settle(problem: Problem, poses: Poses, stop: Callable[[], bool]) -> Rows:
     start = torch.cat([poses.translation, poses.joints], -1)
+    if (compiled := problem.of_surface.compiled) is not None:
+        x, out = pack(poses).contiguous(), torch.empty_like(start)
+        compiled.call("graspd_settle", _SETTLING, len(x), x, out, watch=lambda _: stop())
+        return Poses(out[:, :3], poses.quaternion, out[:, 3:])
     rates, cost = _rates_and_costs(problem, _SETTLING)
     with torch.no_grad():
         reached = sample_sdf(problem.object.sdf, hand_forward(problem, problem.hand.fine, poses).points)[0]
@@ -248,7 +243,8 @@ def _settle(problem: Problem, poses: Poses, stop: Callable[[], bool]) -> Rows:
             total = total + _SETTLING.self_collision * blocked
         return total + (cost * (x - start) ** 2).sum(-1)
 
-    return _descended(problem, start, loss, rates, _SETTLING.steps, stop)
+    out = _descended(problem, start, loss, rates, _SETTLING.steps, stop)
+    return Poses(out[:, :3], poses.quaternion, out[:, 3:])
 
 
 def _sunk_surface(on_surface: Problem, placed: HandPlacement, poses: Poses, x: Rows) -> Values:
@@ -315,12 +311,6 @@ def approach_depth(problem: Problem, obstacles: ObstacleTensors, pregrasp: Poses
     begun = [drawn_back(pregrasp.translation, rotation, obstacles.approach, RETREAT * s) for s in RETREAT_SHARES]
     nearest = [hand_distance(problem, SE3(rotation, at), pregrasp.joints).amin(-1) for at in begun]
     return (-torch.stack(nearest).amin(0)).clamp_min(0.0)
-
-
-def hand_distance(problem: Problem, base: SE3, joints: Joints) -> Distances:
-    """Return the signed distance of every coarse contact candidate to the object [m]."""
-    points = place_points(problem.hand.coarse.matrix, forward(problem.hand.kinematics, joints))
-    return sample_sdf(problem.object.sdf, base.apply(points))[0]
 
 
 @dataclass(frozen=True)

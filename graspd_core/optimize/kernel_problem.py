@@ -15,7 +15,8 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from graspd_core.hands.kinematics import placed_points
+from graspd_core.hands.model import HandModel
+from graspd_core.hands.self_collision import collision_spheres
 from graspd_core.mesh.sdf import GridSDF
 from graspd_core.optimize.kernel import builds as structs
 from graspd_core.optimize.obstacle_distance import ObstacleTensors
@@ -131,19 +132,19 @@ def kernel_problem(problem: Problem) -> KernelProblem:
 def _hand(hand: HandTensors) -> tuple[dict[str, Structure], Arrays]:
     """Return the fields of `builds.Problem` that describe the hand, and the arrays of these fields."""
     arrays = Arrays()
-    spheres, links = placed_points(hand.spheres.matrix)
-    order = np.argsort(links.numpy(), kind="stable")
+    spheres, radii, links = collision_spheres(hand.model)
+    order = np.argsort(links, kind="stable")
     width = _padded(len(order))
     weight = np.zeros((len(order), width))
     # Each pair is stored once, above the diagonal. Sorting the spheres by link may move a pair below the diagonal.
     both = hand.spheres.weight + hand.spheres.weight.T
     weight[:, : len(order)] = np.triu(both.numpy()[np.ix_(order, order)], 1)
-    centers = _points(spheres.numpy()[order], links.numpy()[order], arrays)
-    radius = arrays.rows(hand.spheres.radii.numpy()[order, None], width)
+    centers = _points(spheres[order], links[order], arrays)
+    radius = arrays.rows(radii[order, None], width)
     parts: dict[str, Structure] = {
         "hand": _links(hand, arrays),
-        "coarse": _candidates(hand.coarse, arrays),
-        "fine": _candidates(hand.fine, arrays),
+        "coarse": _candidates(hand.model, hand.coarse, arrays),
+        "fine": _candidates(hand.model, hand.fine, arrays),
         "solids": _solids(hand, arrays),
         "spheres": structs.Spheres(centers, radius, arrays.floats(weight)),
     }
@@ -153,8 +154,6 @@ def _hand(hand: HandTensors) -> tuple[dict[str, Structure], Arrays]:
 def _links(hand: HandTensors, arrays: Arrays) -> structs.Hand:
     model, k = hand.model, hand.kinematics
     count = model.num_links
-    moved = model.link_joint >= 0
-    kind = np.array([_KINDS[kind] if moves else 0 for kind, moves in zip(model.joint_kind, moved, strict=True)])
     order = k.order.numpy()
 
     def rows(values: Tensor | None) -> int:
@@ -166,7 +165,7 @@ def _links(hand: HandTensors, arrays: Arrays) -> structs.Hand:
         groups=len(hand.reach),
         parent=arrays.ints(model.link_parent),
         joint=arrays.ints(np.maximum(model.link_joint, 0)),
-        kind=arrays.ints(kind),
+        kind=arrays.ints(np.array([_KINDS[kind] for kind in model.joint_kind])),
         **{name: rows(getattr(k, name)) for name in ("constant", "sine", "cosine", "slide")},
         axis=arrays.floats(model.joint_axis),
         multiplier=arrays.floats(model.link_multiplier),
@@ -175,16 +174,16 @@ def _links(hand: HandTensors, arrays: Arrays) -> structs.Hand:
     )
 
 
-def _candidates(points: PointSet, arrays: Arrays) -> structs.Points:
+def _candidates(hand: HandModel, points: PointSet, arrays: Arrays) -> structs.Points:
     """Return the contact candidates sorted by candidate group (`PointSet.groups`), then by link."""
-    at, links = (values.numpy() for values in placed_points(points.matrix))
+    links = points.links.numpy()
     # A candidate on links without coarse candidates is in no group, and comes last.
-    group = np.full(len(at), len(points.groups))
+    group = np.full(len(links), len(points.groups))
     for index, members in enumerate(points.groups.numpy()):
         group[members] = index
     order = np.lexsort((links, group))
     starts = np.searchsorted(group[order], np.arange(len(points.groups) + 1))
-    return _points(at[order], links[order], arrays, starts)
+    return _points(hand.candidate_points[order], links[order], arrays, starts)
 
 
 def _points(
@@ -250,8 +249,8 @@ def _obstacles(obstacles: ObstacleTensors | None, arrays: Arrays) -> structs.Obs
         return structs.Obstacles()
     grids = (structs.Grid * len(obstacles.sdfs))(*(_grid(sdf, arrays) for sdf in obstacles.sdfs))
     arrays.kept.append(grids)
-    corners, corner_radius = _balls(obstacles.corner_matrix, obstacles.corner_radii, arrays)
-    spheres, sphere_radius = _balls(obstacles.sphere_matrix, obstacles.sphere_radii, arrays)
+    corners, corner_radius = _balls(obstacles, slice(obstacles.corners), arrays)
+    spheres, sphere_radius = _balls(obstacles, slice(obstacles.corners, None), arrays)
     return structs.Obstacles(
         grids=len(obstacles.sdfs),
         has_support=obstacles.normal is not None,
@@ -266,10 +265,10 @@ def _obstacles(obstacles: ObstacleTensors | None, arrays: Arrays) -> structs.Obs
     )
 
 
-def _balls(matrix: Tensor, radii: Tensor, arrays: Arrays) -> tuple[structs.Points, int]:
-    at, links = (values.numpy() for values in placed_points(matrix))
+def _balls(obstacles: ObstacleTensors, some: slice, arrays: Arrays) -> tuple[structs.Points, int]:
+    points, radii, links = (x[some].numpy() for x in (obstacles.points, obstacles.radii, obstacles.links))
     order = np.argsort(links, kind="stable")
-    return _points(at[order], links[order], arrays), arrays.floats(radii.numpy()[order])
+    return _points(points[order], links[order], arrays), arrays.floats(radii[order])
 
 
 def _padded(count: int) -> int:

@@ -49,22 +49,17 @@ class ObstacleTensors:
     """Support and obstacles, and the points of the hand that are tested against them.
 
     Attributes:
-        corner_matrix: matrix from which `place_points` computes the extreme points of the hand's primitives.
-        corner_radii: radii of the balls about the extreme points [m].
-        sphere_matrix: matrix from which `place_points` computes the centres of the collision spheres.
-        sphere_radii: radii of the collision spheres [m].
         normal: unit normal of the support, towards the free side. None without a support.
         offset: n·x on the support, raised by the margin of the support [m]. 0 without a support.
         sdfs: signed distance fields of the obstacles within the hand's reach.
         approach: unit direction in which the hand moves to its pregrasp, base frame.
-        points, radii, links: centre in the link frame [m], radius [m] and link of each ball: corners, then spheres.
+        points, radii, links: centre in the link frame [m], radius [m] and link of each ball: first the balls about the
+            extreme points of the hand's primitives, then the collision spheres.
+        corners: number of balls about extreme points.
+        matrix: matrix from which `place_points` computes the centres of the balls.
         around: for each link, a ball that encloses all balls of the link: centre in the link frame and radius [m].
     """
 
-    corner_matrix: Float[Tensor, "corners columns"]
-    corner_radii: Float[Tensor, "corners"]
-    sphere_matrix: Float[Tensor, "spheres columns"]
-    sphere_radii: Float[Tensor, "spheres"]
     normal: Float[Tensor, "3"] | None
     offset: float
     sdfs: tuple[GridSDF, ...]
@@ -72,6 +67,8 @@ class ObstacleTensors:
     points: Float[Tensor, "balls 3"]
     radii: Float[Tensor, "balls"]
     links: Int[Tensor, "balls"]
+    corners: int
+    matrix: Float[Tensor, "balls columns"]
     around: tuple[Float[Tensor, "links 3"], Float[Tensor, "links"]]
 
 
@@ -93,26 +90,20 @@ def make_obstacle_tensors(
     def tensor(values: np.ndarray) -> Tensor:
         return torch.as_tensor(values, device=device, dtype=dtype)
 
-    def placed(points: np.ndarray, links: np.ndarray) -> Tensor:
-        return placement(hand.num_links, tensor(points), torch.as_tensor(links, device=device, dtype=torch.long))
-
-    corners, radii, links = extreme_points(hand)
-    centers, sphere_radii, sphere_links = collision_spheres(hand)
-    points, widths = np.concatenate([corners, centers]), np.concatenate([radii, sphere_radii])
-    owners = np.concatenate([links, sphere_links])
-    around = _balls_about(hand.num_links, points, widths, owners)
+    corners = extreme_points(hand)
+    points, radii, links = map(np.concatenate, zip(corners, collision_spheres(hand), strict=True))
+    around = _balls_about(hand.num_links, points, radii, links)
+    centers, owners = tensor(points), torch.as_tensor(links, device=device, dtype=torch.long)
     return ObstacleTensors(
-        corner_matrix=placed(corners, links),
-        corner_radii=tensor(radii),
-        sphere_matrix=placed(centers, sphere_links),
-        sphere_radii=tensor(sphere_radii),
         normal=None if scene.support is None else tensor(scene.support.normal),
         offset=0.0 if scene.support is None else scene.support.offset + scene.support.margin,
         sdfs=tuple(n.sdf.to(device, dtype) for n in reached),
         approach=tensor(hand.approach),
-        points=tensor(points),
-        radii=tensor(widths),
-        links=torch.as_tensor(owners, device=device, dtype=torch.long),
+        points=centers,
+        radii=tensor(radii),
+        links=owners,
+        corners=len(corners[0]),
+        matrix=placement(hand.num_links, centers, owners),
         around=(tensor(around[:, :3]), tensor(around[:, 3])),
     )
 
@@ -164,21 +155,23 @@ def _extremes(primitive: Primitive) -> tuple[Float[np.ndarray, "n 3"], float]:
     return outermost(corners, _HULL) if len(corners) > _HULL else corners, 0.0
 
 
-def obstacle_gaps(obstacles: ObstacleTensors, base: SE3, links: SE3, wide: float = WIDE) -> Float[Tensor, "batch gaps"]:
+def obstacle_gaps(obstacles: ObstacleTensors, base: SE3, links: SE3) -> Float[Tensor, "batch gaps"]:
     """Return signed distances [m] of the hand's balls to support and obstacles. `links` are poses in the base frame.
 
-    Distances are negative inside. A distance of at least `wide` may be returned as `wide`.
+    Distances are negative inside. A distance of at least `WIDE` may be returned as `WIDE`.
     """
-    corners = base.apply(place_points(obstacles.corner_matrix, links))
-    gaps = []
-    if obstacles.normal is not None:
-        gaps.append(corners @ obstacles.normal - obstacles.offset - obstacles.corner_radii)
+    gaps = [] if obstacles.normal is None else [_support_gaps(obstacles, obstacles.normal, base, links)]
     if obstacles.sdfs:
-        spheres = base.apply(place_points(obstacles.sphere_matrix, links))
-        points = torch.cat([corners, spheres], 1)
-        radii = torch.cat([obstacles.corner_radii, obstacles.sphere_radii])
-        gaps.extend(_gaps_to(sdf, points, radii, wide) for sdf in obstacles.sdfs)
+        points = base.apply(place_points(obstacles.matrix, links))
+        gaps += [_gaps_to(sdf, points, obstacles.radii, WIDE) for sdf in obstacles.sdfs]
     return torch.cat(gaps, -1)
+
+
+def _support_gaps(
+    obstacles: ObstacleTensors, normal: Float[Tensor, "3"], base: SE3, links: SE3
+) -> Float[Tensor, "batch corners"]:
+    corners = base.apply(place_points(obstacles.matrix[: obstacles.corners], links))
+    return corners @ normal - obstacles.offset - obstacles.radii[: obstacles.corners]
 
 
 @torch.no_grad()
@@ -189,8 +182,7 @@ def least_gap(obstacles: ObstacleTensors, base: SE3, links: SE3, wide: float = W
     """
     least = base.translation.new_full(base.translation.shape[:1], wide)
     if obstacles.normal is not None:
-        corners = base.apply(place_points(obstacles.corner_matrix, links))
-        least = (corners @ obstacles.normal - obstacles.offset - obstacles.corner_radii).amin(-1)
+        least = _support_gaps(obstacles, obstacles.normal, base, links).amin(-1)
     if obstacles.sdfs:
         rotation = base.rotation[:, None] @ links.rotation
         place = base.apply(links.translation)

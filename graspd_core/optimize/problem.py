@@ -30,7 +30,7 @@ from graspd_core.mesh.sdf import GridSDF, sample_sdf
 from graspd_core.mesh.sharp_features import THIN_WALLED, crease_points, neighbours_together
 from graspd_core.optimize import losses
 from graspd_core.optimize.kernel.builds import kernel
-from graspd_core.optimize.loop import Distances, Points, Poses, Values
+from graspd_core.optimize.loop import Distances, Joints, Points, Poses, Values
 from graspd_core.optimize.losses import disturbance_directions, wrench_support
 from graspd_core.optimize.obstacle_distance import ObstacleTensors, make_obstacle_tensors, obstacle_gaps
 from graspd_core.perception.scene import Scene, object_sharp_points, sample_confidence
@@ -449,7 +449,12 @@ def evaluate(
     )
 
 
+def hand_distance(problem: Problem, base: SE3, joints: Joints) -> Distances:
+    """Return the signed distance of every coarse contact candidate to the object [m]."""
+    points = place_points(problem.hand.coarse.matrix, forward(problem.hand.kinematics, joints))
+    return sample_sdf(problem.object.sdf, base.apply(points))[0]
+
+
 def least_distance(problem: Problem, poses: Poses) -> Values:
     """Return the least distance of any coarse contact candidate to the object [m]."""
-    placed = hand_forward(problem, problem.hand.coarse, poses)
-    return sample_sdf(problem.object.sdf, placed.points)[0].amin(-1)
+    return hand_distance(problem, poses.base, poses.joints).amin(-1)

@@ -30,10 +30,11 @@ from graspd_core import HandModel, PlanConfig, Problem, draw_starts, hand_names,
 from graspd_core.config import ProblemConfig
 from graspd_core.hands.kinematics import forward
 from graspd_core.optimize.candidates import PlannerInput, PlannerOutput, find_candidates
-from graspd_core.optimize.grasp_postures import ContactSet, hand_distance
+from graspd_core.optimize.grasp_postures import ContactSet
 from graspd_core.optimize.loop import Hooks, Poses, minimise
 from graspd_core.optimize.losses import disturbance_directions
 from graspd_core.optimize.obstacle_distance import obstacle_gaps
+from graspd_core.optimize.problem import hand_distance
 from graspd_core.perception.scene import Scene, build_scene
 from graspd_core.se3 import rotation_from_quaternion
 from graspd_core.types import Plane

@@ -86,9 +86,7 @@ def test_gaps_up_to_the_widest_are_exact_and_wider_ones_are_known_to_be(hand, sc
     starts = draw_starts(scenes["box"], hand, 6, 0, "cpu", DOUBLE)
     links = forward(small_problem(scene, hand).hand.kinematics, starts.joints)
     base = starts.base
-    balls = [(obstacles.corner_matrix, obstacles.corner_radii), (obstacles.sphere_matrix, obstacles.sphere_radii)]
-    whole = [sample_sdf(obstacles.sdfs[0], base.apply(place_points(at, links)))[0] - radii for at, radii in balls]
-    exact = torch.cat(whole, -1)
+    exact = sample_sdf(obstacles.sdfs[0], base.apply(place_points(obstacles.matrix, links)))[0] - obstacles.radii
     gaps = obstacle_gaps(replace(obstacles, normal=None, sdfs=obstacles.sdfs[:1]), base, links)
     close = exact < WIDE
     assert 0 < int(close.sum()) < close.numel()

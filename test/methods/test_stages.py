@@ -22,12 +22,12 @@ from graspd_core.optimize.grasp_postures import (
     by_link,
     find_contacts,
     find_pregrasp,
-    hand_distance,
     joint_torques,
     self_overlap,
     squeeze,
 )
 from graspd_core.optimize.loop import Hooks, Poses
+from graspd_core.optimize.problem import hand_distance
 from graspd_core.optimize.ranking import Staged, log_odds, ranking_figures, score
 from graspd_core.se3 import rotation_from_quaternion
 

@@ -28,14 +28,8 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from graspd_core.errors import HandError
-from graspd_core.hands.mano.mano_file import BODIES, PARENTS, ManoData, read_mano
-from graspd_core.hands.mano.mano_skin import (
-    close_wrist,
-    closed_faces,
-    rest,
-    rotation_from_vector,
-    skin_vertices,
-)
+from graspd_core.hands.mano.mano_file import BODIES, FINGERS, PARENTS, ManoData, read_mano
+from graspd_core.hands.mano.mano_skin import close_wrist, closed_faces, rest, rotation_from_vector, skin_vertices
 from graspd_core.hands.model import HandModel, Primitive
 from graspd_core.hands.self_collision import adjacent_links
 from graspd_core.hands.surface_points import with_candidates
@@ -46,47 +40,36 @@ from graspd_core.types import Posture, TriangleMesh
 HINGES = ("flexion", "abduction", "twist")
 # The thumb flexes towards a point at this distance in front of the palm [m].
 _OPPOSITION = 0.05
-# Limits of flexion, abduction and twist [deg] from the flat hand. The joints of a finger flex by 90, 110 and 90, and a
-# knuckle abducts by ±15 (Lin, Wu and Huang 2000). A knuckle also bends 20 backwards (Norkin and White: 45 passively).
-# The thumb's knuckle and tip flex by 50 and 80 (American Academy of Orthopaedic Surgeons 1965). Its saddle joint has
-# total ranges of 53, 42 and 17 (Cooney et al. 1981), near the middle of which MANO's rest pose lies. Axes that are no
-# degree of freedom in the literature get a small range, because human joints have some play.
-_LIMITS_DEG = {
-    "finger1": ((-20.0, 90.0), (-15.0, 15.0), (-5.0, 5.0)),
-    "finger2": ((-5.0, 110.0), (-3.0, 3.0), (-3.0, 3.0)),
-    "finger3": ((-5.0, 90.0), (-3.0, 3.0), (-3.0, 3.0)),
-    "thumb1": ((-20.0, 33.0), (-21.0, 21.0), (-8.5, 8.5)),
-    "thumb2": ((-10.0, 50.0), (-8.0, 8.0), (-5.0, 5.0)),
-    "thumb3": ((-15.0, 80.0), (-3.0, 3.0), (-3.0, 3.0)),
-}
+# Limits of flexion, abduction and twist of three joints [deg] from the flat hand. A finger's joints flex by 90, 110 and
+# 90, and a knuckle abducts by ±15 (Lin, Wu and Huang 2000). A knuckle also bends 20 backwards (Norkin and White: 45
+# passively). The thumb's knuckle and tip flex by 50 and 80 (American Academy of Orthopaedic Surgeons 1965). Its saddle
+# joint has total ranges of 53, 42 and 17 (Cooney et al. 1981), near the middle of which MANO's rest pose lies. Axes
+# that are no degree of freedom in the literature get a small range, because human joints have some play.
+_FINGER_LIMITS = (
+    ((-20.0, 90.0), (-15.0, 15.0), (-5.0, 5.0)),
+    ((-5.0, 110.0), (-3.0, 3.0), (-3.0, 3.0)),
+    ((-5.0, 90.0), (-3.0, 3.0), (-3.0, 3.0)),
+)
+_THUMB_LIMITS = (
+    ((-20.0, 33.0), (-21.0, 21.0), (-8.5, 8.5)),
+    ((-10.0, 50.0), (-8.0, 8.0), (-5.0, 5.0)),
+    ((-15.0, 80.0), (-3.0, 3.0), (-3.0, 3.0)),
+)
 # Flexion of the open and of the closed hand [deg], for the three joints of a finger and of the thumb.
-_OPEN_DEG = {"finger": (10.0, 20.0, 10.0), "thumb": (10.0, 0.0, 0.0)}
-_CLOSED_DEG = {"finger": (45.0, 40.0, 20.0), "thumb": (15.0, 10.0, 10.0)}
+_OPEN, _CLOSED = ((10.0, 20.0, 10.0), (10.0, 0.0, 0.0)), ((45.0, 40.0, 20.0), (15.0, 10.0, 10.0))
 # Greatest force of a fingertip [N]: half of an adult's tip pinch (Mathiowetz et al. 1985: 50 N women, 80 N men).
 _TIP_FORCE = 30.0
 # Least lever arm of every axis [m]. Twist has this lever arm.
 _LEAST_LEVER = 0.02
 
 
-def kind_of(body: int) -> str:
-    """Return the key of the body's joint limits in `_LIMITS_DEG`. The body must not be the wrist."""
-    name = BODIES[body]
-    return name if name.startswith("thumb") else f"finger{name[-1]}"
+def _all_fingers(finger: tuple, thumb: tuple) -> Float[np.ndarray, "15 *values"]:
+    """Return the values of a finger's and of the thumb's joints [deg] for all bodies except the wrist [rad]."""
+    return np.deg2rad([*finger * (len(FINGERS) - 1), *thumb])
 
 
-def limits() -> tuple[Float[np.ndarray, "45"], Float[np.ndarray, "45"]]:
-    """Return the lower and upper limits of the hinges, body by body [rad]."""
-    table = np.deg2rad([_LIMITS_DEG[kind_of(body)] for body in range(1, len(BODIES))])
-    return table[..., 0].ravel(), table[..., 1].ravel()
-
-
-def postures() -> tuple[Float[np.ndarray, "45"], Float[np.ndarray, "45"]]:
-    """Return open and closed joint values [rad]."""
-    made = []
-    for table in (_OPEN_DEG, _CLOSED_DEG):
-        flexion = [table["thumb" if kind_of(b).startswith("thumb") else "finger"][(b - 1) % 3] for b in range(1, 16)]
-        made.append(np.column_stack([np.deg2rad(flexion), np.zeros(15), np.zeros(15)]).ravel())
-    return made[0], made[1]
+def _posture(finger: tuple[float, ...], thumb: tuple[float, ...]) -> Float[np.ndarray, "45"]:
+    return np.column_stack([_all_fingers(finger, thumb), np.zeros((15, 2))]).ravel()
 
 
 def efforts(joints: Float[np.ndarray, "16 3"], tips: Float[np.ndarray, "5 3"]) -> Float[np.ndarray, "45"]:
@@ -241,19 +224,18 @@ def _bare_hand(still: _Rest) -> HandModel:
     mass, com, inertia = np.zeros(count), np.zeros((count, 3)), np.zeros((count, 3, 3))
     for body, hull in hulls.items():
         mass[link_of[body]], com[link_of[body]], inertia[link_of[body]] = _inertial(hull)
-    lower, upper = limits()
-    opened, closed = postures()
+    limits = _all_fingers(_FINGER_LIMITS, _THUMB_LIMITS)
     return HandModel(
         name=data.path.stem,
         urdf=str(data.path),
         **tree,
         joint_names=tuple(f"{name}_{hinge}" for name in BODIES[1:] for hinge in HINGES),
-        lower=lower,
-        upper=upper,
+        lower=limits[..., 0].ravel(),
+        upper=limits[..., 1].ravel(),
         effort=efforts(still.joints, still.tips),
         velocity=np.full(count - 1, np.inf),
-        open_posture=opened,
-        closed_posture=closed,
+        open_posture=_posture(*_OPEN),
+        closed_posture=_posture(*_CLOSED),
         palm_center=_palm_center(hulls[0], still.joints, normal),
         palm_normal=normal,
         approach=normal,

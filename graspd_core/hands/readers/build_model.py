@@ -116,19 +116,18 @@ def assemble(
     by_name, into = {link.name: link for link in links}, {joint.child: joint for joint in joints}
     specs = [by_name[link] for link in order]
     chain, couplings, mended = _settled(path, [into[link] for link in order[1:]], couplings)
-    joint_fields = _actuated([joint for joint in chain if joint.kind != "fixed" and joint.name not in couplings])
-    if not joint_fields["joint_names"]:
+    tree = _tree(order, chain, couplings)
+    if not tree["joint_names"]:
         told = f"{path}: {name!r} has no joint that moves ({len(order)} links); valid: one movable joint or more"
         raise HandError("; ".join([told, *mended]))
     return HandModel(
         name=name,
         urdf=str(path),
         link_names=tuple(order),
-        **joint_fields,
+        **tree,
         palm_center=np.zeros(3),
         palm_normal=np.array([1.0, 0.0, 0.0]),
         approach=np.array([1.0, 0.0, 0.0]),
-        **_linked(order, chain, couplings),
         link_mass=np.array([spec.mass for spec in specs]),
         link_com=np.stack([spec.com for spec in specs]),
         link_inertia=np.stack([spec.inertia for spec in specs]),
@@ -138,19 +137,14 @@ def assemble(
     )
 
 
-def _actuated(joints: Sequence[JointSpec]) -> dict[str, Any]:
+def _tree(order: Sequence[str], chain: Sequence[JointSpec], couplings: Mapping[str, Coupling]) -> dict[str, Any]:
+    """Return the fields of links and joints. `chain` has the joint above each link except link 0."""
+    actuated = [joint for joint in chain if joint.kind != "fixed" and joint.name not in couplings]
     keys = ("lower", "upper", "effort", "velocity")
-    limits = {key: np.array([getattr(joint, key) for joint in joints], dtype=float) for key in keys}
+    limits = {key: np.array([getattr(joint, key) for joint in actuated], dtype=float) for key in keys}
     middle = 0.5 * (limits["lower"] + limits["upper"])
-    names = tuple(joint.name for joint in joints)
-    return {"joint_names": names, **limits, "open_posture": middle, "closed_posture": middle}
-
-
-def _linked(order: Sequence[str], chain: Sequence[JointSpec], couplings: Mapping[str, Coupling]) -> dict[str, Any]:
-    """Return the fields of a hand model that describe its tree. `chain` has the joint above each link except link 0."""
     index = {link: i for i, link in enumerate(order)}
-    actuated = [joint.name for joint in chain if joint.kind != "fixed" and joint.name not in couplings]
-    number = {joint: i for i, joint in enumerate(actuated)}
+    number = {joint.name: i for i, joint in enumerate(actuated)}
     link_joint, group = np.full(len(order), -1), np.arange(len(order))
     mimics: list[Mimic] = []
     for link, joint in enumerate(chain, start=1):
@@ -163,6 +157,10 @@ def _linked(order: Sequence[str], chain: Sequence[JointSpec], couplings: Mapping
         if joint.name in couplings:
             mimics.append(Mimic(joint.name, link, number[leader], multiplier, offset))
     return {
+        "joint_names": tuple(number),
+        **limits,
+        "open_posture": middle,
+        "closed_posture": middle,
         "link_parent": np.array([-1, *(index[joint.parent] for joint in chain)]),
         "link_joint": link_joint,
         "link_offset_rotation": np.stack([np.eye(3), *(joint.rotation for joint in chain)]),
@@ -181,44 +179,37 @@ def _depth_first(path: Path, links: Sequence[LinkSpec], joints: Sequence[JointSp
     _refuse_repeated(path, "joint", [joint.name for joint in joints])
     if not 0 < len(names) <= _MOST_LINKS:
         raise HandError(f"{path}: {len(names)} links; a hand has 1 to {_MOST_LINKS}")
-    above: dict[str, str] = {}
+    children: set[str] = set()
     for joint in joints:
         for end, link in (("parent", joint.parent), ("child", joint.child)):
             if link not in names:
                 text = f"{path}: joint {joint.name!r} has the {end} link {short_repr(link)}"
                 raise HandError(f"{text}, which the file does not define")
-        if joint.child in above:
+        if joint.child in children:
             raise HandError(f"{path}: link {joint.child!r} is the child of two joints; a hand is a tree")
-        above[joint.child] = joint.parent
-    roots = [link for link in names if link not in above]
+        children.add(joint.child)
+    roots = [link for link in names if link not in children]
     if len(roots) != 1:
         raise HandError(f"{path}: a hand has one root link, this file has {len(roots)}: {', '.join(roots) or 'a loop'}")
-    lost = [link for link in names if not _reaches(roots[0], link, above)]
+    depth: dict[str, int] = {}
+    ahead = [(roots[0], 0)]
+    while ahead:
+        link, below = ahead.pop()
+        depth[link] = below
+        ahead += [(joint.child, below + 1) for joint in reversed(joints) if joint.parent == link]
+    lost = [link for link in names if depth.get(link, _LONGEST_CHAIN) >= _LONGEST_CHAIN]
     if lost:
         raise HandError(
             f"{path}: links in a loop, or not reachable from the root: {', '.join(lost[:5])}; "
             f"valid: a tree with at most {_LONGEST_CHAIN} joints from the root to a link"
         )
-    order, ahead = [], roots
-    while ahead:
-        link = ahead.pop()
-        order.append(link)
-        ahead.extend(joint.child for joint in reversed(joints) if joint.parent == link)
-    return order
+    return list(depth)
 
 
 def _refuse_repeated(path: Path, what: str, names: Sequence[str]) -> None:
     repeated = sorted(name for name, count in Counter(names).items() if count > 1)
     if repeated:
         raise HandError(f"{path}: {what} {repeated[0]!r} is defined twice; valid: unique names")
-
-
-def _reaches(root: str, link: str, above: Mapping[str, str]) -> bool:
-    for _ in range(_LONGEST_CHAIN):
-        if link == root:
-            return True
-        link = above.get(link, root)
-    return False
 
 
 def _settled(

@@ -44,14 +44,7 @@ _CORNERS_OF_ELLIPSOID = 200
 
 @dataclass(frozen=True, eq=False)
 class _MeshAsset:
-    """A mesh asset of the file.
-
-    Attributes:
-        place: line and name of the asset, for error messages.
-        file: path relative to the MJCF file's folder. Empty if the vertices are in the MJCF file.
-        scale: factor along each axis.
-        vertices: vertices of a mesh without file, before scaling [m].
-    """
+    """A mesh asset at `place` in the MJCF file. `vertices` [m] are not scaled yet, and empty if there is a `file`."""
 
     place: Element
     file: str
@@ -156,10 +149,7 @@ _MOST_FILES = 30
 class _Parts:
     """A file parsed (`spec`) and compiled (`model`) by MuJoCo, and the links and joints read so far.
 
-    Attributes:
-        meshes: mesh asset of each mesh geom, by MuJoCo's geom id.
-        labels: joint names by MuJoCo's joint id. Unnamed joints get a name.
-        shown: names of bodies whose visual geoms are used, because no geom of the body collides.
+    `meshes` and `labels` (names of joints) have MuJoCo's ids as keys. `shown` names bodies without colliding geoms.
     """
 
     path: Path
@@ -172,13 +162,12 @@ class _Parts:
     shown: list[str] = field(default_factory=list)
 
 
-def read_mjcf(path: Path, root: ET.Element | None = None) -> HandModel:
-    """Read the hand of an MJCF file. Palm and postures are set as by `read_urdf`.
+def read_mjcf(path: Path, root: ET.Element) -> HandModel:
+    """Read the hand of an MJCF file with this root element. Palm and postures are set as by `read_urdf`.
 
     The base is the only body directly in `<worldbody>`. If hinges or slides move this body, a new link `world` is the
     base. Raises HandError: MuJoCo refuses the file, `<worldbody>` has several bodies, or an element is unsupported.
     """
-    root = read_xml(path) if root is None else root
     _include(path, path, root, {path.resolve()})
     _refuse(path, root)
     parts = _compiled(path, root)

@@ -59,7 +59,46 @@ def parse_xml(path: Path, text: str) -> Element:
     text = _blanked(text, "<!--", "-->")
     for space in " \t\r\n":
         text = _blanked(text, f"<?xml{space}", "?>")
-    return _parsed(path, text)
+    top: list[Element] = []
+    stack: list[Element] = []
+    count = 0
+    parser = expat.ParserCreate(encoding="utf-8")
+
+    def start(tag: str, attributes: dict[str, str]) -> None:
+        nonlocal count
+        count += 1
+        element = Element(tag, attributes)
+        element.line = parser.CurrentLineNumber
+        if tag in _OWNERS and "name" in attributes:
+            element.owner = f"{tag} {attributes['name']!r}"
+        elif stack:
+            element.owner = stack[-1].owner
+        if tag in _OWNERS and not attributes.get("name", "").isprintable():
+            raise wrong(path, element, "has a name with a line end or an unprintable character; use another name")
+        if len(stack) >= DEEPEST:
+            raise wrong(path, element, f"<{tag}> is nested more than {DEEPEST} deep")
+        if count > _MOST_ELEMENTS or len(attributes) > _MOST_ATTRIBUTES:
+            limits = f"{_MOST_ELEMENTS} elements, nor more than {_MOST_ATTRIBUTES} attributes of one element"
+            raise wrong(path, element, f"a hand file must not have more than {limits}")
+        (stack[-1] if stack else top).append(element)
+        stack.append(element)
+
+    def end(tag: str) -> None:
+        del tag
+        stack.pop()
+
+    def refuse(*_: object) -> None:
+        raise HandError(f"{path}:{parser.CurrentLineNumber}: a <!DOCTYPE> is refused, because it may define entities")
+
+    parser.StartElementHandler, parser.EndElementHandler, parser.StartDoctypeDeclHandler = start, end, refuse
+    try:
+        body = text.lstrip()
+        # The leading line ends are kept, so that line numbers stay correct.
+        before = text.count("\n", 0, len(text) - len(body))
+        parser.Parse(("\n" * before + body).encode("utf-8", errors="replace"), True)
+    except expat.ExpatError as error:
+        raise HandError(f"{path}: not well-formed XML: {error}") from error
+    return top[0]
 
 
 def as_text(root: ET.Element) -> str:
@@ -114,49 +153,6 @@ def _blanked(text: str, start: str, end: str) -> str:
         pieces += [text[at:first], "\n" * text.count("\n", first, last)]
         at = last + len(end)
     return "".join([*pieces, text[at:]])
-
-
-def _parsed(path: Path, text: str) -> Element:
-    top: list[Element] = []
-    stack: list[Element] = []
-    count = 0
-    parser = expat.ParserCreate(encoding="utf-8")
-
-    def start(tag: str, attributes: dict[str, str]) -> None:
-        nonlocal count
-        count += 1
-        element = Element(tag, attributes)
-        element.line = parser.CurrentLineNumber
-        if tag in _OWNERS and "name" in attributes:
-            element.owner = f"{tag} {attributes['name']!r}"
-        elif stack:
-            element.owner = stack[-1].owner
-        if tag in _OWNERS and not attributes.get("name", "").isprintable():
-            raise wrong(path, element, "has a name with a line end or an unprintable character; use another name")
-        if len(stack) >= DEEPEST:
-            raise wrong(path, element, f"<{tag}> is nested more than {DEEPEST} deep")
-        if count > _MOST_ELEMENTS or len(attributes) > _MOST_ATTRIBUTES:
-            limits = f"{_MOST_ELEMENTS} elements, nor more than {_MOST_ATTRIBUTES} attributes of one element"
-            raise wrong(path, element, f"a hand file must not have more than {limits}")
-        (stack[-1] if stack else top).append(element)
-        stack.append(element)
-
-    def end(tag: str) -> None:
-        del tag
-        stack.pop()
-
-    def refuse(*_: object) -> None:
-        raise HandError(f"{path}:{parser.CurrentLineNumber}: a <!DOCTYPE> is refused, because it may define entities")
-
-    parser.StartElementHandler, parser.EndElementHandler, parser.StartDoctypeDeclHandler = start, end, refuse
-    try:
-        body = text.lstrip()
-        # The leading line ends are kept, so that line numbers stay correct.
-        before = text.count("\n", 0, len(text) - len(body))
-        parser.Parse(("\n" * before + body).encode("utf-8", errors="replace"), True)
-    except expat.ExpatError as error:
-        raise HandError(f"{path}: not well-formed XML: {error}") from error
-    return top[0]
 
 
 def read_origin(path: Path, element: ET.Element) -> tuple[Float[np.ndarray, "3 3"], Float[np.ndarray, "3"]]:

@@ -67,12 +67,6 @@ class AdamState:
     def __getitem__(self, rows: Tensor) -> AdamState:
         return AdamState(**{name: value[rows] for name, value in vars(self).items()})
 
-    def best(self) -> tuple[Poses, Values]:
-        """Return each start's best iterate and its loss. Without a best iterate, return the last iterate."""
-        scored = torch.isfinite(self.best_loss)
-        poses = unpack(torch.where(scored[:, None], self.best_x, self.x))
-        return moved_along(poses, -self.pivot), torch.where(scored, self.best_loss, self.loss)
-
 
 def initial_state(problem: Problem, starts: Poses, radius: Values) -> AdamState:
     """Return the state before the first step. `radius` [m] is the object's padding in the first step of each start."""
@@ -143,7 +137,10 @@ class ClosedForm:
         return replace(adam_step(problem, state, gradient, rate, index + 1, config), loss=loss)
 
     def best(self, state: AdamState) -> tuple[Poses, Values]:
-        return state.best()
+        """Return each start's best iterate and its loss. Without a best iterate, return the last iterate."""
+        scored = torch.isfinite(state.best_loss)
+        poses = unpack(torch.where(scored[:, None], state.best_x, state.x))
+        return moved_along(poses, -state.pivot), torch.where(scored, state.best_loss, state.loss)
 
     def value_and_gradient(
         self, problem: Problem, x: Rows, radius: Values, delta: float, *, fine: bool, sharp: bool
@@ -176,19 +173,19 @@ def minimise_compiled(
         kept = rows_kept(config, solver.keep, len(state.x), begin)
         if kept < len(state.x):
             state = state[state.loss.argsort(stable=True)[:kept]]
-        _run_steps(compiled, config, state, (begin, end), follow)
-    return follow.solution(*state.best())
+        _run_steps(compiled, solver, state, (begin, end), follow)
+    return follow.solution(*solver.best(state))
 
 
 def _run_steps(
-    compiled: KernelProblem, config: ClosedFormConfig, state: AdamState, span: tuple[int, int], follow: Follow
+    compiled: KernelProblem, solver: ClosedForm, state: AdamState, span: tuple[int, int], follow: Follow
 ) -> None:
     """Run the steps `span` (first, end) in the kernel and change `state`. A stop ends the run within milliseconds."""
     (begin, end), rows = span, len(state.x)
 
     def over(done: int) -> bool:
         if not follow.over() and done > 0:
-            follow.report(done, lambda: (state.best()[0], state.loss))
+            follow.report(done, lambda: (solver.best(state)[0], state.loss))
         return bool(follow.interrupted)
 
     if rows == 0 or follow.interrupted or over(begin):
@@ -196,7 +193,7 @@ def _run_steps(
     pointers = structs.State(**{name: getattr(state, name).data_ptr() for name in structs.names_of(structs.State)})
     compiled.call(
         "graspd_run_steps",
-        *(_schedule(config), pointers, rows, begin, end),
+        *(_schedule(solver.config), pointers, rows, begin, end),
         watch=lambda done: over(min(begin + done // rows, end - 1)),
     )
     if not follow.interrupted:

@@ -28,7 +28,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, replace
-from typing import Any, NamedTuple, cast
+from typing import NamedTuple
 
 import numpy as np
 import torch
@@ -60,24 +60,9 @@ Variable = Float[Tensor, "batch *shape"]
 Forces = Float[Tensor, "batch points simulations components"]
 
 
-class LeakyMin(torch.autograd.Function):
-    """The function min(x, 0). Its gradient is `leak` instead of zero for x ≥ 0: the leaky gradient of Grasp'D."""
-
-    @staticmethod
-    def forward(ctx: Any, x: Tensor, leak: float) -> Tensor:
-        ctx.save_for_backward(x < 0)
-        ctx.leak = leak
-        return x.clamp(max=0.0)
-
-    @staticmethod
-    def backward(ctx: Any, *gradients: Tensor) -> tuple[Tensor, None]:
-        (touching,) = ctx.saved_tensors
-        return torch.where(touching, gradients[0], ctx.leak * gradients[0]), None
-
-
 def leaky_min(x: Float[Tensor, "*shape"], leak: float) -> Float[Tensor, "*shape"]:
-    """Return min(x, 0). Where x ≥ 0, the gradient is `leak` instead of zero."""
-    return cast(Tensor, LeakyMin.apply(x, leak))
+    """Return min(x, 0). Where x ≥ 0, the gradient is `leak` instead of zero: the leaky gradient of Grasp'D."""
+    return torch.where(x < 0, x, leak * (x - x.detach()))
 
 
 def contact_forces(
@@ -129,14 +114,9 @@ def make_body(
     """Build the body. Thin objects get a radius of gyration of at least `length` / 10 about every axis."""
     moments, axes = np.linalg.eigh(inertia)
     moments = np.maximum(moments, mass * (0.1 * length) ** 2)
-    options: dict[str, Any] = {"device": device, "dtype": dtype}
-    return FreeBody(
-        mass=mass,
-        inertia=torch.as_tensor(axes @ np.diag(moments) @ axes.T, **options),
-        inverse_inertia=torch.as_tensor(axes @ np.diag(1 / moments) @ axes.T, **options),
-        center=torch.as_tensor(center, **options),
-        length=length,
-    )
+    arrays = axes @ np.diag(moments) @ axes.T, axes @ np.diag(1 / moments) @ axes.T, center
+    about, inverse, middle = (torch.as_tensor(array, device=device, dtype=dtype) for array in arrays)
+    return FreeBody(mass, about, inverse, middle, length)
 
 
 def net_wrench(
@@ -281,8 +261,7 @@ def published_starts(problem: Problem, scene: Scene, hand: HandModel, count: int
     translation = palm - (rotation @ torch.as_tensor(hand.palm_center)[:, None]).squeeze(-1)
     joints = torch.as_tensor(hand.open_posture).expand(len(points), -1)
     drawn = Poses(*(x.to(problem.hand.lower) for x in (translation, quaternion_from_rotation(rotation), joints)))
-    placed = hand_forward(problem, problem.hand.coarse, drawn)
-    touching = sample_sdf(problem.object.sdf, placed.points)[0].amin(-1) <= 0
+    touching = least_distance(problem, drawn) <= 0
     return drawn[touching.int().argsort(stable=True)[:count]]
 
 

@@ -126,12 +126,7 @@ class Points(ctypes.Structure):
 
 
 class Grid(ctypes.Structure):
-    _fields_ = [
-        ("field", _AT),
-        *_of(_INT, "nx ny nz"),
-        ("origin", _FLOAT * 3),
-        ("spacing", _FLOAT),
-    ]
+    _fields_ = [("field", _AT), *_of(_INT, "nx ny nz"), ("origin", _FLOAT * 3), ("spacing", _FLOAT)]
 
 
 class Solids(ctypes.Structure):
