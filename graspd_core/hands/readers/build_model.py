@@ -197,7 +197,7 @@ def _depth_first(path: Path, links: Sequence[LinkSpec], joints: Sequence[JointSp
         link, below = ahead.pop()
         depth[link] = below
         ahead += [(joint.child, below + 1) for joint in reversed(joints) if joint.parent == link]
-    lost = [link for link in names if depth.get(link, _LONGEST_CHAIN) >= _LONGEST_CHAIN]
+    lost = [link for link in names if depth.get(link, _LONGEST_CHAIN + 1) > _LONGEST_CHAIN]
     if lost:
         raise HandError(
             f"{path}: links in a loop, or not reachable from the root: {', '.join(lost[:5])}; "

@@ -294,6 +294,14 @@ def test_a_crowd_is_refused_before_it_is_looked_at(tmp_path: Path, text: str, me
         _read(tmp_path, f"<robot>{text}</robot>")
 
 
+def test_a_chain_has_at_most_a_hundred_joints(tmp_path: Path) -> None:
+    joint = '<joint name="j{0}" type="fixed"><parent link="{1}"/><child link="l{0}"/></joint><link name="l{0}"/>'
+    chain = [joint.format(k, f"l{k - 1}" if k else "finger") for k in range(100)]
+    assert _read(tmp_path, _changed(("</robot>", "".join(chain[:99]) + "</robot>"))).num_links == 101
+    with pytest.raises(HandError, match="at most 100 joints from the root"):
+        _read(tmp_path, _changed(("</robot>", "".join(chain) + "</robot>")))
+
+
 def test_a_file_without_end_is_refused() -> None:
     with pytest.raises(HandError, match="too large; valid: at most 32 MiB"):
         read_hand_file(Path("/dev/zero"))
