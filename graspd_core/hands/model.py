@@ -218,8 +218,10 @@ class HandModel:
     @cached_property
     def slides(self) -> Bool[np.ndarray, "joints"]:
         """True for each actuated joint that is prismatic."""
-        kinds = dict(zip(self.link_joint_names, self.joint_kind, strict=True))
-        return np.array([kinds[name] == "prismatic" for name in self.joint_names], dtype=bool)
+        slides, own = np.zeros(self.num_joints, dtype=bool), self.link_joint >= 0
+        own[[mimic.link for mimic in self.mimics]] = False
+        slides[self.link_joint[own]] = np.array(self.joint_kind)[own] == "prismatic"
+        return slides
 
     @cached_property
     def joint_scale(self) -> Float[np.ndarray, "joints"]:
