@@ -226,8 +226,9 @@ def test_a_workspace_hides_what_is_outside():
     # A whole object that leans on the wall of a bin is not cut, although the region ends before the wall.
     wall, pose = box_between((-0.2, 0.031, 0.0), (0.2, 0.04, 0.06)), look_at(np.array([0.3, -0.1, 0.7]), np.zeros(3))
     walled, _ = seen((THREE.meshes[0], THREE.meshes[-1], wall), pose, LEVELS["default"])
-    inside = SegmentationConfig(roi_low=(-1.0, -0.2, -1.0), roi_high=(1.0, 0.027, 1.0))
-    assert not segment([walled], settings=inside).cut
+    for side in (0.027, 0.035):
+        inside = SegmentationConfig(roi_low=(-0.3, -0.3, -1.0), roi_high=(0.3, side, 1.0))
+        assert not segment([walled], settings=inside).cut
     with pytest.raises(CloudError, match=r"only 0 of \d+ points are within 0.1 m of the camera; at least 50"):
         segment([view], settings=SegmentationConfig(max_range=0.1))
 

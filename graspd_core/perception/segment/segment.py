@@ -14,7 +14,7 @@ from scipy.spatial import KDTree
 from graspd_core.config import SegmentationConfig
 from graspd_core.errors import CloudError, NoObjectError
 from graspd_core.perception.cloud.camera import MIN_BORDER_POINTS, reaches_image_border
-from graspd_core.perception.cloud.point_cloud import MIN_POINTS, Eyes, PointCloud, Vector
+from graspd_core.perception.cloud.point_cloud import MIN_POINTS, Eyes, PointCloud, Vector, measured
 from graspd_core.perception.cloud.voxel_downsample import Labels, Mask, VoxelScene, voxel_downsample
 from graspd_core.perception.segment import clusters
 from graspd_core.perception.segment.planes import find_planes
@@ -102,7 +102,9 @@ def segment(
         # In a pile, a part need not stand on the support, so the seam may also lie within one object.
         touching, beside = (), "a seam divides the target from its neighbour, and both may be one object"
     told = (*warnings, *touching)
-    return Segmentation(tuple(found.values()), tuple(found), support, obstacles, told, _cut(parted, chosen), beside)
+    return Segmentation(
+        tuple(found.values()), tuple(found), support, obstacles, told, _cut(parted, chosen, views), beside
+    )
 
 
 def find_things(
@@ -232,7 +234,7 @@ def _warnings(parted: _Parted, crowded: bool) -> tuple[str, ...]:
     return tuple(warnings)
 
 
-def _cut(parted: _Parted, chosen: Mask) -> str:
+def _cut(parted: _Parted, chosen: Mask, views: Sequence[PointCloud]) -> str:
     """Return why the object may extend beyond what the views show, or ""."""
     scene, ground, settings = parted.scene, parted.ground, parted.settings
     if _cut_off(parted, chosen):
@@ -240,10 +242,12 @@ def _cut(parted: _Parted, chosen: Mask) -> str:
     # Without surroundings, the object's own outline is the outline of the view.
     if ground.support is None and not ground.background:
         return ""
-    for k in range(len(scene.rows)):
-        part = scene.of_view(k)
-        mine = chosen[scene.voxel[part]]
-        if mine.any() and not reaches_image_border(scene.points[part], parted.eyes[k], mine, settings.border_width):
+    for k, view in enumerate(views):
+        # The points outside the workspace count too, because its border is no border of the image.
+        mine, seen = np.zeros(len(view.points), dtype=bool), measured(view.points, view.viewpoint)
+        mine[scene.rows[k]] = chosen[scene.voxel[scene.of_view(k)]]
+        width = settings.border_width
+        if mine.any() and not reaches_image_border(view.points[seen], parted.eyes[k], mine[seen], width):
             return ""
     return "the object reaches the border of the image, and may extend beyond it"
 
