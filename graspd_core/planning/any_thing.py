@@ -2,8 +2,9 @@
 
 Objects with fewer earlier failures come first. At equal numbers of failures, higher objects come first, because nothing
 lies on them. An object gets one round of the planner, but all rounds if an earlier try failed with this or an unknown
-object. The first verified grasp ends the search. After `enough` objects, a grasp with a probability of at least 0.5
-also ends the search, to limit the time. `result_of_things` returns the result of one request.
+object, and twice the effort if an earlier search found no grasp. The first verified grasp ends the search. After
+`enough` objects, a grasp with a probability of at least 0.5 also ends the search, to limit the time. `result_of_things`
+returns the result of one request.
 """
 
 from __future__ import annotations
@@ -39,6 +40,9 @@ OUT_OF_TRIES, NOT_LOOKED_AT = "no tries left", "not tried before the search ende
 _SAME_PLACE = 0.04
 # Doubt about the scene of an object if a robot executed a grasp of the object and the grasp failed.
 _FAILED = "an earlier grasp of this object failed"
+# Effort of a search for an object for which an earlier search found no grasp. In two full bins on which it was chosen,
+# such searches then found a grasp.
+_HARDER = 2.0
 # Least probability of a likely grasp.
 _LIKELY = 0.5
 # Points belong to a known solid if the fraction `_NEARLY_ALL` of them is within `_STRAY` of the solid's surface [m].
@@ -233,6 +237,8 @@ def _thing_plan(
     lost, config = [failure.grasp for failure in failed if failure.grasp is not None], plan["preset"]
     if not failed:
         config = replace(config, rounds=replace(config.rounds, most=1))
+    elif any(failure.grasp is None for failure in failed):
+        config = config.at_budget(_HARDER)
     count, seed = min(plan["count"] + 2 * len(lost), MOST_GRASPS), (plan["seed"] + len(failed)) % SEEDS
     try:
         result = plan_grasps(scene, hand, **{**plan, "preset": config, "count": count, "seed": seed})

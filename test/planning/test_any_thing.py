@@ -8,7 +8,18 @@ from expected import some
 
 from graspd_bench.rendering.depth_noise import DEFAULT
 from graspd_bench.rendering.tabletop import CAMERA, ring_poses, tabletop, views_of
-from graspd_core import Grasp, Outcome, PointCloud, Posture, Sphere, Steering, Verdict, load_hand, load_preset
+from graspd_core import (
+    Grasp,
+    Outcome,
+    PlanConfig,
+    PointCloud,
+    Posture,
+    Sphere,
+    Steering,
+    Verdict,
+    load_hand,
+    load_preset,
+)
 from graspd_core.config.planning_config import DOUBTED_SHARE, CertaintyConfig
 from graspd_core.errors import CloudError, ConfigError, NoObjectError
 from graspd_core.planning import any_thing as module
@@ -115,11 +126,14 @@ def test_a_grasp_like_one_that_was_lost_is_not_given_again(views: tuple[PointClo
     assert spared[0].grasp.verdict is Verdict.VERIFIED
 
 
-def test_failures_make_no_valid_number_invalid(views, first, monkeypatch: pytest.MonkeyPatch):
-    asked = []
+def test_failures_make_no_valid_number_invalid_and_a_search_in_vain_is_followed_by_more_starts(
+    views, first, monkeypatch: pytest.MonkeyPatch
+):
+    asked, starts = [], []
 
-    def plan(scene, hand, *, count: int, seed: int, **others: object):
+    def plan(scene, hand, *, count: int, seed: int, preset: PlanConfig, **others: object):
         asked.append((count, seed))
+        starts.append(preset.settings.starts_per_grasp)
         raise ConfigError("no grasp is needed here")
 
     monkeypatch.setattr(module, "plan_grasps", plan)
@@ -127,6 +141,9 @@ def test_failures_make_no_valid_number_invalid(views, first, monkeypatch: pytest
     greatest = {**ASKED, "count": 1024, "seed": 2**63 - 1}
     plan_any_thing(views, HAND, failures=lost, **greatest)
     assert asked == [(1024, 0)] * len(first)
+    vain = sum(failure.grasp is None for failure in lost)
+    assert 0 < vain < len(lost)
+    assert sorted(starts) == [min(starts)] * (len(lost) - vain) + [2 * min(starts)] * vain
 
 
 def test_nothing_on_the_table_is_no_thing_and_an_empty_cloud_is_told(views: tuple[PointCloud, ...]):
