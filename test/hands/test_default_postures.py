@@ -149,9 +149,9 @@ def joint(
     limits: tuple[float, float] | None,
     follows: tuple[str, float] | None = None,
 ) -> str:
-    """The joint that moves the second of two links against the first, named after it; without limits it is fixed.
+    """The joint that moves the second of two links against the first. Without limits it is fixed.
 
-    `follows` has leader and multiplier.
+    The joint is named after the second link. `follows` has leader and multiplier.
     """
     links = f'<parent link="{ends[0]}"/><child link="{ends[1]}"/>{place}'
     if limits is None:
