@@ -35,6 +35,8 @@ _POOL, _SPAN_POINTS, _SPAN_SCALE = 6, 400, 0.012
 # Among obstacles: poses drawn for each start kept, the depth in an obstacle that makes a pose e times less likely [m],
 # and the greatest lift off the support [m].
 _POOL_AMONG_OBSTACLES, _DEPTH_SCALE, _HIGHEST_LIFT = 18, 0.005, 0.03
+# Penalties are computed for this many rows per start at once (`_lowered`).
+_ROWS_AT_ONCE = 6
 # With restrictions: the greatest number of pools, and the seed step between two pools.
 _MOST_POOLS, _POOL_SEED_STEP = 20, 7_919
 # A hand closes around a slab of the object: the slab's half breadth, and depth from the grip [m].
@@ -229,7 +231,7 @@ def _lowered(preference: Values, count: int, penalty: Callable[[Tensor], Values]
     A penalty is never negative, but slow to compute. So rows follow in descending order of `preference`, while needed.
     """
     lowered = torch.full_like(preference, -torch.inf)
-    for rows in preference.argsort(descending=True).split(count):
+    for rows in preference.argsort(descending=True).split(_ROWS_AT_ONCE * count):
         if bool((lowered.topk(min(count, len(lowered))).values >= preference[rows[:1]]).all()):
             break
         lowered[rows] = preference[rows] - penalty(rows)

@@ -2,12 +2,12 @@
 
 The obstacle of a neighbouring object is the convex hull of its seen points and their projection onto the support plane.
 So space beneath overhangs counts as full. Nothing is guessed behind the seen side, because a thick guess would block
-free space. A neighbour that surrounds the target is split into parts.
+free space. A neighbour that surrounds the target is halved until its parts leave that space free.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -18,16 +18,15 @@ from scipy.spatial import KDTree
 from graspd_core.config import ObstacleConfig, SceneConfig
 from graspd_core.mesh.convex_parts import convex_hull, hull_surface, limited_hull
 from graspd_core.mesh.mesh_files import surface_samples
-from graspd_core.mesh.sdf import sample_sdf
 from graspd_core.mesh.surface_queries import winding_inside
-from graspd_core.mesh.topology import scaled_normals, voxel_keys
+from graspd_core.mesh.topology import scaled_normals
 from graspd_core.perception.cloud.point_cloud import Points, Vector
 from graspd_core.perception.scene import Obstacle, Scene, make_obstacle
 from graspd_core.se3 import perpendicular, rotation_from_quaternion
 from graspd_core.types import Plane, Posture, TriangleMesh
 
-# A neighbour whose hull would overlap the target is split into at most this many parts along each axis.
-MAX_PARTS_ACROSS = 8
+# Parts of a neighbour have at least this fraction of its length. A hull may fill this much space to the target [m].
+_LEAST_PART, _FILLED = 1 / 8, 0.01
 _TARGET_SAMPLES = 2000  # surface points of the target, to measure its distance from neighbours
 _HELD_CORNERS = 128  # most corners of the hull of a held object
 # A collision object counts as the target if the intersection over union of their hulls is at least this. A box around a
@@ -63,27 +62,43 @@ def make_obstacles(
         seen = seen[np.isfinite(seen).all(1)]
         if len(seen) < settings.min_points or near.query(seen)[0].min() > reach:
             continue
-        whole = make_obstacle(padded_hull(seen, support, settings.padding))
-        at = torch.as_tensor(near.data).to(whole.sdf.field)
-        if not (sample_sdf(whole.sdf, at)[0] < -2 * settings.padding).any():
-            found.append(whole)
-            continue
-        # The neighbour surrounds the target, like a tray, a box or a ring. One hull would fill the target's own place.
-        parts = [part for part in _cells(seen, support, settings.part_size) if near.query(part)[0].min() <= reach]
-        found += [make_obstacle(padded_hull(part, support, settings.padding)) for part in parts]
+        right = None if support is None else perpendicular(support.normal)
+        axes = np.eye(3) if support is None else np.column_stack([right, np.cross(support.normal, right)])
+        side = max(settings.part_size, _LEAST_PART * float(np.ptp(seen @ axes, axis=0).max()))
+        for gap, hull in _hulls(seen, axes, side, near, support, settings.padding):
+            found += [make_obstacle(hull)] if gap <= reach else []
     return tuple(found)
 
 
-def _cells(points: Points, support: Plane | None, side: float) -> list[Float[np.ndarray, "_ 3"]]:
-    """Split the points by a grid of cubes, or by a grid of columns normal to the support if there is a support."""
-    if support is None:
-        local = points
-    else:
-        right = perpendicular(support.normal)
-        local = points @ np.column_stack([right, np.cross(support.normal, right)])
-    side = max(side, float(np.ptp(local, axis=0).max()) / MAX_PARTS_ACROSS)
-    _, which = np.unique(voxel_keys(local - local.min(0), side), return_inverse=True)
-    return [points[which == part] for part in range(which.max() + 1)]
+def _hulls(
+    seen: Float[np.ndarray, "_ 3"],
+    axes: Float[np.ndarray, "3 k"],
+    side: float,
+    target: KDTree,
+    support: Plane | None,
+    padding: float,
+    whole: bool = True,
+) -> Iterator[tuple[float, TriangleMesh]]:
+    """Yield hulls of parts of the points, and each part's distance from the target's points [m].
+
+    A neighbour whose hull fills the target's place is halved across the longest of `axes`, down to `side` [m]. Parts
+    must also leave free the space between their points and the target. A whole neighbour need not, because its unseen
+    back may be there.
+    """
+    gap, hull = float(target.query(seen)[0].min()), padded_hull(seen, support, padding)
+    normals = scaled_normals(hull.vertices, hull.faces)
+    normals = normals / np.linalg.norm(normals, axis=1, keepdims=True)
+    offsets = (normals * hull.vertices[hull.faces[:, 0]]).sum(1)
+    free = float((target.data @ normals.T - offsets).max(1).min())
+    local = seen @ axes
+    low, high = local.min(0), local.max(0)
+    longest = int((high - low).argmax())
+    if free >= (-2 * padding if whole else gap - padding - _FILLED) or high[longest] - low[longest] <= side:
+        yield gap, hull
+        return
+    lower = local[:, longest] < 0.5 * (low[longest] + high[longest])
+    for half in (seen[lower], seen[~lower]):
+        yield from _hulls(half, axes, side, target, support, padding, whole=False)
 
 
 def padded_hull(points: Points, support: Plane | None, padding: float) -> TriangleMesh:

@@ -85,8 +85,8 @@ HEAVY_LITRE, HEAVY_GROWTH = 1.35, 0.5
 
 # Settings for cutting reconstructed or guessed surfaces into convex parts. They are accurate to millimetres only.
 COARSE_CUTS: dict[str, Any] = {"tolerance": 0.003, "max_parts": 32, "surface_points": 2000}
-# Nodes per side of an obstacle's distance grid, and free space around the obstacle that the grid covers [m].
-_OBSTACLE_RESOLUTION, _OBSTACLE_PADDING = 32, 0.02
+# Obstacle grids: most nodes per side of a cube, least width of a cell [m], and free space around the obstacle [m].
+_OBSTACLE_RESOLUTION, _OBSTACLE_CELL, _OBSTACLE_PADDING = 32, 0.005, 0.02
 # Number of surface points of a reconstructed object that are searched for sharp points.
 _COARSE_POOL = 2000
 
@@ -311,7 +311,9 @@ def moved_object(model: ObjectModel, offset: Float[np.ndarray, "3"]) -> ObjectMo
 def make_obstacle(mesh: TriangleMesh) -> Obstacle:
     """Return the obstacle with this surface. A distant grid keeps its place in float64 (`moved_sdf`)."""
     far = far_centre(mesh.vertices)
-    sdf = build_sdf(moved_mesh(mesh, -far), resolution=_OBSTACLE_RESOLUTION, padding=_OBSTACLE_PADDING)
+    sides = np.ptp(mesh.vertices, axis=0) + 2 * _OBSTACLE_PADDING
+    resolution = min(int(np.ceil(np.cbrt(sides.prod()) / _OBSTACLE_CELL)), _OBSTACLE_RESOLUTION)
+    sdf = build_sdf(moved_mesh(mesh, -far), resolution=resolution, padding=_OBSTACLE_PADDING)
     return Obstacle(mesh, moved_sdf(sdf, far))
 
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pickle
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from hashlib import blake2b
 
 import numpy as np
@@ -93,7 +93,7 @@ def segment(
     total = sum(len(view.points) for view in found.values())
     if total < MIN_POINTS:
         raise CloudError(f"cloud: only {total} points show the object; at least {MIN_POINTS} are needed")
-    obstacles = _obstacles(parted, chosen)
+    obstacles = _obstacles(parted, chosen, parts)
     warnings = _warnings(parted, bool(obstacles))
     support = ground.support and ground.support.as_support(scene.mean_distance[chosen])
     touching = () if marked else _touching(scene, chosen, parts)
@@ -134,7 +134,7 @@ def find_things(
 class _Parted:
     """A scene with its camera positions `eyes` [m], its support and the object number of each voxel (`label`).
 
-    Objects are numbered from the largest. Background and noise are -1.
+    Objects are numbered from the largest. Background and noise are -1. `parts` caches the results of `_parts`.
     """
 
     scene: VoxelScene
@@ -142,6 +142,7 @@ class _Parted:
     ground: Ground
     label: Labels
     settings: SegmentationConfig
+    parts: dict[bytes, Labels] = field(default_factory=dict)
 
 
 # The last scene, by a hash of its clouds and settings. If any object may be grasped, it serves each of them.
@@ -207,13 +208,17 @@ def _cut_out(views: Sequence[PointCloud], scene: VoxelScene, chosen: Mask, groun
     return found
 
 
-def _obstacles(parted: _Parted, chosen: Mask) -> tuple[Float[np.ndarray, "_ 3"], ...]:
-    """Return the points of other objects and large flat parts within reach of the object's bounding box [m]."""
+def _obstacles(parted: _Parted, chosen: Mask, part: Labels) -> tuple[Float[np.ndarray, "_ 3"], ...]:
+    """Return the points of other objects and large flat parts within reach of the object's bounding box [m].
+
+    Each part of the cluster that holds the object (`part`, from `_parts`) is an object of its own.
+    """
     mean, label, reach = parted.scene.mean, parted.label, parted.settings.obstacle_range
     mine = mean[chosen]
     low, high = mine.min(0) - reach, mine.max(0) + reach
     near = ((mean >= low) & (mean <= high)).all(1) & ~chosen
-    masks = [near & (label == k) for k in range(int(label.max()) + 1)]
+    masks = [near & (part == k) for k in range(int(part.max()) + 1)]
+    masks += [near & (label == k) & (part < 0) for k in range(int(label.max()) + 1)]
     masks += [near & part.inliers & (label < 0) for part in parted.ground.background]
     return tuple(mean[mask] for mask in masks if mask.any())
 
@@ -254,8 +259,10 @@ def _cut(parted: _Parted, chosen: Mask, views: Sequence[PointCloud]) -> str:
 
 def _parts(parted: _Parted, chosen: Mask) -> Labels:
     """Split the chosen object at seams if there is a support. Return each voxel's part number, -1 outside."""
-    scene, support = parted.scene, parted.ground.support
-    part = np.where(chosen, 0, -1)
+    scene, support, key = parted.scene, parted.ground.support, chosen.tobytes()
+    if key in parted.parts:
+        return parted.parts[key]
+    part = parted.parts[key] = np.where(chosen, 0, -1)
     if support is not None:
         points, eyes = scene.mean[chosen], parted.eyes
         if parted.settings.piled:
