@@ -15,7 +15,7 @@ from graspd_cell.robot import DepthView
 from graspd_cell.simulated_robot import box_mesh
 from graspd_core.arms.arm import Arm
 from graspd_core.arms.reach import Reach
-from graspd_core.config import SceneConfig, SegmentationConfig
+from graspd_core.config import ObstacleConfig, SceneConfig, SegmentationConfig
 from graspd_core.errors import CloudError
 from graspd_core.hands.model import HandModel
 from graspd_core.perception.cloud.camera import PinholeCamera, cloud_from_depth
@@ -74,6 +74,8 @@ def cloud_of(view: DepthView) -> PointCloud:
 EMPTY = "the bin is empty"
 # Distance of the crop box from the walls, which allows for camera errors, and height of its top above the table [m].
 _STRAY, _RISE = 0.006, 0.3
+# Thickness added to neighbours and walls [m]. It is less than the default, because objects in a bin give way.
+_GIVES_WAY = 0.0015
 # Plane that hands keep above. Its offset above the table top [m] allows for errors of arm and camera.
 TABLE = Plane(np.array([0.0, 0.0, 1.0]), 0.002)
 
@@ -82,7 +84,7 @@ def scene_config(source: Bin) -> SceneConfig:
     """Return scene settings that crop clouds to the inside of a bin."""
     (x, y), half = source.center, source.half - _STRAY
     cut = SegmentationConfig(roi_low=(x - half, y - half, -0.02), roi_high=(x + half, y + half, _RISE), piled=True)
-    return SceneConfig(segmentation=cut)
+    return SceneConfig(segmentation=cut, obstacles=ObstacleConfig(padding=_GIVES_WAY))
 
 
 class InProcessGrasps:

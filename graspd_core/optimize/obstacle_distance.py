@@ -184,17 +184,15 @@ def least_gap(obstacles: ObstacleTensors, base: SE3, links: SE3, wide: float = W
     if obstacles.normal is not None:
         least = _support_gaps(obstacles, obstacles.normal, base, links).amin(-1)
     if obstacles.sdfs:
-        rotation = base.rotation[:, None] @ links.rotation
-        place = base.apply(links.translation)
+        points = base.apply(place_points(obstacles.matrix, links))
         middle, reach = obstacles.around
-        middle = (rotation @ middle[..., None]).squeeze(-1) + place
+        middle = base.apply((links.rotation @ middle[..., None]).squeeze(-1) + links.translation)
     for sdf in obstacles.sdfs:
         off_grid = (middle - (sdf.origin + sdf.half)).abs() - sdf.half
         touched = torch.lt(off_grid, reach.add(wide).unsqueeze(1)).all(-1)
         row, ball = touched[:, obstacles.links].nonzero(as_tuple=True)
-        link = obstacles.links[ball]
-        points = (rotation[row, link] @ obstacles.points[ball][..., None]).squeeze(-1) + place[row, link]
-        least = least.scatter_reduce(0, row, _gaps_to(sdf, points, obstacles.radii[ball], wide), "amin")
+        gaps = _gaps_to(sdf, points[row, ball], obstacles.radii[ball], wide)
+        least = least.scatter_reduce(0, row, gaps, "amin")
     return least
 
 

@@ -62,8 +62,10 @@ def make_obstacles(
         seen = seen[np.isfinite(seen).all(1)]
         if len(seen) < settings.min_points or near.query(seen)[0].min() > reach:
             continue
-        right = None if support is None else perpendicular(support.normal)
-        axes = np.eye(3) if support is None else np.column_stack([right, np.cross(support.normal, right)])
+        axes = np.eye(3)
+        if support is not None:
+            right = perpendicular(support.normal)
+            axes = np.column_stack([right, np.cross(support.normal, right)])
         side = max(settings.part_size, _LEAST_PART * float(np.ptp(seen @ axes, axis=0).max()))
         for gap, hull in _hulls(seen, axes, side, near, support, settings.padding):
             found += [make_obstacle(hull)] if gap <= reach else []
@@ -89,7 +91,7 @@ def _hulls(
     normals = scaled_normals(hull.vertices, hull.faces)
     normals = normals / np.linalg.norm(normals, axis=1, keepdims=True)
     offsets = (normals * hull.vertices[hull.faces[:, 0]]).sum(1)
-    free = float((target.data @ normals.T - offsets).max(1).min())
+    free = float((np.asarray(target.data) @ normals.T - offsets).max(1).min())
     local = seen @ axes
     low, high = local.min(0), local.max(0)
     longest = int((high - low).argmax())

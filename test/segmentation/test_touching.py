@@ -145,6 +145,10 @@ def test_a_small_thing_of_a_heap_is_found_beside_large_ones():
         middle, radius = ball.vertices.mean(0), float(np.ptp(ball.vertices[:, 0])) / 2
         away = [np.linalg.norm(points - middle, axis=1) for points in found]
         assert sum(np.mean(distance < radius + 0.006) > 0.9 for distance in away) == 1
+    # A hull about the two large balls would fill the gap between them.
+    small = min(found, key=len)
+    seen = segment([view], target=Target(point=small[0]), settings=SegmentationConfig(piled=True))
+    assert sum(np.ptp(points[:, 0]) > 0.08 for points in seen.obstacles) == 2
 
 
 def test_one_that_lies_on_another_is_a_thing_where_things_are_piled():

@@ -21,10 +21,28 @@ static float support_depth(const Problem& p, float weight, Scratch& s) {
     return total;
 }
 
+// Returns whether any ball is nearer than `margin` to the grid. In a bin, most obstacles are away from the hand.
+static bool near_grid(const Grid& grid, int count, const float* radius, float margin, const Samples& at) {
+    const int nodes[3] = {grid.nx, grid.ny, grid.nz};
+    float half[3], middle[3];
+    for (int k = 0; k < 3; k++) {
+        half[k] = 0.5f * (nodes[k] - 1) * grid.spacing;
+        middle[k] = grid.origin[k] + half[k];
+    }
+    int away = 0;
+    for (int i = 0; i < count; i++) {
+        float reach = radius[i] + margin;
+        away += (fabsf(at.x[i] - middle[0]) - half[0] >= reach) | (fabsf(at.y[i] - middle[1]) - half[1] >= reach) |
+                (fabsf(at.z[i] - middle[2]) - half[2] >= reach);
+    }
+    return away < count;
+}
+
 // Returns the loss of the balls at placed points in one obstacle, and adds forces to the links.
 static float neighbour_depth(
     const Grid& grid, const Points& points, const float* radius, float margin, float weight, Scratch& s) {
     Samples& at = s.obstacle;
+    if (!near_grid(grid, points.count, radius, margin, at)) return 0;
     sample(grid, points.count, at);
     float total = 0;
     for (int i = 0; i < points.count; i++) {
