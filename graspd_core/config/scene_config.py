@@ -121,7 +121,7 @@ class ObstacleConfig:
 
     Attributes:
         padding: thickness added around the seen points [m].
-        part_size: a neighbour whose hull would contain the object, e.g. a tray, is split into parts of this size [m].
+        part_size: a neighbour whose hull would contain the object, e.g. a tray, is halved to parts of this size [m].
         min_points: neighbours with fewer points are noise.
     """
 

@@ -13,7 +13,7 @@ from dataclasses import replace
 import numpy as np
 import torch
 from jaxtyping import Float
-from scipy.spatial import KDTree
+from scipy.spatial import ConvexHull, KDTree
 
 from graspd_core.config import ObstacleConfig, SceneConfig
 from graspd_core.mesh.convex_parts import convex_hull, hull_surface, limited_hull
@@ -62,10 +62,8 @@ def make_obstacles(
         seen = seen[np.isfinite(seen).all(1)]
         if len(seen) < settings.min_points or near.query(seen)[0].min() > reach:
             continue
-        axes = np.eye(3)
-        if support is not None:
-            right = perpendicular(support.normal)
-            axes = np.column_stack([right, np.cross(support.normal, right)])
+        up = None if support is None else support.normal
+        axes = np.eye(3) if up is None else np.column_stack([right := perpendicular(up), np.cross(up, right)])
         side = max(settings.part_size, _LEAST_PART * float(np.ptp(seen @ axes, axis=0).max()))
         for gap, hull in _hulls(seen, axes, side, near, support, settings.padding):
             found += [make_obstacle(hull)] if gap <= reach else []
@@ -88,10 +86,8 @@ def _hulls(
     back may be there.
     """
     gap, hull = float(target.query(seen)[0].min()), padded_hull(seen, support, padding)
-    normals = scaled_normals(hull.vertices, hull.faces)
-    normals = normals / np.linalg.norm(normals, axis=1, keepdims=True)
-    offsets = (normals * hull.vertices[hull.faces[:, 0]]).sum(1)
-    free = float((np.asarray(target.data) @ normals.T - offsets).max(1).min())
+    planes = ConvexHull(hull.vertices).equations
+    free = float((np.asarray(target.data) @ planes[:, :3].T + planes[:, 3]).max(1).min())
     local = seen @ axes
     low, high = local.min(0), local.max(0)
     longest = int((high - low).argmax())
