@@ -74,7 +74,12 @@ def test_each_kind_of_object_gets_grasps_and_feedback_before(client, planning, m
     target = {"mesh": mug, "primitive": lambda: box(0.05, 0.05, 0.12), "cluster": lambda: cluster(make_cloud)}[kind]()
     status, grasps, feedback = ask(client, planning, target, "allegro_right")
     assert status == GoalStatus.STATUS_SUCCEEDED
-    assert len(grasps) == 2
+    (answer,) = client.spin_until(lambda: client.answers, "the answer")
+    good = [grasp for grasp in answer.grasps if all(trial.passed for trial in grasp.trials)]
+    assert len(good) == 2
+    # A grasp that the fingers only reach by closing is left out. On a guessed back, the processor decides which one is.
+    assert len(grasps) == sum(bool(grasp.arrival_joints.name) for grasp in good) > 0
+    assert len(grasps) == 2 or kind == "cluster"
     assert feedback[:1] == [1]
     best = grasps[0]
     assert best.grasp_pose.header.frame_id == ("camera_depth_optical_frame" if kind == "cluster" else "object")
@@ -88,7 +93,6 @@ def test_each_kind_of_object_gets_grasps_and_feedback_before(client, planning, m
     assert retreat.header.frame_id == best.grasp_pose.header.frame_id
     assert np.dot(array_of(retreat.vector), array_of(approach.vector)) == pytest.approx(-1.0, abs=0.2)
     assert list(best.allowed_touch_objects) == []
-    (answer,) = client.spin_until(lambda: client.answers, "the answer")
     assert not any("/tmp" in told for told in answer.warnings)
 
 
