@@ -31,27 +31,34 @@ class Offer:
 
     Attributes:
         grasp: the grasp with its arm path. None if no object can be grasped.
-        place: centre of the object's points [m].
+        points: seen points of the object [m].
         surface: object's surface with the reconstructed hidden side. None without a grasp.
         mass: mass used in the trials [kg].
         verified: True if the grasp's verdict is `VERIFIED`.
-        things: number of objects seen.
+        seen: places of all objects seen [m].
         reason: why there is no verified grasp.
         failures: objects for which planning found no grasp.
+        earlier: earlier failures with the grasp's object.
         exhausted: True if no further try is worthwhile: every object seen failed too often, or the cloud is unusable.
         seconds: graspd's wall-clock time [s].
     """
 
     grasp: Grasp | None
-    place: Float[np.ndarray, "3"] = field(default_factory=lambda: np.zeros(3))
+    points: Float[np.ndarray, "_ 3"] = field(default_factory=lambda: np.zeros((1, 3)))
     surface: TriangleMesh | None = None
     mass: float = 0.0
     verified: bool = False
-    things: int = 0
+    seen: Float[np.ndarray, "_ 3"] = field(default_factory=lambda: np.zeros((0, 3)))
     reason: str = ""
     failures: tuple[Failure, ...] = ()
+    earlier: Sequence[Failure] = ()
     exhausted: bool = False
     seconds: float = 0.0
+
+    @property
+    def place(self) -> Float[np.ndarray, "3"]:
+        """Centre of the object's points [m]."""
+        return self.points.mean(0)
 
 
 class GraspSource(Protocol):
@@ -76,6 +83,8 @@ EMPTY = "the bin is empty"
 _STRAY, _RISE = 0.006, 0.3
 # Thickness added to neighbours and walls [m]. It is less than the default, because objects in a bin give way.
 _GIVES_WAY = 0.0015
+# Least probability that ends the search for a better object. In a full bin, the best of all objects is worth the time.
+_LIKELY = 0.7
 # Plane that hands keep above. Its offset above the table top [m] allows for errors of arm and camera.
 TABLE = Plane(np.array([0.0, 0.0, 1.0]), 0.002)
 
@@ -93,45 +102,48 @@ class InProcessGrasps:
     Args:
         arm, hand, layout: parts of the cell.
         preset: name of graspd's preset.
-        most: greatest number of objects planned for in one view. Unlike a time limit, it gives repeatable results.
         seed: seed of the optimiser.
         tries: number of failed grasps after which an object is given up.
     """
 
     def __init__(
-        self, arm: Arm, hand: HandModel, layout: CellLayout, *, preset: str = "balanced", most: int = 4,
-        seed: int = 0, tries: int = 4,
+        self, arm: Arm, hand: HandModel, layout: CellLayout, *, preset: str = "balanced", seed: int = 0,
+        tries: int = 4,
     ) -> None:  # fmt: skip
         self._hand, self._source = hand, layout.pick
         self._plan = {
-            "settings": scene_config(layout.pick), "surface": TABLE, "tries": tries, "most": most,
+            "settings": scene_config(layout.pick), "surface": TABLE, "tries": tries,
+            "enough": 1, "likely": _LIKELY,
             "solids": {f"wall {k}": [box_mesh(wall)] for k, wall in enumerate(layout.solids[1:])},
             "restrictions": (Reach(arm, (0.0, 0.0, 0.0)),), "measure": False, "preset": preset, "seed": seed,
         }  # fmt: skip
+        self._before: Sequence[ThingPlan] = ()
         warm_up(hand)
 
     def next(self, view: DepthView, failures: Sequence[Failure]) -> Offer:
         """Return the most reliable grasp of an object in the pick bin. See `GraspSource`."""
         began = time.perf_counter()
         try:
-            found = plan_any_thing([cloud_of(view)], self._hand, failures=failures, **self._plan)
+            found = plan_any_thing([cloud_of(view)], self._hand, failures=failures, before=self._before, **self._plan)
         except CloudError as error:
             return Offer(None, reason=str(error), exhausted=True, seconds=time.perf_counter() - began)
+        self._before = found
         return _offer(found, time.perf_counter() - began)
 
 
 def _offer(found: Sequence[ThingPlan], seconds: float) -> Offer:
     failed = tuple(Failure(thing.place) for thing in found if thing.grasp is None and thing.looked_at)
+    seen = np.array([thing.place for thing in found]).reshape(-1, 3)
     reasons = "; ".join(dict.fromkeys(thing.reason for thing in found if thing.reason))
     if not found or found[0].grasp is None:
         told, over = reasons or EMPTY, all(thing.reason == OUT_OF_TRIES for thing in found)
-        return Offer(None, things=len(found), reason=told, failures=failed, exhausted=over, seconds=seconds)
+        return Offer(None, seen=seen, reason=told, failures=failed, exhausted=over, seconds=seconds)
     best = found[0]
     assert best.grasp is not None
     assert best.scene is not None
     assert best.result is not None
     target, verified = best.scene.object, best.grasp.verdict is Verdict.VERIFIED
     return Offer(
-        best.grasp, best.place, target.mesh, best.result.mass or target.mass, verified, len(found), best.reason, failed,
-        seconds=seconds,
+        best.grasp, best.points, target.mesh, best.result.mass or target.mass, verified, seen, best.reason, failed,
+        best.failures, seconds=seconds,
     )  # fmt: skip

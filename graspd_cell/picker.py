@@ -41,6 +41,9 @@ from graspd_core.mesh.mesh_files import surface_samples
 from graspd_core.perception.obstacles import held_hull
 from graspd_core.planning.any_thing import Failure
 
+# An object is still in its place if more than `_STILL_THERE` of its points are within `_UNMOVED` of points seen [m].
+_UNMOVED, _STILL_THERE = 0.006, 0.6
+
 
 class Ending(StrEnum):
     """Outcome of one attempt."""
@@ -142,6 +145,8 @@ class Picker:
         self._pace, self._cancelled = pace or Pace(), cancelled
         self._failures: list[Failure] = []
         self._picked = 0
+        # The last offer, if its object seemed to arrive in the other bin.
+        self._taken: Offer | None = None
         # Joint targets last sent to the hand. A squeezing hand does not reach its targets, because the object stops it.
         self._sent = hand.open_posture
         # Boxes of objects in the place bin, which the camera hardly sees.
@@ -160,6 +165,7 @@ class Picker:
         while attempts < most:
             self.go_home()
             view, began = self._robot.look(), self._robot.joints().time
+            self._look_again(view)
             offer = self.offer = self._source.next(view, self._failures)
             self._failures += offer.failures
             likely = offer.grasp is not None and (offer.grasp.probability or 0.0) >= self._pace.least_probability
@@ -195,10 +201,9 @@ class Picker:
         if ending is not Ending.PICKED:
             self.back_off(world)
         now, closed = self._robot.joints().time, taking.closed if taking else 0.0
-        tries = sum(np.linalg.norm(failure.place - offer.place) < 0.04 for failure in self._failures)
         return Attempt(
-            number, ending, reason, offer.place, offer.verified, offer.grasp and offer.grasp.probability, int(tries),
-            offer.seconds, max(closed - began, 0.0), now - began, offer.things,
+            number, ending, reason, offer.place, offer.verified, offer.grasp and offer.grasp.probability,
+            len(offer.earlier), offer.seconds, max(closed - began, 0.0), now - began, len(offer.seen),
         )  # fmt: skip
 
     def _steps(self, taking: _Taking) -> tuple[Ending, str]:
@@ -315,11 +320,21 @@ class Picker:
 
     def _learn(self, attempt: Attempt, offer: Offer) -> None:
         """Store a failed grasp. After a success, forget which objects had no grasp: they may have one now."""
-        if attempt.ending is Ending.PICKED:
-            self._failures = [failure for failure in self._failures if failure.grasp is not None]
+        picked = attempt.ending is Ending.PICKED
+        self._taken = offer if picked else None
+        if picked:
+            self._failures = [f for f in self._failures if f.grasp is not None and f not in offer.earlier]
         elif offer.grasp is not None:
             executed = attempt.ending is not Ending.NO_WAY
-            self._failures.append(Failure(offer.place, offer.grasp.grasp, executed))
+            self._failures.append(Failure(offer.place, offer.grasp.grasp, executed, offer.seen))
+
+    def _look_again(self, view: DepthView) -> None:
+        """Store the last grasp as failed if the object that it seemed to take is still in its place."""
+        taken, points = self._taken, cloud_of(view).points
+        if taken is None or taken.grasp is None or not len(points):
+            return
+        if (KDTree(points).query(taken.points)[0] < _UNMOVED).mean() > _STILL_THERE:
+            self._failures.append(Failure(taken.place, taken.grasp.grasp, True, taken.seen))
 
     # Helpers of the behaviours.
 

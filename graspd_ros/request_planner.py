@@ -133,13 +133,14 @@ class RecentRuns:
 
         `excluded` is the result of the method `excluded`. Raises the errors of `lookup`.
         """
-        places: list[Any] = [None] * len(excluded)
+        seen: list[Any] = [None] * len(excluded)
         for row, name in enumerate(request.exclude):
             run = self._grasp(name)[0]
-            for place, _ in run.planned.objects[:1]:
+            if run.planned.objects:
                 T_object_run = request.to_object(run.frame, run.T_frame_object, lookup)
-                places[row] = moved_points(place[None], T_object_run)[0]
-        return [Failure(*failed) for failed in zip(places, _postures(excluded), strict=True)]
+                seen[row] = moved_points(np.array([place for place, _ in run.planned.objects]), T_object_run)
+        rows = zip(seen, _postures(excluded), strict=True)
+        return [Failure(None if places is None else places[0], posture, seen=places) for places, posture in rows]
 
     def _grasp(self, name: str) -> tuple[_Run, Grasp]:
         run_id, _, rank = name.rpartition("/")

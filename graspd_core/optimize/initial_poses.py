@@ -221,8 +221,9 @@ def _lift(obstacles: ObstacleTensors, base: SE3, links: SE3) -> Positions | floa
 def _depth(obstacles: ObstacleTensors, base: SE3, links: SE3) -> Values:
     """Return the depth of each hand in obstacles, at its pose or at its retreat, whichever is greater [m]."""
     behind = drawn_back(base.translation, base.rotation, obstacles.approach)
-    gaps = [least_gap(obstacles, SE3(base.rotation, at), links) for at in (base.translation, behind)]
-    return (-torch.stack(gaps).amin(0)).clamp_min(0.0)
+    twice = SE3(base.rotation.repeat(2, 1, 1), torch.cat([base.translation, behind]))
+    both = SE3(links.rotation.repeat(2, 1, 1, 1), links.translation.repeat(2, 1, 1))
+    return -least_gap(obstacles, twice, both).view(2, len(behind)).amin(0).clamp_max(0.0)
 
 
 def _lowered(preference: Values, count: int, penalty: Callable[[Tensor], Values]) -> Values:

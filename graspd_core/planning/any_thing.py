@@ -1,10 +1,10 @@
 """Plan for any object of a scene: find an object with a verified grasp, else rank the objects by their best grasp.
 
-Objects with fewer earlier failures come first. At equal numbers of failures, higher objects come first, because nothing
-lies on them. An object gets one round of the planner, but all rounds if an earlier try failed with this or an unknown
-object, and twice the effort if an earlier search found no grasp. The first verified grasp ends the search. After
-`enough` objects, a grasp with a probability of at least 0.5 also ends the search, to limit the time. `result_of_things`
-returns the result of one request.
+Objects with fewer earlier failures come first. At equal numbers of failures, objects with more probable grasps in the
+previous view come first, then higher objects, because nothing lies on them. An object gets one round of the planner,
+but all rounds if an earlier try failed with this or an unknown object, and twice the effort if an earlier search found
+no grasp. The first verified grasp ends the search. After `enough` objects, a grasp with a probability of at least
+`likely` also ends the search, to limit the time. `result_of_things` returns the result of one request.
 """
 
 from __future__ import annotations
@@ -13,10 +13,12 @@ import time
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
+from itertools import compress
 from typing import Any
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Bool, Float
+from scipy.spatial.distance import cdist
 
 from graspd_core.config import SceneConfig
 from graspd_core.errors import CloudError, ConfigError, MeshError, NoObjectError
@@ -43,8 +45,8 @@ _FAILED = "an earlier grasp of this object failed"
 # Effort of a search for an object for which an earlier search found no grasp. In two full bins on which it was chosen,
 # such searches then found a grasp.
 _HARDER = 2.0
-# Least probability of a likely grasp.
-_LIKELY = 0.5
+# Probability of an object's best grasp before any search: the mean of 73 objects in ten full bins, for two hands.
+_UNKNOWN = 0.2
 # Points belong to a known solid if the fraction `_NEARLY_ALL` of them is within `_STRAY` of the solid's surface [m].
 _STRAY, _NEARLY_ALL = 0.016, 0.9
 
@@ -57,11 +59,26 @@ class Failure:
         place: mean of the object's points [m]. None if the object is unknown. Then only the failed grasp is avoided.
         grasp: hand posture at the failed grasp. None if no grasp was found.
         executed: whether a robot executed the grasp. If so, the object gets a doubt, so that no grasp is verified.
+        seen: places of all objects seen before the try [m], or None. They help to find the object after it has moved.
     """
 
     place: Float[np.ndarray, "3"] | None
     grasp: Posture | None = None
     executed: bool = True
+    seen: Float[np.ndarray, "_ 3"] | None = None
+
+    def is_of(self, places: Float[np.ndarray, "_ 3"]) -> Bool[np.ndarray, "_"]:
+        """Return which of the objects at `places` [m] failed: those within 4 cm of the failure's place.
+
+        If none is there, the object has moved. Then it is the nearest object of those where none was seen before.
+        """
+        if self.place is None:
+            return np.zeros(len(places), dtype=bool)
+        away = np.linalg.norm(places - self.place, axis=1)
+        if self.seen is None or not len(self.seen) or (away < _SAME_PLACE).any():
+            return away < _SAME_PLACE
+        away[cdist(places, self.seen).min(1) < _SAME_PLACE] = np.inf
+        return (away == away.min(initial=np.inf)) & np.isfinite(away)
 
 
 @dataclass(frozen=True, eq=False)
@@ -75,6 +92,7 @@ class ThingPlan:
         grasp: the best grasp, verified or unverified. None if no grasp was found.
         reason: why there is no verified grasp. Empty if there is a verified grasp.
         looked_at: whether this request tried to find a grasp for the object.
+        failures: earlier failures with this object.
     """
 
     points: Float[np.ndarray, "_ 3"]
@@ -83,16 +101,16 @@ class ThingPlan:
     grasp: Grasp | None = None
     reason: str = ""
     looked_at: bool = True
+    failures: Sequence[Failure] = ()
 
     @property
     def place(self) -> Float[np.ndarray, "3"]:
         """Mean of the object's points [m]."""
         return self.points.mean(0)
 
-    @property
-    def is_likely(self) -> bool:
-        """Whether the grasp's probability is at least 0.5 or unknown. False without a grasp."""
-        return self.grasp is not None and (self.grasp.probability is None or self.grasp.probability >= _LIKELY)
+    def is_likely(self, least: float) -> bool:
+        """Return whether the grasp's probability is at least `least` or unknown. False without a grasp."""
+        return self.grasp is not None and (self.grasp.probability is None or self.grasp.probability >= least)
 
     @property
     def surety(self) -> float:
@@ -115,8 +133,9 @@ def plan_any_thing(
     failures: Sequence[Failure] = (),
     tries: int = 4,
     deadline: float | None = None,
+    before: Sequence[ThingPlan] = (),
     enough: int = 2,
-    most: int | None = None,
+    likely: float = 0.5,
     **plan: Any,
 ) -> tuple[ThingPlan, ...]:
     """Plan for one object after the other until one has a verified grasp. Return all objects, by descending `surety`.
@@ -132,8 +151,8 @@ def plan_any_thing(
         failures: failures of earlier requests. Grasps like a failed grasp are left out (`unlike`).
         tries: number of failures after which an object is skipped.
         deadline: time after which the whole search ends [s]. None for no limit.
-        enough: number of objects after which a grasp with a probability of at least 0.5 ends the search.
-        most: greatest number of objects to plan for. None for all objects.
+        before: plans for the previous view. Where they had probable grasps, the search begins.
+        enough, likely: number of objects after which a grasp with a probability of at least `likely` ends the search.
         plan: other arguments of `plan_grasps`. `seed` grows by 1 per failure with this object or an unknown object.
 
     Raises:
@@ -143,24 +162,23 @@ def plan_any_thing(
     began, things, over = time.perf_counter(), list[ThingPlan](), False
     asked = {"seed": 0, "count": 1, "verify": "standard", "device": "cpu", "preset": "balanced"} | plan
     check_request(deadline=deadline, **{name: asked[name] for name in ("count", "seed", "verify", "device")})
-    config = load_preset(asked["preset"]) if isinstance(asked["preset"], str) else asked["preset"]
+    config = asked["preset"] = load_preset(asked["preset"]) if isinstance(asked["preset"], str) else asked["preset"]
     ahead = None if asked["verify"] == "none" else partial(begin_other_shapes, config.certainty.probability)
     about = {"settings": settings, "mass": mass, "friction": friction, "source": source, "ahead": ahead}
     stop = asked.get("stop") or (lambda: False)
     seen = [p for p in things_from_views(views, settings and settings.segmentation) if not _is_solid(p, solids or {})]
-    for points, failed in _in_order(seen, failures):
+    for points, failed in _in_order(seen, failures, before):
         if over or len(failed) >= tries:
             reason = OUT_OF_TRIES if len(failed) >= tries else NOT_LOOKED_AT
-            things.append(ThingPlan(points, reason=reason, looked_at=False))
+            things.append(ThingPlan(points, reason=reason, looked_at=False, failures=failed))
             continue
         scene = _scene_among(views, points, surface, solids, about, failed)
         left = None if deadline is None else max(deadline - (time.perf_counter() - began), 1e-3)
         lost = [*failed, *(failure for failure in failures if failure.place is None)]
-        things.append(_thing_plan(points, scene, hand, lost, {**asked, "preset": config, "deadline": left}))
-        looked = sum(thing.looked_at for thing in things)
+        things.append(replace(_thing_plan(points, scene, hand, lost, {**asked, "deadline": left}), failures=failed))
         late = deadline is not None and time.perf_counter() - began > deadline
-        over = late or stop() or looked == most or things[-1].surety >= 1.0
-        over = over or (looked >= enough and any(thing.is_likely for thing in things))
+        found = any(thing.is_likely(likely) for thing in things) and sum(thing.looked_at for thing in things) >= enough
+        over = late or stop() or found or things[-1].surety >= 1.0
     return tuple(sorted(things, key=lambda thing: -thing.surety))
 
 
@@ -193,14 +211,19 @@ def _is_solid(points: Float[np.ndarray, "_ 3"], solids: Mapping[str, Sequence[Tr
 
 
 def _in_order(
-    things: Sequence[Float[np.ndarray, "_ 3"]], failures: Sequence[Failure]
+    things: Sequence[Float[np.ndarray, "_ 3"]], failures: Sequence[Failure], before: Sequence[ThingPlan]
 ) -> list[tuple[Float[np.ndarray, "_ 3"], list[Failure]]]:
-    known = [(failure, failure.place) for failure in failures if failure.place is not None]
-    rows = [
-        (points, [failure for failure, place in known if np.linalg.norm(points.mean(0) - place) < _SAME_PLACE])
-        for points in things
-    ]
-    return sorted(rows, key=lambda row: (len(row[1]), -float(row[0][:, 2].max())))
+    places = np.array([points.mean(0) for points in things]).reshape(-1, 3)
+    failed = np.array([failure.is_of(places) for failure in failures], dtype=bool).reshape(len(failures), len(places))
+    rows = [(points, list(compress(failures, failed[:, row]))) for row, points in enumerate(things)]
+    known = [(thing.place, max(thing.surety, 0.0)) for thing in before if thing.looked_at]
+
+    def rank(row: tuple[Float[np.ndarray, "_ 3"], list[Failure]]) -> tuple[int, float, float]:
+        place = row[0].mean(0)
+        hopes = [surety for there, surety in known if np.linalg.norm(place - there) < _SAME_PLACE]
+        return len(row[1]), -max(hopes, default=_UNKNOWN), -float(row[0][:, 2].max())
+
+    return sorted(rows, key=rank)
 
 
 def _scene_among(

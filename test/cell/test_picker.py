@@ -166,7 +166,32 @@ def test_jaws_that_close_further_as_a_thing_turns_between_them_still_hold_it(rob
     hold = after_squeeze(hand, grasp, reading(0.0))
     assert why_lost(hold, hand, reading(0.5)) == ""
     assert why_lost(hold, hand, replace(reading(0.7), efforts=0.6 * (target - touch))) == ""
+    assert why_lost(hold, hand, replace(reading(0.9), efforts=0.5 * (target - touch))) == ""
     assert why_lost(hold, hand, reading(0.95))
+
+
+def test_a_thing_that_only_seemed_to_be_taken_counts_as_lost(robot_of: RobotOf, monkeypatch: pytest.MonkeyPatch):
+    robot = robot_of("ur5e_like", "parallel_gripper", THING, height=0.05)
+    robot.wait(1.0)
+    told, next_offer = list[Failure](), KeptGrasps.next
+
+    def noted(self: KeptGrasps, view: DepthView, failures: tuple[Failure, ...]) -> Offer:
+        told[:] = failures
+        return next_offer(self, view, failures)
+
+    monkeypatch.setattr(KeptGrasps, "next", noted)
+    picker = picker_of(robot)
+    # The arm moves nothing, and the picker notices nothing.
+    monkeypatch.setattr(Picker, "_steps", lambda *_: (Ending.PICKED, ""))
+    assert [attempt.ending for attempt in picker.empty_the_bin(most=2)] == [Ending.PICKED] * 2
+    (lost,) = told
+    offer = OFFERS["ur5e_like", "parallel_gripper"]
+    assert offer.grasp is not None
+    assert (lost.grasp, lost.executed) == (offer.grasp.grasp, True)
+    # Once the thing is gone, nothing counts as lost.
+    robot._data.qpos[robot.world.thing_qpos[0]] += 3.0
+    next(iter(picker.empty_the_bin(most=1)))
+    assert told == [lost]
 
 
 @pytest.mark.parametrize("after", [0.5, 2.5, 4.5, 6.5])

@@ -75,6 +75,14 @@ def test_without_a_verified_grasp_the_search_ends_after_some_objects(views, enou
     assert some(found[0].grasp).verdict is Verdict.UNVERIFIED
 
 
+def test_a_grasp_is_likely_from_a_given_probability_on(first):
+    grasp = some(first[0].grasp)
+    thing = replace(first[0], grasp=replace(grasp, probability=0.6))
+    assert (thing.is_likely(0.6), thing.is_likely(0.7)) == (True, False)
+    assert replace(thing, grasp=replace(grasp, probability=None)).is_likely(0.7)
+    assert not replace(thing, grasp=None).is_likely(0.0)
+
+
 def test_what_failed_comes_last_and_is_given_up_after_some_tries(views, first):
     place = first[0].place
     other = plan_any_thing(views, HAND, failures=[Failure(place)], **ASKED)
@@ -84,11 +92,35 @@ def test_what_failed_comes_last_and_is_given_up_after_some_tries(views, first):
     assert not any(thing.looked_at for thing in over)
 
 
+def test_an_object_that_moved_keeps_its_failures():
+    here, there, far = np.eye(3)
+    failed = Failure(here, seen=np.array([here, there]))
+    # It still lies there, or it is the nearest of those that lie where nothing was seen, or it is gone.
+    assert failed.is_of(np.array([there, here + 0.02])).tolist() == [False, True]
+    assert failed.is_of(np.array([there, far, 0.6 * here, far - here])).tolist() == [False, False, True, False]
+    assert not failed.is_of(np.array([there + 0.01])).any()
+    assert failed.is_of(np.zeros((0, 3))).tolist() == []
+    # Without the places of the other objects nobody knows which one moved.
+    assert not replace(failed, seen=None).is_of(np.array([there, far])).any()
+    assert not Failure(None).is_of(np.array([here])).any()
+
+
+def test_the_best_of_the_view_before_comes_first(views, first):
+    quick = {**ASKED, "verify": "none", "enough": 1}
+    # The object that comes first without a view before comes last if the other one had a surer grasp.
+    sure, unsure = (replace(some(first[0].grasp), probability=p) for p in (0.9, 0.1))
+    for best, worst in (first, first[::-1]):
+        before = [replace(worst, grasp=unsure, looked_at=True), replace(best, grasp=sure, looked_at=True)]
+        again = plan_any_thing(views, HAND, before=before, **quick)
+        np.testing.assert_array_equal(again[0].points, best.points)
+        assert [thing.looked_at for thing in again] == [True, False]
+
+
 def test_one_result_answers_for_all_things(views, first):
     assert result_of_things(first) is some(first[0].result)
     # A grasp that failed nobody knows where is left out, and makes no object come later.
     loose = Failure(None, first[0].grasp.grasp)
-    again = plan_any_thing(views, HAND, failures=[loose], verify="none", most=1, **ASKED)
+    again = plan_any_thing(views, HAND, failures=[loose], verify="none", enough=1, **ASKED)
     assert [thing.reason for thing in again][1:] == [NOT_LOOKED_AT]
     np.testing.assert_array_equal(again[0].points, first[0].points)
     best = some(again[0].grasp)
