@@ -258,10 +258,10 @@ def _thing_plan(
     if isinstance(scene, str):
         return ThingPlan(points, reason=scene)
     lost, config = [failure.grasp for failure in failed if failure.grasp is not None], plan["preset"]
-    if not failed:
-        config = replace(config, rounds=replace(config.rounds, most=1))
-    elif any(failure.grasp is None for failure in failed):
+    if any(failure.grasp is None for failure in failed):
         config = config.at_budget(_HARDER)
+    if not lost:
+        config = replace(config, rounds=replace(config.rounds, most=1))
     count, seed = min(plan["count"] + 2 * len(lost), MOST_GRASPS), (plan["seed"] + len(failed)) % SEEDS
     try:
         result = plan_grasps(scene, hand, **{**plan, "preset": config, "count": count, "seed": seed})
