@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import time
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Protocol
 
 import numpy as np
 from jaxtyping import Float
 
-from graspd_cell.layout import Bin, CellLayout
+from graspd_cell.layout import Bin, Box, CellLayout
 from graspd_cell.robot import DepthView
 from graspd_cell.simulated_robot import box_mesh
 from graspd_core.arms.arm import Arm
@@ -81,8 +81,8 @@ def cloud_of(view: DepthView) -> PointCloud:
 EMPTY = "the bin is empty"
 # Distance of the crop box from the walls, which allows for camera errors, and height of its top above the table [m].
 _STRAY, _RISE = 0.006, 0.3
-# Thickness added to neighbours and walls [m]. It is less than the default, because objects in a bin give way.
-_GIVES_WAY = 0.0015
+# Thickness added to objects in the bin, which give way, and to walls, which do not [m].
+_GIVES_WAY, _STANDS = 0.0015, 0.005
 # Least probability that ends the search for a better object. In a full bin, the best of all objects is worth the time.
 _LIKELY = 0.7
 # Plane that hands keep above. Its offset above the table top [m] allows for errors of arm and camera.
@@ -114,7 +114,7 @@ class InProcessGrasps:
         self._plan = {
             "settings": scene_config(layout.pick), "surface": TABLE, "tries": tries,
             "enough": 1, "likely": _LIKELY,
-            "solids": {f"wall {k}": [box_mesh(wall)] for k, wall in enumerate(layout.solids[1:])},
+            "solids": {f"wall {k}": [box_mesh(_thickened(wall))] for k, wall in enumerate(layout.solids[1:])},
             "restrictions": (Reach(arm, (0.0, 0.0, 0.0)),), "measure": False, "preset": preset, "seed": seed,
         }  # fmt: skip
         self._before: Sequence[ThingPlan] = ()
@@ -129,6 +129,11 @@ class InProcessGrasps:
             return Offer(None, reason=str(error), exhausted=True, seconds=time.perf_counter() - began)
         self._before = found
         return _offer(found, time.perf_counter() - began)
+
+
+def _thickened(wall: Box) -> Box:
+    x, y, z = (half + _STANDS - _GIVES_WAY for half in wall.half)
+    return replace(wall, half=(x, y, z))
 
 
 def _offer(found: Sequence[ThingPlan], seconds: float) -> Offer:
