@@ -29,13 +29,19 @@ def tip_pose(mover: Mover, q: Joints) -> Pose:
     return pose
 
 
-def straight(mover: Mover, q: Joints, way: Float[np.ndarray, "3"]) -> Float[np.ndarray, "rows joints"]:
+def straight(
+    mover: Mover, q: Joints, way: Float[np.ndarray, "3"], *, freeing: bool = False
+) -> Float[np.ndarray, "rows joints"]:
     """Return joint values that move the tip straight by `way` [m], base frame. The first row is `q`.
 
-    The path ends before the first pose that collides, is out of reach, or makes a joint jump.
+    The path ends before the first pose that collides, is out of reach, or makes a joint jump. With `freeing`, hand and
+    object may touch obstacles all the way if they touch one at `q`, to leave a heap.
     """
     arm, pose, rows = mover.shape.arm, tip_pose(mover, q), [q]
     allowed = mover.allowed(q[None])
+    if freeing:
+        carried = mover.carried_columns
+        allowed[carried] = allowed[carried].min()
     count = max(1, int(np.ceil(np.linalg.norm(way) / _STEP)))
     for k in range(1, count + 1):
         target = pose.copy()

@@ -274,9 +274,15 @@ class Mover:
             parts.append(gap + self.margin)
         return np.concatenate(parts, 1)
 
+    @property
+    def carried_columns(self) -> slice:
+        """Columns of `clearances` for the balls of hand and object."""
+        arm = int(self.shape.beyond_shoulder.sum())
+        return slice(arm, arm + len(self.carried.radius))
+
     def arm_clearances(self, q: Path) -> Float[np.ndarray, "rows balls"]:
         """Return the distances of the arm's balls (not of hand and object) to floor, boxes and points seen [m]."""
-        return self.clearances(q)[:, : int(self.shape.beyond_shoulder.sum())]
+        return self.clearances(q)[:, : self.carried_columns.start]
 
     def allowed(self, ends: Path) -> Float[np.ndarray, "balls"]:
         """Return the distance that each ball must keep [m]: the margin, or less if it is nearer at one of `ends`."""

@@ -276,7 +276,7 @@ class Picker:
         world = self._without_thing(taking)
         mover = self._mover(world, self._hand_now())
         mover = replace(mover, carried=held_balls(mover, here, thing))
-        up = straight(mover, here, np.array([0.0, 0.0, 0.1]))
+        up = straight(mover, here, np.array([0.0, 0.0, 0.1]), freeing=True)
         risen = thing + np.array([0.0, 0.0, tip_pose(mover, up[-1])[2, 3] - tip_pose(mover, here)[2, 3]])
         goal = release_posture(mover, up[-1], risen, self._layout.place, self._picked)
         if goal is None:
@@ -319,13 +319,12 @@ class Picker:
             self._stop_if_cancelled()
 
     def _learn(self, attempt: Attempt, offer: Offer) -> None:
-        """Store a failed grasp. After a success, forget which objects had no grasp: they may have one now."""
-        picked = attempt.ending is Ending.PICKED
+        """Store a failed grasp. After a try in the bin, forget which objects had no grasp. They may have one now."""
+        picked, executed = attempt.ending is Ending.PICKED, attempt.ending is not Ending.NO_WAY
         self._taken = offer if picked else None
-        if picked:
-            self._failures = [f for f in self._failures if f.grasp is not None and f not in offer.earlier]
-        elif offer.grasp is not None:
-            executed = attempt.ending is not Ending.NO_WAY
+        if executed:
+            self._failures = [f for f in self._failures if f.grasp is not None and not (picked and f in offer.earlier)]
+        if offer.grasp is not None and not picked:
             self._failures.append(Failure(offer.place, offer.grasp.grasp, executed, offer.seen))
 
     def _look_again(self, view: DepthView) -> None:

@@ -119,3 +119,16 @@ def test_a_thing_is_raised_straight_and_let_go_above_the_other_bin(name: str):
     assert layout.place.holds(moved.mean(0))
     assert moved[:, 2].min() > 0.05
     assert loaded.clearances(goal[None]).min() >= loaded.margin
+
+
+def test_a_hand_that_touches_a_heap_is_raised_out_of_it():
+    arm, up = load_arm("ur5e_like"), np.array([0.0, 0.0, 0.1])
+    hand = mover_of("ur5e_like").placed(arm.seed)[1]
+    low, high = hand[hand[:, 2].argmin()], hand[hand[:, 2].argmax()]
+    # One point touches the hand, and one is in its way upwards.
+    heap = mover_of("ur5e_like", np.array([low, high + [0.0, 0.0, 0.05]]))
+    assert len(straight(heap, arm.seed, up)) < 6
+    assert len(straight(heap, arm.seed, up, freeing=True)) == 6
+    # A hand that touches nothing does not rise into something.
+    above = mover_of("ur5e_like", np.array([high + [0.0, 0.0, 0.09]]))
+    assert len(straight(above, arm.seed, up, freeing=True)) < 6
