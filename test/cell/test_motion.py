@@ -126,9 +126,9 @@ def test_a_hand_that_touches_a_heap_is_raised_out_of_it():
     hand = mover_of("ur5e_like").placed(arm.seed)[1]
     low, high = hand[hand[:, 2].argmin()], hand[hand[:, 2].argmax()]
     # One point touches the hand, and one is in its way upwards.
-    heap = mover_of("ur5e_like", np.array([low, high + [0.0, 0.0, 0.05]]))
+    heap = mover_of("ur5e_like", np.array([low, high + 0.5 * up]))
     assert len(straight(heap, arm.seed, up)) < 6
     assert len(straight(heap, arm.seed, up, freeing=True)) == 6
     # A hand that touches nothing does not rise into something.
-    above = mover_of("ur5e_like", np.array([high + [0.0, 0.0, 0.09]]))
+    above = mover_of("ur5e_like", np.array([high + 0.9 * up]))
     assert len(straight(above, arm.seed, up, freeing=True)) < 6
