@@ -9,7 +9,7 @@ import torch
 from jaxtyping import Float
 
 from graspd_cell.layout import Bin, Box
-from graspd_cell.motion import Balls, Mover, Points, balls_about
+from graspd_cell.motion import DEEPEST, Balls, Mover, Points, balls_about
 from graspd_core.arms.arm import Arm
 from graspd_core.arms.inverse_kinematics import nearest_postures, solve, start_table
 from graspd_core.se3 import SE3
@@ -35,13 +35,13 @@ def straight(
     """Return joint values that move the tip straight by `way` [m], base frame. The first row is `q`.
 
     The path ends before the first pose that collides, is out of reach, or makes a joint jump. With `freeing`, hand and
-    object may touch obstacles all the way if they touch one at `q`, to leave a heap.
+    object may penetrate obstacles as deep as at `q`, but at most 2 cm. So a held object can leave a heap.
     """
     arm, pose, rows = mover.shape.arm, tip_pose(mover, q), [q]
     allowed = mover.allowed(q[None])
     if freeing:
         carried = mover.carried_columns
-        allowed[carried] = allowed[carried].min()
+        allowed[carried] = np.minimum(allowed[carried], max(allowed[carried].min(), DEEPEST))
     count = max(1, int(np.ceil(np.linalg.norm(way) / _STEP)))
     for k in range(1, count + 1):
         target = pose.copy()

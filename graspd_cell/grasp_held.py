@@ -2,7 +2,7 @@
 
 A joint presses if its squeeze target lies beyond its position at the grasp. An object in the hand stops the joint
 before the target. A joint that reaches its target presses on nothing, and its effort drops. Joints also stop early if
-fingers press on each other. Then points of fingers meet. A false alarm drops the object, so an unclear reading is none.
+fingers press on each other. Then points of fingers meet. A false alarm drops the object, so doubt is no alarm.
 """
 
 from __future__ import annotations
@@ -22,14 +22,14 @@ Joints = Float[np.ndarray, "joints"]
 
 # A joint presses if its target is farther than this from its value at the grasp [rad].
 _PRESSES = 0.03
-# Fingers that closed on nothing cover more than the fraction `_ARRIVED` of the motion from grasp to target, or, if they
-# press on each other, `_MEETING`. Of 76 attempts in 13 bins (seeds 204 to 210), fingers that held an object covered up
-# to 0.72, and those that met and held one up to 0.6.
+# The fingers closed on nothing if they covered more than the fraction `_ARRIVED` of the motion from grasp to target. If
+# they press on each other, `_MEETING` is enough. In 76 attempts in 13 bins (seeds 204 to 210), fingers that held an
+# object covered up to 0.72. Fingers that held an object and met covered up to 0.6.
 _ARRIVED, _MEETING = 0.85, 0.62
 # Two fingers meet if points of theirs were farther apart than `_APART` at the grasp and are within `_NEAR` now [m].
 _APART, _NEAR = 0.009, 0.004
-# As an object slips out, the joints move on and their efforts fall. It is lost if the fraction covered, minus the
-# fraction of effort left, exceeds this. It was up to 0.48 for objects that turned in the hand but arrived.
+# As an object slips out, the joints move on and their efforts fall. The object is lost if the fraction covered minus
+# the fraction of effort left exceeds this. Objects that turned in the hand, but reached the other bin, had up to 0.48.
 _SLIPPED = 0.5
 
 
@@ -72,14 +72,16 @@ def why_lost(hold: Hold, hand: HandModel, reading: JointReading) -> str:
     """Return why the object is no longer in the hand, by a later reading, or "" if the hand still holds it."""
     own, toward = reading.of(hand.joint_names), np.sign(hold.target - hold.touch)
     before, now = (np.maximum((toward * efforts)[hold.presses], 0.0).sum() for efforts in (hold.efforts, own.efforts))
-    covered, left = _covered(hold, own.positions), now / before if before > 0 else 1.0
+    covered = _covered(hold, own.positions)
+    # A hand that reports no efforts pushes the less, the nearer its joints are to their targets.
+    left = now / before if before > 0 else 1.0 - covered
     if covered - left > _SLIPPED:
         return f"the fingers covered {100 * covered:.0f} % of the squeeze with {100 * left:.0f} % of their effort left"
     return ""
 
 
 def _covered(hold: Hold, positions: Joints) -> float:
-    """Return which fraction of the motion from grasp to target the median pressing joint covered. 0 if none presses."""
+    """Return the fraction of the way from grasp to target that the median pressing joint covered. 0 if none presses."""
     way, gone = (hold.target - hold.touch)[hold.presses], (positions - hold.touch)[hold.presses]
     return float(np.median(gone / way)) if len(way) else 0.0
 

@@ -306,9 +306,9 @@ def dense(path: Path, step: float = _STEP) -> Path:
     return np.concatenate([*parts, path[-1:]])
 
 
-# Deepest penetration allowed at a motion's goal [m]. `_DEEPEST` is for the whole robot, because the grid is coarse.
+# Deepest penetration allowed at a motion's goal [m]. `DEEPEST` is for the whole robot, because the grid is coarse.
 # `ARM_DEEPEST` is for the arm alone, because its capsules are larger than its links.
-_DEEPEST, ARM_DEEPEST = -0.02, -0.01
+DEEPEST, ARM_DEEPEST = -0.02, -0.01
 
 # Greatest number of checks of postures and straight lines to find a path, and then to shorten the path. Limits of time
 # would give other paths on a busy machine.
@@ -324,7 +324,7 @@ def find_path(mover: Mover, start: Joints, goal: Joints, checks: int = _CHECKS) 
     ends = np.stack([start, goal])
     # Only the goal is checked. The arm is already at the start, even if it touches something there.
     whole, own = mover.clearances(ends)[1].min(), mover.arm_clearances(ends)[1].min()
-    if whole < _DEEPEST or own < ARM_DEEPEST:
+    if whole < DEEPEST or own < ARM_DEEPEST:
         told = f"penetrates an obstacle by {-1e3 * min(whole, own):.0f} mm at its goal; valid: a goal without collision"
         raise NoMotionError(f"motion: {mover.shape.arm.name} {told}")
     allowed = mover.allowed(ends)

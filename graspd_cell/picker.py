@@ -35,7 +35,7 @@ from graspd_cell.motion import (
 from graspd_cell.robot import DepthView, JointMotion, JointReading, MotionAborted, Robot, never
 from graspd_core.arms.arm import Arm, tip_hand
 from graspd_core.arms.execution import Execution, ExecutionPace, execution_of
-from graspd_core.errors import GraspdError
+from graspd_core.errors import CloudError, GraspdError
 from graspd_core.hands.model import HandModel
 from graspd_core.mesh.mesh_files import surface_samples
 from graspd_core.perception.obstacles import held_hull
@@ -126,7 +126,7 @@ class _Taking:
 
 
 class Picker:
-    """Picker that drives one robot.
+    """Picker that empties one bin. It remembers the bin's objects, so make a new picker and source for each bin.
 
     Args:
         robot: the robot to drive.
@@ -165,16 +165,16 @@ class Picker:
         while attempts < most:
             self.go_home()
             view, began = self._robot.look(), self._robot.joints().time
-            self._look_again(view)
+            self._check_taken(view)
             offer = self.offer = self._source.next(view, self._failures)
-            self._failures += offer.failures
+            self._failures = list(offer.failures)
             likely = offer.grasp is not None and (offer.grasp.probability or 0.0) >= self._pace.least_probability
             if offer.grasp is None or not (offer.verified or likely):
                 self.why_ended = offer.reason
                 if offer.exhausted:
                     return
                 if offer.grasp is not None:
-                    self._failures.append(Failure(offer.place, offer.grasp.grasp, executed=False))
+                    self._failures.append(Failure(offer.place, offer.grasp.grasp, executed=False, seen=offer.seen))
                 continue
             attempts += 1
             attempt = self.attempt(offer, self.world_of(view), began, attempts)
@@ -323,17 +323,24 @@ class Picker:
         picked, executed = attempt.ending is Ending.PICKED, attempt.ending is not Ending.NO_WAY
         self._taken = offer if picked else None
         if executed:
-            self._failures = [f for f in self._failures if f.grasp is not None and not (picked and f in offer.earlier)]
+            self._failures = [failure for failure in self._failures if failure.grasp is not None]
         if offer.grasp is not None and not picked:
             self._failures.append(Failure(offer.place, offer.grasp.grasp, executed, offer.seen))
 
-    def _look_again(self, view: DepthView) -> None:
-        """Store the last grasp as failed if the object that it seemed to take is still in its place."""
-        taken, points = self._taken, cloud_of(view).points
-        if taken is None or taken.grasp is None or not len(points):
+    def _check_taken(self, view: DepthView) -> None:
+        """Store the last grasp as failed if its object is still in its place. Else forget the object's failures."""
+        taken, self._taken = self._taken, None
+        if taken is None or taken.grasp is None:
             return
-        if (KDTree(points).query(taken.points)[0] < _UNMOVED).mean() > _STILL_THERE:
+        try:
+            points = cloud_of(view).points
+        except CloudError:
+            return
+        if len(points) and (KDTree(points).query(taken.points)[0] < _UNMOVED).mean() > _STILL_THERE:
             self._failures.append(Failure(taken.place, taken.grasp.grasp, True, taken.seen))
+            self._dropped = self._dropped[:-1]
+        else:
+            self._failures = [failure for failure in self._failures if failure not in taken.earlier]
 
     # Helpers of the behaviours.
 

@@ -129,7 +129,7 @@ class RecentRuns:
         return poses + [request.to_object(frame, pose, lookup) for frame, pose in request.exclude_poses]
 
     def failures(self, request: Request, excluded: Sequence[Matrix], lookup: FrameLookup) -> list[Failure]:
-        """Return the excluded grasps as `Failure` values for planning, each with its object's position [m] if known.
+        """Return the excluded grasps as `Failure` values, with the positions [m] of all objects seen, if known.
 
         `excluded` is the result of the method `excluded`. Raises the errors of `lookup`.
         """

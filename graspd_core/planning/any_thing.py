@@ -2,8 +2,8 @@
 
 Objects with fewer earlier failures come first. At equal numbers of failures, objects with more probable grasps in the
 previous view come first, then higher objects, because nothing lies on them. An object gets one round of the planner,
-but all rounds if an earlier try failed with this or an unknown object, and twice the effort if an earlier search found
-no grasp. The first verified grasp ends the search. After `enough` objects, a grasp with a probability of at least
+but all rounds if an earlier grasp of this or an unknown object failed. It gets twice the effort if an earlier search
+found no grasp. The first verified grasp ends the search. After `enough` objects, a grasp with a probability of at least
 `likely` also ends the search, to limit the time. `result_of_things` returns the result of one request.
 """
 
@@ -13,14 +13,13 @@ import time
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
-from itertools import compress
 from typing import Any
 
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Float
 from scipy.spatial.distance import cdist
 
-from graspd_core.config import SceneConfig
+from graspd_core.config import ObstacleConfig, SceneConfig
 from graspd_core.errors import CloudError, ConfigError, MeshError, NoObjectError
 from graspd_core.hands.model import HandModel
 from graspd_core.mesh.surface_queries import make_surface, surface_distance
@@ -42,8 +41,7 @@ OUT_OF_TRIES, NOT_LOOKED_AT = "no tries left", "not tried before the search ende
 _SAME_PLACE = 0.04
 # Doubt about the scene of an object if a robot executed a grasp of the object and the grasp failed.
 _FAILED = "an earlier grasp of this object failed"
-# Effort of a search for an object for which an earlier search found no grasp. In two full bins on which it was chosen,
-# such searches then found a grasp.
+# Effort of a search for an object for which an earlier search found no grasp.
 _HARDER = 2.0
 # Probability of an object's best grasp before any search: the mean of 73 objects in ten full bins, for two hands.
 _UNKNOWN = 0.2
@@ -59,7 +57,8 @@ class Failure:
         place: mean of the object's points [m]. None if the object is unknown. Then only the failed grasp is avoided.
         grasp: hand posture at the failed grasp. None if no grasp was found.
         executed: whether a robot executed the grasp. If so, the object gets a doubt, so that no grasp is verified.
-        seen: places of all objects seen before the try [m], or None. They help to find the object after it has moved.
+        seen: places of all objects seen before the try [m]. They help to find the object after it has moved. None if
+            unknown.
     """
 
     place: Float[np.ndarray, "3"] | None
@@ -67,18 +66,19 @@ class Failure:
     executed: bool = True
     seen: Float[np.ndarray, "_ 3"] | None = None
 
-    def is_of(self, places: Float[np.ndarray, "_ 3"]) -> Bool[np.ndarray, "_"]:
-        """Return which of the objects at `places` [m] failed: those within 4 cm of the failure's place.
+    def object_among(self, places: Float[np.ndarray, "_ 3"]) -> int | None:
+        """Return the index of the failed object among objects at `places` [m]: the nearest within 4 cm, or None.
 
-        If none is there, the object has moved. Then it is the nearest object of those where none was seen before.
+        If none is there, the object has moved. Then it is the nearest of those that lie where none was seen before.
         """
-        if self.place is None:
-            return np.zeros(len(places), dtype=bool)
+        if self.place is None or not len(places):
+            return None
         away = np.linalg.norm(places - self.place, axis=1)
-        if self.seen is None or not len(self.seen) or (away < _SAME_PLACE).any():
-            return away < _SAME_PLACE
-        away[cdist(places, self.seen).min(1) < _SAME_PLACE] = np.inf
-        return (away == away.min(initial=np.inf)) & np.isfinite(away)
+        if away.min() >= _SAME_PLACE:
+            if self.seen is None or not len(self.seen):
+                return None
+            away[cdist(places, self.seen).min(1) < _SAME_PLACE] = np.inf
+        return int(away.argmin()) if np.isfinite(away).any() else None
 
 
 @dataclass(frozen=True, eq=False)
@@ -144,15 +144,15 @@ def plan_any_thing(
         views: point cloud of each camera, all in the same frame [m].
         settings: settings for segmentation, reconstruction and obstacles.
         surface: support plane of all objects, if it is known.
-        solids: known solids by name, in the frame of the views [m]. They are obstacles and never grasped.
+        solids: known solids by name, in the frame of the views [m]: obstacles, padded by at least 5 mm, never grasped.
         mass: mass of each object [kg]. None assumes the greatest mass that the object's volume allows (`heavy_mass`).
         friction: Coulomb friction coefficient between hand and objects.
         source: name of the views, for messages.
         failures: failures of earlier requests. Grasps like a failed grasp are left out (`unlike`).
         tries: number of failures after which an object is skipped.
         deadline: time after which the whole search ends [s]. None for no limit.
-        before: plans for the previous view. Where they had probable grasps, the search begins.
-        enough, likely: number of objects after which a grasp with a probability of at least `likely` ends the search.
+        before: plans for the previous view. The search begins where their grasps were more probable.
+        enough, likely: number of objects after which a grasp with at least the probability `likely` ends the search.
         plan: other arguments of `plan_grasps`. `seed` grows by 1 per failure with this object or an unknown object.
 
     Raises:
@@ -214,8 +214,10 @@ def _in_order(
     things: Sequence[Float[np.ndarray, "_ 3"]], failures: Sequence[Failure], before: Sequence[ThingPlan]
 ) -> list[tuple[Float[np.ndarray, "_ 3"], list[Failure]]]:
     places = np.array([points.mean(0) for points in things]).reshape(-1, 3)
-    failed = np.array([failure.is_of(places) for failure in failures], dtype=bool).reshape(len(failures), len(places))
-    rows = [(points, list(compress(failures, failed[:, row]))) for row, points in enumerate(things)]
+    rows = [(points, list[Failure]()) for points in things]
+    for failure in failures:
+        if (index := failure.object_among(places)) is not None:
+            rows[index][1].append(failure)
     known = [(thing.place, max(thing.surety, 0.0)) for thing in before if thing.looked_at]
 
     def rank(row: tuple[Float[np.ndarray, "_ 3"], list[Failure]]) -> tuple[int, float, float]:
@@ -248,7 +250,12 @@ def _scene_among(
     if again and scene.evidence is not None:
         scene = replace(scene, evidence=replace(scene.evidence, doubts=(*scene.evidence.doubts, _FAILED)))
     scene = scene if surface is None else replace(scene, support=surface)
-    return with_neighbours(scene, solids, about["settings"]) if solids else scene
+    if not solids:
+        return scene
+    settings = about["settings"] or SceneConfig()
+    # Unlike objects in a heap, known solids do not give way.
+    padding = max(settings.obstacles.padding, ObstacleConfig().padding)
+    return with_neighbours(scene, solids, replace(settings, obstacles=replace(settings.obstacles, padding=padding)))
 
 
 def _thing_plan(

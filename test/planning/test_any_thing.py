@@ -96,13 +96,13 @@ def test_an_object_that_moved_keeps_its_failures():
     here, there, far = np.eye(3)
     failed = Failure(here, seen=np.array([here, there]))
     # It still lies there, or it is the nearest of those that lie where nothing was seen, or it is gone.
-    assert failed.is_of(np.array([there, here + 0.02])).tolist() == [False, True]
-    assert failed.is_of(np.array([there, far, 0.6 * here, far - here])).tolist() == [False, False, True, False]
-    assert not failed.is_of(np.array([there + 0.01])).any()
-    assert failed.is_of(np.zeros((0, 3))).tolist() == []
+    assert failed.object_among(np.array([there, here + 0.02, here + 0.01])) == 2
+    assert failed.object_among(np.array([there, far, 0.6 * here, far - here])) == 2
+    assert failed.object_among(np.array([there + 0.01])) is None
+    assert failed.object_among(np.zeros((0, 3))) is None
     # Without the places of the other objects nobody knows which one moved.
-    assert not replace(failed, seen=None).is_of(np.array([there, far])).any()
-    assert not Failure(None).is_of(np.array([here])).any()
+    assert replace(failed, seen=None).object_among(np.array([there, far])) is None
+    assert Failure(None).object_among(np.array([here])) is None
 
 
 def test_the_best_of_the_view_before_comes_first(views, first):
