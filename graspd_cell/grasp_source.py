@@ -128,21 +128,23 @@ class InProcessGrasps:
         try:
             found = plan_any_thing([cloud_of(view)], self._hand, failures=failures, before=self._before, **self._plan)
         except CloudError as error:
-            return Offer(None, reason=str(error), exhausted=True, seconds=time.perf_counter() - began)
+            return Offer(None, reason=str(error), failures=tuple(failures), exhausted=True)
+        if not found:
+            return Offer(None, reason=EMPTY, failures=tuple(failures), exhausted=True)
         self._before = found
         return _offer(found, time.perf_counter() - began)
 
 
 def _offer(found: Sequence[ThingPlan], seconds: float) -> Offer:
-    seen = np.array([thing.place for thing in found]).reshape(-1, 3)
+    seen = np.array([thing.place for thing in found])
     # Each failure follows its object from view to view. Failures of objects that are gone are dropped.
     known = [tuple(replace(failure, place=thing.place, seen=seen) for failure in thing.failures) for thing in found]
     failed = [Failure(thing.place) for thing in found if thing.grasp is None and thing.looked_at]
     failures = (*chain.from_iterable(known), *failed)
     reasons = "; ".join(dict.fromkeys(thing.reason for thing in found if thing.reason))
-    if not found or found[0].grasp is None:
-        told, over = reasons or EMPTY, all(thing.reason == OUT_OF_TRIES for thing in found)
-        return Offer(None, seen=seen, reason=told, failures=failures, exhausted=over, seconds=seconds)
+    if found[0].grasp is None:
+        over = all(thing.reason == OUT_OF_TRIES for thing in found)
+        return Offer(None, seen=seen, reason=reasons, failures=failures, exhausted=over, seconds=seconds)
     best = found[0]
     assert best.grasp is not None
     assert best.scene is not None

@@ -161,7 +161,7 @@ class Picker:
             Cancelled: the caller cancelled.
             MotionAborted, NoMotionError: the arm cannot return to `start`, where it does not occlude the camera.
         """
-        attempts = 0
+        attempts, ended = 0, False
         while attempts < most:
             self.go_home()
             view, began = self._robot.look(), self._robot.joints().time
@@ -171,12 +171,14 @@ class Picker:
             likely = offer.grasp is not None and (offer.grasp.probability or 0.0) >= self._pace.least_probability
             if offer.grasp is None or not (offer.verified or likely):
                 self.why_ended = offer.reason
-                if offer.exhausted:
+                # One noisy image may show nothing, so two must agree.
+                if ended and offer.exhausted:
                     return
+                ended = offer.exhausted
                 if offer.grasp is not None:
                     self._failures.append(Failure(offer.place, offer.grasp.grasp, executed=False, seen=offer.seen))
                 continue
-            attempts += 1
+            attempts, ended = attempts + 1, False
             attempt = self.attempt(offer, self.world_of(view), began, attempts)
             self._learn(attempt, offer)
             yield attempt

@@ -206,6 +206,21 @@ def test_a_thing_that_only_seemed_to_be_taken_counts_as_lost_each_time(
     assert told[-1] == []
 
 
+def test_one_look_at_nothing_does_not_end_it(robot_of: RobotOf, monkeypatch: pytest.MonkeyPatch):
+    robot = robot_of("ur5e_like", "parallel_gripper", THING, height=0.05)
+    offers, next_offer = [True, False, True, True, False], KeptGrasps.next
+
+    def sometimes(self: KeptGrasps, view: DepthView, failures: tuple[Failure, ...]) -> Offer:
+        empty = Offer(None, reason=EMPTY, failures=tuple(failures), exhausted=True)
+        return empty if offers.pop(0) else next_offer(self, view, failures)
+
+    monkeypatch.setattr(KeptGrasps, "next", sometimes)
+    monkeypatch.setattr(Picker, "_steps", lambda *_: (Ending.NOT_GRIPPED, "nothing"))
+    picker = picker_of(robot)
+    assert len(list(picker.empty_the_bin(most=9))) == 1
+    assert (picker.why_ended, offers, len(picker._failures)) == (EMPTY, [False], 1)
+
+
 @pytest.mark.parametrize("after", [0.5, 2.5, 4.5, 6.5])
 def test_a_cancel_at_any_time_leaves_the_arm_still_and_the_hand_as_it_is(robot_of: RobotOf, after: float):
     robot = robot_of("ur5e_like", "parallel_gripper", THING, height=0.05)
