@@ -43,7 +43,7 @@ _SAME_PLACE = 0.04
 _FAILED = "an earlier grasp of this object failed"
 # Effort of a search for an object for which an earlier search found no grasp.
 _HARDER = 2.0
-# Probability of an object's best grasp before any search: the mean of 73 objects in ten full bins, for two hands.
+# Probability of an object's best grasp before any search: the mean of 93 objects in eight full bins, for two hands.
 _UNKNOWN = 0.2
 # Points belong to a known solid if the fraction `_NEARLY_ALL` of them is within `_STRAY` of the solid's surface [m].
 _STRAY, _NEARLY_ALL = 0.016, 0.9
