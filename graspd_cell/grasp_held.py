@@ -2,7 +2,8 @@
 
 A joint presses if its squeeze target lies beyond its position at the grasp. An object in the hand stops the joint
 before the target. A joint that reaches its target presses on nothing, and its effort drops. Joints also stop early if
-fingers press on each other. Then points of fingers meet. A false alarm drops the object, so doubt is no alarm.
+fingers press on each other. Then points of fingers meet. An unclear reading counts as held, because the hand opens
+after an alarm and drops what it holds.
 """
 
 from __future__ import annotations

@@ -124,15 +124,16 @@ class InProcessGrasps:
 
     def next(self, view: DepthView, failures: Sequence[Failure]) -> Offer:
         """Return the most reliable grasp of an object in the pick bin. See `GraspSource`."""
-        began = time.perf_counter()
+        began, told = time.perf_counter(), EMPTY
         try:
             found = plan_any_thing([cloud_of(view)], self._hand, failures=failures, before=self._before, **self._plan)
         except CloudError as error:
-            return Offer(None, reason=str(error), failures=tuple(failures), exhausted=True)
+            found, told = (), str(error)
+        seconds = time.perf_counter() - began
         if not found:
-            return Offer(None, reason=EMPTY, failures=tuple(failures), exhausted=True)
+            return Offer(None, reason=told, failures=tuple(failures), exhausted=True, seconds=seconds)
         self._before = found
-        return _offer(found, time.perf_counter() - began)
+        return _offer(found, seconds)
 
 
 def _offer(found: Sequence[ThingPlan], seconds: float) -> Offer:

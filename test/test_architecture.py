@@ -72,7 +72,7 @@ MAX_PACKAGE_LINES = {
     "graspd_bench": 8_128,
     "graspd_dataset": 3_023,
     "graspd_viewer": 2_408,
-    "graspd_cell": 3_782,
+    "graspd_cell": 3_784,
     "test": 34_328,
 }
 # Lines that a program reaches through its imports, those inside functions too.
