@@ -37,8 +37,8 @@ from graspd_core.verify.robustness import begin_other_shapes
 LIKE_DISTANCE, LIKE_TURN = 0.015, 0.26
 # Reasons why an object is skipped: too many failures, or the search ended before.
 OUT_OF_TRIES, NOT_LOOKED_AT = "no tries left", "not tried before the search ended"
-# An object within this distance of an earlier failure's place is the same object [m].
-_SAME_PLACE = 0.04
+# An object this near to an earlier failure's place is the same object. No object slips farther than `_SLIPPED` [m].
+_SAME_PLACE, _SLIPPED = 0.04, 0.2
 # Doubt about the scene of an object if a robot executed a grasp of the object and the grasp failed.
 _FAILED = "an earlier grasp of this object failed"
 # Effort of a search for an object for which an earlier search found no grasp.
@@ -58,7 +58,7 @@ class Failure:
         grasp: hand posture at the failed grasp. None if no grasp was found.
         executed: whether a robot executed the grasp. If so, the object gets a doubt, so that no grasp is verified.
         seen: places of all objects seen before the try [m]. They help to find the object after it has moved. None if
-            unknown.
+            unknown, or if the object may be gone.
     """
 
     place: Float[np.ndarray, "3"] | None
@@ -69,16 +69,16 @@ class Failure:
     def object_among(self, places: Float[np.ndarray, "_ 3"]) -> int | None:
         """Return the index of the failed object among objects at `places` [m]: the nearest within 4 cm, or None.
 
-        If none is there, the object has moved. Then it is the nearest of those that lie where none was seen before.
+        If none is there, the object has moved, at most 20 cm. Then it is the nearest of those that lie where none was
+        seen before, or else the nearest, because images of a heap do not always show the same objects.
         """
-        if self.place is None or not len(places):
+        away = np.zeros(0) if self.place is None else np.linalg.norm(places - self.place, axis=1)
+        if away.min(initial=np.inf) > (_SAME_PLACE if self.seen is None else _SLIPPED):
             return None
-        away = np.linalg.norm(places - self.place, axis=1)
-        if away.min() >= _SAME_PLACE:
-            if self.seen is None or not len(self.seen):
-                return None
-            away[cdist(places, self.seen).min(1) < _SAME_PLACE] = np.inf
-        return int(away.argmin()) if np.isfinite(away).any() else None
+        if away.min() > _SAME_PLACE and self.seen is not None:
+            is_new = (cdist(places, self.seen) > _SAME_PLACE).all(1) & (away <= _SLIPPED)
+            away[is_new] -= _SLIPPED
+        return int(away.argmin())
 
 
 @dataclass(frozen=True, eq=False)

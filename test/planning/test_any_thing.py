@@ -95,10 +95,13 @@ def test_what_failed_comes_last_and_is_given_up_after_some_tries(views, first):
 def test_an_object_that_moved_keeps_its_failures():
     here, there, far = np.eye(3)
     failed = Failure(here, seen=np.array([here, there]))
-    # It still lies there, or it is the nearest of those that lie where nothing was seen, or it is gone.
+    # It still lies there, or it is the nearest of those that lie where nothing was seen, or the nearest, or gone.
     assert failed.object_among(np.array([there, here + 0.02, here + 0.01])) == 2
-    assert failed.object_among(np.array([there, far, 0.6 * here, far - here])) == 2
-    assert failed.object_among(np.array([there + 0.01])) is None
+    assert failed.object_among(np.array([there, far, 0.85 * here, far - here])) == 2
+    part = replace(failed, seen=np.array([here, 0.9 * here, 0.85 * here]))
+    assert part.object_among(np.array([0.91 * here, 0.86 * here])) == 0
+    assert part.object_among(np.array([0.91 * here, 1.15 * here])) == 1
+    assert failed.object_among(np.array([there + 0.01, 0.7 * here])) is None
     assert failed.object_among(np.zeros((0, 3))) is None
     # Without the places of the other objects nobody knows which one moved.
     assert replace(failed, seen=None).object_among(np.array([there, far])) is None
