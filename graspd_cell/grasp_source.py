@@ -82,9 +82,8 @@ def cloud_of(view: DepthView) -> PointCloud:
 EMPTY = "the bin is empty"
 # Distance of the crop box from the walls, which allows for camera errors, and height of its top above the table [m].
 _STRAY, _RISE = 0.006, 0.3
-# Thickness added to objects in the bin [m], if no finger presses harder than `_STRONG` [N] with a lever arm of `_LEVER`
-# [m]. It is less than the default, because such fingers push objects aside. Strong jaws press on them instead.
-_GIVES_WAY, _STRONG, _LEVER = 0.0015, 50.0, 0.1
+# Thickness added to objects in the bin [m]. It is less than the default, because these objects give way.
+_GIVES_WAY = 0.0015
 # A grasp of at least this probability ends the search. In a full bin, the best object is often the last one looked at.
 # With a look at all objects, the first grasp had a mean probability of 0.57 instead of 0.42 (LEAP hand, eight bins).
 _LIKELY = 0.7
@@ -92,13 +91,11 @@ _LIKELY = 0.7
 TABLE = Plane(np.array([0.0, 0.0, 1.0]), 0.002)
 
 
-def scene_config(source: Bin, hand: HandModel) -> SceneConfig:
+def scene_config(source: Bin) -> SceneConfig:
     """Return scene settings that crop clouds to the inside of a bin."""
     (x, y), half = source.center, source.half - _STRAY
     cut = SegmentationConfig(roi_low=(x - half, y - half, -0.02), roi_high=(x + half, y + half, _RISE), piled=True)
-    strongest = float((hand.effort / np.where(hand.slides, 1.0, _LEVER)).max())
-    padding = ObstacleConfig().padding if strongest > _STRONG else _GIVES_WAY
-    return SceneConfig(segmentation=cut, obstacles=ObstacleConfig(padding=padding))
+    return SceneConfig(segmentation=cut, obstacles=ObstacleConfig(padding=_GIVES_WAY))
 
 
 class InProcessGrasps:
@@ -117,7 +114,7 @@ class InProcessGrasps:
     ) -> None:  # fmt: skip
         self._hand = hand
         self._plan = {
-            "settings": scene_config(layout.pick, hand), "surface": TABLE, "tries": tries,
+            "settings": scene_config(layout.pick), "surface": TABLE, "tries": tries,
             "enough": 1, "likely": _LIKELY,
             "solids": {f"wall {k}": [box_mesh(wall)] for k, wall in enumerate(layout.solids[1:])},
             "restrictions": (Reach(arm, (0.0, 0.0, 0.0)),), "measure": False, "preset": preset, "seed": seed,

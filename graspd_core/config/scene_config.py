@@ -45,7 +45,8 @@ class SegmentationConfig:
         target_share: a box or mask that covers this fraction of an object selects the whole object.
         obstacle_range: other objects up to this distance from the object to grasp become obstacles [m].
         piled: True if objects lie on each other. Parts divided by a seam are then separate objects, even if stacked. If
-            a target point selects such a part, no grasp counts as verified. The heap may have any size.
+            a target point selects such a part, or a part hidden by a nearer one, no grasp counts as verified. The heap
+            may have any size.
     """
 
     roi_low: tuple[float, float, float] | None = None

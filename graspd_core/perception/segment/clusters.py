@@ -301,7 +301,7 @@ def _hangs(piece: Points, distance: Float[np.ndarray, "n"], support: FlatPart, v
         return False
     below = piece - height[:, None] * support.plane.normal
     for eye in viewpoints:
-        (seen, near), (foot, far) = _directions(piece, eye), _directions(below, eye)
+        (seen, near), (foot, far) = directions(piece, eye), directions(below, eye)
         apart, which = KDTree(seen).query(foot)
         if np.mean((apart * near[which] <= link) & (near[which] < far)) >= HIDDEN_FOOT_SHARE:
             return False
@@ -316,11 +316,12 @@ def _may_stand(piece: Points, other: Float[np.ndarray, "m 3"], support: FlatPart
 
 
 def _touch_in_image(a: Points, b: Float[np.ndarray, "m 3"], eye: Vector, gap: float) -> bool:
-    (one, near), (other, far) = _directions(a, eye), _directions(b, eye)
+    (one, near), (other, far) = directions(a, eye), directions(b, eye)
     return _apart(one, other) <= gap / min(float(np.median(near)), float(np.median(far)))
 
 
-def _directions(points: Points, eye: Vector) -> tuple[Points, Float[np.ndarray, "n"]]:
+def directions(points: Points, eye: Vector) -> tuple[Points, Float[np.ndarray, "n"]]:
+    """Return unit directions from a camera to points, and the distances [m]."""
     away = np.linalg.norm(points - eye, axis=1).clip(1e-6)
     return (points - eye) / away[:, None], away
 
