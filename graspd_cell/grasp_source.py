@@ -138,7 +138,7 @@ class InProcessGrasps:
 
 def _offer(found: Sequence[ThingPlan], seconds: float) -> Offer:
     seen = np.array([thing.place for thing in found])
-    # Each failure follows its object from view to view. Failures of objects that are gone are dropped.
+    # Each failure follows its object from view to view. Failures of no object seen are dropped.
     known = [tuple(replace(failure, place=thing.place, seen=seen) for failure in thing.failures) for thing in found]
     failed = [Failure(thing.place) for thing in found if thing.grasp is None and thing.looked_at]
     failures = (*chain.from_iterable(known), *failed)

@@ -35,11 +35,14 @@ from graspd_cell.motion import (
 from graspd_cell.robot import DepthView, JointMotion, JointReading, MotionAborted, Robot, never
 from graspd_core.arms.arm import Arm, tip_hand
 from graspd_core.arms.execution import Execution, ExecutionPace, execution_of
-from graspd_core.errors import GraspdError
+from graspd_core.errors import CloudError, GraspdError
 from graspd_core.hands.model import HandModel
 from graspd_core.mesh.mesh_files import surface_samples
 from graspd_core.perception.obstacles import held_hull
 from graspd_core.planning.any_thing import Failure
+
+# An object is still in its place if more than `_STILL_THERE` of its points are within `_UNMOVED` of points seen [m].
+_UNMOVED, _STILL_THERE = 0.006, 0.6
 
 
 class Ending(StrEnum):
@@ -142,6 +145,8 @@ class Picker:
         self._pace, self._cancelled = pace or Pace(), cancelled
         self._failures: list[Failure] = []
         self._picked = 0
+        # The last offer, if its object seemed to arrive in the other bin.
+        self._taken: Offer | None = None
         # Joint targets last sent to the hand. A squeezing hand does not reach its targets, because the object stops it.
         self._sent = hand.open_posture
         # Boxes of objects in the place bin, which the camera hardly sees.
@@ -160,6 +165,7 @@ class Picker:
         while attempts < most:
             self.go_home()
             view, began = self._robot.look(), self._robot.joints().time
+            self._check_taken(view)
             offer = self.offer = self._source.next(view, self._failures)
             self._failures = list(offer.failures)
             likely = offer.grasp is not None and (offer.grasp.probability or 0.0) >= self._pace.least_probability
@@ -315,18 +321,32 @@ class Picker:
             self._stop_if_cancelled()
 
     def _learn(self, attempt: Attempt, offer: Offer) -> None:
-        """Store the grasp as failed. Even after success, the next image decides whether its object is gone.
+        """Store the grasp as failed. After success, the next image decides whether its object is gone.
 
         After a try in the bin, forget which objects had no grasp. They may have one now.
         """
         assert offer.grasp is not None
         picked, executed = attempt.ending is Ending.PICKED, attempt.ending is not Ending.NO_WAY
-        own = [*offer.earlier, Failure(offer.place, offer.grasp.grasp, executed, offer.seen)]
-        # The failures of an object that seems to be gone do not pass to another object, unless it lies in its place.
-        own = [replace(failure, seen=None) for failure in own] if picked else own
-        self._failures = [failure for failure in self._failures if failure not in offer.earlier] + own
+        self._taken = offer if picked else None
         if executed:
             self._failures = [failure for failure in self._failures if failure.grasp is not None]
+        # Without `seen`, only an object in the same place takes over the failure.
+        seen = None if picked else offer.seen
+        self._failures.append(Failure(offer.place, offer.grasp.grasp, executed, seen))
+
+    def _check_taken(self, view: DepthView) -> None:
+        """Forget the earlier failures of the last object, unless the image shows it where it was."""
+        taken, self._taken = self._taken, None
+        if taken is None:
+            return
+        try:
+            points = cloud_of(view).points
+        except CloudError:
+            return
+        if len(points) and (KDTree(points).query(taken.points)[0] < _UNMOVED).mean() > _STILL_THERE:
+            self._dropped = self._dropped[:-1]
+        else:
+            self._failures = [failure for failure in self._failures if failure not in taken.earlier]
 
     # Helpers of the behaviours.
 

@@ -66,19 +66,19 @@ class Failure:
     executed: bool = True
     seen: Float[np.ndarray, "_ 3"] | None = None
 
-    def object_among(self, places: Float[np.ndarray, "_ 3"]) -> int | None:
+    def object_among(self, places: Float[np.ndarray, "_ 3"], *, unsure: bool = False) -> int | None:
         """Return the index of the failed object among objects at `places` [m]: the nearest within 4 cm, or None.
 
-        If none is there, the object has moved, at most 20 cm. Then it is the nearest of those that lie where none was
-        seen before, or else the nearest, because images of a heap do not always show the same objects.
+        If none is there, and `seen` is known, the object has moved by up to 20 cm. Then it is the nearest of those that
+        lie where none was seen before, or with `unsure` the nearest of all.
         """
         away = np.zeros(0) if self.place is None else np.linalg.norm(places - self.place, axis=1)
-        if away.min(initial=np.inf) > (_SAME_PLACE if self.seen is None else _SLIPPED):
-            return None
-        if away.min() > _SAME_PLACE and self.seen is not None:
-            is_new = (cdist(places, self.seen) > _SAME_PLACE).all(1) & (away <= _SLIPPED)
-            away[is_new] -= _SLIPPED
-        return int(away.argmin())
+        if away.min(initial=np.inf) >= _SAME_PLACE:
+            if self.seen is None or not len(away):
+                return None
+            was_seen = (cdist(places, self.seen) < _SAME_PLACE).any(1)
+            away[(away > _SLIPPED) | (was_seen & (not unsure))] = np.inf
+        return int(away.argmin()) if np.isfinite(away).any() else None
 
 
 @dataclass(frozen=True, eq=False)
@@ -215,8 +215,16 @@ def _in_order(
 ) -> list[tuple[Float[np.ndarray, "_ 3"], list[Failure]]]:
     places = np.array([points.mean(0) for points in things]).reshape(-1, 3)
     rows = [(points, list[Failure]()) for points in things]
+    lost = dict[int | None, Failure]()
     for failure in failures:
         if (index := failure.object_among(places)) is not None:
+            rows[index][1].append(failure)
+        elif failure.grasp is not None and failure.executed:
+            lost[failure.object_among(places, unsure=True)] = failure
+    # Images of a heap do not always show the same objects. So lost failures add one doubt about the nearest object, but
+    # no more, because another object must not run out of tries.
+    for index, failure in lost.items():
+        if index is not None and not rows[index][1]:
             rows[index][1].append(failure)
     known = [(thing.place, max(thing.surety, 0.0)) for thing in before if thing.looked_at]
 

@@ -95,17 +95,33 @@ def test_what_failed_comes_last_and_is_given_up_after_some_tries(views, first):
 def test_an_object_that_moved_keeps_its_failures():
     here, there, far = np.eye(3)
     failed = Failure(here, seen=np.array([here, there]))
-    # It still lies there, or it is the nearest of those that lie where nothing was seen, or the nearest, or gone.
+    # It still lies there, or it is the nearest of those that lie where nothing was seen, or it is gone.
     assert failed.object_among(np.array([there, here + 0.02, here + 0.01])) == 2
     assert failed.object_among(np.array([there, far, 0.85 * here, far - here])) == 2
     part = replace(failed, seen=np.array([here, 0.9 * here, 0.85 * here]))
-    assert part.object_among(np.array([0.91 * here, 0.86 * here])) == 0
+    assert part.object_among(np.array([0.91 * here, 0.86 * here])) is None
+    assert part.object_among(np.array([0.91 * here, 0.86 * here]), unsure=True) == 0
     assert part.object_among(np.array([0.91 * here, 1.15 * here])) == 1
+    assert part.object_among(np.array([0.7 * here]), unsure=True) is None
     assert failed.object_among(np.array([there + 0.01, 0.7 * here])) is None
     assert failed.object_among(np.zeros((0, 3))) is None
     # Without the places of the other objects nobody knows which one moved.
     assert replace(failed, seen=None).object_among(np.array([there, far])) is None
-    assert Failure(None).object_among(np.array([here])) is None
+    assert Failure(None).object_among(np.array([here]), unsure=True) is None
+
+
+def test_lost_failures_make_the_nearest_object_doubted_once(views, first):
+    best = first[0]
+    seen = np.array([thing.place for thing in first])
+    lost = [Failure(best.place + np.array([0.0, 0.0, 0.06]), some(best.grasp).grasp, seen=seen)] * 4
+    again = plan_any_thing(views, HAND, failures=lost, **ASKED)
+    assert sorted(len(thing.failures) for thing in again) == [0, 1]
+    (doubted,) = (thing for thing in again if thing.failures)
+    np.testing.assert_allclose(doubted.place, best.place)
+    assert doubted.grasp is None or doubted.grasp.verdict is not Verdict.VERIFIED
+    # A grasp that no robot executed moved nothing.
+    kept = plan_any_thing(views, HAND, failures=[replace(lost[0], executed=False)], **ASKED)
+    assert not any(thing.failures for thing in kept)
 
 
 def test_the_best_of_the_view_before_comes_first(views, first):

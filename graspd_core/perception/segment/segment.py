@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import pickle
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field, replace
 from hashlib import blake2b
 
@@ -104,7 +104,7 @@ def segment(
     if parted.settings.piled and target.point is not None and touching:
         # In a pile, a part need not stand on the support, so the seam may also lie within one object.
         touching, beside = (), "a seam divides the target from its neighbour, and both may be one object"
-    elif parted.settings.piled and target.point is not None and _hidden_share(parted, chosen) > _HIDDEN:
+    elif parted.settings.piled and target.point is not None and _hidden_share(parted, chosen, found) > _HIDDEN:
         beside = "a nearer object hides a part of the target"
     told = (*warnings, *touching)
     return Segmentation(
@@ -292,12 +292,15 @@ def _touching(scene: VoxelScene, chosen: Mask, part: Labels) -> tuple[str, ...]:
     )
 
 
-def _hidden_share(parted: _Parted, chosen: Mask) -> float:
-    """Return the fraction of the object's voxels that border on a nearer object in the image that shows most of it."""
+def _hidden_share(parted: _Parted, chosen: Mask, seen_by: Iterable[int]) -> float:
+    """Return the fraction of the object's voxels that border on a nearer object, the least of all views that show it.
+
+    The workspace's surroundings and pieces too small for an object do not count.
+    """
     scene, others, shares = parted.scene, (parted.label >= 0) & ~chosen, [1.0]
     if not others.any():
         return 0.0
-    for eye in parted.eyes:
+    for eye in parted.eyes[list(seen_by)]:
         (mine, away), (theirs, reach) = (clusters.directions(scene.mean[rows], eye) for rows in (chosen, others))
         nearest = [
             reach[rows].min(initial=np.inf)
