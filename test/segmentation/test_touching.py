@@ -182,3 +182,10 @@ def test_a_part_that_a_nearer_one_hides_is_doubted_where_things_are_piled():
         assert not any(segment([view], target=one).beside for one in targets)
     hides = "a nearer object hides a part of the target"
     assert list(told.values()) == [[hides, ""], ["", ""], ["", hides]]
+    # A second camera that does not show the box clears no doubt. One that sees the box unhidden does.
+    hidden, free = (view_of(stage, azimuth, elevation=0.5) for azimuth in (0.0, np.pi))
+    box, piled = Target(point=stage.truth.vertices.mean(0)), SegmentationConfig(piled=True)
+    away = np.linalg.norm(free.points - stage.truth.vertices.mean(0), axis=1) > 0.2
+    blind = PointCloud(free.points[away], free.viewpoint)
+    assert segment([hidden, blind], target=box, settings=piled).beside == hides
+    assert segment([hidden, free], target=box, settings=piled).beside == ""
