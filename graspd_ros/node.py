@@ -14,8 +14,9 @@ import sys
 import tempfile
 import threading
 from collections.abc import Callable
+from importlib.metadata import version
 from pathlib import Path
-from typing import TYPE_CHECKING, NoReturn
+from typing import TYPE_CHECKING, Any, NoReturn
 
 from graspd_core.errors import ConfigError, GraspdError
 
@@ -41,7 +42,11 @@ SWITCH_INTERVAL = 0.001
 
 
 class Parser(argparse.ArgumentParser):
-    """Argument parser that raises ConfigError for an invalid option."""
+    """Argument parser with `--version`. It raises ConfigError for an invalid option."""
+
+    def __init__(self, **settings: Any) -> None:
+        super().__init__(**settings)
+        self.add_argument("--version", action="version", version=f"{self.prog} {version('graspd')}")
 
     def error(self, message: str) -> NoReturn:
         raise ConfigError(f"{message} (see {self.prog} --help)")

@@ -60,7 +60,11 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 
 class _Parser(argparse.ArgumentParser):
-    """Argument parser that raises a one-line ConfigError instead of printing its usage."""
+    """Argument parser with `--version`. It raises a one-line ConfigError instead of printing its usage."""
+
+    def __init__(self, **settings: Any) -> None:
+        super().__init__(**settings)
+        self.add_argument("--version", action="version", version=f"graspd {version('graspd')}")
 
     def error(self, message: str) -> NoReturn:
         # The top parser reports unknown options, so search the options of all its commands.
@@ -112,7 +116,6 @@ _SUMMARIES = {
 def _overview() -> argparse.ArgumentParser:
     """Build the parser for `--help` and `--version`. The parser knows only names and summaries of the commands."""
     parser = _parser()
-    parser.add_argument("--version", action="version", version=f"graspd {version('graspd')}")
     commands = parser.add_subparsers(metavar="COMMAND", dest="command")
     for name in _modules():
         commands.add_parser(name, help=_SUMMARIES.get(name, ""))

@@ -96,7 +96,7 @@ def test_an_unwritable_result_is_refused_before_the_run(tmp_path, capsys, monkey
 
 @pytest.mark.parametrize(
     ("words", "said"), [([], "reconstruct"), (["--help"], "doctor"), (["--version"], "graspd 0."),
-                        (["synthesize", "--help"], "--friction")]
+                        (["synthesize", "--help"], "--friction"), (["hands", "inspect", "--version"], "graspd 0.")]
 )  # fmt: skip
 def test_help_and_version_are_no_errors(capsys: pytest.CaptureFixture[str], words: list[str], said: str):
     with pytest.raises(SystemExit) as left:

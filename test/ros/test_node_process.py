@@ -115,10 +115,11 @@ def test_a_bad_parameter_or_argument_ends_the_start_with_one_line(tmp_path, doma
 def test_an_argument_that_is_not_for_ros_is_refused(capsys):
     assert main(["--hand", "leap_right"]) == 2
     assert "unrecognized arguments: --hand leap_right (see graspd_node --help)" in capsys.readouterr().err
-    with pytest.raises(SystemExit) as ended:
-        main(["--help"])
-    assert ended.value.code == 0
-    assert "--ros-args" in capsys.readouterr().out
+    for option, told in (("--help", "--ros-args"), ("--version", "graspd_node 0.")):
+        with pytest.raises(SystemExit) as ended:
+            main([option])
+        assert ended.value.code == 0
+        assert told in capsys.readouterr().out
 
 
 def test_a_request_whose_work_blows_up_is_answered_and_the_next_is_served(client, start_node, shared_node):
