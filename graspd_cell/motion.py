@@ -77,7 +77,7 @@ class SeenWorld:
 
 
 def seen_world(points: Points, floor: float, boxes: Sequence[Box] = (), slack: float = 0.012) -> SeenWorld:
-    """Build the obstacles from a camera's points [m], base frame, and known solids.
+    """Build the obstacles from known solids and from a camera's points in the base frame [m].
 
     Points within `slack` [m] of the floor or of a box, and points out of the arm's reach, are dropped.
     """

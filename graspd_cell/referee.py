@@ -92,7 +92,7 @@ def _pair_forces(world: CellWorld, data: Any) -> Forces:
 
 
 def place_of(world: CellWorld, data: Any, index: int) -> str:
-    """Return the place of an object, decided by its centre of mass."""
+    """Return which bin has the object's centre of mass, or `table` or `lost` if neither has it."""
     center = data.xipos[world.thing_bodies[index]]
     if center[2] < _LOST:
         return "lost"

@@ -19,13 +19,12 @@ from graspd_cell.controller import MotionState, TrajectoryController
 from graspd_cell.robot import JointMotion
 from graspd_cell.robot_description import CAMERA_FRAME, frames_of, robot_description
 from graspd_cell.simulated_robot import CAMERA_PERIOD, SimulatedRobot
-from graspd_core.errors import ConfigError, GraspdError
+from graspd_core.errors import ConfigError, GraspdError, Parser
 from graspd_core.types import TriangleMesh
 from graspd_ros.node import (
     EXIT_FAILED,
     EXIT_STOPPED,
     STOP_TIMEOUT,
-    Parser,
     exit_at_once,
     run_command,
     start_thread,

@@ -1,8 +1,10 @@
 """Define the exceptions for bad input. Planning that finds no grasp raises no exception, but returns an `Outcome`."""
 
+import argparse
 import difflib
 import reprlib
 from collections.abc import Iterable
+from typing import Any, NoReturn
 
 # Least similarity, from 0 to 1, of an unknown name to the valid name that is suggested.
 _NEAR = 0.65
@@ -92,3 +94,17 @@ class Extra:
     def __exit__(self, kind: object, error: object, trace: object) -> None:
         if isinstance(error, ModuleNotFoundError):
             raise ConfigError(f"{error.name} is not installed; run: pip install 'graspd[{self.name}]'") from None
+
+
+class Parser(argparse.ArgumentParser):
+    """Argument parser with `--version`. For an invalid option, it raises ConfigError and does not print its usage."""
+
+    def __init__(self, **settings: Any) -> None:
+        from importlib.metadata import version
+
+        super().__init__(**settings)
+        program = self.prog.split()[0]
+        self.add_argument("--version", action="version", version=f"{program} {version('graspd')}")
+
+    def error(self, message: str) -> NoReturn:
+        raise ConfigError(f"{message} (see {self.prog} --help)")

@@ -85,7 +85,7 @@ def begin_run(store: DatasetStore, request: DatasetRequest, blocks: int, *, any_
     records = run_records(store)
     others = sorted({record.code for record in records} - {code})
     if others and not any_code:
-        raise ConfigError(f"{store.label}: made by code {others[0]}, not by {code}; give --any-code to add to it")
+        raise ConfigError(f"{store.label}: made by code {others[0]}, not by this code ({code}); give --any-code to add")
     machine = f"{os.cpu_count()} cores, {platform.machine()}, Python {platform.python_version()}"
     new = RunRecord(command_of(request, store.label), code, commit(), date.today().isoformat(), machine, blocks)
     return next((replace(record, blocks=blocks) for record in records if record.path == new.path), new)

@@ -14,11 +14,10 @@ import sys
 import tempfile
 import threading
 from collections.abc import Callable
-from importlib.metadata import version
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NoReturn
+from typing import TYPE_CHECKING, NoReturn
 
-from graspd_core.errors import ConfigError, GraspdError
+from graspd_core.errors import ConfigError, GraspdError, Parser
 
 if TYPE_CHECKING:
     from rclpy.executors import Executor
@@ -39,17 +38,6 @@ EXIT_STOPPED, EXIT_FAILED, EXIT_BAD_INPUT = 0, 1, 2
 STOP_TIMEOUT = 2.0  # seconds that a busy worker has to stop
 # Python's thread switch interval [s] (default 0.005). Each message needs several switches to the executor's thread.
 SWITCH_INTERVAL = 0.001
-
-
-class Parser(argparse.ArgumentParser):
-    """Argument parser with `--version`. It raises ConfigError for an invalid option."""
-
-    def __init__(self, **settings: Any) -> None:
-        super().__init__(**settings)
-        self.add_argument("--version", action="version", version=f"{self.prog} {version('graspd')}")
-
-    def error(self, message: str) -> NoReturn:
-        raise ConfigError(f"{message} (see {self.prog} --help)")
 
 
 def run_command(

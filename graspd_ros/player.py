@@ -14,10 +14,10 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from graspd_core.errors import BagError, ConfigError
+from graspd_core.errors import BagError, ConfigError, Parser
 from graspd_core.io.bags import BagTopic, bag_topics, read_raw
 from graspd_core.transforms import SECOND
-from graspd_ros.node import Parser, run_command
+from graspd_ros.node import run_command
 
 DEPTH = 10
 SETTLE = 0.3  # wait after discovery [s], because the first messages could still be lost

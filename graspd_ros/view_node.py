@@ -13,9 +13,9 @@ from typing import Any
 
 import numpy as np
 
-from graspd_core.errors import GraspdError, HandError
+from graspd_core.errors import GraspdError, HandError, Parser
 from graspd_core.types import Contact, Grasp, GraspMetrics, Posture, TrialResult
-from graspd_ros.node import Parser, run_command
+from graspd_ros.node import run_command
 
 
 def main(args: list[str] | None = None) -> int:

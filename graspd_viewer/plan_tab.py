@@ -174,7 +174,7 @@ class PlanTab:
         self._preset = gui.add_dropdown("Preset", preset_names(), initial_value="fast")
         self._friction = gui.add_slider("Friction", 0.1, 1.5, 0.05, 0.6, hint="between object and hand")
         self._approach = gui.add_dropdown("The hand comes from", tuple(APPROACHES), hint="side in the object's frame")
-        self._angle = gui.add_slider("Within [°]", 5, 180, 5, 30, hint="greatest angle to that direction")
+        self._angle = gui.add_slider("Within [°]", 5, 180, 5, 30, hint="greatest angle to this direction")
         self._count = gui.add_slider("Grasps", 1, MOST_GRASPS, 1, 8, hint="number of verified grasps")
         self._plan = gui.add_button("Plan")
         self._halt = gui.add_button("Stop", disabled=True)

@@ -70,7 +70,7 @@ def compilers() -> tuple[str, str]:
 
 
 def translate(share: Path) -> list[str]:
-    """Write an .idl file of every interface file into `share`. Return the .idl files as rosidl names them."""
+    """Write an .idl file for each interface file into `share`. Return their paths, as rosidl takes them."""
     for path in interface_files():
         kind = path.parent.name
         convert = getattr(import_module(f"rosidl_adapter.{kind}"), f"convert_{kind}_to_idl")

@@ -104,7 +104,7 @@ def advance(problem: Problem, closing: Closing, hand: HandModel, poses: Poses) -
 def touching_groups(
     problem: Problem, closing: Closing, hand: HandModel, poses: Poses, reach: float
 ) -> Float[Tensor, "batch"]:
-    """Return how many links of each hand are within `reach` [m] of the object. Rigidly joined links count as one."""
+    """Return for each pose how many links are within `reach` [m] of the object. Rigidly joined links count as one."""
     near = link_gaps(problem, poses, closing.sphere_links)[:, 0] <= reach
     groups = torch.as_tensor(hand.link_group, device=near.device)
     found = torch.zeros(len(near), int(groups.max()) + 1, device=near.device, dtype=problem.hand.lower.dtype)

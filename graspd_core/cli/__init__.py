@@ -13,12 +13,12 @@ import importlib
 import sys
 import time
 from collections.abc import Iterator, Sequence
-from importlib.metadata import entry_points, version
+from importlib.metadata import entry_points
 from typing import Any, NoReturn
 
 from graspd_core.cli.output import add_output_options, flush_output, output_of, print_error
 from graspd_core.cli.running import EXIT_BAD_INPUT, EXIT_INTERRUPTED, EXIT_PIPE, SIBLINGS, process_began
-from graspd_core.errors import ConfigError, GraspdError, choices
+from graspd_core.errors import ConfigError, GraspdError, Parser, choices
 
 # A garbage collection starts after this number of new objects. Python's default is 700. Collections during imports free
 # nothing and take a tenth of the start-up time.
@@ -59,12 +59,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
             gc.freeze()
 
 
-class _Parser(argparse.ArgumentParser):
-    """Argument parser with `--version`. It raises a one-line ConfigError instead of printing its usage."""
-
-    def __init__(self, **settings: Any) -> None:
-        super().__init__(**settings)
-        self.add_argument("--version", action="version", version=f"graspd {version('graspd')}")
+class _Parser(Parser):
+    """Parser of `graspd` and its commands."""
 
     def error(self, message: str) -> NoReturn:
         # The top parser reports unknown options, so search the options of all its commands.
@@ -72,7 +68,7 @@ class _Parser(argparse.ArgumentParser):
             known = [option for below in runnable(self) for option in below._option_string_actions]
             if near := difflib.get_close_matches(words.split()[0].split("=")[0], known, 1):
                 message = f"{message}; did you mean {near[0]}?"
-        raise ConfigError(f"{message} (see {self.prog} --help)")
+        super().error(message)
 
 
 class _Commands(argparse._SubParsersAction):

@@ -279,8 +279,7 @@ def _refuse_unused(options: argparse.Namespace, frame: BagFrame) -> None:
 def merged_views(path: Path, options: argparse.Namespace) -> tuple[PointCloud, ...]:
     """Return the chosen clouds as views of one scene. If clouds are unusable, print their number on stderr.
 
-    Raises BagError: nothing can be read, no cloud is usable, the clouds are in several frames, or there are too many
-    clouds and no --limit.
+    Raises BagError: no cloud is usable, the clouds are in several frames, or there are too many without --limit.
     """
     views, names, refusals = [], set(), []
     for frame, seen in bag_views(path, options):

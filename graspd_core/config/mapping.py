@@ -128,8 +128,7 @@ class _Loader(yaml.SafeLoader):
 def parse_yaml(text: str) -> tuple[yaml.Node | None, Any]:
     """Return the node tree of a YAML text, with line numbers, and the value of the text.
 
-    Both are None for an empty text. Raises YamlError (a ValueError): the text is malformed, or a value does not fit its
-    tag or format.
+    Both are None for an empty text. Raises YamlError (a ValueError): the text or a value is malformed.
     """
     try:
         return yaml.compose(text, Loader=yaml.SafeLoader), yaml.load(text, Loader=_Loader)

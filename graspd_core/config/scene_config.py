@@ -45,8 +45,7 @@ class SegmentationConfig:
         target_share: a box or mask that covers this fraction of an object selects the whole object.
         obstacle_range: other objects up to this distance from the object to grasp become obstacles [m].
         piled: True if objects lie on each other. Parts divided by a seam are then separate objects, even if stacked. If
-            a target point selects such a part, or a part hidden by a nearer one, no grasp counts as verified. The heap
-            may have any size.
+            a target point selects such a part, or a part hidden by a nearer one, no grasp counts as verified.
     """
 
     roi_low: tuple[float, float, float] | None = None
@@ -143,8 +142,7 @@ class SceneConfig:
 def load_scene_config(path: str | Path) -> SceneConfig:
     """Read the settings of a scene from a YAML file. Missing settings keep their defaults.
 
-    Raises ConfigError: the file is missing, the YAML is malformed, a key is unknown, or a value is not valid. The error
-    lists the valid keys.
+    Raises ConfigError: the file is missing or malformed, a key is unknown, or a value is not valid.
     """
     with yaml_values(path := Path(path)) as values:
         config = from_mapping(SceneConfig, values, where=path.name)

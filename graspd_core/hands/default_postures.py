@@ -204,7 +204,7 @@ def _along(hand: HandModel, fingers: Fingers) -> Float[np.ndarray, "3"]:
 def _first_bends(
     hand: HandModel, fingers: Fingers, q: Float[np.ndarray, "joints"], along: Float[np.ndarray, "3"]
 ) -> Float[np.ndarray, "tips 3"]:
-    """Return the position of each finger's first joint that does not turn the finger about `along`, base frame [m]."""
+    """Return the position of each finger's first joint that bends: its axis is not `along`. Base frame [m]."""
     rotations, translations = link_poses(hand, q)
     places = fingers.roots.copy()
     for finger, tip in enumerate(fingers.links):

@@ -1,8 +1,7 @@
 """Store verified grasps in an SQLite file. Each entry is one record, written in one transaction.
 
 The key of an entry is a hash of the mesh, the hand and the physics of the trials. A write-ahead log lets other
-processes read while a process writes. A killed writer loses only the record that it was writing. Each call opens and
-closes the file.
+processes read while a process writes. A killed writer loses only the record that it was writing.
 """
 
 from __future__ import annotations
@@ -186,7 +185,7 @@ class GraspLibrary:
     ) -> int:
         """Append the verified grasps, object frame, to an entry of `target` and `hand`. Ignore all other grasps.
 
-        `config` holds the settings that found the grasps. Return the new number of grasps of the entry. Raises
+        `config` holds the settings that found the grasps. Return how many grasps the entry has then. Raises
         FormatError: the library cannot be read or written.
         """
         new = [replace(grasp, arm=None) for grasp in grasps if grasp.verdict is Verdict.VERIFIED]

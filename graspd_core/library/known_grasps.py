@@ -239,7 +239,7 @@ def _least_mass(scene: Scene, masses: Sequence[float]) -> dict[str, float | None
 def library_result(library: GraspLibrary, grasps: Sequence[Grasp], count: int, seconds: float) -> GraspResult:
     """Return the result of a request for `count` grasps, answered with `grasps` of a library in `seconds` [s]."""
     timing = Timing(first_verified=seconds if grasps else None, total=seconds)
-    message = f"{len(grasps)} grasps of the library {library.path.name}"
+    message = f"{len(grasps)} grasps from the library {library.path.name}"
     return GraspResult(outcome_of(grasps, count), tuple(grasps), timing, 0, "library", message, count=count)
 
 
@@ -286,7 +286,7 @@ def known_or_planned(
     outcome = planned.outcome
     if outcome in (Outcome.SUCCEEDED, Outcome.NO_CANDIDATES) and found + len(new):
         outcome = Outcome.SUCCEEDED if found + len(new) >= count else Outcome.TOO_FEW
-    counts = f"{found} grasps of the library {library.path.name}, {len(new)} planned"
+    counts = f"{found} grasps from the library {library.path.name}, and {len(new)} newly planned"
     # Use the planner's message only if it says more than the outcome.
     why = planned.message if planned.message != planned.outcome.value else ""
     return replace(
@@ -312,7 +312,7 @@ def add_planned(
 ) -> int:
     """Add the verified grasps of a run to the library. Of their trials, keep only the hold trials.
 
-    Return the new number of grasps of the entry. Raises FormatError: the library cannot be written.
+    Return how many grasps the object has then. Raises FormatError: the library cannot be written.
     """
     if verify == "none":
         return 0

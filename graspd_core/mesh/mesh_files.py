@@ -155,8 +155,7 @@ def load_mesh(path: str | Path, *, scale: float = 1.0) -> TriangleMesh:
     """Read a mesh file. Join the parts of its scene at their poses, and multiply coordinates by `scale`.
 
     Raises:
-        MeshError: the file does not exist, has an unknown ending or holds no complete mesh with a finite surface, or
-            the scale is not positive.
+        MeshError: the file is missing, has an unknown ending or no whole mesh of finite size, or the scale is invalid.
     """
     return read_mesh(path, scale=scale)[0]
 

@@ -1,7 +1,6 @@
 """Sample points on the sharp convex parts of a surface: edges, corners, rims, thin walls.
 
-Points on a hand are millimetres apart, so an object's edge can enter the hand between the points. Points on the edge
-detect such an overlap.
+An object's edge can enter the hand between the hand's points. Points on the edge detect such an overlap.
 """
 
 from __future__ import annotations
@@ -38,7 +37,7 @@ def sharp_points(mesh: TriangleMesh, count: int, *, pool: int = _POOL) -> tuple[
     fewer or none. The points are in farthest-point order, so the first k points are evenly spread for every k.
 
     Args:
-        pool: number of candidates at vertices, and number of candidates on edges. Half as many lie on faces.
+        pool: number of candidates at vertices. As many lie on edges, and half as many on faces.
 
     Returns:
         The points, and the fraction of the surface with less than 6 mm of material below it. The fraction is near one

@@ -164,7 +164,7 @@ def pressed_points(
 ) -> tuple[Float[np.ndarray, "n 3"], Float[np.ndarray, "n 3"]]:
     """Return the closest surface points [m], and at each point the outward unit normal nearest to that in `normals`.
 
-    On a face, the face's normal is returned. On an edge or a corner, any direction between the face normals is valid.
+    On a face, this is the face's normal. On an edge or a corner, it lies between the normals of the faces.
     """
     closest, own = closest_points(surface, points)
     around = closest_points(surface, (closest[:, None] + _ABOUT * _AROUND).reshape(-1, 3))[1]

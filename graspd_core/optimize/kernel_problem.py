@@ -130,7 +130,7 @@ def kernel_problem(problem: Problem) -> KernelProblem:
 
 @lru_cache(maxsize=8)
 def _hand(hand: HandTensors) -> tuple[dict[str, Structure], Arrays]:
-    """Return the fields of `builds.Problem` that describe the hand, and the arrays of these fields."""
+    """Return the hand's fields of `builds.Problem`, and the arrays that they point to."""
     arrays = Arrays()
     spheres, radii, links = collision_spheres(hand.model)
     order = np.argsort(links, kind="stable")

@@ -238,7 +238,7 @@ def make_object_tensors(scene: Scene, settings: ProblemConfig, device: str, dtyp
 def _patches(hand: HandModel, candidates: int, size: int) -> Int[np.ndarray, "points"]:
     """Return for each contact candidate the index of the nearest patch in the same rigid group of links.
 
-    A group has about one patch per `size` coarse candidates (the first `candidates`). Patch centres are far apart.
+    The first `candidates` are coarse. A group has about one patch per `size` of these. Patch centres are far apart.
     In a group without coarse candidates, the index is −1.
     """
     posture = link_poses(hand, (hand.lower + hand.upper) / 2)

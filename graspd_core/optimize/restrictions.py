@@ -133,7 +133,7 @@ class BoundRestrictions:
 
     Attributes:
         each: the restrictions, applied in order. The first restriction that refuses a candidate gives the reason.
-        origin: origin of the frame in which this class takes and returns poses, in the frame of `each` [m].
+        origin: origin of the frame of this class's poses, in the frame of the restrictions [m].
     """
 
     each: tuple[BoundRestriction, ...] = ()

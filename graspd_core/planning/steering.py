@@ -85,15 +85,13 @@ class Steering:
     point along the approach, as in a gripper, the side is the closing direction.
 
     Attributes:
-        approach_direction: wanted approach direction, of any non-zero length, kept with length 1. (0, 0, -1) is from
-            above.
+        approach_direction: wanted approach direction, of any non-zero length. (0, 0, -1) is from above.
         approach_angle: greatest angle between `approach_direction` and a grasp's approach, above 0, at most π [rad].
         region: a `Box`, a `Sphere` or `NearPoints`. Every contact lies in the region, or at most 5 mm outside.
         avoid: boxes that no link enters at pregrasp, grasp and squeeze.
         roll: wanted right-handed rotation of the side [rad]. It needs `approach_direction`, and `approach_angle` below
             π/2. At 0 the side points along z, or along x for an approach within 18° of vertical.
-        roll_zero: direction of the side at roll 0, projected normal to the approach, also kept with length 1. None for
-            z or x, as in `roll`.
+        roll_zero: direction of the side at roll 0, projected normal to the approach. None for z or x, as in `roll`.
         roll_tolerance: greatest deviation from `roll` in either direction, above 0, at most π [rad].
 
     Raises:

@@ -42,8 +42,7 @@ def hold_trial(
 
     Returns:
         The result, with the greatest displacement [m] of the object's centre of mass and the greatest rotation [rad]
-        until the trial ended. If the simulation diverges or runs out of contact memory, the trial fails, and the
-        result's `reason` says so.
+        until the trial ended. If the simulation diverges or runs out of contact memory, the trial fails.
     """
     import mujoco
 

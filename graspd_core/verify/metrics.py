@@ -150,8 +150,7 @@ def distinct(grasps: Sequence[Grasp], hand: HandModel) -> tuple[Grasp, ...]:
     """Return the grasps in order, but leave out each near-duplicate of an earlier grasp.
 
     The palm centres of near-duplicates are less than 20 mm apart. Their base rotations differ by less than 20°.
-    Symmetry of the object is ignored. Grasping a ball from the left or the right gives two grasps, because a robot may
-    reach only one side.
+    Grasping a ball from the left or the right gives two grasps, because a robot may reach only one side.
     """
     kept: list[Grasp] = []
     palms, turns = np.zeros((0, 3)), np.zeros((0, 3, 3))

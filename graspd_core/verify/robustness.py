@@ -207,8 +207,7 @@ def robustness_checks_of(
 ) -> RobustnessChecks | None:
     """Return the checks that a grasp must pass to reach the requested `probability`. None if no check is needed.
 
-    `others` comes from `begin_other_worlds`. If the mass is known, a grasp must hold at all displaced poses and with
-    less friction.
+    `others` comes from `begin_other_worlds`. If the mass is known, all displaced poses and less friction must hold.
     """
     shares, doubts = held_shares(scene.object), scene.evidence.doubts if scene.evidence else ()
     if doubts:

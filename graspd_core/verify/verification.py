@@ -96,8 +96,7 @@ class Prefetched:
 def prefetch(run: Run, scene: Scene, hand: HandModel, verify: str, certainty: CertaintyConfig) -> Prefetched:
     """Start to build the trial worlds in background threads. Building takes about as long as the optimiser.
 
-    Only one object at a time is cut into convex parts. The object of an ended run is skipped, so that quickly cancelled
-    runs do not pile up work.
+    Only one object at a time is cut into convex parts. Objects of ended runs are skipped, so that no work piles up.
     """
 
     def build() -> TrialContext | None:

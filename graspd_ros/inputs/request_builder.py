@@ -382,7 +382,7 @@ def frame_loader(
 
 
 def frame_views(frame: SensorFrame, settings: Settings, place: CameraPlace, lookup: Lookup) -> SeenViews:
-    """Return a function that returns the frame's one view and its warnings. The worker's thread calls `lookup`."""
+    """Return a function that reads the frame's view and its warnings. It calls `lookup`, in the worker's thread."""
 
     def read() -> tuple[tuple[PointCloud, ...], tuple[str, ...]]:
         cloud = seen.seen_by_camera(frame, place, lookup)

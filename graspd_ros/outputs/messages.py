@@ -319,8 +319,8 @@ def arm_trajectory(grasp: Grasp, path: ArmPath, pace: Pace) -> JointTrajectory:
     """Return all waypoints of the arm without velocities, so that controllers pass them without stopping.
 
     The first point is the retreat posture, at the time `pace.shortest` [s]. The arm must start in this posture. Points
-    of a stage are evenly spaced in time. Joints stay below `pace.joint_speed` and their own limits, the hand and
-    prismatic joints below `pace.base_speed`.
+    of a stage are evenly spaced in time. No joint exceeds its own speed limit. Revolute joints stay below
+    `pace.joint_speed`. Prismatic joints and the hand's base stay below `pace.base_speed`.
     """
     from graspd_core.arms.arm_paths import LIFT
 

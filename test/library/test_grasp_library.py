@@ -286,7 +286,7 @@ def test_a_known_object_alone_is_answered_without_a_trial(library, scene, hand, 
     result = known_or_planned(library, scene, hand, count=4)
     assert result.outcome is Outcome.SUCCEEDED
     assert [grasp.verdict for grasp in result.grasps] == [Verdict.VERIFIED] * 4
-    assert "4 grasps of the library known.grasps" in result.message
+    assert "4 grasps from the library known.grasps" in result.message
 
 
 def test_an_object_that_is_not_there_has_none(library: GraspLibrary, hand: HandModel):
@@ -299,7 +299,7 @@ def test_an_object_that_is_not_there_has_none(library: GraspLibrary, hand: HandM
 def test_what_is_missing_is_planned_and_added(library: GraspLibrary, scene: Scene, hand: HandModel):
     result = known_or_planned(library, scene, hand, count=6, preset="fast")
     assert result.outcome is Outcome.SUCCEEDED
-    assert "4 grasps of the library known.grasps, 2 planned" in result.message
+    assert "4 grasps from the library known.grasps, and 2 newly planned" in result.message
     ((_, count),) = library.entries()
     assert count == 6
     assert len(known_grasps(library, scene, hand, count=6).grasps) == 6

@@ -96,14 +96,14 @@ def test_a_known_object_is_answered_where_it_stands_without_its_mesh_being_read(
     assert planned.result.outcome is Outcome.SUCCEEDED
     assert len(planned.result.grasps) == 2
     assert all(abs(grasp.grasp.position[0] - 5.0) < 0.3 for grasp in planned.result.grasps)
-    assert "2 grasps of the library known.grasps" in planned.result.message
+    assert "2 grasps from the library known.grasps" in planned.result.message
     assert planned.mass == 0.1
     assert planned.mass_assumed == ("mesh_uri" in fields)
     assert not Node(hand, mass=0.1).answer(**fields).mass_assumed
 
 
 def test_a_mesh_named_by_its_path_alone_is_known_too(folder: Path, hand: HandModel, unread: None):
-    assert "2 grasps of the library known.grasps" in Node(hand).answer_path("ball.obj").result.message
+    assert "2 grasps from the library known.grasps" in Node(hand).answer_path("ball.obj").result.message
 
 
 def test_grasps_that_were_lost_are_left_out(folder: Path, hand: HandModel, unread: None):
@@ -123,16 +123,16 @@ def test_a_known_object_s_grasps_are_given_for_a_hand_that_closes_late(folder: P
 def test_what_is_missing_is_planned_and_added(folder: Path, hand: HandModel):
     planned = Node(hand, num_grasps=5).answer(**known())
     assert planned.result.outcome is Outcome.SUCCEEDED
-    assert "3 grasps of the library known.grasps, 2 planned" in planned.result.message
+    assert "3 grasps from the library known.grasps, and 2 newly planned" in planned.result.message
     assert [count for _, count in GraspLibrary(folder / "known.grasps").entries()] == [5]
 
 
 def test_a_mesh_that_is_new_is_planned_for_once(folder: Path, hand: HandModel, monkeypatch: pytest.MonkeyPatch):
     node, new = Node(hand), {"source": GraspRequest.MESH, "mesh_uri": "new.obj"}
     save_mesh(folder / "new.obj", make_shape("capsule"))
-    assert "0 grasps of the library known.grasps, 2 planned" in node.answer(**new).result.message
+    assert "0 grasps from the library known.grasps, and 2 newly planned" in node.answer(**new).result.message
     monkeypatch.setattr(known_objects, "known_or_planned", None)
-    assert "2 grasps of the library known.grasps" in node.answer(**new).result.message
+    assert "2 grasps from the library known.grasps" in node.answer(**new).result.message
 
 
 def test_a_direction_and_a_surface_are_kept(folder: Path, hand: HandModel):
@@ -184,7 +184,7 @@ def test_a_node_answers_another_process_from_its_library(client, start_node, fol
     client.send_request(**known(id="first"))
     answer = client.answer("first")
     assert (answer.status, len(answer.grasps)) == (GraspArray.SUCCEEDED, 2), answer.message
-    assert "2 grasps of the library known.grasps" in answer.message
+    assert "2 grasps from the library known.grasps" in answer.message
     client.send_request(**known(id="none", known_object="bell"))
     refused = client.answer("none")
     assert (refused.status, refused.error_code) == (GraspArray.FAILED, "BAD_REQUEST")

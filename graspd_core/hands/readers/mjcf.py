@@ -1,8 +1,7 @@
 """Read a `HandModel` from an MJCF file. MuJoCo parses and compiles the file.
 
 MuJoCo gets the XML of `read_xml`, reduced to the sections that describe how the hand moves. MuJoCo opens no file.
-graspd itself reads the meshes, in more formats than MuJoCo, and makes convex hulls. Unsupported elements that affect
-motion are an error.
+graspd itself reads the meshes and makes convex hulls. Unsupported elements that affect motion are an error.
 """
 
 from __future__ import annotations

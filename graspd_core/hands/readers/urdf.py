@@ -122,9 +122,9 @@ _HEAVIEST = 1e3
 def read_urdf(path: Path, root: ET.Element | None = None, *, keep_world: bool = False) -> HandModel:
     """Read a hand from a URDF. Contact candidates are not set.
 
-    The open and the closed posture are mid-range. The palm is at the base's origin. A missing or zero effort or
-    velocity becomes infinite. The following changes add a warning. A `continuous` joint is limited to ±π. A link
-    without collision shapes gets its visual shapes. A `world` link or a floating joint above the base is dropped.
+    The open and the closed posture are mid-range. The palm is at the base's origin. Limits of effort and velocity
+    become infinite if they are missing or zero. These changes add a warning: a `continuous` joint is limited to ±π, a
+    link without collision shapes gets its visual shapes, a `world` link or a floating joint above the base is dropped.
 
     Args:
         path: path of the file.

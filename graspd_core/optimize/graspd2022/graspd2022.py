@@ -17,8 +17,7 @@ Hand points that penetrate the object push it by the penalty contact of Grasp'D:
 
 φ is the object's signed distance at the hand's point. v_t is the tangential part of the object's velocity relative to
 the hand. The simulation is one semi-implicit Euler step of a free rigid body without gravity. Only velocities are
-computed. All values are in SI units and in the object frame. Torques and angular velocities are about the centre of
-mass.
+computed. Values are in SI units and in the object frame. Torques and angular velocities are about the mass centre.
 
 Gradients are exact with four exceptions. Points out of contact get a gradient too (`leaky_min`). The tangential speed
 has a floor, so that friction is smooth at rest. L_task has no gradient in the pose. `into_cone` has no gradient.
@@ -437,7 +436,7 @@ class Graspd2022:
         return unpack(x), torch.where(scored, state.best_loss, state.loss)
 
     def cost(self, found: Evaluation) -> Values:
-        """Return L_phys + L_range + L_inter, weighted. Without relaxation the object's motion replaces L_phys."""
+        """Return L_phys + L_range + L_inter, weighted. Without relaxation, a loss on the motion replaces L_phys."""
         config = self.config
         goal = config.weights.physics * found.physics if config.relaxation.enabled else found.motion
         return goal + config.weights.range * found.range + config.weights.inter * found.inter

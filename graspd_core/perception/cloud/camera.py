@@ -150,7 +150,7 @@ def undistort(seen: _Places, coefficients: _Numbers) -> _Places:
 def distort(ideal: _Places, coefficients: _Numbers) -> tuple[_Places, Float[np.ndarray, "3 *batch"]]:
     """Apply the lens distortion to positions on the plane at depth 1.
 
-    Return the distorted positions, and (a, b, d). Their Jacobian by the ideal positions is [[a, b], [b, d]].
+    Return the distorted positions, and (a, b, d). The Jacobian with respect to `ideal` is [[a, b], [b, d]].
     """
     k1, k2, p1, p2, k3, k4, k5, k6 = (*coefficients, *[0.0] * (8 - len(coefficients)))
     x, y = ideal[..., 0], ideal[..., 1]

@@ -52,8 +52,7 @@ class _Element:
 def read_ply_points(data: bytes) -> Points:
     """Read the vertices of a ply file, text or binary in either byte order. NaN is kept.
 
-    Raises ValueError if the file is not a ply file, lacks x, y or z, is cut short, or has list properties in or before
-    the vertices.
+    Raises ValueError: no ply file, no x, y or z, a file cut short, or list properties in or before the vertices.
     """
     # The header ends where end_header starts a line. A comment may contain the same word.
     head, *more = re.split(rb"[\r\n]end_header", data, maxsplit=1)

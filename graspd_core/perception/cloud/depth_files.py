@@ -2,8 +2,7 @@
 
 The camera file is JSON with `width`, `height`, and one of `K` (row by row), Open3D's `intrinsic_matrix` (column by
 column), or `fx fy cx cy`. Optional keys are `distortion` and `distortion_model` as in CameraInfo, `T_world_camera`
-(4×4), and `depth_unit`: metres per unit of the image, or m, cm, mm or um. A `depth_scale` is refused, because programs
-disagree on its unit.
+(4×4), and `depth_unit`: metres per unit of the image, or m, cm, mm or um. `depth_scale` is refused, as its unit varies.
 """
 
 from __future__ import annotations

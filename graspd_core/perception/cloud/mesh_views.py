@@ -29,8 +29,7 @@ _MOST_FACES, _STEPS = 20_000, 300  # faces to check, and steps of the search for
 def view_in_mesh(mesh: TriangleMesh, source: str) -> PointCloud | None:
     """Return the points of a view mesh as a cloud seen from the origin, or None if the mesh is not a view mesh.
 
-    Raises MeshError if the mesh is a view mesh in another frame than the camera's, because the camera's position is
-    then unknown.
+    Raises MeshError if the mesh is a view mesh, but not in the camera's frame: the camera's position is unknown.
     """
     if len(mesh.vertices) < MIN_VERTICES or len(mesh.faces) < MIN_VERTICES or not np.isfinite(mesh.vertices).all():
         return None

@@ -80,8 +80,7 @@ def seen_from(pixels: Pixels, viewpoint: Vector, forward: Vector | None = None) 
     NaN points are kept. An image of one row or column is not checked.
 
     Raises:
-        CloudError: the pixels show that the camera stood at another position, which the error names, or the viewpoint
-            is no position.
+        CloudError: the viewpoint is no position, or the pixels show another one, which the error names.
     """
     viewpoint = np.asarray(viewpoint, dtype=float)
     refuse_no_place(viewpoint)

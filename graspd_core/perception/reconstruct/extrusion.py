@@ -71,7 +71,7 @@ def with_foot(surfels: Surfels, free_space: FreeSpace, step: float) -> Surfels:
 
 
 def stand(surfels: Surfels, free_space: FreeSpace, step: float) -> Surfels:
-    """Guess walls from the lowest surfels down to the support, and the bottom. Return nothing if walls are doubtful."""
+    """Guess the bottom, and walls from the lowest surfels down to it. Return nothing if walls are doubtful."""
     lowest = float(np.percentile(surfels.points[:, 2], 1))
     band = take(surfels, surfels.points[:, 2] < lowest + 3 * step)
     wall = np.abs(band.normals[:, 2]) < MAX_WALL_COSINE
