@@ -2,6 +2,7 @@
 
 import argparse
 import difflib
+import re
 import reprlib
 from collections.abc import Iterable
 from typing import Any, NoReturn
@@ -31,7 +32,8 @@ def choices(name: object, valid: Iterable[str], more: str = "") -> str:
     """Return a hint for an unknown name: the most similar valid name. If no name is similar, all names and `more`."""
     names = [*valid]
     # In a file, a name may be any value, not only text.
-    near = difflib.get_close_matches(name, names, 1, _NEAR) if isinstance(name, str) else ()
+    near = difflib.get_close_matches(name, names, 3, _NEAR) if isinstance(name, str) else []
+    near.sort(key=lambda other: sorted(other) != sorted(str(name)))  # swapped letters first
     return f"did you mean {near[0]!r}?" if near else f"valid: {', '.join(names)}{more}"
 
 
@@ -107,4 +109,7 @@ class Parser(argparse.ArgumentParser):
         self.add_argument("--version", action="version", version=f"{program} {version('graspd')}")
 
     def error(self, message: str) -> NoReturn:
+        if found := re.fullmatch(r"(.*): invalid choice: '(.*)' \(choose from (.*)\)", message):
+            where, given, valid = found.groups()
+            message = f"{where}: {given!r}; {choices(given, valid.replace(chr(39), '').split(', '))}"
         raise ConfigError(f"{message} (see {self.prog} --help)")

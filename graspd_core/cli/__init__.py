@@ -10,6 +10,7 @@ import argparse
 import difflib
 import gc
 import importlib
+import os
 import sys
 import time
 from collections.abc import Iterator, Sequence
@@ -68,6 +69,7 @@ class _Parser(Parser):
             known = [option for below in runnable(self) for option in below._option_string_actions]
             if near := difflib.get_close_matches(words.split()[0].split("=")[0], known, 1):
                 message = f"{message}; did you mean {near[0]}?"
+            self.prog = os.path.commonpath([below.prog.replace(" ", "/") for below in runnable(self)]).replace("/", " ")
         super().error(message)
 
 

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
-from graspd_core.cli.output import answer, waiting
+from graspd_core.cli.output import answer, busy, waiting
 from graspd_core.cli.running import EXIT_OK, sibling
 from graspd_core.errors import ConfigError
 from graspd_core.hands.kinematics import link_depths
@@ -70,8 +70,9 @@ def run_inspect(options: argparse.Namespace) -> int:
     hand = load_hand(options.hand, candidates=options.candidates)
     # Write the files first, because printing fails if the reader of the output has ended.
     if options.picture is not None:
-        render = sibling("graspd_bench.rendering.render")
-        render.save_png(options.picture, render.hand_picture(hand))
+        with busy("draw"):
+            render = sibling("graspd_bench.rendering.render")
+            render.save_png(options.picture, render.hand_picture(hand))
     if options.yaml is not None:
         urdf = os.path.relpath(hand.urdf, options.yaml.parent)
         save_text(options.yaml, as_yaml(hand, urdf))

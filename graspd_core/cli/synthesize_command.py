@@ -170,10 +170,11 @@ def _report(
         page = sibling("graspd_viewer.grasp_page")
         content = (scene.object.mesh, hand, result.grasps)
         up = result.support and result.support.normal
-        if options.html:
-            page.save_view(options.html, *content, name=Path(options.object).name, up=up)
-        if options.picture:
-            page.save_picture(options.picture, *content, up=up)
+        with busy("draw"):
+            if options.html:
+                page.save_view(options.html, *content, name=Path(options.object).name, up=up)
+            if options.picture:
+                page.save_picture(options.picture, *content, up=up)
     answer({**result_document(result, scene.object, hand, config), **(about or {})})
     different = len(distinct(result.grasps[: good_grasps(result)], hand))
     print(summary(result, options.count, different))

@@ -116,7 +116,14 @@ _MOST_MERGED = 10_000
 
 
 class _Loader(yaml.SafeLoader):
-    """The safe YAML loader, with a limit on the entries that `<<` merges add."""
+    """The safe YAML loader. It refuses a key that stands twice, and limits the entries that `<<` merges add."""
+
+    def compose_mapping_node(self, anchor: Any) -> yaml.MappingNode:
+        node, known = super().compose_mapping_node(anchor), set[str]()
+        for key, _ in node.value:
+            if isinstance(key, yaml.ScalarNode) and (key.value in known or known.add(key.value)):
+                raise yaml.constructor.ConstructorError(None, None, f"{key.value!r} stands twice", key.start_mark)
+        return node
 
     def flatten_mapping(self, node: yaml.MappingNode) -> None:
         super().flatten_mapping(node)

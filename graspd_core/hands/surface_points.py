@@ -193,7 +193,7 @@ def with_candidates(hand: HandModel, count: int) -> HandModel:
     if count == len(hand.candidate_link):
         return hand
     shapes = {"candidate_points": (3,), "candidate_normals": (3,), "candidate_link": ()}
-    return replace(hand, **kept(hand, f"candidates-{count}", 1, shapes, lambda: candidates(hand, count, seed=0)))
+    return replace(hand, **kept(hand, f"candidates-palm-{count}", 1, shapes, lambda: candidates(hand, count, seed=0)))
 
 
 def candidates(hand: HandModel, count: int, seed: int) -> tuple[Points, Points, LinkNumbers]:
@@ -201,12 +201,13 @@ def candidates(hand: HandModel, count: int, seed: int) -> tuple[Points, Points, 
 
     Corners that face a grasped object are chosen first. Then farthest-point sampling (Gonzalez 1985) runs within each
     rigid group. Candidates are denser on fingertips and sparser on the hand's back (`_weights`). The first n candidates
-    cover the hand evenly too. If a link has a skin, its candidates lie on the skin.
+    cover the hand evenly too. If a link has a skin, its candidates lie on the skin. Forearm and wrist get none.
     """
     rng = np.random.default_rng(seed)
     features = _exposed(hand, _feature_pool(hand))
     faces = _exposed(hand, _random_pool(hand, 20 * count, rng))
     pool = _Pool(*(np.concatenate(pair) for pair in zip(vars(features).values(), vars(faces).values(), strict=True)))
+    pool = pool.take(~np.isin(hand.link_group[pool.links], _before_palm(hand)))
     weights, facing = _weights(hand, pool)
     placed = in_base(link_poses(hand, hand.open_posture), pool.points, pool.links)
     corners = np.flatnonzero(pool.corner & facing)
@@ -241,10 +242,16 @@ def dense_samples(hand: HandModel, *, count: int = 4000, seed: int = 1) -> Sampl
     return pool.points, pool.links, pool.areas
 
 
-def kept_dense_samples(hand: HandModel, *, count: int, seed: int) -> Samples:
-    """Return `dense_samples`, cached on disk by the content of the hand."""
-    build = lambda: dense_samples(hand, count=count, seed=seed)  # noqa: E731
-    found = kept(hand, f"samples-{count}-{seed}", count, {"points": (3,), "links": (), "areas": ()}, build)
+def samples_with_edges(hand: HandModel, *, count: int, seed: int) -> Samples:
+    """Return `dense_samples`, then points without area on edges and corners. Cached on disk by the hand's content."""
+
+    def build() -> Samples:
+        edges = _exposed(hand, _feature_pool(hand, 0.002))
+        parts = zip(dense_samples(hand, count=count, seed=seed), (edges.points, edges.links, edges.areas), strict=True)
+        points, links, areas = (np.concatenate(pair) for pair in parts)
+        return points, links, areas
+
+    found = kept(hand, f"surface-{count}-{seed}", count, {"points": (3,), "links": (), "areas": ()}, build)
     return found["points"], found["links"], found["areas"]
 
 
@@ -291,8 +298,8 @@ def _random_pool(hand: HandModel, count: int, rng: np.random.Generator) -> _Pool
     return _pool(hand, parts, np.repeat(areas / counts, counts), np.zeros(counts.sum(), dtype=bool))
 
 
-def _feature_pool(hand: HandModel) -> _Pool:
-    parts = [feature_points(p, spacing=0.004) for p in hand.primitives]
+def _feature_pool(hand: HandModel, spacing: float = 0.004) -> _Pool:
+    parts = [feature_points(p, spacing) for p in hand.primitives]
     corner = np.concatenate([part[2] for part in parts])
     pool = _pool(hand, parts, np.zeros(len(corner)), corner)
     # If there are too many points, every n-th point is taken, so that every solid keeps its share.
@@ -368,6 +375,17 @@ def parent_groups(hand: HandModel) -> Int[np.ndarray, "links"]:
         if group >= 0 and not solid[group]:
             above[link] = above[group]
     return above
+
+
+def _before_palm(hand: HandModel) -> list[int]:
+    """Return the groups of forearm and wrist: from the root on, each with one child group. Empty without a palm."""
+    above, found = parent_groups(hand), list[int]()
+    solid = np.unique(hand.link_group[[primitive.link for primitive in hand.primitives]])
+    below = solid[above[solid] < 0]
+    while len(below) == 1:
+        found.append(int(below[0]))
+        below = solid[above[solid] == found[-1]]
+    return found[:-1] if len(below) else []
 
 
 def _weights(hand: HandModel, pool: _Pool) -> tuple[Float[np.ndarray, "points"], Bool[np.ndarray, "points"]]:

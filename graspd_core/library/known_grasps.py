@@ -260,8 +260,7 @@ def known_or_planned(
     """Return grasps from the library. If there are fewer than `count`, plan more.
 
     Planned grasps that are verified are added to the library. `wanted` filters both stored and planned grasps. `name`
-    is the object's name in the library. The other arguments are as for `plan_grasps`. If the library cannot be written,
-    the result has a warning.
+    is the object's name in the library. Other arguments: see `plan_grasps`. Unwritable libraries cause a warning.
     """
     began, deadline, stop = time.perf_counter(), request.pop("deadline", None), request.get("stop")
     check_request(count=count, seed=seed, verify=verify, deadline=deadline, device=request.get("device", "cpu"))

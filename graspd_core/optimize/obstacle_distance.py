@@ -214,8 +214,7 @@ def gap_on_path(
 ) -> Values:
     """Return the hand's least signed distance [m] to obstacles on the path from retreat via pregrasp to grasp.
 
-    Distances are negative inside. A distance of at least `wide` may be returned as `wide`. The base must have the same
-    orientation in both poses.
+    Distances are negative inside, and may be cut at `wide`. The base must have the same orientation in both poses.
     """
     rotation = rotation_from_quaternion(grasp.quaternion)
     begun = [drawn_back(pregrasp.translation, rotation, obstacles.approach, RETREAT * s) for s in RETREAT_SHARES]

@@ -71,8 +71,8 @@ def _contact_per_volume(grasp: PreparedGrasp) -> float | None:
 _ROWS = (
     Metric(
         "penetration", "mm", 1e3, lambda g: penetration(g.context, g.placed),
-        "greatest depth of a sample of the hand inside the object, or of a point of the object's surface or "
-        "edges inside the hand",
+        "greatest depth of a sample of the hand's surface or edges inside the object, or of a point of the object's "
+        "surface or edges inside the hand",
     ),
     Metric(
         "contact_depth", "mm", 1e3, lambda g: contact_depth(g.context, g.posture),
@@ -97,8 +97,8 @@ _ROWS = (
     ),
     Metric(
         "intersection_volume", "cm³", 1e6, lambda g: g.shared_volume,
-        "IV: volume shared by hand and object, summed over 2 mm grid cells in the hand's base frame. An octree finds "
-        "the cells, so even the smallest overlap counts. Each cell counts by the thickness of the overlap",
+        "IV: volume shared by hand and object, summed over 2 mm grid cells in the hand's base frame. Each cell counts "
+        "by the thickness of the overlap. Overlaps of less than a cell at an edge count up to twice",
     ),
     Metric(
         "contact_per_volume", "1/cm", 1e-2, _contact_per_volume,

@@ -17,7 +17,7 @@ from jaxtyping import Bool, Float, Int
 from graspd_core.hands.kinematics import Kinematics, forward, make_kinematics
 from graspd_core.hands.link_distance import bounds, depth_inside, primitive_sdf
 from graspd_core.hands.model import HandModel, Primitive
-from graspd_core.hands.surface_points import kept_dense_samples
+from graspd_core.hands.surface_points import samples_with_edges
 from graspd_core.mesh.mesh_files import surface_samples
 from graspd_core.mesh.sharp_features import crease_points, farthest_points, neighbours_together
 from graspd_core.mesh.surface_queries import DistanceQuery
@@ -90,8 +90,8 @@ def make_metrics_context(target: ObjectModel, hand: HandModel) -> MetricsContext
 
 @lru_cache(maxsize=8)
 def hand_surface(hand: HandModel) -> HandSurface:
-    """Return dense samples of the hand's collision surface."""
-    points, links, areas = kept_dense_samples(hand, count=_SAMPLES, seed=_SEED)
+    """Return dense samples of the hand's collision surface, and points on its edges, which may go deeper."""
+    points, links, areas = samples_with_edges(hand, count=_SAMPLES, seed=_SEED)
     of_link = [np.flatnonzero(links == link) for link in range(hand.num_links)]
     order = np.concatenate([rows[neighbours_together(points[rows])] for rows in of_link]).astype(np.int32)
     return HandSurface(points, links, areas, make_kinematics(hand, "cpu", torch.float64), order)

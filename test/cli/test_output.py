@@ -185,7 +185,7 @@ def test_completion_says_what_it_lacks(capsys: pytest.CaptureFixture[str], monke
     assert main(["completion", "bash"]) == EXIT_BAD_INPUT
     assert capsys.readouterr().err == "graspd: completion: shtab is not installed; run: pip install shtab\n"
     assert main(["completion", "fish"]) == EXIT_BAD_INPUT
-    assert "choose from" in capsys.readouterr().err
+    assert "'fish'; valid: bash, zsh, tcsh (see graspd completion --help)" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize("unbuffered", ["", "1"])

@@ -1,6 +1,7 @@
 """Candidates and dense samples lie on the hand's outer surface and cover it; on disk they are that hand's alone."""
 
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -16,8 +17,8 @@ from graspd_core.hands.surface_points import (
     candidates,
     dense_samples,
     feature_points,
-    kept_dense_samples,
     primitive_area,
+    samples_with_edges,
     surface_points,
     with_candidates,
 )
@@ -94,6 +95,31 @@ def test_corners_that_face_the_grasp_are_candidates(hand: HandModel) -> None:
         assert np.linalg.norm(own - corner, axis=1).min() < 1e-9
 
 
+FOREARM = """<robot name="armed">
+  <link name="forearm"><collision><geometry><box size="0.08 0.08 0.25"/></geometry></collision></link>
+  <link name="wrist"><collision><geometry><box size="0.05 0.05 0.03"/></geometry></collision></link>
+  <link name="palm"><collision><geometry><box size="0.08 0.03 0.08"/></geometry></collision></link>
+  <link name="left"><collision><geometry><box size="0.015 0.015 0.08"/></geometry></collision></link>
+  <link name="right"><collision><geometry><box size="0.015 0.015 0.08"/></geometry></collision></link>
+  <joint name="a" type="revolute"><parent link="forearm"/><child link="wrist"/><origin xyz="0 0 0.15"/>
+    <axis xyz="1 0 0"/><limit lower="-0.5" upper="0.5" effort="5" velocity="2"/></joint>
+  <joint name="b" type="revolute"><parent link="wrist"/><child link="palm"/><origin xyz="0 0 0.07"/>
+    <axis xyz="0 1 0"/><limit lower="-0.5" upper="0.5" effort="5" velocity="2"/></joint>
+  <joint name="c" type="revolute"><parent link="palm"/><child link="left"/><origin xyz="-0.03 0 0.09"/>
+    <axis xyz="0 1 0"/><limit lower="0" upper="1" effort="1" velocity="2"/></joint>
+  <joint name="d" type="revolute"><parent link="palm"/><child link="right"/><origin xyz="0.03 0 0.09"/>
+    <axis xyz="0 -1 0"/><limit lower="0" upper="1" effort="1" velocity="2"/></joint>
+</robot>"""
+
+
+def test_a_forearm_and_a_wrist_get_no_candidates(tmp_path: Path) -> None:
+    (tmp_path / "armed.urdf").write_text(FOREARM)
+    hand = load_hand(tmp_path / "armed.urdf", candidates=200)
+    share = {name: (hand.candidate_link == link).mean() for link, name in enumerate(hand.link_names)}
+    assert share["forearm"] == share["wrist"] == 0
+    assert min(share["palm"], share["left"], share["right"]) > 0.15
+
+
 def test_dense_samples_carry_the_outer_area(hand: HandModel) -> None:
     points, links, areas = dense_samples(hand, count=20000, seed=3)
     assert len(points) >= 20000
@@ -155,7 +181,7 @@ def own_cache(tmp_path, monkeypatch):
 
 
 def arrays_of(hand):
-    samples = kept_dense_samples(hand, count=500, seed=3)
+    samples = [part[:500] for part in samples_with_edges(hand, count=500, seed=3)]
     return [hand.adjacent, hand.candidate_points, hand.candidate_normals, hand.candidate_link, *samples]
 
 
@@ -164,7 +190,11 @@ def test_what_is_on_disk_is_what_sampling_gives(name, own_cache, monkeypatch):
     hand = load_hand(name, candidates=100)
     fresh = arrays_of(hand)
     bare = replace(hand, adjacent=np.zeros_like(hand.adjacent))
-    expected = [hand.adjacent, *candidates(hand, 100, 0), *dense_samples(hand, count=500, seed=3)]
+    expected = [
+        hand.adjacent,
+        *candidates(hand, 100, 0),
+        *(part[:500] for part in dense_samples(hand, count=500, seed=3)),
+    ]
     cache.forget()
     for module, function in ((sampling, "candidates"), (sampling, "dense_samples")):
         monkeypatch.setattr(module, function, lambda *_, **__: pytest.fail("sampled again"))

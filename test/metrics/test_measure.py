@@ -21,6 +21,7 @@ from graspd_core.optimize.kernel.builds import kernel
 from graspd_core.perception.scene import ObjectModel, build_scene
 from graspd_core.se3 import quaternion_from_rotation, random_rotations
 from graspd_core.types import Grasp, GraspMetrics, Posture, TriangleMesh
+from graspd_core.verify import prepared_grasp
 from graspd_core.verify.compiled_overlap import CompiledQuery
 from graspd_core.verify.metrics import distinct, measure
 from graspd_core.verify.prepared_grasp import (
@@ -112,6 +113,20 @@ def test_a_block_sunk_into_a_flat_face(depth, block):
     if depth == 0.005:
         # Within 10 mm: the end, 5 mm of the sides within and 10 mm without.
         assert contact_area(placed, 0.01) == pytest.approx(0.0006 + 0.1 * 0.015, abs=area_noise(0.0021))
+
+
+@pytest.mark.parametrize("hand_points", [40, 4000])
+def test_an_edge_that_goes_deeper_than_every_sample_of_a_face_is_found(hand_points, block, monkeypatch):
+    """The block is turned by 45° about y, so that the edge between its end and a side, 30 mm long, sinks in."""
+    monkeypatch.setattr(prepared_grasp, "_SAMPLES", hand_points)
+    prepared_grasp.hand_surface.cache_clear()
+    reach = (0.02 + 0.01) / np.sqrt(2)
+    context = make_metrics_context(as_object(BOX), block)
+    placed = placed_hand(
+        context, at((0.03 + reach - 0.004, 0, 0), (0.0,), (np.cos(np.pi / 8), 0, np.sin(np.pi / 8), 0))
+    )
+    prepared_grasp.hand_surface.cache_clear()
+    assert penetration(context, placed) == pytest.approx(0.004, abs=1e-6)
 
 
 @pytest.mark.parametrize("gap", [0.001, 0.003])

@@ -5,8 +5,7 @@
 with damped multipliers and Adamax. The hand touches the level set φ = r, where r shrinks to zero (docs/method.md, §1).
 
 Physics is relaxed as in contact-invariant optimisation. Every hand point has in every simulation a desired force f̂ on
-the object. The pose need not supply f̂. L_task is a constraint: f̂ shall stop the object. L_phys is a cost: the pose
-shall supply f̂.
+the object. L_task is a constraint: f̂ shall stop the object. L_phys is a cost: the pose shall supply f̂.
 
 For min f(x) subject to g(x) < C the Lagrangian is f + λ c + d c² / 2 with c = max(g − C, 0). Each step decreases the
 Lagrangian in x and increases it in λ. The damping d c² / 2 prevents oscillation (Platt & Barr, NIPS 1987).

@@ -232,8 +232,7 @@ def cloud_from_depth(
         T_frame_camera: pose of the camera (z forward, x right, y down). If None, points are in the camera frame.
 
     Raises:
-        CloudError: image and camera differ in size, depth was cut to 8 bits, the matrix is for another image size, or
-            the pose is not rigid.
+        CloudError: sizes of image, camera or matrix differ, depth was cut to 8 bits, or the pose is not rigid.
     """
     if depth.shape != (camera.height, camera.width):
         raise CloudError(

@@ -191,8 +191,7 @@ def load_views(path: str | Path, viewpoint: Vector | None = None, scale: float =
     """Read the views of one or several cameras from a file, in one frame.
 
     For a file of points, `viewpoint` [m] replaces the camera's position in the file. With depth, `viewpoint` is an
-    error. `scale` is in metres per unit of points and viewpoint, or per unit of depth. 1 means the units below. Poses
-    are not scaled.
+    error. `scale` is in metres per unit of points and viewpoint, or of depth, not of poses. 1 means the units below.
 
     * ply, xyz, npy (n×3 or h×w×3): points [m], seen from the origin.
     * pcd: points [m], seen from its `VIEWPOINT`. The format does not give the camera's direction.
