@@ -61,7 +61,8 @@ sbom: wheel  ## what the wheel brings: dist/graspd.cdx.json, requirements.lock, 
 	$(EMPTY)/pip install -q --disable-pip-version-check -c constraints.txt "$$(ls $(CURDIR)/dist/*.whl)[clouds]"
 	$(TOOLS)/cyclonedx-py environment build/empty --output-file dist/graspd.cdx.json
 	$(EMPTY)/pip freeze --exclude graspd | sed 's/+cpu$$//' > requirements.lock
-	$(EMPTY)/python scripts/dependencies.py dist/graspd.cdx.json docs/reference/dependencies.md
+	$(EMPTY)/pip install -q --disable-pip-version-check -c constraints.txt "$$(ls $(CURDIR)/dist/*.whl)[view,bench,dataset,cell,ros]"
+	$(EMPTY)/python scripts/dependencies.py docs/reference/dependencies.md
 
 demo: setup  ## the main job over DDS: a mug in, verified grasps, a picture and figures out, in demo/
 	$(RUN)/python examples/demo.py

@@ -1,26 +1,30 @@
-"""Write the table of what an installation brings: `python scripts/dependencies.py SBOM PAGE`.
+"""Write the table of what an installation brings: `python scripts/dependencies.py PAGE`.
 
-Run by the interpreter of an environment that holds graspd[clouds], whose files are measured. Licences are those of the
-CycloneDX file SBOM. What a library is for is its comment in pyproject.toml.
+Run by the interpreter of an environment that holds graspd with all of `EXTRAS`. Files are measured, and licences read,
+in this environment. What a library is for is its comment in pyproject.toml.
 """
 
 from __future__ import annotations
 
-import json
 import re
 import sys
 from collections import defaultdict
 from importlib.metadata import distribution, version
 from pathlib import Path
+from xml.etree import ElementTree
 
 from packaging.requirements import Requirement
 from packaging.utils import canonicalize_name
 
+# Greatest number of packages named as users of a package.
+_MOST_USERS = 3
+EXTRAS = ("clouds", "view", "bench", "dataset", "cell", "ros")
 PAGE = """# What an installation brings
 
 Made by `make sbom` for graspd {graspd} on Python {python} with torch {torch}.
-Without extras, {core} packages take {core_mb:.0f} MB. The extra `clouds` brings {more} more, {more_mb:.0f} MB.
-graspd ships no files of others: its hands and arms were written for it. requirements.lock has the versions.
+Without extras, {core} packages take {core_mb:.0f} MB. {extras}
+A package that several extras bring stands in the first of them. graspd ships no files of others: its hands and arms
+were written for it. requirements.lock has the versions of graspd[clouds].
 
 | package | MB | extra | needed for | licence |
 |---|---|---|---|---|
@@ -51,32 +55,36 @@ def megabytes(name: str) -> float:
     return sum(path.stat().st_size for path in paths if path.is_file()) / 1e6
 
 
-def licence(component: dict) -> str:
-    """Return the licence that a package states."""
-    for entry in component.get("licenses", ()):
-        stated = entry.get("expression") or entry["license"].get("id") or entry["license"]["name"]
-        return stated.split(" :: ")[-1].splitlines()[0]
-    return "not stated"
+def licence(name: str) -> str:
+    """Return the licence that a package states: in package.xml of ROS, as an expression, or as a classifier."""
+    ros = Path(sys.prefix) / "share" / name.removeprefix("ros-").replace("-", "_") / "package.xml"
+    if name.startswith("ros-") and ros.is_file():
+        return ", ".join(sorted({element.text or "" for element in ElementTree.parse(ros).iter("license")}))
+    about = distribution(name).metadata.json
+    classifiers = [row for row in about.get("classifier", ()) if row.startswith("License ::")]
+    stated = about.get("license_expression") or "".join(classifiers[:1]) or about.get("license") or ""
+    return str(stated).strip().splitlines()[0].split(" :: ")[-1] if str(stated).strip() else "not stated"
 
 
-def main(sbom: Path, page: Path) -> None:
+def main(page: Path) -> None:
     """Write the page."""
-    licences: dict[str, str] = {
-        canonicalize_name(row["name"]): licence(row) for row in json.loads(sbom.read_text())["components"]
-    }
     comments = re.findall(r'^    "([\w-]+).*",  # (.+)$', Path("pyproject.toml").read_text(), re.MULTILINE)
-    purposes, core, users = dict(comments), {"graspd": set(), **users_of("")}, users_of("clouds")
-    sizes = {name: megabytes(name) for name in {*core, *users}}
+    purposes, brought, users = dict(comments), {"graspd": ""}, defaultdict(set)
+    for extra in ("", *EXTRAS):
+        for name, needed_by in users_of(extra).items():
+            brought.setdefault(name, extra)
+            users[name] |= needed_by
+    sizes = {name: megabytes(name) for name in brought}
     rows = []
     for name in sorted(sizes, key=lambda name: -sizes[name]):
-        purpose = purposes.get(name) or ", ".join(sorted(users[name]))
-        extra = "" if name in core else "clouds"
-        rows.append(f"| {name} | {sizes[name]:.1f} | {extra} | {purpose} | {licences[name]} |")
-    core_mb = sum(sizes[name] for name in core)
-    numbers = {"core_mb": core_mb, "more": len(sizes) - len(core), "more_mb": sum(sizes.values()) - core_mb}
+        purpose = purposes.get(name) or ", ".join(sorted(users[name])[:_MOST_USERS])
+        rows.append(f"| {name} | {sizes[name]:.1f} | {brought[name]} | {purpose} | {licence(name)} |")
+    own = {extra: [size for name, size in sizes.items() if brought[name] == extra] for extra in ("", *EXTRAS)}
+    more = ", ".join(f"`{extra}` {len(own[extra])} ({sum(own[extra]):.0f} MB)" for extra in EXTRAS)
+    numbers = {"core": len(own[""]), "core_mb": sum(own[""]), "extras": f"The extras bring more: {more}."}
     versions = {"graspd": version("graspd"), "torch": version("torch"), "python": "{}.{}".format(*sys.version_info)}
-    page.write_text(PAGE.format(core=len(core), **numbers, **versions, rows="\n".join(rows)))
+    page.write_text(PAGE.format(**numbers, **versions, rows="\n".join(rows)))
 
 
 if __name__ == "__main__":
-    main(Path(sys.argv[1]), Path(sys.argv[2]))
+    main(Path(sys.argv[1]))

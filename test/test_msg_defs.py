@@ -87,9 +87,12 @@ def test_every_library_is_locked_listed_and_named_to_ros():
     assert lock.keys() >= names
     assert not {name for name in lock.keys() & pins.keys() if lock[name] != pins[name]}
     page = (ROOT / "docs" / "reference" / "dependencies.md").read_text()
-    table = re.findall(r"^\| ([\w.-]+) \| [\d.]+ \|", page, re.MULTILINE)
+    table = dict(re.findall(r"^\| ([\w.-]+) \| [\d.]+ \| (\w*) ?\|", page, re.MULTILINE))
+    locked = {name for name, extra in table.items() if extra in ("", "clouds")}
     # pip's list leaves setuptools out.
-    assert {*table} - {"graspd", "setuptools"} == lock.keys() - {"setuptools"}
+    assert locked - {"graspd", "setuptools"} == lock.keys() - {"setuptools"}
+    users = project["optional-dependencies"].keys() - {"fuzz", "docs", "dev"}
+    assert {*table.values()} - {""} == users
     keys = {"pyyaml": "python3-yaml", "pillow": "python3-pil", "tqdm": "python3-tqdm"}
     by_pip = re.findall(r"[\w-]+", re.findall(r"<!-- From pip.*?-->", (ROOT / "package.xml").read_text(), re.DOTALL)[0])
     assert {keys[name] for name in names & keys.keys()} <= dependencies(ROOT / "package.xml", "exec_depend")
