@@ -57,7 +57,7 @@ def run(options: argparse.Namespace) -> int:
     """Empty the bin. Return 0 if all objects are in the place bin, 3 if not, 130 after Ctrl-C."""
     import torch
 
-    from graspd_cell.cell_view import Film, LiveCell, ToldSource
+    from graspd_cell.cell_view import Film, LiveCell, ReportingSource
     from graspd_cell.grasp_source import InProcessGrasps
     from graspd_cell.picker import Cancelled, Ending, Picker, summary
     from graspd_core.arms.arm import load_arm
@@ -74,7 +74,7 @@ def run(options: argparse.Namespace) -> int:
     world = robot.world
     live = LiveCell(robot, host=options.host, port=options.port, speed=options.speed) if options.view else None
     film = Film(robot) if options.film else None
-    source = ToldSource(
+    source = ReportingSource(
         InProcessGrasps(arm, hand, world.layout, preset=options.preset, seed=options.seed),
         lambda view, offer: live.show_offer(hand, view, offer) if live else None,
     )

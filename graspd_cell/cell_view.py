@@ -140,7 +140,7 @@ class LiveCell:
         self.page.draw("chosen", parts)
 
 
-class ToldSource:
+class ReportingSource:
     """Grasp source that passes every view, and every answer of another source, to a callback."""
 
     def __init__(self, source: GraspSource, tell: Callable[[DepthView, Offer], None]) -> None:

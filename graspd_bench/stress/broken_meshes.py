@@ -25,7 +25,7 @@ _SEED = 7
 _FEW = ("TOO_FEW", "NO_CANDIDATES")
 
 # Words that the message to the user must contain: what was repaired, or what the user can do.
-_TOLD = {
+_MESSAGES = {
     "debris": "40 ",
     "millions-of-faces": "simplified from ",
     "one-triangle": "not closed",
@@ -99,7 +99,7 @@ def _case(name: str, about: str, make: Maker, expect: tuple[str, ...] = (GRASP,)
         write_obj(make(), path)
         return load_scene(path)
 
-    return Case(name, "mesh", about, scene, expect, whole, told=_TOLD.get(name, ""))
+    return Case(name, "mesh", about, scene, expect, whole, message=_MESSAGES.get(name, ""))
 
 
 def write_obj(mesh: TriangleMesh, path: Path) -> None:

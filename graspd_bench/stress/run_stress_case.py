@@ -43,7 +43,7 @@ class Case:
         loading: time limit of loading [s].
         memory: limit of the process's peak memory, including libraries [MB].
         options: further arguments of `plan_grasps`.
-        told: text that the message to the user must contain.
+        message: text that the message to the user must contain.
         truth: returns the true mesh in the scene frame. None: grasps are not tried on a true object.
     """
 
@@ -57,7 +57,7 @@ class Case:
     loading: float = 15.0
     memory: float = 2000.0
     options: dict[str, Any] = field(default_factory=dict)
-    told: str = ""
+    message: str = ""
     truth: Callable[[], TriangleMesh] | None = None
 
 
@@ -108,8 +108,8 @@ def faults(case: Case, ending: StressEnding) -> tuple[str, ...]:
         wrong.append("a number of the result is not finite")
     if ending.ending != GRASP and not ending.message:
         wrong.append("the user gets no message")
-    if case.told not in ending.message:
-        wrong.append(f"the message lacks {case.told!r}")
+    if case.message not in ending.message:
+        wrong.append(f"the message lacks {case.message!r}")
     return tuple(wrong)
 
 

@@ -27,7 +27,7 @@ from graspd_dataset.run_records import markdown_table, object_name
 
 SHAPES = ("box", "bottle", "mug", "hammer", "torus", "plate", "cylinder", "l_block", "bowl", "capsule")
 HANDS = ("allegro_right", "leap_right", "barrett_like", "parallel_gripper")
-WISHES = ("cone", "cone and roll", "region", "cone and region", "avoid")
+CONSTRAINTS = ("cone", "cone and roll", "region", "cone and region", "avoid")
 # Ranges of a cone's half-angle [rad] and of a region's share of the object's length. Least length of this share [m].
 _ANGLES, _SHARES, _BREADTH = (0.35, 0.8), (0.4, 0.7), 0.05
 _ROLL_TOLERANCE = 0.35
@@ -37,39 +37,39 @@ _END, _BEYOND = 0.25, 0.03
 
 @dataclass(frozen=True)
 class SteeredCase(ObjectCase):
-    """Two plans of the same request: one with a steering constraint of kind `wish` (one of `WISHES`), one without."""
+    """Two plans of the same request: one with a steering constraint (a kind of `CONSTRAINTS`), one without."""
 
-    wish: str = "cone"
+    constraint: str = "cone"
 
 
 def steered_cases(request: Request) -> tuple[SteeredCase, ...]:
-    """Return a case for each object, hand, kind of constraint (`WISHES`) and seed."""
+    """Return a case for each object, hand, kind of constraint (`CONSTRAINTS`) and seed."""
     things = find_objects(request.objects or tuple(f"shape:{s}" for s in SHAPES[: 1 if request.quick else None]))
     hands = (request.hand,) if request.hand else HANDS[: 1 if request.quick else None]
     count, preset = request.count or (2 if request.quick else 4), request.preset()
     return tuple(
-        SteeredCase(thing, preset, hand, seed, count, wish)
+        SteeredCase(thing, preset, hand, seed, count, constraint)
         for seed in request.seeds or (0,)
         for hand in hands
         for thing in things
-        for wish in WISHES
+        for constraint in CONSTRAINTS
     )
 
 
 def drawn_constraint(case: SteeredCase, scene: Scene) -> Steering:
     """Draw the steering constraint of a case. The constraint depends only on seed, object, hand and kind."""
-    rng = np.random.default_rng([case.seed, zlib.crc32(f"{case.object} {case.hand} {case.wish}".encode())])
+    rng = np.random.default_rng([case.seed, zlib.crc32(f"{case.object} {case.hand} {case.constraint}".encode())])
     direction, angle = rng.normal(size=3), float(rng.uniform(*_ANGLES))
     vertices = scene.object.mesh.vertices
     cone = {"approach_direction": direction / np.linalg.norm(direction), "approach_angle": angle}
-    if case.wish == "cone":
+    if case.constraint == "cone":
         return Steering(**cone)
-    if case.wish == "cone and roll":
+    if case.constraint == "cone and roll":
         return Steering(**cone, roll=float(rng.uniform(-np.pi, np.pi)), roll_tolerance=_ROLL_TOLERANCE)
-    if case.wish == "avoid":
+    if case.constraint == "avoid":
         return Steering(avoid=[_end_of(vertices, rng, _END, _BEYOND)])
     region = _end_of(vertices, rng, float(rng.uniform(*_SHARES)), 0.01)
-    return Steering(**(cone if case.wish == "cone and region" else {}), region=region)
+    return Steering(**(cone if case.constraint == "cone and region" else {}), region=region)
 
 
 def _end_of(vertices: Float[np.ndarray, "n 3"], rng: np.random.Generator, share: float, beyond: float) -> Box:
@@ -147,21 +147,22 @@ def steered_sections(records: Sequence[Record], chart: Path | None) -> Sections:
     """Return a table with a row for each kind of constraint: success and CPU time with and without it, violations."""
     headings = ["constraint", "requests", "with a verified grasp", "without it", "grasps of those asked for"]
     headings += ["without it", "CPU s, median", "without it", "beyond cone, at worst", "beyond region", "in boxes"]
-    body = [_row(wish, [r for r in records if wish in ("all", r["wish"])]) for wish in (*WISHES, "all")]
+    kinds = (*CONSTRAINTS, "all")
+    body = [_row(kind, [record for record in records if kind in ("all", record["constraint"])]) for kind in kinds]
     return {"steered": [markdown_table(headings, [row for row in body if row])]}
 
 
-def _row(wish: str, here: Sequence[Record]) -> list[str]:
+def _row(constraint: str, here: Sequence[Record]) -> list[str]:
     if not here:
         return []
     share = lambda key: f"{np.mean([r[key] > 0 for r in here]):.1%}"  # noqa: E731
     count = sum(r["count"] for r in here)
     grasps = lambda key: f"{sum(r[key] for r in here) / count:.1%}"  # noqa: E731
     seconds = lambda key: f"{np.median([r[key] for r in here]):.2f}"  # noqa: E731
-    cones = [r["beyond_cone_rad"] for r in here if r["beyond_cone_rad"] is not None and "cone" in r["wish"]]
-    regions = [r["beyond_region_m"] for r in here if r["beyond_region_m"] is not None and "region" in r["wish"]]
+    cones = [r["beyond_cone_rad"] for r in here if r["beyond_cone_rad"] is not None and "cone" in r["constraint"]]
+    regions = [r["beyond_region_m"] for r in here if r["beyond_region_m"] is not None and "region" in r["constraint"]]
     return [
-        wish,
+        constraint,
         str(len(here)),
         share("held"),
         share("plain"),
@@ -171,5 +172,5 @@ def _row(wish: str, here: Sequence[Record]) -> list[str]:
         seconds("plain_cpu_s"),
         f"{max(0.0, np.degrees(max(cones))):.2f}°" if cones else "",
         f"{max(0.0, 1e3 * max(regions)):.1f} mm" if regions else "",
-        str(sum(r["in_boxes"] for r in here)) if wish in ("avoid", "all") else "",
+        str(sum(r["in_boxes"] for r in here)) if constraint in ("avoid", "all") else "",
     ]

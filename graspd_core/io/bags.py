@@ -16,7 +16,7 @@ from typing import Any
 from graspd_core.errors import BagError, first_line
 from graspd_core.io.messages import ORIGIN, CameraPlace, add_transforms, cloud_from_depth_message, no_lookup, stamp_of
 from graspd_core.perception.cloud.camera import ENCODINGS
-from graspd_core.perception.cloud.cloud_files import recording_told
+from graspd_core.perception.cloud.cloud_files import recording_message
 from graspd_core.perception.cloud.point_cloud import PointCloud, transform_cloud
 from graspd_core.transforms import TransformBuffer
 
@@ -182,7 +182,7 @@ def _opened(path: str | Path) -> Iterator[Any]:
     if not path.exists():
         raise BagError(f"{path}: no such bag")
     if path.suffix.lower() == ".bag" and path.is_file():
-        raise BagError(f"{path}: {recording_told(path)}")
+        raise BagError(f"{path}: {recording_message(path)}")
     if not is_bag(path):
         kinds = "a directory of rosbag2, or a file ending in " + " or ".join(f".{e}" for e in BAG_ENDINGS)
         raise BagError(f"{path}: not a bag; a bag is {kinds}")

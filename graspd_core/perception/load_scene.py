@@ -19,7 +19,7 @@ from graspd_core.perception.cloud.cloud_files import (
     RECORDINGS,
     is_cloud_file,
     load_views,
-    recording_told,
+    recording_message,
 )
 from graspd_core.perception.cloud.depth_files import is_depth_image, load_depth_view
 from graspd_core.perception.cloud.mesh_views import view_in_mesh
@@ -119,7 +119,7 @@ def _read_mesh(source: str | Path | TriangleMesh, scale: float) -> tuple[Triangl
         return TriangleMesh(shape.vertices * scale, shape.faces), ()
     endings = sorted({*MESH_ENDINGS, *CLOUD_ENDINGS})
     if Path(source).suffix.lower().lstrip(".") in RECORDINGS:
-        raise MeshError(f"{name}: {recording_told(Path(source))}")
+        raise MeshError(f"{name}: {recording_message(Path(source))}")
     if Path(source).is_file() and Path(source).suffix.lower().lstrip(".") not in endings:
         raise MeshError(f"{name}: unknown ending {Path(source).suffix!r}; valid endings: {', '.join(endings)}")
     return read_mesh(source, scale=scale)

@@ -206,7 +206,7 @@ def load_views(path: str | Path, viewpoint: Vector | None = None, scale: float =
     path = Path(path)
     ending = path.suffix.lower().lstrip(".")
     if ending in RECORDINGS and path.is_file():
-        raise CloudError(f"{path}: {recording_told(path)}")
+        raise CloudError(f"{path}: {recording_message(path)}")
     refuse_path(path, "cloud", CLOUD_ENDINGS, CloudError)
     said = None if viewpoint is None else np.asarray(viewpoint, dtype=float) / scale
     if ending not in ("npy", "npz"):
@@ -226,7 +226,7 @@ def _scaled(view: PointCloud, scale: float) -> PointCloud:
     return replace(view, points=view.points * scale, viewpoint=view.viewpoint * scale)
 
 
-def recording_told(path: Path) -> str:
+def recording_message(path: Path) -> str:
     """Return the end of an error message for a ROS recording: its kind, and the command that reads or converts it."""
     if path.suffix.lower() != ".bag":
         return f"is a recording of ROS 2; read it with graspd replay {path.name}"

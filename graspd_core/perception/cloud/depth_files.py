@@ -55,8 +55,8 @@ def load_depth_view(image: str | Path, camera: str | Path, unit: float | None = 
     Raises:
         CloudError: a file cannot be read or has the wrong content, or image and camera do not fit each other.
     """
-    taken_by, pose, told = load_depth_camera(camera)
-    depth = _metres(_pixels(Path(image)), unit or told, str(image))
+    taken_by, pose, content = load_depth_camera(camera)
+    depth = _metres(_pixels(Path(image)), unit or content, str(image))
     try:
         return cloud_from_depth(depth, taken_by, pose)
     except CloudError as error:
@@ -66,75 +66,75 @@ def load_depth_view(image: str | Path, camera: str | Path, unit: float | None = 
 def load_depth_camera(path: str | Path) -> DepthCamera:
     """Read a camera file. Raises CloudError if the file is missing, is not JSON, lacks a key, or has a bad value."""
     try:
-        told = json.loads(Path(path).read_text(encoding="utf-8"))
+        content = json.loads(Path(path).read_text(encoding="utf-8"))
     except OSError as error:
         raise CloudError(f"{path}: {error.strerror or error}") from None
     except (ValueError, RecursionError) as error:
         raise CloudError(f"{path}: not JSON: {str(error)[:200]}") from None
-    if not isinstance(told, dict):
-        raise CloudError(f"{path}: {short_repr(told)}; valid: a JSON object with width, height and K")
+    if not isinstance(content, dict):
+        raise CloudError(f"{path}: {short_repr(content)}; valid: a JSON object with width, height and K")
     try:
-        return _camera_of(told)
+        return _camera_of(content)
     except CloudError as error:
         raise CloudError(f"{path}: {error}") from None
 
 
-def _camera_of(told: Mapping[str, Any]) -> DepthCamera:
+def _camera_of(content: Mapping[str, Any]) -> DepthCamera:
     for key in ("width", "height"):
-        if key not in told:
-            raise CloudError(f"{key} is missing; give the image's width and height; the file has {_keys(told)}")
-    if "depth_scale" in told and "depth_unit" not in told:
+        if key not in content:
+            raise CloudError(f"{key} is missing; give the image's width and height; the file has {_keys(content)}")
+    if "depth_scale" in content and "depth_unit" not in content:
         raise CloudError(
-            f"depth_scale: {short_repr(told['depth_scale'])} is ambiguous, because programs disagree on its unit; "
+            f"depth_scale: {short_repr(content['depth_scale'])} is ambiguous, because programs disagree on its unit; "
             "write depth_unit, in metres per unit: 0.001 for millimetres"
         )
-    width, height = (int(_numbers(told[key], (), key)) for key in ("width", "height"))
-    distortion = _numbers(told.get("distortion", []), None, "distortion").reshape(-1).tolist()
-    model = told.get("distortion_model", "plumb_bob" if len(distortion) <= 5 else "rational_polynomial")
-    camera = camera_from_calibration(width, height, _matrix(told), distortion, str(model))
+    width, height = (int(_numbers(content[key], (), key)) for key in ("width", "height"))
+    distortion = _numbers(content.get("distortion", []), None, "distortion").reshape(-1).tolist()
+    model = content.get("distortion_model", "plumb_bob" if len(distortion) <= 5 else "rational_polynomial")
+    camera = camera_from_calibration(width, height, _matrix(content), distortion, str(model))
     pose = None
-    if "T_world_camera" in told:
-        pose = rigid(_numbers(told["T_world_camera"], (4, 4), "T_world_camera"), "T_world_camera")
-    return camera, pose, _unit(told["depth_unit"]) if "depth_unit" in told else None
+    if "T_world_camera" in content:
+        pose = rigid(_numbers(content["T_world_camera"], (4, 4), "T_world_camera"), "T_world_camera")
+    return camera, pose, _unit(content["depth_unit"]) if "depth_unit" in content else None
 
 
-def _matrix(told: Mapping[str, Any]) -> list[float]:
+def _matrix(content: Mapping[str, Any]) -> list[float]:
     """Return the nine numbers of the camera matrix, row by row, from the keys of a camera file."""
-    if "K" in told:
-        return _numbers(told["K"], None, "K").reshape(-1).tolist()
-    if "intrinsic_matrix" in told:
-        return _numbers(told["intrinsic_matrix"], (9,), "intrinsic_matrix").reshape(3, 3).T.reshape(-1).tolist()
-    lost = [key for key in _SIMPLE if key not in told]
+    if "K" in content:
+        return _numbers(content["K"], None, "K").reshape(-1).tolist()
+    if "intrinsic_matrix" in content:
+        return _numbers(content["intrinsic_matrix"], (9,), "intrinsic_matrix").reshape(3, 3).T.reshape(-1).tolist()
+    lost = [key for key in _SIMPLE if key not in content]
     if lost:
-        raise CloudError(f"{lost[0]} is missing; give K, or fx, fy, cx and cy; the file has {_keys(told)}")
-    fx, fy, cx, cy = (float(_numbers(told[key], (), key)) for key in _SIMPLE)
+        raise CloudError(f"{lost[0]} is missing; give K, or fx, fy, cx and cy; the file has {_keys(content)}")
+    fx, fy, cx, cy = (float(_numbers(content[key], (), key)) for key in _SIMPLE)
     return [fx, 0.0, cx, 0.0, fy, cy, 0.0, 0.0, 1.0]
 
 
-def _unit(told: Any) -> float:
+def _unit(value: Any) -> float:
     """Return metres per unit, from a number or from a text that begins with the name of a unit."""
-    word = told.replace(",", " ").split()[:1] if isinstance(told, str) else None
+    word = value.replace(",", " ").split()[:1] if isinstance(value, str) else None
     if word and word[0] in _UNITS:
         return _UNITS[word[0]]
-    unit = 0.0 if isinstance(told, str) else float(_numbers(told, (), "depth_unit"))
+    unit = 0.0 if isinstance(value, str) else float(_numbers(value, (), "depth_unit"))
     if not 0 < unit <= 1:
-        raise CloudError(f"depth_unit: {short_repr(told)}; valid: metres per unit in (0, 1], or {', '.join(_UNITS)}")
+        raise CloudError(f"depth_unit: {short_repr(value)}; valid: metres per unit in (0, 1], or {', '.join(_UNITS)}")
     return unit
 
 
-def _numbers(told: Any, shape: tuple[int, ...] | None, key: str) -> np.ndarray:
+def _numbers(value: Any, shape: tuple[int, ...] | None, key: str) -> np.ndarray:
     try:
-        numbers = np.array(told, dtype=float)
+        numbers = np.array(value, dtype=float)
     except (TypeError, ValueError, OverflowError):
         numbers = np.full(1, np.nan)
-    if not np.isfinite(numbers).all() or isinstance(told, bool) or (shape is not None and numbers.shape != shape):
+    if not np.isfinite(numbers).all() or isinstance(value, bool) or (shape is not None and numbers.shape != shape):
         wanted = "numbers" if shape is None else f"{' × '.join(map(str, shape))} numbers" if shape else "a number"
-        raise CloudError(f"{key}: {short_repr(told)}; expected {wanted}")
+        raise CloudError(f"{key}: {short_repr(value)}; expected {wanted}")
     return numbers
 
 
-def _keys(told: Mapping[str, Any]) -> str:
-    return ", ".join(str(key)[:40] for key in list(told)[:20]) or "no key"
+def _keys(content: Mapping[str, Any]) -> str:
+    return ", ".join(str(key)[:40] for key in list(content)[:20]) or "no key"
 
 
 def _pixels(path: Path) -> np.ndarray:
@@ -171,6 +171,6 @@ def _metres(pixels: np.ndarray, unit: float | None, name: str) -> DepthImage:
         depth = depth_in_metres((pixels.astype(float) * unit).astype(np.float32), "32FC1")
     seen = depth[depth > 0]
     if len(seen) and float(np.median(seen)) > _FARTHEST:
-        told = f"half of its depths are beyond {float(np.median(seen)):.0f} m at {unit:g} m a unit"
-        raise CloudError(f"{name}: {told}; give the unit: --units mm, or depth_unit in the camera's file")
+        content = f"half of its depths are beyond {float(np.median(seen)):.0f} m at {unit:g} m a unit"
+        raise CloudError(f"{name}: {content}; give the unit: --units mm, or depth_unit in the camera's file")
     return depth
