@@ -171,6 +171,6 @@ def _metres(pixels: np.ndarray, unit: float | None, name: str) -> DepthImage:
         depth = depth_in_metres((pixels.astype(float) * unit).astype(np.float32), "32FC1")
     seen = depth[depth > 0]
     if len(seen) and float(np.median(seen)) > _FARTHEST:
-        content = f"half of its depths are beyond {float(np.median(seen)):.0f} m at {unit:g} m a unit"
-        raise CloudError(f"{name}: {content}; give the unit: --units mm, or depth_unit in the camera's file")
+        reason = f"half of its depths are beyond {float(np.median(seen)):.0f} m at {unit:g} m a unit"
+        raise CloudError(f"{name}: {reason}; give the unit: --units mm, or depth_unit in the camera's file")
     return depth
