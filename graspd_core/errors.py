@@ -5,6 +5,7 @@ import difflib
 import re
 import reprlib
 from collections.abc import Iterable
+from contextlib import suppress
 from typing import Any, NoReturn
 
 # Least similarity, from 0 to 1, of an unknown name to the valid name that is suggested.
@@ -29,7 +30,7 @@ def first_line(error: BaseException) -> str:
 
 
 def choices(name: object, valid: Iterable[str], more: str = "") -> str:
-    """Return a hint for an unknown name: the most similar valid name. If no name is similar, all names and `more`."""
+    """Return a hint for an unknown name: the most similar valid name, or if none is similar, all names and `more`."""
     names = [*valid]
     # In a file, a name may be any value, not only text.
     near = difflib.get_close_matches(name, names, 3, _NEAR) if isinstance(name, str) else []
@@ -102,11 +103,12 @@ class Parser(argparse.ArgumentParser):
     """Argument parser with `--version`. For an invalid option, it raises ConfigError and does not print its usage."""
 
     def __init__(self, **settings: Any) -> None:
-        from importlib.metadata import version
+        from importlib.metadata import PackageNotFoundError, version
 
         super().__init__(**settings)
-        program = self.prog.split()[0]
-        self.add_argument("--version", action="version", version=f"{program} {version('graspd')}")
+        with suppress(PackageNotFoundError):
+            text = f"{self.prog.split()[0]} {version('graspd')}"
+            self.add_argument("--version", action="version", version=text)
 
     def error(self, message: str) -> NoReturn:
         if found := re.fullmatch(r"(.*): invalid choice: '(.*)' \(choose from (.*)\)", message):

@@ -13,7 +13,7 @@ import numpy as np
 import torch
 from jaxtyping import Float
 
-from graspd_bench.rendering.render import BACKGROUND, camera_of_view, look_at, render_scene, render_shaded, save_png
+from graspd_bench.rendering.render import BACKGROUND, camera_of_view, draw_labels, look_at, render_shaded, save_png
 from graspd_core.hands.kinematics import hand_mesh
 from graspd_core.hands.model import HandModel
 from graspd_core.io.grasps_json import save_text
@@ -120,7 +120,7 @@ def best_view(
     level = np.cos(azimuth)[:, None] * side + np.sin(azimuth)[:, None] * np.cross(up, side)
     eyes = middle + distance * (np.cos(elevation)[:, None] * level + np.sin(elevation)[:, None] * up)
     camera = camera_of_view(*_SMALL, _FIELD)
-    labels = [render_scene(meshes, camera, look_at(eye, middle, up))[1] for eye in eyes]
+    labels = [draw_labels(meshes, camera, look_at(eye, middle, up)) for eye in eyes]
     seen = np.array([[(image == number).sum() for number in range(len(meshes))] for image in labels])
     best = int((seen / seen.max(0).clip(1)).min(1).argmax())
     return eyes[best], middle, up

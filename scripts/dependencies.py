@@ -72,8 +72,8 @@ def main(page: Path) -> None:
     purposes, brought, users = dict(comments), {"graspd": ""}, defaultdict(set)
     for extra in ("", *EXTRAS):
         for name, needed_by in users_of(extra).items():
-            brought.setdefault(name, extra)
-            users[name] |= needed_by
+            if brought.setdefault(name, extra) == extra:
+                users[name] |= needed_by
     sizes = {name: megabytes(name) for name in brought}
     rows = []
     for name in sorted(sizes, key=lambda name: -sizes[name]):

@@ -1,6 +1,7 @@
-"""Rendering by ray casting, without a display: depth images, shaded pictures of meshes, and pictures of a hand.
+"""Rendering without a display: depth images by ray casting, shaded pictures of meshes, and pictures of a hand.
 
-Camera frames follow the optical convention: z forward, x right, y down.
+Camera frames follow the optical convention: z forward, x right, y down. Pictures need no Open3D: they are drawn point
+by point, with outlines that are up to half a pixel too wide.
 """
 
 from __future__ import annotations
@@ -15,6 +16,7 @@ from PIL import Image
 from graspd_core.hands.kinematics import hand_mesh, link_poses
 from graspd_core.hands.model import HandModel
 from graspd_core.mesh.surface_queries import first_hits
+from graspd_core.mesh.topology import scaled_normals
 from graspd_core.perception.cloud.camera import PinholeCamera, camera_rays
 from graspd_core.se3 import perpendicular
 from graspd_core.types import TriangleMesh, joined
@@ -62,9 +64,19 @@ def render_scene(
     """Return the depth image of all meshes together [m] (0: no hit), and the mesh index of each pixel (-1: no hit)."""
     distance, face, _ = _cast(joined(*meshes), camera, T_world_camera)
     hit = np.isfinite(distance)
-    label = np.full(distance.shape, -1)
-    label[hit] = np.repeat(np.arange(len(meshes)), [len(mesh.faces) for mesh in meshes])[face[hit]]
-    return np.where(hit, distance, 0.0), label
+    return np.where(hit, distance, 0.0), np.where(hit, _owner(meshes)[np.where(hit, face, 0)], -1)
+
+
+def draw_labels(
+    meshes: Sequence[TriangleMesh], camera: PinholeCamera, T_world_camera: Float[np.ndarray, "4 4"]
+) -> Int[np.ndarray, "height width"]:
+    """Return the mesh index of each pixel of a picture, -1 where no mesh is."""
+    distance, face, _ = draw_points(joined(*meshes), camera, T_world_camera)
+    return np.where(np.isfinite(distance), _owner(meshes)[face], -1)
+
+
+def _owner(meshes: Sequence[TriangleMesh]) -> Int[np.ndarray, "faces"]:
+    return np.repeat(np.arange(len(meshes)), [len(mesh.faces) for mesh in meshes])
 
 
 def render_shaded(
@@ -77,7 +89,7 @@ def render_shaded(
     """Return a picture of meshes with their RGB colours (0 to 1), on white. Light comes from the camera and from +z."""
     together = joined(*(mesh for mesh, _ in meshes))
     colours = np.repeat(np.array([rgb for _, rgb in meshes], dtype=float), [len(m.faces) for m, _ in meshes], axis=0)
-    distance, face, normal = _cast(together, camera_of_view(width, height), T_world_camera)
+    distance, face, normal = draw_points(together, camera_of_view(width, height), T_world_camera)
     hit = np.isfinite(distance)
     view, above = -T_world_camera[:3, 2], np.array([0.0, 0.0, 1.0])
     # Normals are flipped towards the viewer, so that the winding of a face does not matter.
@@ -105,6 +117,48 @@ def _cast(mesh: TriangleMesh, camera: PinholeCamera, T_world_camera: Float[np.nd
     return np.where(blind, np.inf, distance), face, normal
 
 
+# Nearest depth that is drawn [m], and greatest distance between drawn points of a face [pixels].
+_NEAREST, _DOT_GAP = 1e-3, 0.7
+
+
+def draw_points(mesh: TriangleMesh, camera: PinholeCamera, T_world_camera: Float[np.ndarray, "4 4"]):
+    """Return the same as `_cast`, from points on the faces and a depth buffer. The camera's lens is ignored."""
+    corners = ((mesh.vertices - T_world_camera[:3, 3]) @ T_world_camera[:3, :3])[mesh.faces]
+    scaled = scaled_normals(mesh.vertices, mesh.faces)
+    normals = scaled / np.maximum(np.linalg.norm(scaled, axis=1, keepdims=True), 1e-300)
+    focal, middle = np.array([camera.fx, camera.fy]), np.array([camera.cx, camera.cy])
+    pixels = corners[..., :2] / np.maximum(corners[..., 2:], _NEAREST) * focal + middle
+    size = np.array([camera.width, camera.height])
+    shown = (corners[..., 2] > _NEAREST).all(1) & (pixels.max(1) > -1).all(1) & (pixels.min(1) < size).all(1)
+    # Rows of points are parallel to the longest side. Faces with equally many points are drawn together, and powers of
+    # two make these groups few.
+    sides = np.roll(pixels, -1, axis=1) - pixels
+    lengths = np.linalg.norm(sides, axis=-1)
+    first, longest = lengths.argmax(1)[:, None], lengths.max(1)
+    corners = np.take_along_axis(corners, (first + np.arange(3))[..., None] % 3, 1)
+    heights = np.abs(sides[:, 0, 0] * sides[:, 1, 1] - sides[:, 0, 1] * sides[:, 1, 0]) / np.maximum(longest, 1e-12)
+    levels = np.ceil(np.log2(np.maximum(np.column_stack([longest, heights]), _DOT_GAP) / _DOT_GAP)).astype(int)
+    depth, face = np.full(camera.height * camera.width, np.inf), np.zeros(camera.height * camera.width, dtype=int)
+    for level in np.unique(levels[shown], axis=0):
+        along, across = (grid.ravel() for grid in np.meshgrid(*(np.arange(2**n + 1) / 2**n for n in level)))
+        weights = np.column_stack([(1.0 - across) * (1.0 - along), (1.0 - across) * along, across])
+        rows = np.flatnonzero(shown & (levels == level).all(1))
+        for some in np.array_split(rows, -(-len(rows) * len(weights) // _AT_ONCE)):
+            points = (weights @ corners[some]).reshape(-1, 3)
+            at = np.rint(points[:, :2] / points[:, 2:] * focal + middle).astype(int)
+            seen = ((at >= 0) & (at < size)).all(1)
+            of, z = np.repeat(some, len(weights))[seen], points[seen, 2]
+            pixel = at[seen, 1] * camera.width + at[seen, 0]
+            # The nearest point is written last, and so stays.
+            order = np.argsort(-z, kind="stable")
+            order = order[z[order] < depth[pixel[order]]]
+            depth[pixel[order]], face[pixel[order]] = z[order], of[order]
+    shape = (camera.height, camera.width)
+    return depth.reshape(shape), face.reshape(shape), normals[face].reshape(*shape, 3)
+
+
+# Greatest number of points that are drawn at once.
+_AT_ONCE = 500_000
 _HAND, _CANDIDATE, _PALM = (0.45, 0.55, 0.75), (0.85, 0.25, 0.15), (0.15, 0.6, 0.2)
 _WIDTH, _HEIGHT = 560, 480
 # Radius of the dots at candidates, and length and radius of the palm's arrow, as fractions of the hand's size.

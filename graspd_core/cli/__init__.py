@@ -69,7 +69,8 @@ class _Parser(Parser):
             known = [option for below in runnable(self) for option in below._option_string_actions]
             if near := difflib.get_close_matches(words.split()[0].split("=")[0], known, 1):
                 message = f"{message}; did you mean {near[0]}?"
-            self.prog = os.path.commonpath([below.prog.replace(" ", "/") for below in runnable(self)]).replace("/", " ")
+            if programs := [below.prog.replace(" ", "/") for below in runnable(self)]:
+                self.prog = os.path.commonpath(programs).replace("/", " ")
         super().error(message)
 
 

@@ -106,6 +106,10 @@ def test_help_and_version_are_no_errors(capsys: pytest.CaptureFixture[str], word
 
 
 def test_an_unknown_command_is_named_with_the_one_that_was_meant(capsys: pytest.CaptureFixture[str]):
+    assert main(["--foo"]) == EXIT_BAD_INPUT
+    assert "(see graspd --help)" in the_line(capsys)
+    assert main(["library", "biuld"]) == EXIT_BAD_INPUT
+    assert the_line(capsys) == "graspd: argument ACTION: 'biuld'; did you mean 'build'? (see graspd library --help)\n"
     assert main(["synthesise"]) == EXIT_BAD_INPUT
     assert the_line(capsys) == "graspd: unknown command 'synthesise'; did you mean 'synthesize'?\n"
     assert main(["frobnicate"]) == EXIT_BAD_INPUT

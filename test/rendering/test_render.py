@@ -6,9 +6,20 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from scipy.ndimage import maximum_filter, minimum_filter
 
 from graspd_bench.rendering.depth_noise import DEFAULT, HIGH, LEVELS, LOW, NONE, DepthNoise, add_noise
-from graspd_bench.rendering.render import BACKGROUND, look_at, render_depth, render_scene, render_shaded, save_png
+from graspd_bench.rendering.render import (
+    BACKGROUND,
+    camera_of_view,
+    draw_labels,
+    draw_points,
+    look_at,
+    render_depth,
+    render_scene,
+    render_shaded,
+    save_png,
+)
 from graspd_bench.rendering.tabletop import CAMERA as D415
 from graspd_bench.rendering.tabletop import TABLE_HALF, depth_views, lowest_pose, moved, ring_poses, tabletop, views_of
 from graspd_core.errors import CloudError
@@ -60,6 +71,26 @@ def test_a_scene_is_seen_with_the_name_of_what_each_pixel_shows():
     alone, nothing = render_scene([sphere], CAMERA, pose)
     assert (alone[nothing < 0] == 0).all()
     assert (nothing == label - 1).all()
+
+
+@pytest.mark.parametrize("name", ["sphere", "box", "mug", "torus"])
+def test_a_picture_shows_what_rays_hit_but_for_half_a_pixel_at_outlines(name: str):
+    """Points cover every face: no pixel inside the outline stays empty, and depths are those of rays."""
+    mesh, camera = make_shape(name), camera_of_view(161, 121)
+    pose = look_at((0.21, 0.1, 0.15), (0, 0, 0))
+    depth, face, normal = draw_points(mesh, camera, pose)
+    label = draw_labels([mesh], camera, pose)
+    true = render_depth(mesh, camera, pose)
+    assert (label[true > 0] == 0).all()
+    assert (np.isfinite(depth) == (label == 0)).all()
+    assert (label[maximum_filter(true, 3) == 0] == -1).all()
+    # Where depth jumps, a point may belong to the neighbouring pixel's surface.
+    inner = maximum_filter(true, 3) - minimum_filter(true, 3) < 0.008
+    inner &= true > 0
+    assert inner.sum() > 300
+    assert depth[inner] == pytest.approx(true[inner], abs=0.004)
+    assert np.linalg.norm(normal, axis=-1)[inner] == pytest.approx(1.0)
+    assert (face[inner] < len(mesh.faces)).all()
 
 
 def test_a_scene_appears_where_the_lens_puts_it():

@@ -55,8 +55,8 @@ def load_depth_view(image: str | Path, camera: str | Path, unit: float | None = 
     Raises:
         CloudError: a file cannot be read or has the wrong content, or image and camera do not fit each other.
     """
-    taken_by, pose, content = load_depth_camera(camera)
-    depth = _metres(_pixels(Path(image)), unit or content, str(image))
+    taken_by, pose, own_unit = load_depth_camera(camera)
+    depth = _metres(_pixels(Path(image)), unit or own_unit, str(image))
     try:
         return cloud_from_depth(depth, taken_by, pose)
     except CloudError as error:

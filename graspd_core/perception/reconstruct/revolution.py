@@ -133,7 +133,7 @@ def _thinner(
     """Return a Gauss-Newton step of four motions of the axis: two shifts [m] and two tilts [rad].
 
     `rates` holds how fast each motion changes a point's height and radius. Cells group points of the profile. A point's
-    residual is its distance from the mean of its cell, along its normal. Residuals above `scale` [m] count little.
+    residual is its distance from its cell's mean, along the cell's normal. Residuals above `scale` [m] count little.
     """
     height, radius, along, across = rows.T
     wall = np.abs(across) > np.abs(along)
