@@ -1,7 +1,7 @@
-"""A client of the node: python examples/ros_client.py mug.obj, beside `graspd_node --ros-args -p mesh_roots:="['.']"`.
+"""A client of the node: python examples/ros_client.py mug.obj, beside `graspd_node`.
 
 It requests grasps by the action /graspd/synthesize, shows progress, and prints what a robot must execute. A path is
-relative to the node's `mesh_roots`. To grasp what a camera sees, set `source=GraspRequest.LATEST_CLOUD` instead.
+relative to the node's folder. To grasp what a camera sees, set `source=GraspRequest.LATEST_CLOUD` instead.
 """
 
 from __future__ import annotations
@@ -51,6 +51,9 @@ def show_grasp(grasp: Grasp) -> None:
 
 def main(arguments: Sequence[str]) -> int:
     """Return 0 if the node answered with a verified grasp, else 1."""
+    if not arguments:
+        print("usage: python examples/ros_client.py MESH", file=sys.stderr)
+        return 2
     rclpy.init()
     node = rclpy.create_node("graspd_example_client")
     try:

@@ -1,5 +1,7 @@
 """Add your own metric, measured like the built-in metrics: python examples/your_own_metric.py [OBJECT].
 
+As a plugin: graspd synthesize OBJECT --plugin examples/your_own_metric.py --out grasps.json.
+
 A metric is one row of `METRICS`. Every verified grasp then has the metric, and files and tables show the metric.
 `grasp.placed` has surface samples of the hand in the object's frame, `grasp.context` has object and hand.
 """
@@ -26,16 +28,18 @@ def contact_offset(grasp: PreparedGrasp) -> float | None:
     return float(np.linalg.norm(centroid - grasp.context.target.center_of_mass))
 
 
+METRICS["contact_offset"] = Metric(
+    name="contact_offset",
+    unit="mm",
+    scale=1e3,
+    measure=contact_offset,
+    description="distance of the contacts' centroid to the centre of mass",
+    digits=1,
+)
+
+
 def main(arguments: Sequence[str]) -> int:
     """Return 0 if there is a verified grasp, else 1."""
-    METRICS["contact_offset"] = Metric(
-        name="contact_offset",
-        unit="mm",
-        scale=1e3,
-        measure=contact_offset,
-        description="distance of the contacts' centroid to the centre of mass",
-        digits=1,
-    )
     scene, hand, preset = load_scene(*(arguments or ["shape:hammer"])), load_hand("allegro_right"), load_preset("fast")
     result = plan_grasps(scene, hand, count=4, seed=0, preset=preset)
     held = [grasp for grasp in result.grasps if grasp.verdict is Verdict.VERIFIED and grasp.metrics]

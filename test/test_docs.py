@@ -144,6 +144,13 @@ def test_your_own_metric(run: Run, tmp_path: Path, monkeypatch: pytest.MonkeyPat
     assert 0 < best["metrics"]["contact_offset_mm"] < 100
 
 
+def test_your_own_metric_is_a_plugin(tmp_path: Path):
+    plugin = str(EXAMPLES / "your_own_metric.py")
+    done = graspd(tmp_path, "synthesize", "shape:box", "--plugin", plugin, "-n", "1", "--out", "g.json")
+    assert done.returncode == 0, done.stderr
+    assert "contact_offset_mm" in json.loads((tmp_path / "g.json").read_text())["grasps"][0]["metrics"]
+
+
 PLUGIN = ("--plugin", str(EXAMPLES / "your_own_method.py"))
 
 
