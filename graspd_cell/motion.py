@@ -107,6 +107,8 @@ class Balls:
 
 # Spacing of the surface points that are kept of hands and objects, and radius of the ball at each point [m].
 _SPACING, _BALL = 0.012, 0.004
+# Side of the cubes whose enclosing balls stand for hand and held object in the check against the arm [m].
+_COARSE = 0.02
 # Points sampled on a hand's surface.
 _SAMPLES = 4000
 
@@ -115,6 +117,12 @@ def balls_about(points: Points, spacing: float = _SPACING, radius: float = _BALL
     """Return a ball of `radius` [m] at one point of every cube of side `spacing` [m] that has points."""
     kept = np.unique(voxel_keys(points - points.min(0), spacing), return_index=True)[1]
     return Balls(points[kept], np.full(len(kept), radius))
+
+
+def enclosing_balls(points: Points, spacing: float = _COARSE) -> Balls:
+    """Return balls that enclose all points: one about every cube of side `spacing` [m] that has points."""
+    cubes = np.unique(np.floor(points / spacing), axis=0)
+    return Balls((cubes + 0.5) * spacing, np.full(len(cubes), 0.5 * np.sqrt(3.0) * spacing))
 
 
 @lru_cache(maxsize=4)
@@ -205,8 +213,6 @@ def arm_shape(arm: Arm) -> ArmShape:
 
 # Pairs of balls that are nearer than this in the seed posture are not checked against each other [m].
 _TOUCHING = 0.01
-# Diameter of the balls of hand and held object for the check against the arm [m].
-_COARSE = 0.03
 
 
 @dataclass(frozen=True, eq=False)
@@ -229,7 +235,7 @@ class Mover:
     def _own(self) -> tuple[Balls, np.ndarray, np.ndarray]:
         """Return coarse balls of hand and object, and index pairs to check: arm with arm, and arm with coarse balls."""
         shape, arm = self.shape, self.shape.arm
-        coarse = balls_about(self.carried.at, _COARSE, 0.5 * _COARSE)
+        coarse = enclosing_balls(self.carried.at)
         group = arm.chain.link_group
         parent = np.where(arm.chain.link_parent[group] < 0, -1, group[arm.chain.link_parent[group]])
         own, above = group[shape.link], parent[shape.link]

@@ -72,8 +72,8 @@ MAX_PACKAGE_LINES = {
     "graspd_bench": 8_183,
     "graspd_dataset": 3_023,
     "graspd_viewer": 2_408,
-    "graspd_cell": 3_787,
-    "test": 34_463,
+    "graspd_cell": 3_793,
+    "test": 34_489,
 }
 # Lines that a program reaches through its imports, those inside functions too.
 # The layout aims at 22,000 of the node.

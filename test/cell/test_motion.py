@@ -8,7 +8,19 @@ import torch
 
 from graspd_cell.carrying import held_balls, release_posture, straight, tip_pose
 from graspd_cell.layout import Box, layout_of
-from graspd_cell.motion import Mover, NoMotionError, Speeds, arm_shape, dense, find_path, hand_balls, seen_world, timed
+from graspd_cell.motion import (
+    Mover,
+    NoMotionError,
+    SeenWorld,
+    Speeds,
+    arm_shape,
+    dense,
+    enclosing_balls,
+    find_path,
+    hand_balls,
+    seen_world,
+    timed,
+)
 from graspd_core.arms.arm import arm_links, load_arm
 from graspd_core.hands.library import load_hand
 
@@ -50,6 +62,20 @@ def test_a_way_around_a_pillar_of_points_keeps_clear_of_every_one_of_them(name: 
         balls, carried = mover.placed(q)
         away = np.linalg.norm(points[:, None] - np.concatenate([balls, carried])[None], axis=-1)
         assert (away.min(0) > np.concatenate([mover.shape.radius, mover.carried.radius])).all()
+
+
+@pytest.mark.parametrize("share", [0.0, 0.2, 0.4, 0.6, 0.8])
+def test_a_palm_on_the_forearm_is_seen_at_every_posture_of_the_fingers(share: float):
+    """In this posture MuJoCo presses the Allegro's base and the forearm together with 71 N (bin 238 of the study)."""
+    arm, hand = load_arm("ur5e_like"), load_hand("allegro_right")
+    fingers = hand.open_posture + share * (hand.closed_posture - hand.open_posture)
+    mover = Mover(arm_shape(arm), SeenWorld(-1.0), hand_balls(arm, hand, fingers))
+    own = slice(mover.carried_columns.stop, None)
+    q = np.array([[-0.054, -1.764, 1.66, -1.019, -3.202, -0.235], arm.seed])
+    assert mover.clearances(q)[0, own].min() < 0 < mover.clearances(q)[1, own].min()
+    balls = enclosing_balls(mover.carried.at)
+    away = np.linalg.norm(mover.carried.at[:, None] - balls.at, axis=-1) - balls.radius
+    assert away.min(1).max() <= 0
 
 
 def test_points_far_away_need_no_memory():
