@@ -69,7 +69,7 @@ MAY_IMPORT = {
 MAX_PACKAGE_LINES = {
     "graspd_core": 27_729,
     "graspd_ros": 5_190,
-    "graspd_bench": 8_183,
+    "graspd_bench": 8_187,
     "graspd_dataset": 3_023,
     "graspd_viewer": 2_408,
     "graspd_cell": 3_793,

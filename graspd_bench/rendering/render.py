@@ -122,7 +122,11 @@ _NEAREST, _DOT_GAP = 1e-3, 0.7
 
 
 def draw_points(mesh: TriangleMesh, camera: PinholeCamera, T_world_camera: Float[np.ndarray, "4 4"]):
-    """Return the same as `_cast`, from points on the faces and a depth buffer. The camera's lens is ignored."""
+    """Return the same as `_cast`, from points on the faces and a depth buffer, for a camera that sees the whole mesh.
+
+    Faces that reach behind the camera are left out. Faces far larger than the picture need much memory. There is no
+    lens distortion.
+    """
     corners = ((mesh.vertices - T_world_camera[:3, 3]) @ T_world_camera[:3, :3])[mesh.faces]
     scaled = scaled_normals(mesh.vertices, mesh.faces)
     normals = scaled / np.maximum(np.linalg.norm(scaled, axis=1, keepdims=True), 1e-300)
