@@ -149,6 +149,7 @@ def test_your_own_metric_is_a_plugin(tmp_path: Path):
     done = graspd(tmp_path, "synthesize", "shape:box", "--plugin", plugin, "-n", "1", "--out", "g.json")
     assert done.returncode == 0, done.stderr
     assert "contact_offset_mm" in json.loads((tmp_path / "g.json").read_text())["grasps"][0]["metrics"]
+    assert "contact_offset " in graspd(tmp_path, "metrics", "--plugin", plugin).stdout
 
 
 PLUGIN = ("--plugin", str(EXAMPLES / "your_own_method.py"))

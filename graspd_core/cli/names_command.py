@@ -8,6 +8,7 @@ from collections.abc import Callable
 from functools import partial
 from typing import Any
 
+from graspd_core.cli.options import add_plugin_option
 from graspd_core.cli.output import answer
 from graspd_core.cli.running import EXIT_OK
 from graspd_core.optimize.plan_config import method_names, method_row, preset_names
@@ -17,7 +18,9 @@ from graspd_core.paths import config_dir
 def add_command(commands: Any) -> None:
     """Add the commands `methods`, `presets` and `metrics` to the parsers in `commands`."""
     for name, rows in _TABLES.items():
-        commands.add_parser(name).set_defaults(run=partial(run, rows))
+        parser = commands.add_parser(name)
+        parser.set_defaults(run=partial(run, rows))
+        add_plugin_option(parser)
 
 
 def run(rows: Callable[[], dict[str, str]], options: argparse.Namespace) -> int:

@@ -107,7 +107,7 @@ def summary(result: GraspResult, wanted: int, different: int) -> str:
     good = good_grasps(result)
     kind = "unverified" if any(not grasp.trials for grasp in result.tried) else "verified"
     ending = result.message or result.outcome.value
-    copies = f", {different} of them different" if different < good else ""
+    copies = f", {different} of them over 20 mm or 20° apart" if different < good else ""
     lines = [f"{good} of {wanted} grasps ({kind}{copies}, {len(result.tried)} tried): {ending}"]
     timing = result.timing
     lines.append(
