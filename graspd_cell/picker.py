@@ -43,6 +43,8 @@ from graspd_core.planning.any_thing import Failure
 
 # An object is still in its place if more than `_STILL_THERE` of its points are within `_UNMOVED` of points seen [m].
 _UNMOVED, _STILL_THERE = 0.006, 0.6
+# Collision checks for the path to `start`. Without this path the picker ends, so the search is longer than usual.
+_WAY_HOME = 20_000
 
 
 class Ending(StrEnum):
@@ -238,7 +240,7 @@ class Picker:
             mover = self._mover(SeenWorld(0.0, self._known))
             up = straight(mover, now, np.array([0.0, 0.0, 0.12]))
             self._follow_arm(up, self._pace.free)
-            self._follow_arm(find_path(mover, up[-1], self._layout.start), self._pace.free)
+            self._follow_arm(find_path(mover, up[-1], self._layout.start, _WAY_HOME), self._pace.free)
         self._move_hand(self._hand.open_posture)
 
     def go_to_retreat(self, taking: _Taking) -> None:

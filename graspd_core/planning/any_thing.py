@@ -41,8 +41,9 @@ OUT_OF_TRIES, NOT_LOOKED_AT = "no tries left", "not tried before the search ende
 _SAME_PLACE, _SLIPPED = 0.04, 0.2
 # Doubt about the scene of an object if a robot executed a grasp of the object and the grasp failed.
 _FAILED = "an earlier grasp of this object failed"
-# Effort of a search for an object for which an earlier search found no grasp.
-_HARDER = 2.0
+# Effort of a search for one grasp of an object for which one earlier search found none, or several. Twice the effort
+# would not have more starts, because no search has fewer than 16. For many grasps, it is twice the effort.
+_HARDER, _TWICE = (4.0, 8.0), 2.0
 # Probability of an object's best grasp before any search: the mean of 93 objects in eight full bins, for two hands.
 _UNKNOWN = 0.2
 # Points belong to a known solid if the fraction `_NEARLY_ALL` of them is within `_STRAY` of the solid's surface [m].
@@ -273,11 +274,11 @@ def _thing_plan(
     if isinstance(scene, str):
         return ThingPlan(points, reason=scene)
     lost, config = [failure.grasp for failure in failed if failure.grasp is not None], plan["preset"]
-    if any(failure.grasp is None for failure in failed):
-        config = config.at_budget(_HARDER)
+    count, seed = min(plan["count"] + 2 * len(lost), MOST_GRASPS), (plan["seed"] + len(failed)) % SEEDS
+    if in_vain := sum(failure.grasp is None for failure in failed):
+        config = config.at_budget(max(_HARDER[in_vain > 1] / count, _TWICE))
     if not lost:
         config = replace(config, rounds=replace(config.rounds, most=1))
-    count, seed = min(plan["count"] + 2 * len(lost), MOST_GRASPS), (plan["seed"] + len(failed)) % SEEDS
     try:
         result = plan_grasps(scene, hand, **{**plan, "preset": config, "count": count, "seed": seed})
     except ConfigError as error:  # The object cannot meet a restriction.

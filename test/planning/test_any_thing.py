@@ -192,9 +192,14 @@ def test_failures_make_no_valid_number_invalid_and_a_search_in_vain_is_followed_
     greatest = {**ASKED, "count": 1024, "seed": 2**63 - 1}
     plan_any_thing(views, HAND, failures=lost, **greatest)
     assert asked == [(1024, 0)] * len(first)
-    vain = sum(failure.grasp is None for failure in lost)
+    usual, vain = min(starts), sum(failure.grasp is None for failure in lost)
     assert 0 < vain < len(lost)
-    assert sorted(starts) == [min(starts)] * (len(lost) - vain) + [2 * min(starts)] * vain
+    assert sorted(starts) == [usual] * (len(lost) - vain) + [2 * usual] * vain
+    # For one grasp, twice the starts would be no more than the fewest that a search has.
+    for times, more in ((1, 4), (2, 8), (3, 8)):
+        starts.clear()
+        plan_any_thing(views, HAND, failures=[Failure(first[0].place)] * times, **ASKED)
+        assert sorted(starts) == [usual] * (len(first) - 1) + [more * usual]
 
 
 def test_nothing_on_the_table_is_no_thing_and_an_empty_cloud_is_told(views: tuple[PointCloud, ...]):
