@@ -6,7 +6,7 @@ import argparse
 import os
 from collections import Counter
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from jaxtyping import Float
@@ -14,8 +14,9 @@ from jaxtyping import Float
 from graspd_core.cli.output import answer, busy, waiting
 from graspd_core.cli.running import EXIT_OK, sibling
 from graspd_core.errors import ConfigError
-from graspd_core.hands.kinematics import link_depths
-from graspd_core.hands.model import HandModel, all_joint_names
+
+if TYPE_CHECKING:
+    from graspd_core.hands.model import HandModel
 
 
 def add_command(commands: Any) -> None:
@@ -102,6 +103,9 @@ def _document(hand: HandModel) -> dict[str, Any]:
 
 def as_text(hand: HandModel) -> str:
     """Return a hand as text in rad and m: link tree, joints, palm, number of self-collision pairs, and warnings."""
+    from graspd_core.hands.kinematics import link_depths
+    from graspd_core.hands.model import all_joint_names
+
     couplings = {mimic.name: mimic for mimic in hand.mimics}
     lines = [
         f"{hand.name}: {hand.num_links} links, {hand.num_joints} actuated joints, {len(couplings)} coupled",
@@ -142,6 +146,8 @@ def as_text(hand: HandModel) -> str:
 
 def as_yaml(hand: HandModel, urdf: str) -> str:
     """Return an editable hand description in YAML. `urdf` is the hand's file, relative to the description."""
+    from graspd_core.hands.model import all_joint_names
+
     lines = [f"urdf: {_quoted(urdf)}", "", "palm:", f"  link: {_quoted(hand.base_link)}"]
     lines += [f"  center: {_list(hand.palm_center)}", f"  normal: {_list(hand.palm_normal)}"]
     lines += ["", f"approach: {_list(hand.approach)}"]

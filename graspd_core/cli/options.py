@@ -15,16 +15,15 @@ from graspd_core.cli.output import print_note
 from graspd_core.cli.running import EXIT_INTERRUPTED, EXIT_OK, EXIT_TOO_FEW, Deadline
 from graspd_core.config import VERIFICATIONS, SceneConfig, load_scene_config
 from graspd_core.errors import BagError, CloudError, ConfigError, TransformError
-from graspd_core.io.bags import BagFrame, is_bag, read_frames, read_transforms
-from graspd_core.io.messages import ORIGIN, CameraPlace, frame_fault
 from graspd_core.optimize.plan_config import PlanConfig, load_plugin, load_preset, preset_names
-from graspd_core.perception.cloud.point_cloud import PointCloud
 from graspd_core.types import GraspResult, Outcome, Timing
 
 if TYPE_CHECKING:
     from graspd_core.arms.reach import Reach
     from graspd_core.hands.model import HandModel
+    from graspd_core.io.bags import BagFrame
     from graspd_core.optimize.restrictions import Restriction
+    from graspd_core.perception.cloud.point_cloud import PointCloud
     from graspd_core.perception.scene import Scene
     from graspd_core.planning.regions import Region
     from graspd_core.planning.steering import Steering
@@ -243,6 +242,9 @@ def bag_views(path: Path, options: argparse.Namespace) -> Iterator[tuple[BagFram
     Raises BagError: nothing can be read, or the requested frame is not in the bag. Raises ConfigError: an option is
     given that messages of this kind do not use.
     """
+    from graspd_core.io.bags import read_frames, read_transforms
+    from graspd_core.io.messages import ORIGIN, CameraPlace, frame_fault
+
     said = options.view_point and tuple(options.view_point)
     transforms, place = None, CameraPlace(said, options.sensor_frame)
     done = set[str]()
@@ -305,6 +307,7 @@ def load_views(path: Path, options: argparse.Namespace) -> tuple[PointCloud, ...
 
     Raises ConfigError: an option of bags is given with a file.
     """
+    from graspd_core.io.bags import is_bag
     from graspd_core.perception.load_scene import scaled_views
 
     if not is_bag(path):

@@ -7,7 +7,7 @@ import time
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from graspd_core.cli.options import (
     add_bag_options,
@@ -35,11 +35,13 @@ from graspd_core.cli.running import (
     Interrupt,
 )
 from graspd_core.errors import CloudError, ConfigError, GraspdError, NoObjectError
-from graspd_core.hands.model import HandModel
 from graspd_core.optimize.plan_config import PlanConfig
-from graspd_core.perception.cloud.point_cloud import PointCloud
 from graspd_core.transforms import SECOND
 from graspd_core.types import GraspResult
+
+if TYPE_CHECKING:
+    from graspd_core.hands.model import HandModel
+    from graspd_core.perception.cloud.point_cloud import PointCloud
 
 
 @dataclass(frozen=True)

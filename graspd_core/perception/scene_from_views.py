@@ -157,9 +157,9 @@ def _camera_doubts(seen: Segmentation, views: Sequence[PointCloud]) -> tuple[str
     if len(views) > 1 and (apart := check_views(seen.views, views)):
         return (apart,)
     # Views from several sides confirm each other. Several clouds of one camera that stood still do not.
-    if np.ptp([thing.viewpoint for thing in seen.views], axis=0).max() > _SAME_PLACE or _needs_no_camera(seen.views):
+    if np.ptp([thing.viewpoint for thing in seen.views], axis=0).max() > _SAME_PLACE or not any(told):
         return ()
-    return tuple(filter(None, told))[:1]
+    return () if _needs_no_camera(seen.views) else tuple(filter(None, told))[:1]
 
 
 def _is_whole_object(views: Sequence[PointCloud]) -> bool:

@@ -41,8 +41,8 @@ OUT_OF_TRIES, NOT_LOOKED_AT = "no tries left", "not tried before the search ende
 _SAME_PLACE, _SLIPPED = 0.04, 0.2
 # Doubt about the scene of an object if a robot executed a grasp of the object and the grasp failed.
 _FAILED = "an earlier grasp of this object failed"
-# Effort of a search for one grasp of an object for which one earlier search found none, or several. Twice the effort
-# would not have more starts, because no search has fewer than 16. For many grasps, it is twice the effort.
+# Efforts of a search for one grasp, after one search in vain and after several. With an effort of 2, it would not have
+# more starts, because no search has fewer than 16. A search for many grasps has an effort of 2.
 _HARDER, _TWICE = (4.0, 8.0), 2.0
 # Probability of an object's best grasp before any search: the mean of 93 objects in eight full bins, for two hands.
 _UNKNOWN = 0.2

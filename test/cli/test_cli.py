@@ -116,8 +116,8 @@ def test_an_unknown_command_is_named_with_the_one_that_was_meant(capsys: pytest.
     assert "valid: synthesize, replay, " in the_line(capsys)
 
 
-def test_the_overview_names_every_command_and_imports_none(capsys: pytest.CaptureFixture[str]):
-    code = "import sys, graspd_core.cli as c; c._overview(); print('torch' in sys.modules)"
+def test_the_overview_names_every_command_and_no_help_imports_torch(capsys: pytest.CaptureFixture[str]):
+    code = "import sys, graspd_core.cli as c; c._overview(); c.build_parser(); print('torch' in sys.modules)"
     assert subprocess.run([sys.executable, "-c", code], capture_output=True, text=True).stdout == "False\n"
     with pytest.raises(SystemExit):
         main(["--help"])
