@@ -73,7 +73,7 @@ MAX_PACKAGE_LINES = {
     "graspd_dataset": 3_023,
     "graspd_viewer": 2_408,
     "graspd_cell": 3_795,
-    "test": 34_495,
+    "test": 34_494,
 }
 # Lines that a program reaches through its imports, those inside functions too.
 # The layout aims at 22,000 of the node.

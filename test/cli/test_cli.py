@@ -185,11 +185,6 @@ def test_an_arm_that_reaches_is_written_and_one_that_does_not_is_told(tmp_path: 
     assert "m from the base of panda_like" in capsys.readouterr().out
 
 
-def test_a_run_that_ends_with_too_few_says_so(capsys: pytest.CaptureFixture[str]):
-    assert main(["synthesize", "shape:box", "-n", "2", "--preset", "fast", "--deadline", "0.01"]) == EXIT_TOO_FEW
-    assert "0 of 2 grasps (verified, 0 tried): the deadline passed" in capsys.readouterr().out
-
-
 def test_the_summary_lists_three_grasps_and_counts_the_others():
     posture = Posture(np.zeros(3), np.array([1.0, 0.0, 0.0, 0.0]), np.zeros(1))
     grasp = Grasp(posture, posture, posture, (), 0.0, trials=(TrialResult("hold", True, 0.0, 0.0),))
@@ -265,14 +260,13 @@ def test_the_main_job_in_a_process_of_its_own(tmp_path: Path):
     assert "total" in done.stdout
 
 
-@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
-def test_an_interrupt_in_a_process_of_its_own(tmp_path: Path, number: signal.Signals):
+def test_an_interrupt_in_a_process_of_its_own(tmp_path: Path):
     out = tmp_path / "grasps.json"
     command = [*GRASPD, "synthesize", "shape:box", "-n", "32", "--preset", "accurate", "--out", str(out)]
     command += ["--mass", "0.1"]
     process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
     assert "optimise" in some(process.stderr).readline()
-    os.kill(process.pid, number)
+    os.kill(process.pid, signal.SIGINT)
     output, errors = process.communicate()
     assert process.returncode == EXIT_INTERRUPTED, errors
     assert "Traceback" not in errors

@@ -349,4 +349,12 @@ FILE_ONLY = {
     "another array",
     "depth without a matrix",
     "points with colours, n by 6",
+    # As messages, these are others of the table: their points are the same.
+    "a pcd of text with colours",
+    "a pcd with NaN",
+    "a pcd with gaps in its fields",
+    "a ply of text and doubles",
+    "a ply of text with nan",
+    "a ply that calls its types float64",
+    "points and the camera's place",
 }

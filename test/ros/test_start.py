@@ -7,6 +7,7 @@ import sys
 from pathlib import Path
 
 import pytest
+from expected import refused
 from geometry_msgs.msg import Point, Pose
 from graspd_msgs.action import SynthesizeGrasps
 from graspd_msgs.msg import GraspArray, GraspRequest
@@ -14,8 +15,9 @@ from rclpy.action.client import ActionClient
 from std_msgs.msg import Header, String
 
 from graspd_core import load_hand
-from graspd_core.errors import HandError
+from graspd_core.errors import ConfigError, HandError
 from graspd_core.paths import config_dir
+from graspd_ros.inputs import tf_listener
 from graspd_ros.node import foreign_ros, log_directory
 
 LAUNCH = Path(__file__).parents[2] / "graspd_ros" / "launch" / "graspd.launch.py"
@@ -110,17 +112,12 @@ def test_grasps_come_with_the_joints_of_an_arm_that_was_heard(client, robot, sta
     assert list(answer.grasps[0].arm_trajectory.joint_names) == [f"joint_{number}" for number in range(1, 8)]
 
 
-def test_a_robot_that_never_comes_is_waited_for_so_long(start_node, tmp_path):
+def test_a_robot_that_never_comes_is_waited_for_so_long(make_node, claim_domain, monkeypatch, tmp_path):
+    monkeypatch.setattr(tf_listener, "ROBOT_PATIENCE", 0.2)
     arm = description(tmp_path)
-    node = start_node(ready=False, arm=arm)
-    node.process.wait(100)
-    status, log = node.stop()
-    (told,) = [line for line in log.splitlines() if line.startswith("graspd_node:")]
-    assert status == 2
-    assert told == (
-        f"graspd_node: parameter arm: {arm} needs a URDF from /robot_description, but none arrived within 10 s"
-        "; start robot_state_publisher first, or give a URDF file as urdf"
-    )
+    told = f"parameter arm: {arm} needs a URDF from /robot_description, but none arrived within 0.2 s; start "
+    with refused(ConfigError, start=told):
+        tf_listener.heard_robot(make_node(domain=claim_domain()), str(arm))
 
 
 def test_two_nodes_of_one_domain_answer_each_for_its_own_hand(client, start_node, tmp_path):
