@@ -67,13 +67,13 @@ MAY_IMPORT = {
 # Most lines of Python per package. They are lowered when the code shrinks, and raised only with a reason.
 # The layout aims at 22,000 of graspd_core, 4,500 of graspd_ros, 26,000 of test. Input checks added 1,700, 500, 3,300.
 MAX_PACKAGE_LINES = {
-    "graspd_core": 27_743,
+    "graspd_core": 27_745,
     "graspd_ros": 5_190,
     "graspd_bench": 8_187,
     "graspd_dataset": 3_023,
     "graspd_viewer": 2_408,
     "graspd_cell": 3_795,
-    "test": 34_494,
+    "test": 34_499,
 }
 # Lines that a program reaches through its imports, those inside functions too.
 # The layout aims at 22,000 of the node.

@@ -18,8 +18,10 @@ from graspd_core.paths import config_dir
 def add_command(commands: Any) -> None:
     """Add the commands `methods`, `presets` and `metrics` to the parsers in `commands`."""
     for name, rows in _TABLES.items():
-        add_plugin_option(parser := commands.add_parser(name))
+        parser = commands.add_parser(name)
         parser.set_defaults(run=partial(run, rows))
+        if rows is not _presets:
+            add_plugin_option(parser)
 
 
 def run(rows: Callable[[], dict[str, str]], options: argparse.Namespace) -> int:
