@@ -44,8 +44,9 @@ def named_loader(known: KnownObject, settings: Settings) -> Callable[[], Scene]:
     def load() -> Scene:
         entry = find_entry(known, settings, None)
         assert entry is not None
-        numbers = {"mass": entry.mass, "friction": entry.friction, "scale": entry.scale}
-        return run_isolated(load_scene, entry.source, **numbers)
+        # An assumed mass is assumed again, because the entry's may be lower: as much as the hand lifts.
+        mass = (settings.mass or None) if entry.mass_assumed else entry.mass
+        return run_isolated(load_scene, entry.source, mass=mass, friction=entry.friction, scale=entry.scale)
 
     return load
 
@@ -57,10 +58,11 @@ def answer_known(
     excluded: Sequence[Matrix],
     restrictions: Sequence[Steering | Reach],
     **plan: Any,
-) -> tuple[GraspResult, Scene | None]:
-    """Return grasps that are not similar to the `excluded` base-link poses, and the scene (None if not loaded).
+) -> tuple[GraspResult, Scene | None, bool]:
+    """Return grasps that are not similar to the `excluded` base-link poses, the scene, and whether its mass is assumed.
 
-    If the library has too few grasps, plan more with arguments `plan`. Raises the errors of `find_entry` and planning.
+    The scene is None if it was not loaded. If the library has too few grasps, plan more with arguments `plan`. Raises
+    the errors of `find_entry` and planning.
     """
     began, settings = time.perf_counter(), request.settings
     count, library = settings.num_grasps, GraspLibrary(Path(settings.grasp_library))
@@ -69,7 +71,9 @@ def answer_known(
         grasps = unlike(library.grasps(entry, hand), excluded)[:count]
         if len(grasps) >= count:
             found = library_result(library, grasps, count, time.perf_counter() - began)
-            return replace(found, mass=entry.mass, tried_mass=entry.mass), None
+            assumed = not settings.mass and (entry.mass_assumed or not known.name)
+            return replace(found, mass=entry.mass, tried_mass=entry.mass), None, assumed
     scene = request.load()
     plan |= {"deadline": max(request.time_left(), 1e-3), "count": count, "restrictions": restrictions}
-    return known_or_planned(library, scene, hand, wanted=lambda grasps: unlike(grasps, excluded), **plan), scene
+    result = known_or_planned(library, scene, hand, wanted=lambda grasps: unlike(grasps, excluded), **plan)
+    return result, scene, scene.object.mass_assumed

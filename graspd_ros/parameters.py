@@ -20,6 +20,7 @@ from rclpy.validate_topic_name import validate_topic_name
 from graspd_core import load_preset
 from graspd_core.config import VERIFICATIONS, load_scene_config
 from graspd_core.errors import ConfigError, GraspdError
+from graspd_core.perception.scene import MASSES
 from graspd_ros.outputs.messages import GEOMETRIES, PARTS, USUAL_PARTS
 from graspd_ros.worker import BusyPolicy
 
@@ -27,7 +28,6 @@ CLOUD_POLICIES = ("newest", "each", "off")
 MOST_GRASPS = 256
 BUDGETS = (0.1, 3600.0)  # valid time limits of a request [s]
 SCALES = (1e-6, 1e6)
-MASSES = (1e-6, 100.0)  # valid masses of an object [kg]
 _CORNERS = ("roi_min", "roi_max", "view_point")
 WORKSPACE = 10.0  # default limit of the cloud coordinates [m]. Depth sensors for grasping see less far
 

@@ -292,7 +292,7 @@ class Planner:
         self, request: Request, excluded: list[Matrix], reach: tuple[Reach, ...], stop: StopHook, report: ProgressHook
     ) -> Planned:
         """Plan grasps, drop those similar to `excluded`, and write the rest to a file if `output_dir` is set."""
-        settings, objects, arrived = request.settings, (), None
+        settings, objects, arrived, assumed = request.settings, (), None, False
         config = load_preset(settings.preset)
         steering = () if request.steering is None else (request.steering(),)
         plan: dict[str, Any] = {"preset": config, "device": settings.device, "progress": report, "stop": stop}
@@ -305,7 +305,7 @@ class Planner:
         elif settings.grasp_library and request.known is not None:
             from graspd_ros.known_objects import answer_known
 
-            result, scene = answer_known(request, request.known, self._hand, excluded, **plan)
+            result, scene, assumed = answer_known(request, request.known, self._hand, excluded, **plan)
         else:
             scene = request.load()
             if request.closes_late:
@@ -318,9 +318,7 @@ class Planner:
             result = replace(result, tried=tuple(map(arrived or _arrivals(scene, self._hand), result.tried)))
         if excluded:
             result = without(result, excluded, settings.num_grasps)
-        # The mass of an object that the request names is the library's. Of a mesh it is assumed, as without library.
-        named = request.known is not None and request.known.name
-        mass, assumed = result.mass or 0.0, not (settings.mass or named)
+        mass = result.mass or 0.0
         if scene is not None:
             mass, assumed = result.mass or scene.object.mass, scene.object.mass_assumed
         planned = Planned(result, mass=mass, mass_assumed=assumed, objects=objects, surface=scene and scene.object.mesh)

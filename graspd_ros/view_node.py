@@ -101,7 +101,8 @@ class Follower:
         if self._scene is None:
             self._viewer.show(Session(title, hand, grasps, seen=seen, notes=notes))
         else:
-            self._viewer.show(make_session(title, hand, grasps, self._scene, PlanConfig(), seen, notes))
+            about = self._scene, PlanConfig(), seen, notes
+            self._viewer.show(make_session(title, hand, grasps, *about, mass=message.mass or None))
 
     def _seen(self, frame: str) -> np.ndarray:
         """Return the points of the newest cloud [m], or no points if the cloud is not in the answer's frame."""

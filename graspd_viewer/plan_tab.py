@@ -296,7 +296,8 @@ class PlanTab:
         )  # fmt: skip
         self._live.end()
         self._saved = (json.dumps(result_document(result, scene.object, hand, config), indent=1) + "\n").encode()
-        self._show(make_session(title, hand, result.tried, scene, config, seen, result.warnings))
+        about = scene, config, seen, result.warnings
+        self._show(make_session(title, hand, result.tried, *about, mass=result.tried_mass))
         good = sum(grasp.verdict is Verdict.VERIFIED for grasp in result.tried)
         ending = result.message or result.outcome.value
         self._say(f"{good} of {request.count} grasps in {result.timing.total:.1f} s: {ending}", 1.0)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -64,6 +64,10 @@ def open_grasps(path: Path, *, object_source: str | None = None, hand: str | Non
     model = _hand_of(document, path, hand)
     config = plan_config(document.get("config") or {}, f"{path}: config")
     scene, seen, notes = _object_of(document, path, object_source, config)
+    # Among the planner's warnings are its assumptions, such as the object's mass.
+    outcome = document.get("outcome")
+    warnings = outcome.get("warnings") if isinstance(outcome, dict) else None
+    notes = tuple(dict.fromkeys((*notes, *map(str, warnings if isinstance(warnings, list) else ()))))
     if scene is None:
         return Session(path.name, model, grasps, notes=notes)
     return make_session(path.name, model, grasps, scene, config, seen, notes)
@@ -77,9 +81,15 @@ def make_session(
     config: PlanConfig,
     seen: Float[np.ndarray, "points 3"],
     notes: tuple[str, ...],
+    *,
+    mass: float | None = None,
 ) -> Session:
-    """Make a session. Move a distant object to the origin, as a browser's float32 is coarse for large coordinates."""
+    """Make a session. Move a distant object to the origin, as a browser's float32 is coarse for large coordinates.
+
+    `mass` is the object's mass in the trials of the grasps [kg]. None: the scene's.
+    """
     scene, far = planning_scene(scene, config.resolution)
+    scene = replace(scene, object=scene.object.at_mass(mass or scene.object.mass))
     return Session(title, hand, tuple(moved_grasp(g, -far) for g in grasps), scene, seen - far, notes, far)
 
 

@@ -75,7 +75,8 @@ def watched(options: argparse.Namespace, scene: Scene, hand: HandModel, config: 
 
     def show(result: GraspResult) -> None:
         viewer.live.end()
-        viewer.show(make_session(name, hand, result.tried, scene, config, seen, notes))
+        about = scene, config, seen, result.warnings
+        viewer.show(make_session(name, hand, result.tried, *about, mass=result.tried_mass))
         wait_for_end(viewer.url)
 
     viewer = Viewer(host=options.host, port=options.port, plan=False)

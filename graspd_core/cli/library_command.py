@@ -79,7 +79,7 @@ def _add_object(options: argparse.Namespace, library: GraspLibrary, source: str,
 
     def stored() -> int:
         # An object without a given mass may be stored at less than its assumed mass, if the hand cannot lift that.
-        same = library.of_mesh(entry, any_mass=scene.object.mass_assumed)
+        same = library.of_mesh(entry)
         return sum(len(library.grasps(one, hand)) for one in same if one.verify == entry.verify)
 
     has = stored()
@@ -90,6 +90,8 @@ def _add_object(options: argparse.Namespace, library: GraspLibrary, source: str,
     with Reporter() as reporter:
         hooks = {"progress": reporter, "stop": stop}
         result = plan_grasps(scene, hand, preset=config, deadline=options.deadline, **hooks, **missing)
+    for warning in result.warnings[len(scene.object.warnings) + len(hand.named_warnings) :]:
+        print_note(warning)
     add_planned(library, scene, hand, config, result, options.verify)
     has = stored()
     print(f"{entry.name}: {has} of {options.count} grasps, {result.timing.total:.1f} s", flush=True)

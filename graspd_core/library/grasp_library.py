@@ -10,20 +10,22 @@ import json
 import os
 import sqlite3
 import zlib
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import astuple, dataclass, fields, replace
 from functools import lru_cache
 from pathlib import Path
+from typing import Any
 from urllib.parse import quote
 
+from graspd_core.config.planning_config import light_end
 from graspd_core.errors import ConfigError, FormatError, GraspdError
 from graspd_core.hands.model import HandModel
 from graspd_core.io.grasps_json import grasps_of, result_document
 from graspd_core.mesh.shapes import file_state, source_hash
 from graspd_core.optimize.plan_config import PlanConfig
 from graspd_core.perception.load_scene import SHAPE_PREFIX
-from graspd_core.perception.scene import ObjectModel
+from graspd_core.perception.scene import ObjectModel, heavy_mass
 from graspd_core.planning.plan_grasps import MOST_GRASPS
 from graspd_core.runtime.disk_cache import digest
 from graspd_core.types import Grasp, GraspResult, Outcome, Timing, Verdict
@@ -45,7 +47,9 @@ class LibraryEntry:
         file_sha256: hash of the file's content. Empty for a mesh without a file.
         mesh_sha256: hash of the cleaned mesh in metres.
         scale: metres per unit of the file.
-        mass: mass of the object [kg].
+        mass: mass of the object in the trials [kg].
+        mass_assumed: True if no mass was given.
+        volume: enclosed volume of the object [m³].
         friction: Coulomb friction coefficient.
         verify: name of the trials that the grasps passed, a key of `STRICTNESS`.
         hand: name of the hand.
@@ -58,10 +62,17 @@ class LibraryEntry:
     mesh_sha256: str
     scale: float
     mass: float
+    mass_assumed: bool
+    volume: float
     friction: float
     verify: str
     hand: str
     hand_content: str
+
+    @property
+    def is_heavy_enough(self) -> bool:
+        """Whether its grasps may count as verified for an object of the same mesh whose mass nobody knows."""
+        return self.mass >= light_end(heavy_mass(self.volume))
 
     @property
     def key(self) -> str:
@@ -84,6 +95,8 @@ def entry_of(target: ObjectModel, hand: HandModel, verify: str, name: str = "") 
         mesh_sha256=target.sha256,
         scale=target.scale,
         mass=target.mass,
+        mass_assumed=target.mass_assumed,
+        volume=target.volume,
         friction=target.friction,
         verify=verify,
         hand=hand.name,
@@ -104,7 +117,7 @@ def hand_hash(hand: HandModel) -> str:
     return digest((*content, mimics))
 
 
-VERSION = 1
+VERSION = 2
 # Application id in SQLite's header ("grsp"). It marks the file as a library of graspd.
 _APPLICATION = 0x67727370
 # Greatest time that a writer waits for another writer [s].
@@ -154,22 +167,21 @@ class GraspLibrary:
         question = f"SELECT {', '.join(_COLUMNS)}, grasps FROM records WHERE {where} ORDER BY name, hand"
         with self._reading() as base:
             rows = base.execute(question, tuple(wanted.values())).fetchall()
-        return [(LibraryEntry(*row[:-1]), row[-1]) for row in rows]
+        return [(_entry_of_row(row[:-1]), row[-1]) for row in rows]
 
     def names(self) -> list[str]:
         """Return the distinct names of the objects in the library."""
         with self._reading() as base:
             return [name for (name,) in base.execute("SELECT DISTINCT name FROM records ORDER BY name")]
 
-    def of_mesh(self, wanted: LibraryEntry, *, any_mass: bool = False) -> list[LibraryEntry]:
-        """Return the entries with mesh, hand, friction and mass of `wanted`. With `any_mass`, the mass may differ.
+    def of_mesh(self, wanted: LibraryEntry) -> list[LibraryEntry]:
+        """Return the entries with mesh, hand, friction and mass of `wanted`. An assumed mass admits other masses.
 
         Only entries with trials at least as strict as those of `wanted` count. Order: strictest first, then heaviest.
         """
-        names = ("mesh_sha256", "hand_content", "friction", *(() if any_mass else ("mass",)))
-        same = {name: getattr(wanted, name) for name in names}
-        heaviest_first = sorted((entry for entry, _ in self.entries(**same)), key=lambda entry: -entry.mass)
-        return strict_enough(heaviest_first, wanted.verify)
+        same = {name: getattr(wanted, name) for name in ("mesh_sha256", "hand_content", "friction")}
+        mass = None if wanted.mass_assumed else wanted.mass
+        return strict_enough(with_mass((entry for entry, _ in self.entries(**same)), mass), wanted.verify)
 
     def grasps(self, entry: LibraryEntry, hand: HandModel) -> tuple[Grasp, ...]:
         """Return the verified grasps of an entry, object frame. Return no grasps for an unknown entry.
@@ -255,6 +267,19 @@ class GraspLibrary:
             f"{self.path}: damaged or not a library ({' '.join(str(detail).split())[:200]}); use an intact copy, or "
             "build another with `graspd library build --out FILE`"
         )
+
+
+def _entry_of_row(row: Sequence[Any]) -> LibraryEntry:
+    values: dict[str, Any] = dict(zip(_COLUMNS, row, strict=True))
+    # SQLite has no type for truth values.
+    values["mass_assumed"] = bool(values["mass_assumed"])
+    return LibraryEntry(**values)
+
+
+def with_mass(entries: Iterable[LibraryEntry], mass: float | None) -> list[LibraryEntry]:
+    """Return the entries with this mass [kg], heaviest first. For an unknown mass (None), those heavy enough."""
+    same = (entry for entry in entries if (entry.is_heavy_enough if mass is None else entry.mass == mass))
+    return sorted(same, key=lambda entry: -entry.mass)
 
 
 def strict_enough(entries: Sequence[LibraryEntry], verify: str) -> list[LibraryEntry]:

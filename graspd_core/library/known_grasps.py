@@ -31,6 +31,7 @@ from graspd_core.library.grasp_library import (
     entry_of,
     hand_hash,
     strict_enough,
+    with_mass,
 )
 from graspd_core.mesh.mesh_files import surface_samples
 from graspd_core.mesh.sdf import sample_sdf
@@ -53,26 +54,26 @@ _MOST_NAMED = 8
 
 @dataclass(frozen=True)
 class Physics:
-    """Conditions of trials: the object's mass [kg] (None for any mass), its friction, and the name of the trials."""
+    """Conditions of trials: the object's mass [kg] (None if unknown), its friction, and the name of the trials."""
 
     mass: float | None
     friction: float
     verify: str = "standard"
 
     def __str__(self) -> str:
-        mass = "any mass" if self.mass is None else f"{self.mass:g} kg"
+        mass = "unknown mass" if self.mass is None else f"{self.mass:g} kg"
         return f"{mass}, friction {self.friction:g}, {self.verify} trials"
 
     def of(self, entries: Iterable[LibraryEntry]) -> list[LibraryEntry]:
-        """Return the entries with this mass and friction, heaviest first."""
-        same = [e for e in entries if e.friction == self.friction and self.mass in (None, e.mass)]
-        return sorted(same, key=lambda entry: -entry.mass)
+        """Return the entries with this mass and friction, heaviest first (`with_mass`)."""
+        return with_mass((entry for entry in entries if entry.friction == self.friction), self.mass)
 
 
 def entry_by_name(library: GraspLibrary, hand: HandModel | None, name: str, physics: Physics) -> LibraryEntry:
     """Return the entry of the object with this name, for this hand (None for any hand).
 
-    If all entries of the object have one mass and one friction, mass and friction in `physics` are ignored.
+    The object's mass and friction are the library's. If entries differ in them, `physics` selects the entry. An entry
+    whose mass is below a given mass is refused.
 
     Raises:
         ConfigError: the name is unknown, has no entry for this hand or physics, or several objects have this name.
@@ -89,10 +90,11 @@ def entry_by_name(library: GraspLibrary, hand: HandModel | None, name: str, phys
     if len({entry.mesh_sha256 for entry in same}) > 1:
         sources = ", ".join(sorted({entry.source for entry in same}))
         raise ConfigError(f"{name}: the library {library.path} has several such objects: {sources}; name a mesh file")
-    there = physics.of(same)
+    there = [e for e in same if e.friction == physics.friction and physics.mass in (None, e.mass)]
     if not there and len({(entry.mass, entry.friction) for entry in same}) == 1:
-        there = same
-    entry = _held_entry(library, there, same, name, physics)
+        there = [entry for entry in same if entry.mass >= (physics.mass or 0.0)]
+    heaviest_first = sorted(there, key=lambda entry: -entry.mass)
+    entry = _held_entry(library, heaviest_first, same, name, physics)
     if entry.source and Path(entry.source).is_file() and source_hash(entry.source) != entry.file_sha256:
         raise _changed(library, entry)
     return entry
@@ -202,7 +204,7 @@ def known_grasps(
     began = time.perf_counter()
     check_request(count=count, seed=0, verify=verify, deadline=None, device="cpu")
     bound = BoundRestrictions(tuple(one.bind(scene, hand) for one in restrictions))
-    entries = library.of_mesh(entry_of(scene.object, hand, verify), any_mass=scene.object.mass_assumed)
+    entries = library.of_mesh(entry_of(scene.object, hand, verify))
     good, masses, refused = list[Grasp](), list[float](), Counter[str]()
     # Entries with strict trials and heavy objects come first, so that the others are used only if needed.
     for entry in entries:

@@ -82,6 +82,8 @@ MAX_FACES = 25_000
 # and small objects may be metal. So the curve has water's density at 1.8 l, and solid steel's at 0.03 l. None of the
 # ten YCB scans of the fit is above the curve. The heaviest scans, drill and hammer, reach 0.87 and 0.97 of it.
 HEAVY_LITRE, HEAVY_GROWTH = 1.35, 0.5
+# Valid masses of an object [kg]. Below a gram, the trials measure payloads that are too low.
+MASSES = (1e-3, 100.0)
 
 # Settings for cutting reconstructed or guessed surfaces into convex parts. They are accurate to millimetres only.
 COARSE_CUTS: dict[str, Any] = {"tolerance": 0.003, "max_parts": 32, "surface_points": 2000}
@@ -354,8 +356,8 @@ def heavy_mass(volume: float) -> float:
 def refuse_numbers(source: str, *, mass: float | None, friction: float, resolution: int, scale: float = 1.0) -> None:
     if not (np.isfinite(scale) and scale > 0):
         raise MeshError(f"{source}: scale {scale!r} must be a positive number")
-    if mass is not None and not (np.isfinite(mass) and mass > 0):
-        raise MeshError(f"{source}: mass {mass!r} kg must be a positive number")
+    if mass is not None and not MASSES[0] <= mass <= MASSES[1]:
+        raise MeshError(f"{source}: mass {mass!r} kg; valid: {MASSES[0]:g} to {MASSES[1]:g} kg")
     # More is a percentage or an angle in degrees. Rubber has about 1.
     if not 0 < friction <= 5:
         raise MeshError(f"{source}: friction {friction!r}; valid: above 0, up to 5")

@@ -176,13 +176,16 @@ def _why_few(run: Run, scene: Scene, bound: BoundRestrictions, found: RoundsResu
     if found.good or found.context is None:
         return reason
     most = max(payloads(found.context, result.tried[:_WEIGHED], run.over), default=0.0)
-    best = f"the strongest grasp would hold {most:.2g} kg" if most > LEAST_PAYLOAD else ""
-    return "; ".join(filter(None, (reason, best)))
+    best = f"the strongest grasp would hold {most:.2g} kg" if most else f"none would hold {LEAST_PAYLOAD:g} kg"
+    return reason if run.over() else "; ".join(filter(None, (reason, best)))
 
 
 def _less_sure(scene: Scene, far: Float[np.ndarray, "3"], result: GraspResult) -> GraspResult:
     """Say in the result that no grasp is robust. Add the next view if possible. `far`: origin of the planning frame."""
     held = sum(grasp.verdict is Verdict.UNVERIFIED for grasp in result.tried)
+    if scene.evidence is None and held and result.mass is not None:
+        told = f"{held} grasps hold {result.mass:.2g} kg, but the object may weigh {scene.object.mass:.2g} kg"
+        return replace(result, message=f"{told}; {result.message}")
     if scene.evidence is None or not held:
         return result
     message, view = f"{held} grasps hold on the likeliest shape, but none is robust enough", None

@@ -256,10 +256,12 @@ def _too_weak(run: Run, scene: Scene, state: RoundsResult, lowered: float | None
     `lowered` is the lower mass that the strongest grasp lifts, if `_tried_lighter` weighed the grasps [kg].
     """
     context, least = state.context, light_end(scene.object.mass)
-    if context is None or context.checks is None or context.checks.doubts or len(state.grasps) < _ENOUGH:
+    if context is None or len(state.grasps) < _ENOUGH:
         return False
     if scene.object.mass_assumed:
         return lowered is not None and lowered < _LIFTED * least
+    if context.checks is None or context.checks.doubts:
+        return False
     world, protocol = context.trials.alone, context.trials.protocol
     lifts = (payload(world, grasp, protocol, least=least, stop=run.over) for grasp in state.grasps[:_WEIGHED])
     return not any(run.over() or lifted for lifted in lifts)

@@ -252,7 +252,7 @@ def doubted_if_weak(checks: RobustnessChecks, most: float, heavy: float) -> Robu
     if checks.doubts or most >= light_end(heavy):
         return checks
     doubt = f"the grasp lifts {most:.2g} kg, and too many objects of this volume weigh more"
-    return RobustnessChecks((), MASS_KNOWN.likeliest, doubts=(doubt,))
+    return RobustnessChecks((), MASS_KNOWN.likeliest if checks.stages else checks.probability, doubts=(doubt,))
 
 
 def less_sure(checks: RobustnessChecks, most: float, heavy: float) -> RobustnessChecks:

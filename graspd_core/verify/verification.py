@@ -18,6 +18,7 @@ import numpy as np
 import torch
 
 from graspd_core.config import VERIFICATIONS, CertaintyConfig, RobustConfig
+from graspd_core.config.planning_config import MASS_KNOWN
 from graspd_core.errors import ConfigError, short_repr
 from graspd_core.hands.model import HandModel
 from graspd_core.perception.scene import Scene, moved_grasp, near_scene, object_parts
@@ -140,9 +141,11 @@ def lighter(
     around = trials.around and altered(trials.around, mass=mass)
     trials = replace(trials, alone=altered(trials.alone, mass=mass), around=around)
     known = replace(scene, object=replace(scene.object, mass_assumed=False))
-    checks = robustness_checks_of(known, others, trials, certainty.probability)
-    checks = checks and doubted_if_weak(checks, most, scene.object.mass)
-    return replace(context, trials=trials, checks=checks, heavy=scene.object.mass)
+    # Without other checks, the shape is as sure as it was seen.
+    bare = RobustnessChecks((), 1.0 if scene.evidence is None else MASS_KNOWN.likeliest)
+    checks = robustness_checks_of(known, others, trials, certainty.probability) or bare
+    heavy = scene.object.mass
+    return replace(context, trials=trials, checks=doubted_if_weak(checks, most, heavy), heavy=heavy)
 
 
 def payloads(context: VerificationContext, grasps: Sequence[Grasp], stop: StopHook) -> list[float]:

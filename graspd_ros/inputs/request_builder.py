@@ -29,6 +29,7 @@ from graspd_core import Box, NearPoints, PointCloud, Scene, Sphere, Steering, Ta
 from graspd_core.errors import MeshError
 from graspd_core.io.messages import CameraPlace
 from graspd_core.perception.cloud.viewpoint_check import check_scene
+from graspd_core.perception.scene import MASSES
 from graspd_core.planning.regions import unit_vector
 from graspd_core.planning.steering import zero_of_roll
 from graspd_core.runtime.worker_process import run_isolated
@@ -37,7 +38,7 @@ from graspd_ros.error_codes import ErrorCode, RequestError, bad_request
 from graspd_ros.inputs import sensor_frames as seen
 from graspd_ros.inputs.sensor_frames import Lookup, SensorFrame, Views, cloud_frame, place_of
 from graspd_ros.inputs.solids import plane_of, with_support
-from graspd_ros.parameters import BUDGETS, MASSES, MOST_GRASPS, SCALES, Settings
+from graspd_ros.parameters import BUDGETS, MOST_GRASPS, SCALES, Settings
 from graspd_ros.request import MOST_ID, KnownObject, Listener, Request, SeenViews
 
 MOST_EXCLUDED = 256

@@ -42,7 +42,7 @@ BAD_OPTIONS: list[tuple[list[str], str]] = [
     (["--preset", "best"], f"unknown preset 'best'; valid: {', '.join(preset_names())}"),
     (["--preset", "mine/best.yaml"], "preset mine/best.yaml: no such file; valid: accurate"),
     (["-n", "many"], "invalid int value: 'many'"),
-    (["--mass", "-0.1"], "mass -0.1 kg must be a positive number"),
+    (["--mass", "-0.1"], "mass -0.1 kg; valid: 0.001 to 100 kg"),
     (["--units", "furlong"], "argument --units: 'furlong'; valid: m, cm, mm, inch"),
     (["--scale", "2", "--units", "mm"], "not allowed with argument"),
     (["--any", "--alone"], "not allowed with argument"),
@@ -515,9 +515,12 @@ def test_a_library_of_a_hand_that_cannot_lift_the_assumed_mass_is_gone_on_with(t
         description.write("\neffort: 4.0\n")
     words, out = ("shape:box", "--hand", str(tmp_path / "parallel_gripper.yaml")), tmp_path / "known.grasps"
     assert build(out, *words) == 0
-    assert "box: 2 of 2 grasps" in capsys.readouterr().out
+    told, heavy = capsys.readouterr(), load_scene("shape:box").object.mass
+    assert "box: 2 of 2 grasps" in told.out
+    assert f"the hand cannot hold the {heavy:.2g} kg that were assumed: grasps were tried at" in told.err
     ((entry, count),) = GraspLibrary(out).entries()
-    assert entry.mass < load_scene("shape:box").object.mass
+    assert entry.mass < heavy
+    assert entry.mass_assumed
     assert build(out, *words) == 0
     assert "box: the library has 2 grasps already" in capsys.readouterr().out
     assert GraspLibrary(out).entries() == [(entry, count)]

@@ -25,6 +25,7 @@ from graspd_core import (
     load_scene,
     plan_grasps,
 )
+from graspd_core.config.planning_config import light_end
 from graspd_core.errors import ConfigError, FormatError, MeshError
 from graspd_core.hands.kinematics import hand_mesh
 from graspd_core.io.grasps_json import result_document
@@ -247,7 +248,7 @@ def test_a_library_that_nobody_may_write_is_read(library: GraspLibrary, hand, tm
         (lambda path: path.write_text("grasps: none\n" * 500), "damaged or not a library"),
         (lambda path: os.truncate(path, path.stat().st_size // 2), "damaged or not a library"),
         (lambda path: _scribble(path), "damaged or not a library"),
-        (lambda path: _sql(path, "PRAGMA user_version = 7"), "library version 7 is unknown; valid: 1;"),
+        (lambda path: _sql(path, "PRAGMA user_version = 7"), "library version 7 is unknown; valid: 2;"),
         (lambda path: _sql(path, "PRAGMA application_id = 7"), "not a library of grasps"),
     ],
 )
@@ -399,25 +400,41 @@ def test_a_trial_that_was_stopped_refuses_no_grasp(library, scene, hand, planned
     assert "that failed near the support or an obstacle" not in ended.refused
 
 
-def test_of_an_unknown_mass_the_heaviest_are_given_first(library, scene, hand, planned):
-    masses = [0.05, 0.8, 0.4, 0.2]
-    for mass in masses:
-        target = load_scene("shape:sphere", mass=mass).object
-        library.add(entry_of(target, hand, "standard"), target, hand, load_preset("fast"), planned.tried[:1])
-    unknown = entry_of(load_scene("shape:sphere").object, hand, "standard")
-    found = [entry.mass for entry in library.of_mesh(unknown, any_mass=True)]
-    assert found == sorted([*masses, 0.1], reverse=True)
+def add_at(library: GraspLibrary, hand: HandModel, planned: GraspResult, mass: float, count: int) -> None:
+    target = load_scene("shape:sphere", mass=mass).object
+    library.add(entry_of(target, hand, "standard"), target, hand, load_preset("fast"), planned.tried[:count])
+
+
+def test_of_an_unknown_mass_the_heaviest_are_given_first_and_the_light_ones_never(library, scene, hand, planned):
+    for mass in (0.05, 0.4, 0.8, 0.2):
+        add_at(library, hand, planned, mass, 1)
+    unknown = load_scene("shape:sphere")
+    assert 0.2 < light_end(unknown.object.mass) < 0.4
+    assert [entry.mass for entry in library.of_mesh(entry_of(unknown.object, hand, "standard"))] == [0.8, 0.4]
+
+
+def test_what_was_stored_with_a_mass_is_not_verified_for_one_that_nobody_knows(library, hand, planned, ball):
+    unknown = load_scene(ball)
+    assert known_grasps(library, unknown, hand).grasps == ()
+    assert entry_by_file(library, hand, ball, 1.0, Physics(None, 0.6), required=False) is None
+    # Who names the object takes the library's mass.
+    assert entry_by_name(library, hand, "ball", Physics(None, 0.6)).mass == 0.1
+    with refused(ConfigError, "does not have it with 0.5 kg", "valid: 0.1 kg"):
+        entry_by_name(library, hand, "ball", Physics(0.5, 0.6))
+    (entry,) = {entry for entry, _ in library.entries(name="ball")}
+    assert not entry.mass_assumed
+    assert entry_of(unknown.object, hand, "standard").mass_assumed
 
 
 def test_of_an_unknown_mass_the_least_mass_in_the_trials_is_told(library, scene, hand, planned):
-    heavy, unknown = load_scene("shape:sphere", mass=0.8).object, load_scene("shape:sphere")
-    library.add(entry_of(heavy, hand, "standard"), heavy, hand, load_preset("fast"), planned.tried[:2])
+    unknown = load_scene("shape:sphere")
+    add_at(library, hand, planned, 0.8, 2)
+    add_at(library, hand, planned, 0.4, 2)
     found = known_grasps(library, unknown, hand, count=2)
     assert (found.mass, found.tried_mass) == (None, 0.8)
-    # The other grasps of the library were tried at 0.1 kg.
     for found in (known_grasps(library, unknown, hand, count=3), known_or_planned(library, unknown, hand, count=3)):
-        assert (found.mass, found.tried_mass, len(found.grasps)) == (0.1, 0.1, 3)
-        assert "tried at 0.1 kg" in found.message
+        assert (found.mass, found.tried_mass, len(found.grasps)) == (0.4, 0.4, 3)
+        assert "tried at 0.4 kg" in found.message
     assert known_grasps(library, scene, hand).tried_mass == scene.object.mass
 
 
@@ -433,10 +450,11 @@ def test_of_an_unknown_mass_trials_near_the_support_have_the_mass_of_the_entry(
 
     monkeypatch.setattr(module, "grasp_trials", weighed)
     about = at_height(load_scene("shape:sphere"), hand, planned, 0.01)
+    add_at(library, hand, planned, 0.4, 4)
     result = known_grasps(library, about, hand, count=4)
     assert about.object.mass > 0.5
-    assert result.tried_mass == 0.1
-    assert set(tried) == {0.1}
+    assert result.tried_mass == 0.4
+    assert set(tried) == {0.4}
 
 
 @pytest.mark.parametrize(
@@ -474,11 +492,11 @@ def ball(library: GraspLibrary, hand: HandModel, planned: GraspResult, tmp_path:
 def test_an_object_is_found_by_name_and_by_file(library: GraspLibrary, hand: HandModel, ball: Path, tmp_path: Path):
     by_name = entry_by_name(library, hand, "ball", PHYSICS)
     assert entry_by_file(library, hand, ball, 1.0, PHYSICS) == by_name
-    # Whatever the file is called, and with the only mass that there is.
+    # Whatever the file is called, and for a lighter one.
     copy = tmp_path / "copy.obj"
     copy.write_bytes(ball.read_bytes())
     assert entry_by_file(library, hand, copy, 1.0, PHYSICS) == by_name
-    assert entry_by_name(library, hand, "ball", Physics(0.5, 0.6)) == by_name
+    assert entry_by_name(library, hand, "ball", Physics(0.05, 0.6)) == by_name
     assert entry_by_file(library, hand, ball, 1.1, PHYSICS, required=False) is None
 
 

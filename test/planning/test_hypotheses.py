@@ -33,7 +33,7 @@ from graspd_core.perception import scene as scene_module
 from graspd_core.perception.reconstruct.merge_views import Evidence
 from graspd_core.perception.scene import COARSE_CUTS, ObjectModel, Scene, moved_grasp, object_parts
 from graspd_core.planning.rounds import rounds_of, run_rounds
-from graspd_core.types import ROBUSTNESS, Grasp, GraspResult, Posture, Stage, StopHook, TrialResult, Verdict
+from graspd_core.types import ROBUSTNESS, Grasp, GraspResult, Outcome, Posture, Stage, StopHook, TrialResult, Verdict
 from graspd_core.verify import robustness as hypotheses
 from graspd_core.verify import verification
 from graspd_core.verify.hold_trial import hold_trial
@@ -327,7 +327,7 @@ def test_a_grasp_is_as_sure_as_objects_are_lighter_than_its_own_payload():
         share = share_as_light(payloads[id(grasp.grasp)], heavy)
         verified = grasp.verdict is Verdict.VERIFIED
         assert verified == (share >= LEAST_LIGHT)
-        assert grasp.probability == pytest.approx(share * (PASSED if verified else MASS_KNOWN.likeliest))
+        assert grasp.probability == pytest.approx(share * PASSED)
     assert {grasp.verdict for grasp in tried} == {Verdict.VERIFIED, Verdict.UNVERIFIED}
 
 
@@ -367,6 +367,24 @@ def test_rounds_end_if_no_grasp_lifts_most_such_objects(preset, assumed, most):
     assert (found.mass or 0.0) < light_end(heavy)
     # A further round would try grasps at the least mass that counts.
     assert some(found.context).mass == pytest.approx(light_end(heavy) if assumed else heavy)
+
+
+@pytest.mark.parametrize(("mass", "verified"), [(5.0, True), (12.0, False)])
+def test_a_mesh_is_not_verified_at_a_mass_that_most_such_objects_exceed(mass: float, verified: bool):
+    box = load_scene("shape:box")
+    scene = replace(box, object=box.object.at_mass(mass))
+    result = plan_grasps(scene, load_hand("parallel_gripper"), count=1, preset="fast")
+    assert (result.outcome is Outcome.SUCCEEDED) == verified
+    assert some(result.mass) < mass
+    best = result.tried[0]
+    if verified:
+        assert some(some(best.metrics)["payload"]) >= light_end(mass)
+        assert LEAST_LIGHT <= some(best.probability) < 1
+    else:
+        assert best.verdict is Verdict.UNVERIFIED
+        assert "too many objects of this volume weigh more" in best.reason
+        assert some(best.probability) < LEAST_LIGHT
+        assert "but the object may weigh 12 kg; " in result.message
 
 
 def test_what_is_tried_at_less_mass_begins_with_the_strongest():

@@ -92,18 +92,18 @@ def unread(monkeypatch: pytest.MonkeyPatch) -> None:
 )
 def test_a_known_object_is_answered_where_it_stands_without_its_mesh_being_read(folder, hand, unread, fields):
     there = Pose(position=Point(x=5.0))
-    planned = Node(hand).answer(**fields, header=Header(frame_id="world"), object_pose=there)
+    # Of a mesh, only the request can tell the mass.
+    mass = 0.1 if "mesh_uri" in fields else 0.0
+    planned = Node(hand, mass=mass).answer(**fields, header=Header(frame_id="world"), object_pose=there)
     assert planned.result.outcome is Outcome.SUCCEEDED
     assert len(planned.result.grasps) == 2
     assert all(abs(grasp.grasp.position[0] - 5.0) < 0.3 for grasp in planned.result.grasps)
     assert "2 grasps from the library known.grasps" in planned.result.message
-    assert planned.mass == 0.1
-    assert planned.mass_assumed == ("mesh_uri" in fields)
-    assert not Node(hand, mass=0.1).answer(**fields).mass_assumed
+    assert (planned.mass, planned.mass_assumed) == (0.1, False)
 
 
 def test_a_mesh_named_by_its_path_alone_is_known_too(folder: Path, hand: HandModel, unread: None):
-    assert "2 grasps from the library known.grasps" in Node(hand).answer_path("ball.obj").result.message
+    assert "2 grasps from the library known.grasps" in Node(hand, mass=0.1).answer_path("ball.obj").result.message
 
 
 def test_grasps_that_were_lost_are_left_out(folder: Path, hand: HandModel, unread: None):
@@ -132,7 +132,19 @@ def test_a_mesh_that_is_new_is_planned_for_once(folder: Path, hand: HandModel, m
     save_mesh(folder / "new.obj", make_shape("capsule"))
     assert "0 grasps from the library known.grasps, and 2 newly planned" in node.answer(**new).result.message
     monkeypatch.setattr(known_objects, "known_or_planned", None)
-    assert "2 grasps from the library known.grasps" in node.answer(**new).result.message
+    for again in (new, known(known_object="new")):
+        planned = node.answer(**again)
+        assert "2 grasps from the library known.grasps" in planned.result.message
+        assert planned.mass_assumed
+
+
+def test_a_mesh_of_unknown_mass_gets_no_grasp_of_a_light_one(folder: Path, hand: HandModel):
+    planned = Node(hand).answer(source=GraspRequest.MESH, mesh_uri="ball.obj")
+    assert "0 grasps from the library known.grasps, and 2 newly planned" in planned.result.message
+    assert planned.mass_assumed
+    assert planned.mass > 0.5
+    with pytest.raises(ConfigError, match="does not have it with unknown mass"):
+        Node(hand, verify="hard").answer(source=GraspRequest.KNOWN, mesh_uri="ball.obj")
 
 
 def test_a_direction_and_a_surface_are_kept(folder: Path, hand: HandModel):
@@ -154,7 +166,7 @@ def test_a_direction_and_a_surface_are_kept(folder: Path, hand: HandModel):
     ("fields", "settings", "error", "told"),
     [
         (known(), {"grasp_library": ""}, GraspdError, "KNOWN=4 needs a library; set the parameter grasp_library"),
-        (known(), {"verify": "hard"}, ConfigError, "does not have it with any mass, friction 0.6, hard trials"),
+        (known(), {"verify": "hard"}, ConfigError, "does not have it with unknown mass, friction 0.6, hard trials"),
         (known(mesh_uri="ball.obj"), {}, GraspdError, "known_object: 'ball' with mesh_uri too; valid: source KNOWN=4"),
         (
             {"source": GraspRequest.LATEST_CLOUD, "surface": Plane(coef=[0.0, 0.0, 1.0, 0.0])},

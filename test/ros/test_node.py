@@ -67,7 +67,7 @@ def test_the_answer_says_what_the_object_weighed_and_whether_anybody_said_so(cli
     assert unknown.mass_assumed
     assert unknown.mass > 0.1
     client.send_request(id="heavy", mass=float("nan"), **SPHERE)
-    assert "mass: nan; valid: 1e-06 to 100 kg, 0 for the parameter" in client.answer("heavy").message
+    assert "mass: nan; valid: 0.001 to 100 kg, 0 for the parameter" in client.answer("heavy").message
 
 
 def test_bad_input_is_named_and_the_node_lives_on(client, node, make_cloud):

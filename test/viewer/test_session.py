@@ -8,8 +8,10 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from expected import some
 
 from graspd_core.errors import FormatError, HandError, MeshError
+from graspd_core.optimize.plan_config import PlanConfig
 from graspd_core.types import ROBUSTNESS, Snapshot, TrialResult, Verdict
 from graspd_core.verify.prepared_grasp import make_metrics_context
 from graspd_viewer.drawing import (
@@ -25,7 +27,7 @@ from graspd_viewer.grasp_list import figures_html, label, listed, table_html
 from graspd_viewer.live_view import LiveView
 from graspd_viewer.scene_nodes import SceneNodes
 from graspd_viewer.server import LatestJobs
-from graspd_viewer.session import open_grasps
+from graspd_viewer.session import make_session, open_grasps
 
 
 def changed(grasps_file, tmp_path, **changes):
@@ -43,7 +45,14 @@ def test_a_file_gives_what_was_saved(grasps_file, result):
     assert session.hand.name == "parallel_gripper"
     assert [g.verdict for g in session.grasps] == [g.verdict for g in result.tried]
     assert session.scene is not None
-    assert session.notes == ()
+    assert session.notes == result.warnings
+    assert "no mass was given" in session.notes[0]
+
+
+def test_what_was_tried_at_less_mass_is_shown_at_that_mass(grasps_file):
+    heavy = open_grasps(grasps_file)
+    lighter = make_session("", heavy.hand, (), some(heavy.scene), PlanConfig(), heavy.seen, (), mass=0.1)
+    assert some(lighter.scene).object.mass == 0.1 < some(heavy.scene).object.mass
 
 
 def test_an_object_that_is_gone_or_another_is_said(grasps_file, tmp_path):
