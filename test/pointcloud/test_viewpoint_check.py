@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from expected import some
 
-from graspd_bench.rendering.depth_noise import DEFAULT
+from graspd_bench.rendering.depth_noise import DEFAULT, LOW, DepthNoise
 from graspd_bench.rendering.tabletop import depth_views, ring_poses, tabletop
 from graspd_core import PointCloud, Target, load_scene, make_shape, scene_from_views
 from graspd_core.config import SegmentationConfig
@@ -31,11 +31,13 @@ BASES = {
 }
 
 
-def seen(shape: str, elevation: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def seen(
+    shape: str, elevation: float, yaw: float = 0.4, noise: DepthNoise = DEFAULT
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Pixels, finite points and the camera's place of a view of a shape on a table, in the world frame."""
-    scene = tabletop(shape, yaw=0.4, obstacles=[("box", 0.15, 0.05)])
+    scene = tabletop(shape, yaw=yaw, obstacles=[("box", 0.15, 0.05)])
     T = ring_poses(1, elevation=elevation, azimuth=0.3)[0]
-    depth = depth_views(scene, CAMERA, [T], DEFAULT, seed=3)[0][0]
+    depth = depth_views(scene, CAMERA, [T], noise, seed=3)[0][0]
     rays = camera_rays(CAMERA) * np.where(depth > 0, depth, np.nan)[..., None]
     grid = rays @ T[:3, :3].T + T[:3, 3]
     flat = grid.reshape(-1, 3)
@@ -68,6 +70,14 @@ def test_the_true_place_is_taken_and_the_places_of_robots_are_refused(shape, ele
         # The fit is to a pixel or so; the frame of the figure is the cloud's.
         np.testing.assert_allclose([float(x) for x in told.split(",")], place, atol=0.005)
         assert is_refused(PointCloud(thing, np.array(base)), replace(cloud, viewpoint=np.array(base)))
+
+
+@pytest.mark.parametrize(("yaw", "elevation"), [(0.4, 0.5), (0.4, 1.1), (1.4, 1.1), (2.4, 0.8)])
+def test_inside_and_outside_of_a_thin_wall_are_two_surfaces(yaw: float, elevation: float):
+    grid, _, place = seen("mug", elevation, yaw, LOW)
+    points = grid.reshape(-1, 3)[np.isfinite(grid).all(-1).ravel()]
+    thing = points[(np.abs(points[:, :2]) < 0.1).all(1) & (points[:, 2] > 0.008)]
+    assert check_viewpoint(PointCloud(thing, place), PointCloud(points, place), np.array([0.0, 0.0, 1.0])) == ""
 
 
 def test_another_cloud_from_the_same_place_does_not_hide_that_the_camera_was_elsewhere():
