@@ -8,7 +8,9 @@ an error that names the known time span.
 from __future__ import annotations
 
 import bisect
+import math
 import threading
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -22,6 +24,8 @@ HISTORY = 10 * SECOND
 _RIGID = 1e-3
 # Greatest valid translation [m]. No two points on Earth are farther apart.
 _FARTHEST = 1e8
+# A camera rested if it moved and turned by less than this between two views [m], [rad].
+_AT_REST, _AT_REST_TURN = 0.005, 0.01
 
 
 @dataclass
@@ -79,11 +83,12 @@ class TransformBuffer:
     def lookup(self, target: str, source: str, stamp: int | None = None) -> Float[np.ndarray, "4 4"]:
         """Return `T_target_source` at `stamp` [ns], by default at the newest time that all frames in between cover.
 
+        An empty `target` is the root above `source`.
         Raises TransformError: a frame is unknown, the frames are not connected, or the time is outside the known span.
         """
-        target, source = _name(target), _name(source)
+        source = _name(source)
         with self._lock:
-            known = self.frames()
+            target, known = _name(target or self._chain(source)[-1]), self.frames()
             for name in (target, source):
                 if name not in known:
                     told = f"unknown frame {name!r}; known: {', '.join(known) or 'none'}"
@@ -140,6 +145,17 @@ class TransformBuffer:
         for name in names:
             pose = _pose_at(self._links[name], name, stamp, what) @ pose
         return pose
+
+
+def refuse_motion(frame: str, poses: Sequence[Float[np.ndarray, "4 4"]]) -> None:
+    """Raise TransformError if a camera frame moved between views, whose `poses` are in a fixed frame [m]."""
+    far = max((float(np.linalg.norm(pose[:3, 3] - poses[0][:3, 3])) for pose in poses), default=0.0)
+    apart = max((float(np.linalg.norm(pose[:3, :3] - poses[0][:3, :3])) for pose in poses), default=0.0)
+    # Two rotation matrices with the angle a in between differ by a matrix of the norm 2 √2 sin(a / 2).
+    turn = 2 * math.asin(min(apart / math.sqrt(8), 1.0))
+    if far > _AT_REST or turn > _AT_REST_TURN:
+        told = f"frame {frame} moved by {1e3 * far:.0f} mm and {math.degrees(turn):.1f}° between views"
+        raise TransformError(f"{told}; put the views into a fixed frame: fixed_frame of the node, or --frame")
 
 
 def _pose_at(link: _Link, name: str, stamp: int, what: str) -> Float[np.ndarray, "4 4"]:

@@ -72,8 +72,17 @@ def answer_known(
         if len(grasps) >= count:
             found = library_result(library, grasps, count, time.perf_counter() - began)
             assumed = not settings.mass and (entry.mass_assumed or not known.name)
-            return replace(found, mass=entry.mass, tried_mass=entry.mass), None, assumed
+            found = replace(found, mass=entry.mass, tried_mass=entry.mass, warnings=_other_friction(entry, settings))
+            return found, None, assumed
     scene = request.load()
     plan |= {"deadline": max(request.time_left(), 1e-3), "count": count, "restrictions": restrictions}
     result = known_or_planned(library, scene, hand, wanted=lambda grasps: unlike(grasps, excluded), **plan)
-    return result, scene, scene.object.mass_assumed
+    warnings = (*result.warnings, *_other_friction(entry, settings))
+    return replace(result, warnings=warnings), scene, scene.object.mass_assumed
+
+
+def _other_friction(entry: LibraryEntry | None, settings: Settings) -> tuple[str, ...]:
+    if entry is None or entry.friction <= settings.friction:
+        return ()
+    told = f"{entry.name}: grasps were tried at the library's friction of {entry.friction:g}"
+    return (f"{told}, above the parameter's {settings.friction:g}",)

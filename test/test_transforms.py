@@ -85,6 +85,14 @@ def test_without_a_time_it_is_the_newest_that_all_links_know():
     assert buffer.lookup("map", "camera")[:3, 3] == pytest.approx([2, 2, 1])
 
 
+def test_no_target_is_the_root():
+    buffer = TransformBuffer()
+    buffer.add("world", "arm", pose([1.0, 0.0, 0.0]), static=True)
+    buffer.add("arm", "hand", pose([0.0, 2.0, 0.0]), static=True)
+    np.testing.assert_allclose(buffer.lookup("", "hand")[:3, 3], [1.0, 2.0, 0.0])
+    np.testing.assert_allclose(buffer.lookup("", "world"), np.eye(4))
+
+
 def test_the_order_of_arrival_does_not_matter():
     buffer = TransformBuffer()
     for second in (3, 1, 2, 1):

@@ -36,20 +36,21 @@ _ALONG = np.concatenate([[0.0], *(k + np.arange(1, steps + 1) / steps for k, ste
 _SHARES = np.maximum(1.0 - np.abs(_ALONG[:, None] - np.arange(len(STAGE_ROWS))), 0.0)
 
 
-def hand_paths(grasps: Sequence[Grasp], approach: Float[np.ndarray, "3"], up: Float[np.ndarray, "3"]) -> SE3:
+def hand_paths(grasps: Sequence[Grasp], approach: Float[np.ndarray, "3"], up: Float[np.ndarray, "3"] | None) -> SE3:
     """Return `T_scene_hand` at the waypoints of each grasp. The batch shape is (grasps, waypoints).
 
     Args:
         grasps: the grasps. From pregrasp to grasp, the hand moves on a straight line, with the shortest rotation.
         approach: unit direction in which the hand moves towards an object, hand frame.
-        up: unit direction of the lift, scene frame.
+        up: unit direction of the lift, scene frame. None: back along the approach, as in the lift trial.
     """
     postures = ([grasp.pregrasp for grasp in grasps], [grasp.grasp for grasp in grasps])
     before, there = ([torch.as_tensor(rows) for rows in stacked(some)] for some in postures)
     begun = drawn_back(before[0], rotation_from_quaternion(before[1]), torch.as_tensor(approach))
     # Both signs of a quaternion give the same rotation. The sign nearer to the pregrasp gives the shortest path.
     sign = torch.where((before[1] * there[1]).sum(-1, keepdim=True) < 0, -1.0, 1.0)
-    raised = there[0] + LIFT * torch.as_tensor(up)
+    away = drawn_back(there[0], rotation_from_quaternion(there[1]), torch.as_tensor(approach))
+    raised = away if up is None else there[0] + LIFT * torch.as_tensor(up)
     corners = torch.stack([begun, before[0], there[0], raised], 1)
     turns = torch.stack([before[1], before[1], sign * there[1], sign * there[1]], 1)
     shares = torch.as_tensor(_SHARES)
@@ -85,9 +86,9 @@ class ArmTask:
     bounds: Float[Tensor, "2 points"]
 
     @property
-    def up(self) -> Float[np.ndarray, "3"]:
-        """Direction of the lift, scene frame: the support's normal. Without a support, the z axis of the arm's base."""
-        return self.base.rotation[:, 2].numpy() if self.scene.support is None else self.scene.support.normal
+    def up(self) -> Float[np.ndarray, "3"] | None:
+        """Direction of the lift, scene frame: the support's normal. None without a support."""
+        return self.scene.support and self.scene.support.normal
 
 
 def make_task(arm: Arm, hand: HandModel, scene: Scene, base: SE3) -> ArmTask:

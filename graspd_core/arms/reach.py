@@ -117,7 +117,7 @@ class BoundReach(BoundRestriction):
         task, at = self.task, torch.as_tensor(positions)
         rotation = rotation_from_quaternion(torch.as_tensor(quaternions))
         retreat = drawn_back(at, rotation, torch.as_tensor(task.hand.approach))
-        lift = at + LIFT * torch.as_tensor(task.up)
+        lift = retreat if task.up is None else at + LIFT * torch.as_tensor(task.up)
         allowed = torch.arange(len(at))
         for there in (at, retreat, lift):
             tip = tip_poses(task, SE3(rotation[allowed], there[allowed]))

@@ -16,6 +16,7 @@ from graspd_core.cli.running import EXIT_INTERRUPTED, EXIT_OK, EXIT_TOO_FEW, Dea
 from graspd_core.config import VERIFICATIONS, SceneConfig, load_scene_config
 from graspd_core.errors import BagError, CloudError, ConfigError, TransformError
 from graspd_core.optimize.plan_config import PlanConfig, load_plugin, load_preset, preset_names
+from graspd_core.transforms import refuse_motion
 from graspd_core.types import GraspResult, Outcome, Timing
 
 if TYPE_CHECKING:
@@ -283,7 +284,7 @@ def merged_views(path: Path, options: argparse.Namespace) -> tuple[PointCloud, .
 
     Raises BagError: no cloud is usable, the clouds are in several frames, or there are too many without --limit.
     """
-    views, names, refusals = [], set(), []
+    views, stamps, names, refusals = [], [], set(), []
     for frame, seen in bag_views(path, options):
         if isinstance(seen, str):
             refusals.append(f"cloud {frame.index}: {seen}")
@@ -291,6 +292,7 @@ def merged_views(path: Path, options: argparse.Namespace) -> tuple[PointCloud, .
         if len(views) == MOST_VIEWS and options.limit is None:
             raise BagError(f"{path}: more than {MOST_VIEWS} clouds to fuse; choose some with --every or --limit")
         views.append(seen)
+        stamps.append(frame.stamp or frame.received)
         names.add(options.frame or frame.frame)
     if refusals and not views:
         raise BagError(f"{path}: {refusals[0]}")
@@ -299,7 +301,21 @@ def merged_views(path: Path, options: argparse.Namespace) -> tuple[PointCloud, .
         print_note(f"{len(refusals)} of {count} clouds are left out, the first: {refusals[0]}")
     if len(names) > 1:
         raise BagError(f"{path}: clouds in several frames ({', '.join(sorted(names))}); name one with --frame")
+    if len(views) > 1 and not options.frame:
+        _refuse_moving_camera(path, names.pop(), stamps)
     return tuple(views)
+
+
+def _refuse_moving_camera(path: Path, frame: str, stamps: Sequence[int]) -> None:
+    from graspd_core.io.bags import read_transforms
+
+    try:
+        transforms = read_transforms(path)
+        poses = [transforms.lookup("", frame, stamp) for stamp in stamps]
+    except (BagError, TransformError):
+        # Without transforms nobody can tell.
+        return
+    refuse_motion(frame, poses)
 
 
 def load_views(path: Path, options: argparse.Namespace) -> tuple[PointCloud, ...]:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 import time
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -50,6 +50,8 @@ class _Job:
 
     name: str
     label: str
+    frame: str
+    stamp: float | None = None
     views: tuple[PointCloud, ...] = ()
     refusal: str = ""
 
@@ -166,7 +168,7 @@ def _planned(
         print_note(f"{job.label}: {warning}")
     if options.out:
         path = options.out if options.out.suffix == ".json" else options.out / f"{job.name}.json"
-        save_result(path, result, scene.object, hand, config)
+        save_result(path, result, scene.object, hand, config, frame=job.frame, stamp=job.stamp)
     return result, {**result_document(result, scene.object, hand, config), **about}
 
 
@@ -174,12 +176,13 @@ def _jobs(options: argparse.Namespace) -> Iterator[_Job]:
     """Yield one job per cloud. With `--fuse`, yield one job with all clouds."""
     if options.fuse:
         views = merged_views(options.bag, options)
-        yield _Job("fused", f"{len(views)} clouds fused", views)
+        yield _Job("fused", f"{len(views)} clouds fused", options.frame or "", views=views)
         return
     for frame, seen in bag_views(options.bag, options):
         name = f"cloud_{frame.index:06d}"
         label = f"cloud {frame.index} at {frame.stamp // SECOND}.{frame.stamp % SECOND:09d} s"
-        yield _Job(name, label, refusal=seen) if isinstance(seen, str) else _Job(name, label, (seen,))
+        job = _Job(name, label, options.frame or frame.frame, frame.stamp / SECOND)
+        yield replace(job, refusal=seen) if isinstance(seen, str) else replace(job, views=(seen,))
 
 
 def _status(statuses: list[int]) -> int:

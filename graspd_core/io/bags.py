@@ -42,6 +42,7 @@ class BagFrame:
     Attributes:
         index: index among the topic's messages.
         stamp: time stamp of the header [ns].
+        received: time at which the recorder received the message [ns].
         frame: frame id of the header.
         topic: topic of the message.
         message: a PointCloud2, a depth Image, or a CompressedImage with depth.
@@ -50,6 +51,7 @@ class BagFrame:
 
     index: int
     stamp: int
+    received: int
     frame: str
     topic: str
     message: Any
@@ -64,8 +66,9 @@ class BagFrame:
             CloudError: the message is broken or has no usable point.
             TransformError: the transform from the message's frame to `target` is not known at the stamp.
         """
-        # Some drivers leave the stamp at zero. Then use the newest transform.
-        lookup = no_lookup if transforms is None else lambda to, of: transforms.lookup(to, of, self.stamp or None)
+        # Some drivers leave the stamp at zero. The camera may have moved since it saw the cloud.
+        at = self.stamp or self.received
+        lookup = no_lookup if transforms is None else lambda to, of: transforms.lookup(to, of, at)
         if self.info is None:
             cloud = place.cloud(self.message, lookup)
         else:
@@ -138,7 +141,7 @@ def read_frames(
             # The first CameraInfo may be recorded after the first image.
             info = _first(path, reader, info_name)
         index = taken = 0
-        for connection, _, raw in _messages(path, reader, connections):
+        for connection, received, raw in _messages(path, reader, connections):
             if connection.msgtype == INFO:
                 info = _decode(path, reader, connection, raw)
                 continue
@@ -146,7 +149,8 @@ def read_frames(
                 if limit is not None and taken == limit:
                     return
                 message = _decode(path, reader, connection, raw)
-                yield BagFrame(index, stamp_of(message), message.header.frame_id, chosen.name, message, info)
+                stamp, frame = stamp_of(message), message.header.frame_id
+                yield BagFrame(index, stamp, received, frame, chosen.name, message, info)
                 taken += 1
             index += 1
 

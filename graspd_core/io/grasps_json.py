@@ -21,7 +21,7 @@ from graspd_core.runtime.disk_cache import save_bytes
 from graspd_core.types import ARM_STAGES, ArmPath, Contact, Grasp, GraspMetrics, GraspResult, Posture, TrialResult
 from graspd_core.verify.metrics import METRICS
 
-FORMAT, VERSION = "graspd/grasps", 2
+FORMAT, VERSION, _UNITS = "graspd/grasps", 2, "m, rad, N"
 _LIBRARIES = ("graspd", "torch", "mujoco", "open3d", "numpy")
 
 
@@ -30,7 +30,7 @@ def result_document(result: GraspResult, target: ObjectModel, hand: HandModel, c
     return {
         "format": FORMAT,
         "version": VERSION,
-        "units": "m, rad, N",
+        "units": _UNITS,
         "outcome": {
             "name": result.outcome.name,
             "message": result.message or result.outcome.value,
@@ -201,6 +201,8 @@ def load_document(path: str | Path) -> dict[str, Any]:
     if document.get("version") not in (1, VERSION):
         version = short_repr(document.get("version"))
         raise FormatError(f"{path}: version {version} is unknown; this reader knows 1 and {VERSION}")
+    if (units := document.get("units", _UNITS)) != _UNITS:
+        raise FormatError(f"{path}: units {short_repr(units)}; valid: {_UNITS!r}")
     return document
 
 
@@ -243,13 +245,19 @@ def _grasp_of(values: dict[str, Any], actuated: Bool[np.ndarray, "movable"]) -> 
         metrics=_metrics_of(values["metrics"]),
         trials=tuple(_trial_of(trial) for trial in values["trials"]),
         # Files from before probabilities do not have the key "probability".
-        probability=_scaled({"probability": None, **values}, "probability", 1.0),
+        probability=_probability_of(values.get("probability")),
         # Files from before arms do not have the key "arm".
         arm=_arm_of(values["arm"]) if values.get("arm") is not None else None,
     )
     if values["verdict"] != grasp.verdict:
         raise ValueError(f"verdict: {short_repr(values['verdict'])}; expected {grasp.verdict}, by the trials")
     return grasp
+
+
+def _probability_of(value: Any) -> float | None:
+    if value is not None and not 0 <= value <= 1:
+        raise ValueError(f"probability: {short_repr(value)}; expected 0 to 1")
+    return None if value is None else float(value)
 
 
 def _from_version_1(values: dict[str, Any]) -> dict[str, Any]:

@@ -16,12 +16,13 @@ from jaxtyping import Float
 from scipy.spatial import ConvexHull, KDTree
 
 from graspd_core.config import ObstacleConfig, SceneConfig
+from graspd_core.errors import ConfigError
 from graspd_core.mesh.convex_parts import convex_hull, hull_surface, limited_hull
 from graspd_core.mesh.mesh_files import surface_samples
-from graspd_core.mesh.surface_queries import winding_inside
+from graspd_core.mesh.surface_queries import make_surface, surface_distance, winding_inside
 from graspd_core.mesh.topology import scaled_normals
 from graspd_core.perception.cloud.point_cloud import Points, Vector
-from graspd_core.perception.scene import Obstacle, Scene, make_obstacle
+from graspd_core.perception.scene import DEEPEST, SPARE, Obstacle, Scene, make_obstacle
 from graspd_core.se3 import perpendicular, rotation_from_quaternion
 from graspd_core.types import Plane, Posture, TriangleMesh
 
@@ -127,29 +128,50 @@ def with_neighbours(
     """Return the scene with collision objects, e.g. of a MoveIt planning scene, added as obstacles.
 
     A collision object that largely overlaps the target is taken for the target, and left out with a warning. Collision
-    objects that do not rise above the support, or that are too far away, are left out without a warning.
+    objects that do not rise above the support, or that are too far away, are left out without a warning. A collision
+    object that reaches deep into an object which cameras saw is a doubt.
 
     Args:
         scene: the scene of the object to grasp.
         things: closed meshes of each collision object by its name, in the object's frame [m].
         settings: `segmentation.obstacle_range` limits distances from the object. `obstacles` holds the hulls' settings.
+
+    Raises ConfigError: a collision object reaches deep into an object whose surface is known.
     """
     settings = settings or SceneConfig()
     mesh, reach = scene.object.mesh, settings.segmentation.obstacle_range
     low, high = mesh.vertices.min(0) - reach, mesh.vertices.max(0) + reach
     support = scene.support
     level = 0.0 if support is None else support.offset + settings.obstacles.padding
-    found, same = [], []
+    found, same, doubts = [], [], []
     for name, shapes in things.items():
         near = [s for s in shapes if (s.vertices.min(0) <= high).all() and (s.vertices.max(0) >= low).all()]
         if near and _overlap(np.concatenate([s.vertices for s in shapes]), mesh.vertices) >= _SAME:
             same.append(f"collision object {name!r} fills the place of the object to grasp and counts as that object")
             continue
+        if (deep := _deepest_in(scene, near)) > DEEPEST:
+            doubts.append(f"collision object {name!r} reaches {1e3 * deep:.0f} mm into the object to grasp")
         points = [_points_within(shape, low, high) for shape in near]
         found += [p for p in points if len(p) and (support is None or (p @ support.normal).max() > level)]
     obstacles = make_obstacles(found, None, mesh, reach, settings.obstacles) if found else ()
-    warnings = (*scene.object.warnings, *same)
-    return replace(scene, object=replace(scene.object, warnings=warnings), obstacles=(*scene.obstacles, *obstacles))
+    warnings, evidence = (*scene.object.warnings, *same), scene.evidence
+    if doubts and evidence is None:
+        raise ConfigError(f"{doubts[0]}; valid: at most {1e3 * DEEPEST:.0f} mm; correct its pose or the object's")
+    evidence = evidence and replace(evidence, doubts=(*evidence.doubts, *doubts))
+    scene = replace(scene, object=replace(scene.object, warnings=warnings), evidence=evidence)
+    return replace(scene, obstacles=(*scene.obstacles, *obstacles))
+
+
+def _deepest_in(scene: Scene, shapes: Sequence[TriangleMesh]) -> float:
+    """Return how deep the known surface of the scene's object is in the shapes [m]."""
+    points = scene.known_points()
+    depths = np.zeros(len(points))
+    for shape in shapes:
+        places = np.flatnonzero(((points > shape.vertices.min(0)) & (points < shape.vertices.max(0))).all(1))
+        places = places[winding_inside(shape, points[places])] if len(places) else places
+        if len(places):
+            depths[places] = np.maximum(depths[places], surface_distance(make_surface(shape), points[places]))
+    return float(np.quantile(depths, 1.0 if scene.evidence is None else 1.0 - SPARE))
 
 
 def _overlap(a: Float[np.ndarray, "_ 3"], b: Float[np.ndarray, "_ 3"]) -> float:

@@ -20,10 +20,10 @@ from scipy.ndimage import distance_transform_edt
 from scipy.spatial import KDTree
 from torch import Tensor
 
-from graspd_core.errors import MeshError
+from graspd_core.errors import ConfigError, MeshError
 from graspd_core.mesh.components import bodies_apart
 from graspd_core.mesh.convex_parts import convex_parts
-from graspd_core.mesh.mesh_files import check_mesh, content_hash, mass_properties
+from graspd_core.mesh.mesh_files import check_mesh, content_hash, mass_properties, surface_samples
 from graspd_core.mesh.sdf import GridSDF, build_sdf, grid_layout, interpolate, is_solid
 from graspd_core.mesh.sharp_features import sharp_points
 from graspd_core.mesh.topology import far_centre, moved_mesh
@@ -169,6 +169,34 @@ class Scene:
     confidence: Float[torch.Tensor, "x y z"] | None = None
     evidence: Evidence | None = None
 
+    def known_points(self) -> Float[np.ndarray, "points 3"]:
+        """Return points on that part of the object's surface which was not guessed [m]."""
+        if self.evidence is None:
+            return np.vstack([self.object.mesh.vertices, surface_samples(self.object.mesh, _KNOWN_SAMPLES, 0)[0]])
+        return self.evidence.seen.points @ self.evidence.rotation.T + self.evidence.origin
+
+
+# Poses of objects, planes and obstacles are inexact. So an object may be this deep in another body, and this far above
+# its support [m]. Cameras measure a few points far off: this fraction of an object's seen points does not count.
+DEEPEST, _HIGHEST, SPARE = 0.01, 0.03, 0.05
+_KNOWN_SAMPLES = 2000
+
+
+def on_support(scene: Scene, support: Plane) -> Scene:
+    """Return the scene with a support plane. Warn if the object is above the plane, instead of on it.
+
+    Raises ConfigError: the plane cuts the object.
+    """
+    heights, source = scene.known_points() @ support.normal - support.offset, scene.object.source
+    lowest = float(np.quantile(heights, 0.0 if scene.evidence is None else SPARE))
+    if lowest < -DEEPEST:
+        told = f"{source}: the object reaches {-1e3 * lowest:.0f} mm below its support plane"
+        raise ConfigError(f"{told}; valid: at most {1e3 * DEEPEST:.0f} mm; correct the plane or the object's pose")
+    if lowest > _HIGHEST:
+        told = f"{source}: the object is {1e2 * lowest:.0f} cm above its support plane"
+        scene = replace(scene, object=replace(scene.object, warnings=(*scene.object.warnings, told)))
+    return replace(scene, support=support)
+
 
 def build_scene(
     mesh: TriangleMesh,
@@ -200,6 +228,7 @@ def build_scene(
 
     Raises:
         MeshError: the mesh is not usable (`check_mesh`), or `confidence` has another length than the vertices.
+        ConfigError: the support cuts an object whose surface is known.
     """
     if confidence is not None and len(confidence) != len(mesh.vertices):
         raise MeshError(
@@ -224,7 +253,8 @@ def build_scene(
     sdf = sdf.to(device, sdf.field.dtype)
     known = None if confidence is None else confidence_grid(mesh.vertices, confidence, sdf)
     timing = (loaded - started, time.perf_counter() - loaded)
-    return Scene(model, sdf, timing, support, obstacles, known)
+    scene = Scene(model, sdf, timing, support, obstacles, known)
+    return scene if support is None or known is not None else on_support(scene, support)
 
 
 def object_sdf(model: ObjectModel, resolution: int = 48) -> GridSDF:

@@ -168,7 +168,7 @@ def plan_any_thing(
     about = {"settings": settings, "mass": mass, "friction": friction, "source": source, "ahead": ahead}
     stop = asked.get("stop") or (lambda: False)
     seen = [p for p in things_from_views(views, settings and settings.segmentation) if not _is_solid(p, solids or {})]
-    for points, failed in _in_order(seen, failures, before):
+    for points, failed in _in_order(seen, _up(views, surface), failures, before):
         if over or len(failed) >= tries:
             reason = OUT_OF_TRIES if len(failed) >= tries else NOT_LOOKED_AT
             things.append(ThingPlan(points, reason=reason, looked_at=False, failures=failed))
@@ -211,8 +211,21 @@ def _is_solid(points: Float[np.ndarray, "_ 3"], solids: Mapping[str, Sequence[Tr
     return any(float(np.quantile(one, _NEARLY_ALL)) < _STRAY for one in away)
 
 
+def _up(views: Sequence[PointCloud], surface: Plane | None) -> Float[np.ndarray, "3"]:
+    """Return the direction in which objects are high: the support's normal, else towards the camera, else z."""
+    if surface is not None:
+        return surface.normal
+    # In a camera's own frame, z is depth.
+    if any(view.viewpoint.any() for view in views):
+        return np.array([0.0, 0.0, 1.0])
+    return -np.mean([np.nanmean(view.points, 0) for view in views], 0)
+
+
 def _in_order(
-    things: Sequence[Float[np.ndarray, "_ 3"]], failures: Sequence[Failure], before: Sequence[ThingPlan]
+    things: Sequence[Float[np.ndarray, "_ 3"]],
+    up: Float[np.ndarray, "3"],
+    failures: Sequence[Failure],
+    before: Sequence[ThingPlan],
 ) -> list[tuple[Float[np.ndarray, "_ 3"], list[Failure]]]:
     places = np.array([points.mean(0) for points in things]).reshape(-1, 3)
     rows = [(points, list[Failure]()) for points in things]
@@ -232,7 +245,7 @@ def _in_order(
     def rank(row: tuple[Float[np.ndarray, "_ 3"], list[Failure]]) -> tuple[int, float, float]:
         place = row[0].mean(0)
         hopes = [surety for there, surety in known if np.linalg.norm(place - there) < _SAME_PLACE]
-        return len(row[1]), -max(hopes, default=_UNKNOWN), -float(row[0][:, 2].max())
+        return len(row[1]), -max(hopes, default=_UNKNOWN), -float((row[0] @ up).max())
 
     return sorted(rows, key=rank)
 

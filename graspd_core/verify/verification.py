@@ -348,6 +348,8 @@ def most_robust_first(verified: Sequence[Grasp]) -> list[Grasp]:
 
 # Greatest deviation of a quaternion's length from 1.
 _UNIT_TOLERANCE = 0.01
+# Greatest distance between the base in the grasp and in the squeeze [m].
+_SQUEEZE_TOLERANCE = 1e-4
 
 
 def verify_grasps(
@@ -408,3 +410,7 @@ def _refuse_posture(grasp: Grasp, hand: HandModel, name: str) -> None:
         length = float(np.linalg.norm(posture.quaternion_wxyz))
         if abs(length - 1) > _UNIT_TOLERANCE:
             raise ConfigError(f"{name}: {stage}.quaternion_wxyz has length {length:.3g}; valid: 1")
+    # Only the fingers squeeze. Files and messages have no other pose for the squeeze.
+    away = float(np.linalg.norm(grasp.squeeze.position - grasp.grasp.position))
+    if away > _SQUEEZE_TOLERANCE:
+        raise ConfigError(f"{name}: squeeze.position is {1e3 * away:.3g} mm from grasp.position; valid: 0")

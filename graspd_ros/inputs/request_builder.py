@@ -205,6 +205,8 @@ def check_request(message: GraspRequest, hand: str) -> None:
         fault = f"source {message.source}" if message.source != GraspRequest.KNOWN else "mesh_uri too"
         name = message.known_object[:MOST_ID]
         raise bad_request(f"known_object: {name!r} with {fault}; valid: source KNOWN=4, no mesh_uri")
+    if message.known_object and message.mesh_scale not in (0.0, 1.0):
+        raise bad_request(f"mesh_scale: {message.mesh_scale:g} with known_object; the library has its scale; valid: 0")
     if len(message.exclude) + len(message.exclude_poses) > MOST_EXCLUDED:
         counts = f"{len(message.exclude)} ids, {len(message.exclude_poses)} poses"
         raise bad_request(f"exclude: {counts}; valid: at most {MOST_EXCLUDED} together")
@@ -486,7 +488,7 @@ def _of_frame(given: SourceInput, frame: SensorFrame) -> Request:
         views = frame_views(frame, given.settings, place, lookup)
         return given.request(frame.frame, frame.stamp, load, region_points=region_points, views=views)
     key = ""
-    if nanoseconds(frame.stamp) and mask is None:
+    if mask is None:
         aim = f"{message.header.frame_id} {message.target_point}" if message.use_target_point else ""
         key = f"{frame.kind} {frame.frame} {nanoseconds(frame.stamp)} {frame.content()} {aim} {place}"
         used = given.settings  # these settings decide which object a cloud shows

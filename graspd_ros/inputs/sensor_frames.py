@@ -10,6 +10,7 @@ from __future__ import annotations
 import time
 from collections import OrderedDict
 from collections.abc import Callable
+from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from functools import partial
 from typing import Any
@@ -22,13 +23,15 @@ from sensor_msgs.msg import CameraInfo, CompressedImage, Image, PointCloud2
 
 from graspd_core import PointCloud, Scene, Target, cloud_from_depth, load_preset, scene_from_views
 from graspd_core.config import load_scene_config
+from graspd_core.errors import TransformError
 from graspd_core.io.messages import CameraPlace, depth_and_camera, frame_fault, image_size, pixels_from_message
 from graspd_core.perception.cloud.camera import camera_rays
 from graspd_core.perception.cloud.point_cloud import crop, transform_cloud
 from graspd_core.perception.cloud.voxel_downsample import unit_hint
 from graspd_core.runtime.disk_cache import digest
+from graspd_core.transforms import refuse_motion
 from graspd_core.verify.robustness import begin_other_shapes
-from graspd_ros.convert import Matrix, array_of, nanoseconds
+from graspd_ros.convert import Matrix, array_of, nanoseconds, set_nanoseconds
 from graspd_ros.error_codes import ErrorCode, RequestError, bad_request
 from graspd_ros.parameters import WORKSPACE, Settings
 
@@ -54,7 +57,7 @@ class SensorFrame:
     Attributes:
         kind: `cloud` or `depth image`.
         frame: coordinate frame of the points.
-        stamp: capture time on the sensor's clock. Zero if the message has no stamp.
+        stamp: capture time on the sensor's clock. If the message has no stamp, the time of arrival.
         arrived: time of arrival on the node's clock [ns].
         read: returns the points in `frame` [m] and the camera's position. Its arguments are the configured camera
             position and a frame lookup. It takes some milliseconds and may raise a CloudError or TransformError.
@@ -78,7 +81,7 @@ class SensorFrame:
         if not self.frame.strip("/"):
             text = f"the {self.kind} has an empty header.frame_id, so the place of its grasps is unknown"
             raise RequestError(ErrorCode.BAD_CLOUD, f"{text}; let its publisher set the frame")
-        age = (now - (nanoseconds(self.stamp) or self.arrived)) * 1e-9
+        age = (now - nanoseconds(self.stamp)) * 1e-9
         if not limit or -limit <= age <= limit:
             return
         text, hint = f"is {age:.1f} s old", "for a bag, set use_sim_time, or cloud_max_age to 0"
@@ -105,7 +108,7 @@ def cloud_frame(message: PointCloud2, arrived: int) -> SensorFrame:
     header = message.header
     read = lambda place, lookup: place.cloud(message, lookup)  # noqa: E731
     pixels, content = partial(pixels_from_message, message), partial(_content, message, message.fields)
-    return SensorFrame("cloud", header.frame_id, header.stamp, arrived, read, pixels, content)
+    return SensorFrame("cloud", header.frame_id, _seen_at(header.stamp, arrived), arrived, read, pixels, content)
 
 
 def depth_sensor_frame(image: DepthMessage, info: CameraInfo, arrived: int) -> SensorFrame:
@@ -118,7 +121,15 @@ def depth_sensor_frame(image: DepthMessage, info: CameraInfo, arrived: int) -> S
         return camera_rays(camera) * np.where(depth > 0, depth, np.nan)[..., None]
 
     header, content = image.header, partial(_content, image, info)
-    return SensorFrame("depth image", header.frame_id, header.stamp, arrived, read, pixels, content)
+    return SensorFrame("depth image", header.frame_id, _seen_at(header.stamp, arrived), arrived, read, pixels, content)
+
+
+def _seen_at(stamp: Time, arrived: int) -> Time:
+    if nanoseconds(stamp):
+        return stamp
+    # The camera may move until a plan needs its pose, so the newest transform would be wrong.
+    set_nanoseconds(time := Time(), arrived)
+    return time
 
 
 def _content(message: PointCloud2 | DepthMessage, layout: object) -> str:
@@ -235,16 +246,21 @@ def masked_points(
 
 @dataclass(frozen=True)
 class Views:
-    """Clouds of one scene in a common frame. Views are immutable, and `add` returns a new object."""
+    """Clouds of one scene in a common frame. Views are immutable, and `add` returns a new object.
+
+    `places` are the poses of clouds that were not transformed, in the root of /tf [m].
+    """
 
     frame: str = ""
     stamp: Time = field(default_factory=Time)
     clouds: tuple[PointCloud, ...] = ()
+    places: tuple[Matrix, ...] = ()
 
     def add(self, sensor_frame: SensorFrame, cloud: PointCloud, settings: Settings, lookup: Lookup) -> Views:
         """Return the views with a new cloud in the common frame: parameter `fixed_frame`, or the first view's frame.
 
-        Raises GraspdError if `MOST_VIEWS` views are stored already, or the cloud cannot be cropped or transformed.
+        Raises GraspdError if `MOST_VIEWS` views are stored already, the cloud cannot be cropped or transformed, or the
+        camera moved and no fixed frame is known.
         """
         if len(self.clouds) >= MOST_VIEWS:
             raise bad_request(f"{MOST_VIEWS} views are stored, which is the limit; call ~/reset_views first")
@@ -253,9 +269,15 @@ class Views:
         if len(cloud.points) > MOST_VIEW_POINTS:
             every = -(-len(cloud.points) // MOST_VIEW_POINTS)
             cloud = replace(cloud, points=cloud.points[::every])
+        places = self.places
         if frame != sensor_frame.frame:
             cloud = transform_cloud(cloud, lookup(frame, sensor_frame.frame, sensor_frame.stamp))
-        return Views(frame, sensor_frame.stamp, (*self.clouds, cloud))
+        else:
+            # Without /tf nobody can tell. The newest transform is enough for a camera that rests.
+            with suppress(TransformError):
+                places = (*places, lookup("", frame, Time()))
+            refuse_motion(frame, places)
+        return Views(frame, sensor_frame.stamp, (*self.clouds, cloud), places)
 
 
 def scene_of_views(

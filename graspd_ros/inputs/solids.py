@@ -17,6 +17,7 @@ from shape_msgs.msg import Plane as PlaneMessage
 from graspd_core import Scene, SceneConfig, TriangleMesh, with_neighbours
 from graspd_core.config import load_scene_config
 from graspd_core.errors import TransformError
+from graspd_core.perception.scene import on_support
 from graspd_core.types import Plane
 from graspd_ros.convert import Matrix, moved_plane, moved_points, pose_matrix
 from graspd_ros.error_codes import RequestError, bad_request
@@ -103,14 +104,23 @@ def plane_of(surface: PlaneMessage, T_object_frame: Matrix | None = None) -> Pla
 
 
 def with_support(load: Callable[[], Scene], plane: Plane | None) -> Callable[[], Scene]:
-    """Return a loader like `load`. If `plane` is given, it is the scene's support. Its normal points to the object."""
+    """Return a loader like `load`. If `plane` is given, it is the scene's support (`on_support`).
+
+    If the object is below the plane, the plane is turned, with a warning, because a plane's sign is often arbitrary.
+    """
     if plane is None:
         return load
 
     def loaded() -> Scene:
         scene = load()
-        above = float(plane.normal @ scene.object.mesh.vertices.mean(0)) > plane.offset
-        return replace(scene, support=plane if above else Plane(-plane.normal, -plane.offset))
+        heights = scene.object.mesh.vertices @ plane.normal - plane.offset
+        if heights.min() + heights.max() >= 0:
+            return on_support(scene, plane)
+        told = (
+            "surface: its normal points away from the object, so the plane is turned: the object is on its other side"
+        )
+        scene = replace(scene, object=replace(scene.object, warnings=(*scene.object.warnings, told)))
+        return on_support(scene, Plane(-plane.normal, -plane.offset))
 
     return loaded
 

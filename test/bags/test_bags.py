@@ -210,6 +210,23 @@ def test_raw_messages_come_back_in_order_of_recording(tmp_path):
         list(read_raw(tmp_path / "bag", ("/gone",)))
 
 
+def test_a_cloud_without_a_stamp_was_seen_when_it_was_recorded(tmp_path):
+    records = flown_records([(0.4, 0, 0.2), (0, -0.4, 0.2)])
+    at = START + SECOND
+    write_bag(tmp_path / "bag", [*records, Record("/bare", at, cloud_message(np.ones((60, 3)), OPTICAL, 0))])
+    (frame,) = read_frames(tmp_path / "bag", topic="/bare")
+    assert (frame.stamp, frame.received) == (0, at)
+    assert frame.view(read_transforms(tmp_path / "bag"), "world").viewpoint == pytest.approx([0.4, 0, 0.2], abs=1e-6)
+
+
+def test_clouds_of_a_moving_camera_are_fused_in_a_fixed_frame_only(tmp_path, capsys):
+    write_bag(tmp_path / "bag", flown_records([(0.4, 0, 0.2), (0, -0.4, 0.2)]))
+    assert main(["replay", str(tmp_path / "bag"), "--fuse"]) == 2
+    told = capsys.readouterr().err
+    assert f"frame {OPTICAL} moved by 566 mm and 90.0° between views" in told
+    assert "--frame" in told
+
+
 def test_times_and_frames_that_the_bag_does_not_know_are_named(tmp_path):
     records = flown_records([(0.4, 0, 0.2)])
     late = START + 60 * SECOND

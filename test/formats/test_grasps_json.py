@@ -169,6 +169,15 @@ def test_a_file_of_version_1_from_before_there_was_a_lift_trial_is_read():
     assert grasps_of(document)[0].verdict is Verdict.VERIFIED
 
 
+def test_a_probability_above_one_and_other_units_are_refused(document, tmp_path):
+    document["grasps"][1]["probability"] = 1.2
+    with pytest.raises(FormatError, match=r"probability: 1\.2; expected 0 to 1"):
+        grasps_of(document)
+    (tmp_path / "mm.json").write_text(json.dumps({**document, "units": "mm, deg, N"}))
+    with pytest.raises(FormatError, match="units 'mm, deg, N'; valid: 'm, rad, N'"):
+        load_grasps(tmp_path / "mm.json")
+
+
 def test_a_verdict_that_its_trials_do_not_support_is_refused(document):
     document["grasps"][1]["verdict"] = "verified"
     with pytest.raises(FormatError, match="verdict: 'verified'; expected failed, by the trials"):

@@ -17,6 +17,7 @@ from trajectory_msgs.msg import JointTrajectory, JointTrajectoryPoint
 
 from graspd_bench.rendering.tabletop import CAMERA, depth_views, ring_poses, tabletop
 from graspd_core import GraspdError, HandModel, Posture, cloud_from_depth, load_hand, load_scene, make_shape
+from graspd_core.errors import ConfigError
 from graspd_core.verify.prepared_grasp import make_metrics_context, penetration, placed_hand
 from graspd_ros.convert import array_of, matrix_of, matrix_of_pose, wxyz_of_matrix
 from graspd_ros.error_codes import code_of
@@ -204,7 +205,11 @@ def test_the_surface_is_what_the_object_stands_on_whichever_way_it_is_written():
         assert scene.support is not None
         np.testing.assert_allclose(scene.support.normal, [0, 0, 1])
         assert scene.support.offset == pytest.approx(-0.1)
+    assert "its normal points away from the object" in scene.object.warnings[-1]
     assert loaded(box(0.04, 0.05, 0.06)).support is None
+    # The most frequent mistake: the pose of the box is that of its middle.
+    with pytest.raises(ConfigError, match="reaches 30 mm below its support plane"):
+        loaded(box(0.04, 0.05, 0.06, surface=Plane(coef=[0.0, 0.0, 1.0, 0.0])))
 
 
 @pytest.mark.parametrize(

@@ -106,6 +106,12 @@ def test_a_mesh_named_by_its_path_alone_is_known_too(folder: Path, hand: HandMod
     assert "2 grasps from the library known.grasps" in Node(hand, mass=0.1).answer_path("ball.obj").result.message
 
 
+def test_a_friction_below_the_library_s_is_told(folder: Path, hand: HandModel):
+    assert Node(hand, friction=0.6).answer(**known()).result.warnings == ()
+    (told,) = Node(hand, friction=0.3).answer(**known()).result.warnings
+    assert told == "ball: grasps were tried at the library's friction of 0.6, above the parameter's 0.3"
+
+
 def test_grasps_that_were_lost_are_left_out(folder: Path, hand: HandModel, unread: None):
     node = Node(hand, num_grasps=1)
     first = node.answer(**known(id="a")).result.grasps[0]
@@ -173,6 +179,12 @@ def test_a_direction_and_a_surface_are_kept(folder: Path, hand: HandModel):
             {},
             GraspdError,
             "surface: source is 2, a cloud; valid sources: MESH=1, KNOWN=4",
+        ),
+        (
+            known(mesh_scale=0.5),
+            {},
+            GraspdError,
+            "mesh_scale: 0.5 with known_object; .* valid: 0",
         ),
         (known(surface=Plane(coef=[0.0, 0.0, 0.0, 1.0])), {}, GraspdError, "surface: .* is no plane"),
     ],

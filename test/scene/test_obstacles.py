@@ -4,13 +4,14 @@ import numpy as np
 import pytest
 import torch
 import trimesh
+from expected import refused
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from made_meshes import box_between, taken
 
 from graspd_core import Scene, TriangleMesh, load_scene, make_shape, with_neighbours
 from graspd_core.config import ObstacleConfig
-from graspd_core.errors import MeshError
+from graspd_core.errors import ConfigError, MeshError
 from graspd_core.mesh.mesh_files import mass_properties
 from graspd_core.mesh.sdf import sample_sdf
 from graspd_core.perception.obstacles import make_obstacles, padded_hull
@@ -175,6 +176,28 @@ def test_what_does_not_rise_above_the_support_is_the_support():
     table = box_between([-1.0, -1.0, bottom - 0.05], [1.0, 1.0, bottom + 0.002])
     assert with_neighbours(stands, {"table": [table]}).obstacles == ()
     assert len(with_neighbours(scene, {"table": [table]}).obstacles) == 1
+
+
+def test_a_shape_that_reaches_deep_into_the_object_is_refused(scene):
+    low, high = scene.object.mesh.vertices.min(0), scene.object.mesh.vertices.max(0)
+    for deep in (0.008, 0.012, 0.03):
+        table = {"table": [box_between([-1.0, -1.0, low[2] - 0.1], [1.0, 1.0, low[2] + deep])]}
+        if deep < 0.01:
+            assert with_neighbours(scene, table).obstacles
+            continue
+        with refused(ConfigError, f"'table' reaches {1e3 * deep:.0f} mm into the object", "valid: at most 10 mm"):
+            with_neighbours(scene, table)
+    (floor,) = with_neighbours(scene, {"wall": [box_between([high[0] + 0.001, -1, -1], [1, 1, 1])]}).obstacles
+    assert floor.mesh.vertices.min(0)[0] < high[0]
+
+
+def test_an_object_that_its_support_cuts_is_refused_and_one_in_the_air_is_told(scene):
+    bottom, up = float(scene.object.mesh.vertices[:, 2].min()), np.array([0.0, 0.0, 1.0])
+    assert build_scene(scene.object.mesh, support=Plane(up, bottom + 0.009)).object.warnings[1:] == ()
+    with refused(ConfigError, "the object reaches 20 mm below its support plane; valid: at most 10 mm"):
+        build_scene(scene.object.mesh, support=Plane(up, bottom + 0.02))
+    above = build_scene(scene.object.mesh, support=Plane(up, bottom - 0.3))
+    assert above.object.warnings[-1].endswith("the object is 30 cm above its support plane")
 
 
 def test_a_flat_or_open_shape_is_taken_as_far_as_it_goes(scene):

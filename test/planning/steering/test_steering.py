@@ -34,7 +34,7 @@ DOWN = np.array([0.0, 0.0, -1.0])
 
 @pytest.fixture(scope="module")
 def bottle():
-    return load_scene("shape:bottle")
+    return load_scene("shape:bottle", mass=0.1)
 
 
 def plan(scene, hand, steering, **settings):

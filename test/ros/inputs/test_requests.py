@@ -3,6 +3,7 @@
 import array
 import math
 import os
+from contextlib import nullcontext
 from dataclasses import replace
 from pathlib import Path
 
@@ -13,6 +14,7 @@ from geometry_msgs.msg import Point, Pose, PoseStamped, Quaternion, Vector3
 from graspd_msgs.msg import GraspRequest
 from hypothesis import given
 from hypothesis import strategies as st
+from scipy.spatial.transform import Rotation
 from sensor_msgs.msg import Image, PointCloud2
 from shape_msgs.msg import SolidPrimitive
 from std_msgs.msg import Header
@@ -174,8 +176,10 @@ def test_a_cloud_is_refused_when_none_came_or_it_is_old():
     assert refused.value.code is ErrorCode.STALE_CLOUD
     request = taker.from_message("a", Settings(cloud_max_age=0.0), latest)
     assert (request.frame, request.stamp.sec, request.source) == ("camera", 990, "latest_cloud")
-    taker.newest = sensor_frame(np.zeros((3, 3)), stamp=Time())  # without a stamp, arrival counts
-    assert taker.from_message("b", Settings(), latest).stamp == NOW
+    taker.newest = cloud_frame(PointCloud2(header=Header(frame_id="camera")), 1000 * 10**9)
+    # Without a stamp, arrival counts, also for transforms.
+    request = taker.from_message("b", Settings(), latest)
+    assert (request.stamp, request.timeless) == (NOW, False)
 
 
 def test_views_are_gathered_in_one_frame():
@@ -209,6 +213,25 @@ def test_views_are_gathered_in_one_frame():
     assert len(taker.views.clouds) == 2
     assert taker.drop_views() == 2
     assert taker.views == Views()
+
+
+@pytest.mark.parametrize(("moved", "turned"), [(0.004, 0.5), (0.006, 0.0), (0.0, 0.7)])
+def test_views_of_a_camera_that_moved_need_a_fixed_frame(moved: float, turned: float):
+    pose = np.eye(4)
+
+    def lookup(target: str, source: str, stamp: Time) -> np.ndarray:
+        assert (target, source) == ("", "camera")
+        return pose.copy()
+
+    taker = intake(lookup)
+    for _ in range(2):
+        taker.newest = sensor_frame(np.array([[0.0, 0.0, 1.0], [0.0, 0.5, 1.0]]))
+        taker.add_view(Settings())
+    pose[:3, :3] = Rotation.from_euler("y", turned, degrees=True).as_matrix()
+    pose[0, 3] = moved
+    with nullcontext() if moved == 0.004 else pytest.raises(TransformError, match=r"moved by .* fixed_frame"):
+        taker.add_view(Settings())
+    assert len(taker.views.clouds) == 2 + (moved == 0.004)
 
 
 def test_the_number_of_views_and_their_size_are_bounded():
