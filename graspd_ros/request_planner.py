@@ -372,7 +372,7 @@ def _arrivals(scene: Scene, hand: HandModel) -> Callable[[Grasp], Grasp]:
             return grasp
         key = b"".join(part.tobytes() for part in vars(grasp.grasp).values())
         if key not in known:
-            known[key] = arrival(context, grasp, scene.support)
+            known[key] = arrival(context, grasp, scene.support, scene.obstacles)
         return replace(grasp, arrival=known[key])
 
     return arrived

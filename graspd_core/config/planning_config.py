@@ -43,7 +43,8 @@ class GraspStagesConfig:
     Attributes:
         touch_reach: a link counts as touching up to this distance from the object [m].
         grip_force: sum of the normal forces of the squeeze [N]. `link_force` may limit the sum. Heavy objects get more.
-        link_force: greatest planned normal force of one link [N]. For delicate objects, use less, or give the mass.
+        link_force: greatest planned normal force of one link [N]. In trials, links press with up to 9 N more, because
+            fingers push until they reach their posture. For delicate objects, use less, or give the mass.
         stiffness: position gain of the controllers of the hand's revolute joints [N·m/rad].
         slide_stiffness: position gain of the controllers of the hand's prismatic joints [N/m].
         effort_share: fraction of a joint's effort limit that the squeeze may use.

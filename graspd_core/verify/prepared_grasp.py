@@ -7,6 +7,7 @@ The optimiser never sees these samples. The wrenches of unit contact forces give
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property, lru_cache
 
@@ -19,11 +20,12 @@ from graspd_core.hands.link_distance import bounds, depth_inside, primitive_sdf
 from graspd_core.hands.model import HandModel, Primitive
 from graspd_core.hands.surface_points import samples_with_edges
 from graspd_core.mesh.mesh_files import surface_samples
+from graspd_core.mesh.sdf import sample_sdf
 from graspd_core.mesh.sharp_features import crease_points, farthest_points, neighbours_together
 from graspd_core.mesh.surface_queries import DistanceQuery
 from graspd_core.mesh.topology import packed_rows
 from graspd_core.optimize.kernel.builds import kernel
-from graspd_core.perception.scene import ObjectModel
+from graspd_core.perception.scene import ObjectModel, Obstacle
 from graspd_core.se3 import rotation_from_quaternion
 from graspd_core.types import Grasp, Plane, Posture
 from graspd_core.verify.compiled_overlap import (
@@ -174,27 +176,32 @@ def _depth_in_link(context: MetricsContext, placed: PlacedHand, link: int, point
     return float(depth_inside(context.hand, link, local).max(initial=0.0))
 
 
-def arrival(context: MetricsContext, grasp: Grasp, support: Plane | None) -> Posture | None:
+def arrival(
+    context: MetricsContext, grasp: Grasp, support: Plane | None, obstacles: Sequence[Obstacle] = ()
+) -> Posture | None:
     """Return a posture near the grasp with open fingers and a collision-free path from the pregrasp.
 
     Some planners move the open hand to the grasp, then close the fingers. The open fingers may penetrate the object. So
     this function closes the fingers in part, or moves the hand back by at most 3 mm, or both. A small move has priority
-    over open fingers. Return None if every tried posture collides with the object or the support.
+    over open fingers. Return None if every tried posture collides with the object, the support or an obstacle.
     """
     open_joints, closing = grasp.pregrasp.joint_positions, grasp.grasp.joint_positions - grasp.pregrasp.joint_positions
     back = grasp.pregrasp.position - grasp.grasp.position
     length = float(np.linalg.norm(back))
 
-    def height(placed: PlacedHand) -> float:
-        return 0.0 if support is None else float((placed.points @ support.normal).min()) - support.offset
+    def gaps(placed: PlacedHand) -> Float[np.ndarray, "bodies"]:
+        planes = [] if support is None else [(placed.points @ support.normal).min() - support.offset]
+        fields = [sample_sdf(o.sdf, torch.as_tensor(placed.points).to(o.sdf.field))[0] for o in obstacles]
+        return np.array([*planes, *(float(field.min()) for field in fields)])
 
-    low = min(0.0, *(height(placed_hand(context, posture)) for posture in (grasp.pregrasp, grasp.grasp)))
+    # Verified postures may be a little deep in an obstacle, whose hull is padded.
+    low = np.minimum(*(gaps(placed_hand(context, posture)) for posture in (grasp.pregrasp, grasp.grasp))).clip(max=0)
 
     def clear(share: float, at: float) -> bool:
         joints = open_joints + share * closing
         posture = replace(grasp.grasp, position=grasp.grasp.position + at * back, joint_positions=joints)
         placed = placed_hand(context, posture)
-        return height(placed) >= low - _SUNK and penetration(context, placed) <= _SUNK
+        return bool((gaps(placed) >= low - _SUNK).all()) and penetration(context, placed) <= _SUNK
 
     for drawn in (min(drawn / length, 1.0) if length else 0.0 for drawn in _DRAWN_BACK):
         for share in _CLOSED:

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 import torch
 from expected import some
+from made_meshes import box_between
 
 from graspd_bench.studies.robust_ranking import correlation, orders
 from graspd_core import TriangleMesh, load_hand, load_scene, make_shape, plan_grasps, verify_grasps
@@ -15,11 +16,12 @@ from graspd_core.errors import ConfigError
 from graspd_core.io.grasps_json import result_document
 from graspd_core.optimize.candidates import Candidates
 from graspd_core.optimize.plan_config import PlanConfig, load_preset
-from graspd_core.perception.scene import Obstacle, Scene, object_parts
+from graspd_core.perception.scene import Obstacle, Scene, make_obstacle, object_parts
 from graspd_core.planning import rounds as planning_rounds
 from graspd_core.planning.rounds import RoundsResult, rounds_of
 from graspd_core.types import Grasp, GraspMetrics, Outcome, Plane, Posture, Progress, Snapshot, Stage, Verdict
 from graspd_core.verify.hold_trial import noisy_share, pose_errors
+from graspd_core.verify.prepared_grasp import arrival, make_metrics_context, placed_hand
 from graspd_core.verify.run_clock import Run
 from graspd_core.verify.verification import Prefetched, VerificationContext, most_robust_first
 from graspd_core.verify.world import PROTOCOLS, build_world
@@ -241,3 +243,26 @@ def test_postures_of_lists_are_refused_in_one_line():
         ConfigError, match=r"grasp 0: pregrasp.position is \[0.0, 0.0, 0.2\]; valid: 3 finite numbers in an array"
     ):
         verify_grasps(load_scene("shape:box"), HAND, [given])
+
+
+def test_an_arrival_posture_stays_clear_of_obstacles():
+    """A wall stands where the open hand would arrive, but neither before nor after."""
+    scene, hand = load_scene("shape:box", mass=0.1), load_hand("allegro_right")
+    context = make_metrics_context(scene.object, hand)
+    ways = [sign * axis for axis in np.eye(3) for sign in (1.0, -1.0)]
+
+    def extent(posture: Posture) -> np.ndarray:
+        return (placed_hand(context, posture).points @ np.column_stack(ways)).max(0)
+
+    grasps = plan_grasps(scene, hand, count=6, preset="fast", measure=False).grasps
+    free = [(grasp, posture) for grasp in grasps if (posture := arrival(context, grasp, None)) is not None]
+    beyond = [extent(posture) - np.maximum(extent(g.grasp), extent(g.pregrasp)) for g, posture in free]
+    place, way = np.unravel_index(np.argmax(beyond), np.shape(beyond))
+    (grasp, posture), outward = free[place], ways[way]
+    assert beyond[place][way] > 2e-3
+    begin = float(extent(posture)[way] - beyond[place][way] + 5e-4)
+    low, high = np.full(3, -0.3), np.full(3, 0.3)
+    axis, end = int(np.abs(outward).argmax()), begin + 0.05
+    low[axis], high[axis] = sorted(outward[axis] * np.array([begin, end]))
+    clear = arrival(context, grasp, None, (make_obstacle(box_between(low, high)),))
+    assert clear is None or extent(clear)[way] < begin + 1e-3
