@@ -301,7 +301,8 @@ def merged_views(path: Path, options: argparse.Namespace) -> tuple[PointCloud, .
         print_note(f"{len(refusals)} of {count} clouds are left out, the first: {refusals[0]}")
     if len(names) > 1:
         raise BagError(f"{path}: clouds in several frames ({', '.join(sorted(names))}); name one with --frame")
-    if len(views) > 1 and not options.frame:
+    # A camera is at the origin of its own frame. Clouds in another frame may be of a turntable, say.
+    if len(views) > 1 and not options.frame and not any(view.viewpoint.any() for view in views):
         _refuse_moving_camera(path, names.pop(), stamps)
     return tuple(views)
 

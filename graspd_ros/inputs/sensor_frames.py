@@ -272,8 +272,8 @@ class Views:
         places = self.places
         if frame != sensor_frame.frame:
             cloud = transform_cloud(cloud, lookup(frame, sensor_frame.frame, sensor_frame.stamp))
-        else:
-            # Without /tf nobody can tell. The newest transform is enough for a camera that rests.
+        elif not cloud.viewpoint.any():
+            # The frame is the camera's own, not that of a turntable, say. Without /tf nobody can tell if it moved.
             with suppress(TransformError):
                 places = (*places, lookup("", frame, Time()))
             refuse_motion(frame, places)

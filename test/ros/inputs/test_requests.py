@@ -232,6 +232,9 @@ def test_views_of_a_camera_that_moved_need_a_fixed_frame(moved: float, turned: f
     with nullcontext() if moved == 0.004 else pytest.raises(TransformError, match=r"moved by .* fixed_frame"):
         taker.add_view(Settings())
     assert len(taker.views.clouds) == 2 + (moved == 0.004)
+    # In the frame of a turntable, the camera is not at the origin.
+    taker.newest = replace(taker.newest, read=lambda *_: PointCloud(np.eye(3), np.array([0.0, 0.0, 0.5])))
+    taker.add_view(Settings())
 
 
 def test_the_number_of_views_and_their_size_are_bounded():
