@@ -21,6 +21,9 @@ from graspd_core.errors import TransformError
 SECOND = 1_000_000_000
 HISTORY = 10 * SECOND
 
+# Target of a lookup in the root above a frame. No frame has this name.
+ROOT = "<root>"
+
 _RIGID = 1e-3
 # Greatest valid translation [m]. No two points on Earth are farther apart.
 _FARTHEST = 1e8
@@ -83,12 +86,12 @@ class TransformBuffer:
     def lookup(self, target: str, source: str, stamp: int | None = None) -> Float[np.ndarray, "4 4"]:
         """Return `T_target_source` at `stamp` [ns], by default at the newest time that all frames in between cover.
 
-        An empty `target` is the root above `source`.
+        The target `ROOT` is the root above `source`.
         Raises TransformError: a frame is unknown, the frames are not connected, or the time is outside the known span.
         """
         source = _name(source)
         with self._lock:
-            target, known = _name(target or self._chain(source)[-1]), self.frames()
+            target, known = self._chain(source)[-1] if target == ROOT else _name(target), self.frames()
             for name in (target, source):
                 if name not in known:
                     told = f"unknown frame {name!r}; known: {', '.join(known) or 'none'}"
@@ -155,7 +158,8 @@ def refuse_motion(frame: str, poses: Sequence[Float[np.ndarray, "4 4"]]) -> None
     turn = 2 * math.asin(min(apart / math.sqrt(8), 1.0))
     if far > _AT_REST or turn > _AT_REST_TURN:
         told = f"frame {frame} moved by {1e3 * far:.0f} mm and {math.degrees(turn):.1f}° between views"
-        raise TransformError(f"{told}; put the views into a fixed frame: fixed_frame of the node, or --frame")
+        most = f"{1e3 * _AT_REST:.0f} mm and {math.degrees(_AT_REST_TURN):.1f}°"
+        raise TransformError(f"{told}; valid: at most {most}; set the parameter fixed_frame, or --frame")
 
 
 def _pose_at(link: _Link, name: str, stamp: int, what: str) -> Float[np.ndarray, "4 4"]:

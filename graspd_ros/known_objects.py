@@ -45,7 +45,7 @@ def named_loader(known: KnownObject, settings: Settings) -> Callable[[], Scene]:
         entry = find_entry(known, settings, None)
         assert entry is not None
         # An assumed mass is assumed again, because the entry's may be lower: as much as the hand lifts.
-        mass = (settings.mass or None) if entry.mass_assumed else entry.mass
+        mass = None if entry.mass_assumed else entry.mass
         return run_isolated(load_scene, entry.source, mass=mass, friction=entry.friction, scale=entry.scale)
 
     return load
@@ -71,7 +71,7 @@ def answer_known(
         grasps = unlike(library.grasps(entry, hand), excluded)[:count]
         if len(grasps) >= count:
             found = library_result(library, grasps, count, time.perf_counter() - began)
-            assumed = not settings.mass and (entry.mass_assumed or not known.name)
+            assumed = entry.mass_assumed if known.name else not settings.mass
             found = replace(found, mass=entry.mass, tried_mass=entry.mass, warnings=_other_friction(entry, settings))
             return found, None, assumed
     scene = request.load()
@@ -85,4 +85,4 @@ def _other_friction(entry: LibraryEntry | None, settings: Settings) -> tuple[str
     if entry is None or entry.friction <= settings.friction:
         return ()
     told = f"{entry.name}: grasps were tried at the library's friction of {entry.friction:g}"
-    return (f"{told}, above the parameter's {settings.friction:g}",)
+    return (f"{told}; the parameter's is {settings.friction:g}",)

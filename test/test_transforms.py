@@ -23,7 +23,7 @@ from graspd_core.se3 import (
     rotation_from_quaternion,
     safe_norm,
 )
-from graspd_core.transforms import HISTORY, SECOND, TransformBuffer
+from graspd_core.transforms import HISTORY, ROOT, SECOND, TransformBuffer
 
 number = st.floats(-2, 2)
 poses = st.tuples(st.tuples(number, number, number), st.tuples(number, number, number)).map(
@@ -85,12 +85,14 @@ def test_without_a_time_it_is_the_newest_that_all_links_know():
     assert buffer.lookup("map", "camera")[:3, 3] == pytest.approx([2, 2, 1])
 
 
-def test_no_target_is_the_root():
+def test_a_frame_is_looked_up_in_its_root():
     buffer = TransformBuffer()
     buffer.add("world", "arm", pose([1.0, 0.0, 0.0]), static=True)
     buffer.add("arm", "hand", pose([0.0, 2.0, 0.0]), static=True)
-    np.testing.assert_allclose(buffer.lookup("", "hand")[:3, 3], [1.0, 2.0, 0.0])
-    np.testing.assert_allclose(buffer.lookup("", "world"), np.eye(4))
+    np.testing.assert_allclose(buffer.lookup(ROOT, "hand")[:3, 3], [1.0, 2.0, 0.0])
+    np.testing.assert_allclose(buffer.lookup(ROOT, "world"), np.eye(4))
+    with refused(TransformError, "transform: a frame has no name"):
+        buffer.lookup("", "hand")
 
 
 def test_the_order_of_arrival_does_not_matter():

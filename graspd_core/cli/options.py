@@ -6,6 +6,7 @@ import argparse
 import dataclasses
 import time
 from collections.abc import Iterator, Sequence
+from contextlib import suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -16,7 +17,7 @@ from graspd_core.cli.running import EXIT_INTERRUPTED, EXIT_OK, EXIT_TOO_FEW, Dea
 from graspd_core.config import VERIFICATIONS, SceneConfig, load_scene_config
 from graspd_core.errors import BagError, CloudError, ConfigError, TransformError
 from graspd_core.optimize.plan_config import PlanConfig, load_plugin, load_preset, preset_names
-from graspd_core.transforms import refuse_motion
+from graspd_core.transforms import ROOT, refuse_motion
 from graspd_core.types import GraspResult, Outcome, Timing
 
 if TYPE_CHECKING:
@@ -310,12 +311,13 @@ def merged_views(path: Path, options: argparse.Namespace) -> tuple[PointCloud, .
 def _refuse_moving_camera(path: Path, frame: str, stamps: Sequence[int]) -> None:
     from graspd_core.io.bags import read_transforms
 
-    try:
+    poses = []
+    # Without transforms nobody can tell. Recordings often begin with an image.
+    with suppress(BagError):
         transforms = read_transforms(path)
-        poses = [transforms.lookup("", frame, stamp) for stamp in stamps]
-    except (BagError, TransformError):
-        # Without transforms nobody can tell.
-        return
+        for stamp in stamps:
+            with suppress(TransformError):
+                poses.append(transforms.lookup(ROOT, frame, stamp))
     refuse_motion(frame, poses)
 
 

@@ -181,7 +181,7 @@ def _jobs(options: argparse.Namespace) -> Iterator[_Job]:
     for frame, seen in bag_views(options.bag, options):
         name = f"cloud_{frame.index:06d}"
         label = f"cloud {frame.index} at {frame.stamp // SECOND}.{frame.stamp % SECOND:09d} s"
-        job = _Job(name, label, options.frame or frame.frame, frame.stamp / SECOND)
+        job = _Job(name, label, options.frame or frame.frame, (frame.stamp or frame.received) / SECOND)
         yield replace(job, refusal=seen) if isinstance(seen, str) else replace(job, views=(seen,))
 
 

@@ -245,7 +245,7 @@ def _grasp_of(values: dict[str, Any], actuated: Bool[np.ndarray, "movable"]) -> 
         metrics=_metrics_of(values["metrics"]),
         trials=tuple(_trial_of(trial) for trial in values["trials"]),
         # Files from before probabilities do not have the key "probability".
-        probability=_probability_of(values.get("probability")),
+        probability=_probability_of({"probability": None, **values}),
         # Files from before arms do not have the key "arm".
         arm=_arm_of(values["arm"]) if values.get("arm") is not None else None,
     )
@@ -254,10 +254,11 @@ def _grasp_of(values: dict[str, Any], actuated: Bool[np.ndarray, "movable"]) -> 
     return grasp
 
 
-def _probability_of(value: Any) -> float | None:
-    if value is not None and not 0 <= value <= 1:
-        raise ValueError(f"probability: {short_repr(value)}; expected 0 to 1")
-    return None if value is None else float(value)
+def _probability_of(values: dict[str, Any]) -> float | None:
+    probability = _scaled(values, "probability", 1.0)
+    if probability is not None and not 0 <= probability <= 1:
+        raise ValueError(f"probability: {probability:g}; expected 0 to 1")
+    return probability
 
 
 def _from_version_1(values: dict[str, Any]) -> dict[str, Any]:

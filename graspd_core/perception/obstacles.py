@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 import torch
@@ -19,8 +20,9 @@ from graspd_core.config import ObstacleConfig, SceneConfig
 from graspd_core.errors import ConfigError
 from graspd_core.mesh.convex_parts import convex_hull, hull_surface, limited_hull
 from graspd_core.mesh.mesh_files import surface_samples
+from graspd_core.mesh.sdf import sample_sdf
 from graspd_core.mesh.surface_queries import make_surface, surface_distance, winding_inside
-from graspd_core.mesh.topology import scaled_normals
+from graspd_core.mesh.topology import is_closed, scaled_normals
 from graspd_core.perception.cloud.point_cloud import Points, Vector
 from graspd_core.perception.scene import DEEPEST, SPARE, Obstacle, Scene, make_obstacle
 from graspd_core.se3 import perpendicular, rotation_from_quaternion
@@ -149,9 +151,9 @@ def with_neighbours(
         if near and _overlap(np.concatenate([s.vertices for s in shapes]), mesh.vertices) >= _SAME:
             same.append(f"collision object {name!r} fills the place of the object to grasp and counts as that object")
             continue
-        if (deep := _deepest_in(scene, near)) > DEEPEST:
-            doubts.append(f"collision object {name!r} reaches {1e3 * deep:.0f} mm into the object to grasp")
         points = [_points_within(shape, low, high) for shape in near]
+        if (deep := max([_deepest_in(scene, near), *map(partial(_depth_of, scene), points)])) > DEEPEST:
+            doubts.append(f"collision object {name!r} reaches {1e3 * deep:.0f} mm into the object to grasp")
         found += [p for p in points if len(p) and (support is None or (p @ support.normal).max() > level)]
     obstacles = make_obstacles(found, None, mesh, reach, settings.obstacles) if found else ()
     warnings, evidence = (*scene.object.warnings, *same), scene.evidence
@@ -163,15 +165,22 @@ def with_neighbours(
 
 
 def _deepest_in(scene: Scene, shapes: Sequence[TriangleMesh]) -> float:
-    """Return how deep the known surface of the scene's object is in the shapes [m]."""
+    """Return how deep the known surface of the scene's object is in the shapes [m]. Open shapes have no inside."""
     points = scene.known_points()
     depths = np.zeros(len(points))
-    for shape in shapes:
+    for shape in filter(is_closed, shapes):
         places = np.flatnonzero(((points > shape.vertices.min(0)) & (points < shape.vertices.max(0))).all(1))
         places = places[winding_inside(shape, points[places])] if len(places) else places
         if len(places):
             depths[places] = np.maximum(depths[places], surface_distance(make_surface(shape), points[places]))
     return float(np.quantile(depths, 1.0 if scene.evidence is None else 1.0 - SPARE))
+
+
+def _depth_of(scene: Scene, points: Float[np.ndarray, "_ 3"]) -> float:
+    """Return how deep the points are in the scene's object [m], 0 for an object that cameras saw in part."""
+    if scene.evidence is not None or not len(points):
+        return 0.0
+    return -float(sample_sdf(scene.sdf, torch.as_tensor(points).to(scene.sdf.field))[0].min())
 
 
 def _overlap(a: Float[np.ndarray, "_ 3"], b: Float[np.ndarray, "_ 3"]) -> float:

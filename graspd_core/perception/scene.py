@@ -183,7 +183,7 @@ _KNOWN_SAMPLES = 2000
 
 
 def on_support(scene: Scene, support: Plane) -> Scene:
-    """Return the scene with a support plane. Warn if the object is above the plane, instead of on it.
+    """Return the scene with a support plane. Warn if an object of known shape is above the plane, instead of on it.
 
     Raises ConfigError: the plane cuts the object.
     """
@@ -192,7 +192,7 @@ def on_support(scene: Scene, support: Plane) -> Scene:
     if lowest < -DEEPEST:
         told = f"{source}: the object reaches {-1e3 * lowest:.0f} mm below its support plane"
         raise ConfigError(f"{told}; valid: at most {1e3 * DEEPEST:.0f} mm; correct the plane or the object's pose")
-    if lowest > _HIGHEST:
+    if lowest > _HIGHEST and scene.evidence is None:
         told = f"{source}: the object is {1e2 * lowest:.0f} cm above its support plane"
         scene = replace(scene, object=replace(scene.object, warnings=(*scene.object.warnings, told)))
     return replace(scene, support=support)

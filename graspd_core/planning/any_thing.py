@@ -26,7 +26,7 @@ from graspd_core.mesh.surface_queries import make_surface, surface_distance
 from graspd_core.optimize.plan_config import load_preset
 from graspd_core.perception.cloud.point_cloud import PointCloud
 from graspd_core.perception.obstacles import with_neighbours
-from graspd_core.perception.scene import Scene
+from graspd_core.perception.scene import Scene, on_support
 from graspd_core.perception.scene_from_views import scene_from_views, things_from_views
 from graspd_core.perception.segment.target_selection import Target
 from graspd_core.planning.plan_grasps import MOST_GRASPS, SEEDS, check_request, plan_grasps
@@ -212,13 +212,13 @@ def _is_solid(points: Float[np.ndarray, "_ 3"], solids: Mapping[str, Sequence[Tr
 
 
 def _up(views: Sequence[PointCloud], surface: Plane | None) -> Float[np.ndarray, "3"]:
-    """Return the direction in which objects are high: the support's normal, else towards the camera, else z."""
+    """Return the direction of height: the support's normal, towards the camera in a camera's own frame, else z."""
     if surface is not None:
         return surface.normal
-    # In a camera's own frame, z is depth.
     if any(view.viewpoint.any() for view in views):
         return np.array([0.0, 0.0, 1.0])
-    return -np.mean([np.nanmean(view.points, 0) for view in views], 0)
+    points = np.concatenate([view.points for view in views])
+    return -points[np.isfinite(points).all(1)].mean(0)
 
 
 def _in_order(
@@ -271,7 +271,11 @@ def _scene_among(
         return str(error)
     if again and scene.evidence is not None:
         scene = replace(scene, evidence=replace(scene.evidence, doubts=(*scene.evidence.doubts, _FAILED)))
-    scene = scene if surface is None else replace(scene, support=surface)
+    if surface is not None:
+        try:
+            scene = on_support(scene, surface)
+        except ConfigError as error:
+            return str(error)
     if not solids:
         return scene
     settings = about["settings"] or SceneConfig()

@@ -252,7 +252,8 @@ def _tried_lighter(
 def _too_weak(run: Run, scene: Scene, state: RoundsResult, lowered: float | None) -> bool:
     """Return True if no grasp lifts `light_end` of the object's mass. Then no later round is likely to verify a grasp.
 
-    Return False if too few grasps were tried, if no robustness check needs a margin, or if no grasp can be verified.
+    Return False if too few grasps were tried. With a given mass, also return False if no robustness check needs a
+    margin, or if no grasp can be verified.
     `lowered` is the lower mass that the strongest grasp lifts, if `_tried_lighter` weighed the grasps [kg].
     """
     context, least = state.context, light_end(scene.object.mass)

@@ -348,7 +348,7 @@ def most_robust_first(verified: Sequence[Grasp]) -> list[Grasp]:
 
 # Greatest deviation of a quaternion's length from 1.
 _UNIT_TOLERANCE = 0.01
-# Greatest distance between the base in the grasp and in the squeeze [m].
+# Greatest distance between the base in the grasp and in the squeeze [m], and of the quaternions' product from 1.
 _SQUEEZE_TOLERANCE = 1e-4
 
 
@@ -411,6 +411,7 @@ def _refuse_posture(grasp: Grasp, hand: HandModel, name: str) -> None:
         if abs(length - 1) > _UNIT_TOLERANCE:
             raise ConfigError(f"{name}: {stage}.quaternion_wxyz has length {length:.3g}; valid: 1")
     # Only the fingers squeeze. Files and messages have no other pose for the squeeze.
-    away = float(np.linalg.norm(grasp.squeeze.position - grasp.grasp.position))
-    if away > _SQUEEZE_TOLERANCE:
-        raise ConfigError(f"{name}: squeeze.position is {1e3 * away:.3g} mm from grasp.position; valid: 0")
+    base, other = grasp.grasp, grasp.squeeze
+    q, p = (posture.quaternion_wxyz / np.linalg.norm(posture.quaternion_wxyz) for posture in (base, other))
+    if np.linalg.norm(other.position - base.position) > _SQUEEZE_TOLERANCE or 1 - abs(q @ p) > _SQUEEZE_TOLERANCE:
+        raise ConfigError(f"{name}: the base in squeeze has another pose than in grasp; valid: the same pose")

@@ -29,7 +29,7 @@ from graspd_core.perception.cloud.camera import camera_rays
 from graspd_core.perception.cloud.point_cloud import crop, transform_cloud
 from graspd_core.perception.cloud.voxel_downsample import unit_hint
 from graspd_core.runtime.disk_cache import digest
-from graspd_core.transforms import refuse_motion
+from graspd_core.transforms import ROOT, refuse_motion
 from graspd_core.verify.robustness import begin_other_shapes
 from graspd_ros.convert import Matrix, array_of, nanoseconds, set_nanoseconds
 from graspd_ros.error_codes import ErrorCode, RequestError, bad_request
@@ -269,15 +269,25 @@ class Views:
         if len(cloud.points) > MOST_VIEW_POINTS:
             every = -(-len(cloud.points) // MOST_VIEW_POINTS)
             cloud = replace(cloud, points=cloud.points[::every])
-        places = self.places
+        places, own = self.places, not (*self.clouds, cloud)[0].viewpoint.any()
         if frame != sensor_frame.frame:
-            cloud = transform_cloud(cloud, lookup(frame, sensor_frame.frame, sensor_frame.stamp))
-        elif not cloud.viewpoint.any():
+            cloud = transform_cloud(cloud, _pose_at_rest(frame, sensor_frame, lookup))
+        if own and not settings.fixed_frame:
             # The frame is the camera's own, not that of a turntable, say. Without /tf nobody can tell if it moved.
             with suppress(TransformError):
-                places = (*places, lookup("", frame, Time()))
+                places = (*places, lookup(ROOT, frame, Time()))
             refuse_motion(frame, places)
         return Views(frame, sensor_frame.stamp, (*self.clouds, cloud), places)
+
+
+def _pose_at_rest(target: str, sensor_frame: SensorFrame, lookup: Lookup) -> Matrix:
+    try:
+        return lookup(target, sensor_frame.frame, sensor_frame.stamp)
+    except TransformError:
+        if nanoseconds(sensor_frame.stamp) != sensor_frame.arrived:
+            raise
+        # The cloud has no stamp, and the transform of its arrival is still on the way. The camera rests at each view.
+        return lookup(target, sensor_frame.frame, Time())
 
 
 def scene_of_views(

@@ -512,7 +512,7 @@ def test_a_library_of_a_hand_that_cannot_lift_the_assumed_mass_is_gone_on_with(t
     for name in ("parallel_gripper.yaml", "parallel_gripper.urdf"):
         (tmp_path / name).write_text((config_dir() / "hands" / name).read_text())
     with (tmp_path / "parallel_gripper.yaml").open("a") as description:
-        description.write("\neffort: 12.0\n")
+        description.write("\neffort: 11.0\n")
     words, out = ("shape:box", "--hand", str(tmp_path / "parallel_gripper.yaml")), tmp_path / "known.grasps"
     assert build(out, *words) == 0
     told, heavy = capsys.readouterr(), load_scene("shape:box").object.mass

@@ -109,7 +109,7 @@ def test_a_mesh_named_by_its_path_alone_is_known_too(folder: Path, hand: HandMod
 def test_a_friction_below_the_library_s_is_told(folder: Path, hand: HandModel):
     assert Node(hand, friction=0.6).answer(**known()).result.warnings == ()
     (told,) = Node(hand, friction=0.3).answer(**known()).result.warnings
-    assert told == "ball: grasps were tried at the library's friction of 0.6, above the parameter's 0.3"
+    assert told == "ball: grasps were tried at the library's friction of 0.6; the parameter's is 0.3"
 
 
 def test_grasps_that_were_lost_are_left_out(folder: Path, hand: HandModel, unread: None):

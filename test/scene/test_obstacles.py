@@ -178,17 +178,28 @@ def test_what_does_not_rise_above_the_support_is_the_support():
     assert len(with_neighbours(scene, {"table": [table]}).obstacles) == 1
 
 
-def test_a_shape_that_reaches_deep_into_the_object_is_refused(scene):
+@pytest.mark.parametrize(("shape", "deep"), [("table", 0.008), ("table", 0.012), ("board", 0.018), ("cube", 0.03)])
+def test_a_shape_that_reaches_deep_into_the_object_is_refused(scene, shape: str, deep: float):
     low, high = scene.object.mesh.vertices.min(0), scene.object.mesh.vertices.max(0)
-    for deep in (0.008, 0.012, 0.03):
-        table = {"table": [box_between([-1.0, -1.0, low[2] - 0.1], [1.0, 1.0, low[2] + deep])]}
-        if deep < 0.01:
-            assert with_neighbours(scene, table).obstacles
-            continue
-        with refused(ConfigError, f"'table' reaches {1e3 * deep:.0f} mm into the object", "valid: at most 10 mm"):
-            with_neighbours(scene, table)
-    (floor,) = with_neighbours(scene, {"wall": [box_between([high[0] + 0.001, -1, -1], [1, 1, 1])]}).obstacles
-    assert floor.mesh.vertices.min(0)[0] < high[0]
+    middle = 0.5 * (low + high)
+    solid = {
+        "table": box_between([-1.0, -1.0, low[2] - 0.1], [1.0, 1.0, low[2] + deep]),
+        "board": box_between([-0.3, -0.3, middle[2]], [0.3, 0.3, middle[2] + deep]),
+        "cube": box_between(middle - deep / 2, middle + deep / 2),
+    }[shape]
+    if deep < 0.01:
+        assert with_neighbours(scene, {shape: [solid]}).obstacles
+        return
+    with refused(ConfigError, f"collision object '{shape}' reaches", "valid: at most 10 mm"):
+        with_neighbours(scene, {shape: [solid]})
+
+
+def test_a_bin_of_single_walls_has_no_inside(scene):
+    low, high = scene.object.mesh.vertices.min(0) - 0.03, scene.object.mesh.vertices.max(0) + 0.03
+    box = box_between(low, high)
+    lid = (box.vertices[box.faces][..., 2] > high[2] - 1e-9).all(1)
+    assert lid.sum() == 2
+    assert with_neighbours(scene, {"bin": [TriangleMesh(box.vertices, box.faces[~lid])]}).obstacles
 
 
 def test_an_object_that_its_support_cuts_is_refused_and_one_in_the_air_is_told(scene):

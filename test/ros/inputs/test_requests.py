@@ -3,7 +3,6 @@
 import array
 import math
 import os
-from contextlib import nullcontext
 from dataclasses import replace
 from pathlib import Path
 
@@ -14,7 +13,6 @@ from geometry_msgs.msg import Point, Pose, PoseStamped, Quaternion, Vector3
 from graspd_msgs.msg import GraspRequest
 from hypothesis import given
 from hypothesis import strategies as st
-from scipy.spatial.transform import Rotation
 from sensor_msgs.msg import Image, PointCloud2
 from shape_msgs.msg import SolidPrimitive
 from std_msgs.msg import Header
@@ -213,28 +211,6 @@ def test_views_are_gathered_in_one_frame():
     assert len(taker.views.clouds) == 2
     assert taker.drop_views() == 2
     assert taker.views == Views()
-
-
-@pytest.mark.parametrize(("moved", "turned"), [(0.004, 0.5), (0.006, 0.0), (0.0, 0.7)])
-def test_views_of_a_camera_that_moved_need_a_fixed_frame(moved: float, turned: float):
-    pose = np.eye(4)
-
-    def lookup(target: str, source: str, stamp: Time) -> np.ndarray:
-        assert (target, source) == ("", "camera")
-        return pose.copy()
-
-    taker = intake(lookup)
-    for _ in range(2):
-        taker.newest = sensor_frame(np.array([[0.0, 0.0, 1.0], [0.0, 0.5, 1.0]]))
-        taker.add_view(Settings())
-    pose[:3, :3] = Rotation.from_euler("y", turned, degrees=True).as_matrix()
-    pose[0, 3] = moved
-    with nullcontext() if moved == 0.004 else pytest.raises(TransformError, match=r"moved by .* fixed_frame"):
-        taker.add_view(Settings())
-    assert len(taker.views.clouds) == 2 + (moved == 0.004)
-    # In the frame of a turntable, the camera is not at the origin.
-    taker.newest = replace(taker.newest, read=lambda *_: PointCloud(np.eye(3), np.array([0.0, 0.0, 0.5])))
-    taker.add_view(Settings())
 
 
 def test_the_number_of_views_and_their_size_are_bounded():

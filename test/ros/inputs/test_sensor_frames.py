@@ -1,6 +1,7 @@
 """Layouts of clouds and depth images, their cameras, and where a cloud's camera stood."""
 
 import array
+from contextlib import nullcontext
 from typing import Any
 
 import numpy as np
@@ -11,11 +12,13 @@ from geometry_msgs.msg import Point
 from graspd_msgs.msg import GraspRequest
 from hypothesis import given
 from hypothesis import strategies as st
+from scipy.spatial.transform import Rotation
 from sensor_msgs.msg import CameraInfo, CompressedImage, Image, PointCloud2, PointField
 from std_msgs.msg import Header
 
 from graspd_bench.rendering.depth_noise import DEFAULT
 from graspd_bench.rendering.tabletop import depth_views, ring_poses, tabletop
+from graspd_core import PointCloud
 from graspd_core.errors import CloudError, TransformError
 from graspd_core.io.messages import camera_from_message, depth_and_camera, depth_from_message, frame_fault, image_size
 from graspd_core.mesh.shapes import make_shape
@@ -23,7 +26,7 @@ from graspd_core.perception.cloud.camera import PinholeCamera, camera_rays
 from graspd_ros.error_codes import ErrorCode, RequestError, code_of
 from graspd_ros.inputs import sensor_frames
 from graspd_ros.inputs.request_builder import RequestBuilder
-from graspd_ros.inputs.sensor_frames import ImagePairs, cloud_frame, depth_sensor_frame, place_of, seen_by_camera
+from graspd_ros.inputs.sensor_frames import ImagePairs, Views, cloud_frame, depth_sensor_frame, place_of, seen_by_camera
 from graspd_ros.parameters import Settings
 
 CAMERA = PinholeCamera(320, 240, 308.0, 308.0, 159.5, 119.5)
@@ -390,3 +393,20 @@ def test_a_cloud_of_the_object_alone_is_taken_whole(scene):
     assert loaded.support is None
     assert not loaded.obstacles
     assert np.linalg.norm(loaded.object.mesh.vertices.mean(0) - np.nanmean(bottle, axis=(0, 1))) < 0.06
+
+
+@pytest.mark.parametrize(("moved", "turned"), [(0.004, 0.5), (0.006, 0.0), (0.0, 0.7)])
+def test_views_of_a_camera_that_moved_need_a_fixed_frame(moved: float, turned: float):
+    poses = [np.eye(4), np.eye(4), np.eye(4)]
+    poses[2][:3, :3] = Rotation.from_euler("y", turned, degrees=True).as_matrix()
+    poses[2][0, 3] = moved
+
+    def add(views: Views, pose: np.ndarray, eye: float = 0.0) -> Views:
+        frame = cloud_frame(PointCloud2(header=Header(frame_id="camera")), 1)
+        return views.add(frame, PointCloud(np.eye(3), np.array([0.0, 0.0, eye])), Settings(), lambda *_: pose)
+
+    rested = add(add(Views(), poses[0]), poses[1])
+    with nullcontext() if moved == 0.004 else pytest.raises(TransformError, match=r"moved by .* fixed_frame"):
+        assert len(add(rested, poses[2]).clouds) == 3
+    # In the frame of a turntable, the camera is not at the origin.
+    assert len(add(add(Views(), poses[0], 0.5), poses[2], 0.5).clouds) == 2
