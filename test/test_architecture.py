@@ -68,7 +68,7 @@ MAY_IMPORT = {
 # The layout aims at 22,000 of graspd_core, 4,500 of graspd_ros, 26,000 of test. Input checks added 1,700, 500, 3,300.
 MAX_PACKAGE_LINES = {
     "graspd_core": 27_941,
-    "graspd_ros": 5_247,
+    "graspd_ros": 5_245,
     "graspd_bench": 8_187,
     "graspd_dataset": 3_023,
     "graspd_viewer": 2_420,
@@ -77,7 +77,7 @@ MAX_PACKAGE_LINES = {
 }
 # Lines that a program reaches through its imports, those inside functions too.
 # The layout aims at 22,000 of the node.
-MAX_REACH = {"graspd_core.cli.synthesize_command": 22_946, "graspd_ros.node": 26_697}
+MAX_REACH = {"graspd_core.cli.synthesize_command": 22_946, "graspd_ros.node": 26_695}
 
 # The launch file imports this one where ROS runs it, perhaps without any library of graspd.
 SHORT = ("graspd_core/paths.py",)

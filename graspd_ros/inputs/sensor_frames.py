@@ -248,7 +248,7 @@ def masked_points(
 class Views:
     """Clouds of one scene in a common frame. Views are immutable, and `add` returns a new object.
 
-    `places` are the poses of clouds that were not transformed, in the root of /tf [m].
+    `places` are the poses of a camera's own frame at each view, in the root of /tf [m].
     """
 
     frame: str = ""

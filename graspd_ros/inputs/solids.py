@@ -116,9 +116,7 @@ def with_support(load: Callable[[], Scene], plane: Plane | None) -> Callable[[],
         heights = scene.object.mesh.vertices @ plane.normal - plane.offset
         if heights.min() + heights.max() >= 0:
             return on_support(scene, plane)
-        told = (
-            "surface: its normal points away from the object, so the plane is turned: the object is on its other side"
-        )
+        told = "surface: its normal points away from the object, so the plane was turned"
         scene = replace(scene, object=replace(scene.object, warnings=(*scene.object.warnings, told)))
         return on_support(scene, Plane(-plane.normal, -plane.offset))
 
