@@ -245,7 +245,7 @@ def _grasp_of(values: dict[str, Any], actuated: Bool[np.ndarray, "movable"]) -> 
         metrics=_metrics_of(values["metrics"]),
         trials=tuple(_trial_of(trial) for trial in values["trials"]),
         # Files from before probabilities do not have the key "probability".
-        probability=_probability_of({"probability": None, **values}),
+        probability=_probability_of(values),
         # Files from before arms do not have the key "arm".
         arm=_arm_of(values["arm"]) if values.get("arm") is not None else None,
     )

@@ -13,9 +13,10 @@ import torch
 from expected import some
 from hypothesis import given
 from hypothesis import strategies as st
+from made_meshes import box_between
 
 from graspd_bench.rendering.tabletop import CAMERA, ring_poses, tabletop, views_of
-from graspd_core import PointCloud, load_hand, load_preset, load_scene, plan_grasps, scene_from_views
+from graspd_core import PointCloud, load_hand, load_preset, load_scene, plan_grasps, scene_from_views, with_neighbours
 from graspd_core.config import CertaintyConfig
 from graspd_core.config.planning_config import (
     DOUBTED_SHARE,
@@ -385,6 +386,18 @@ def test_a_mesh_is_not_verified_at_a_mass_that_most_such_objects_exceed(mass: fl
         assert "too many objects of this volume weigh more" in best.reason
         assert some(best.probability) < LEAST_LIGHT
         assert "but the object may weigh 12 kg; " in result.message
+
+
+def test_a_solid_deep_in_what_cameras_saw_is_a_doubt():
+    seen = seen_from()
+    points = seen.known_points()
+    low, high = points.min(0) - 0.3, points.max(0) + 0.3
+    for share, doubts in ((0.01, 0), (0.5, 1)):
+        top = float(np.quantile(points[:, 2], share))
+        table = box_between(low, [high[0], high[1], top])
+        found = some(with_neighbours(seen, {"table": [table]}).evidence).doubts
+        assert len(found) == doubts
+        assert all("collision object 'table' reaches" in doubt for doubt in found)
 
 
 def test_what_is_tried_at_less_mass_begins_with_the_strongest():
