@@ -43,8 +43,8 @@ from graspd_core.planning.any_thing import Failure
 
 # An object is still in its place if more than `_STILL_THERE` of its points are within `_UNMOVED` of points seen [m].
 _UNMOVED, _STILL_THERE = 0.006, 0.6
-# Collision checks for the path to `start`. Without this path the picker ends, so the search is longer than usual.
-_WAY_HOME = 20_000
+# Tries to reach `start`, and collision checks for a path to `start`. The picker ends if the arm cannot reach `start`.
+_TRIES_HOME, _WAY_HOME = 3, 20_000
 
 
 class Ending(StrEnum):
@@ -234,14 +234,24 @@ class Picker:
         return seen_world(points[away > radius[nearest] + 0.03], 0.0, self._known)
 
     def go_home(self) -> None:
-        """Move the arm to `start`, out of the camera's view, and open the hand."""
+        """Move the arm to `start`, out of the camera's view, and open the hand. Raise the arm after a failure."""
+        world = SeenWorld(0.0, self._known)
+        for left in reversed(range(_TRIES_HOME)):
+            try:
+                self._move_arm_home(self._mover(world))
+                break
+            except (MotionAborted, NoMotionError):
+                if not left:
+                    raise
+                self.back_off(world)
+        self._move_hand(self._hand.open_posture)
+
+    def _move_arm_home(self, mover: Mover) -> None:
         now = self._arm_now()
         if np.abs(now - self._layout.start).max() > 0.02:
-            mover = self._mover(SeenWorld(0.0, self._known))
             up = straight(mover, now, np.array([0.0, 0.0, 0.12]))
             self._follow_arm(up, self._pace.free)
             self._follow_arm(find_path(mover, up[-1], self._layout.start, _WAY_HOME), self._pace.free)
-        self._move_hand(self._hand.open_posture)
 
     def go_to_retreat(self, taking: _Taking) -> None:
         """Move the fingers to the pregrasp posture, then the arm to the start of graspd's path."""
@@ -319,7 +329,7 @@ class Picker:
             self._move_hand(self._hand.open_posture)
             mover = self._mover(world)
             self._follow_arm(straight(mover, self._arm_now(), np.array([0.0, 0.0, 0.15])), self._pace.loaded)
-        except MotionAborted:
+        except (MotionAborted, NoMotionError):
             self._stop_if_cancelled()
 
     def _learn(self, attempt: Attempt, offer: Offer) -> None:

@@ -11,7 +11,7 @@ import pytest
 from graspd_cell.grasp_held import after_squeeze, why_lost, why_not_gripped
 from graspd_cell.grasp_source import EMPTY, InProcessGrasps, Offer
 from graspd_cell.picker import Cancelled, Ending, Picker
-from graspd_cell.robot import DepthView, JointMotion, JointReading
+from graspd_cell.robot import DepthView, JointMotion, JointReading, MotionAborted
 from graspd_cell.simulated_robot import SimulatedRobot
 from graspd_core.planning.any_thing import Failure
 
@@ -137,6 +137,31 @@ def test_a_thing_that_the_arm_cannot_put_down_counts_as_taken(robot_of: RobotOf,
     assert attempt.ending is Ending.ABORTED
     assert "holds the object above place bin" in attempt.reason
     assert [failure.executed for failure in picker._failures] == [True]
+
+
+@pytest.mark.parametrize("faults", [2, 3])
+def test_the_way_home_is_tried_again_after_an_abort(robot_of: RobotOf, monkeypatch: pytest.MonkeyPatch, faults: int):
+    robot, follow = robot_of("ur5e_like", "parallel_gripper"), SimulatedRobot.follow
+    arm, start, left = robot.world.arm.joint_names, robot.world.layout.start, faults
+
+    def blocked(self: SimulatedRobot, motion: JointMotion, *more) -> object:
+        """The arm does not reach its start, as if something held it."""
+        nonlocal left
+        if motion.names == arm and np.abs(motion.positions[-1] - start).max() < 1e-3 and left:
+            left -= 1
+            raise MotionAborted("joint 'elbow' left its path")
+        return follow(self, motion, *more)
+
+    robot.follow(JointMotion(arm, np.array([2.0]), start[None] + 0.4, np.zeros((1, len(arm)))), 5.0)
+    monkeypatch.setattr(SimulatedRobot, "follow", blocked)
+    picker = picker_of(robot)
+    if faults == 3:
+        with pytest.raises(MotionAborted, match="left its path"):
+            picker.go_home()
+        return
+    picker.go_home()
+    assert left == 0
+    np.testing.assert_allclose(robot.joints().of(arm).positions, start, atol=0.02)
 
 
 @pytest.mark.parametrize("strength", [1.0, 3.0])
