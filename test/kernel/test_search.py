@@ -57,13 +57,6 @@ def test_threads_and_neighbours_change_no_bit(problem, starts):
     assert torch.equal(pack(one.poses)[7], pack(alone.poses)[0])
 
 
-def test_hopeless_starts_are_dropped(problem, starts):
-    kept = search(problem, starts, keep=4)
-    every = search(problem, starts)
-    assert len(kept.loss) == 4
-    assert set(kept.loss.tolist()) < set(every.loss.tolist())
-
-
 def test_limits_hold_and_quaternions_are_unit(problem, starts):
     poses = search(problem, starts, config=replace(CONFIG, joint_rate=1.0)).poses
     assert ((problem.hand.lower <= poses.joints) & (poses.joints <= problem.hand.upper)).all()
