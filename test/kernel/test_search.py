@@ -22,7 +22,7 @@ def problem(problem_of):
 
 @pytest.fixture(scope="module")
 def starts(hands, scenes) -> Poses:
-    return draw_starts(scenes["crowded"], hands["allegro_right"], 10, 0, "cpu", torch.float32)
+    return draw_starts(scenes["crowded"], hands("allegro_right"), 10, 0, "cpu", torch.float32)
 
 
 def search(problem, starts, keep: int = 10, config=CONFIG, **hooks) -> Solution:

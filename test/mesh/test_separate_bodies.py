@@ -15,7 +15,7 @@ from graspd_core import load_scene, make_shape
 from graspd_core.mesh.components import bodies_apart, drop_small_components
 from graspd_core.mesh.convex_parts import convex_parts
 from graspd_core.mesh.mesh_files import mass_properties, surface_samples
-from graspd_core.mesh.sdf import build_sdf, grid_layout
+from graspd_core.mesh.sdf import build_sdf
 from graspd_core.mesh.surface_queries import make_distance_query, signed_distance
 from graspd_core.mesh.topology import is_closed
 from graspd_core.perception.scene import build_scene
@@ -179,7 +179,7 @@ def test_no_part_reaches_far_outside(name):
     mesh = meshes[name]() if name in meshes else make_shape(name)
     far = np.quantile(bulges(mesh, parts_of(mesh) if name in meshes else parts_of_shape(name)), 0.98, axis=1)
     # The tolerance, half of it again because the cuts go by 100 samples of a hull, and what the grid cannot see.
-    assert far.max() < 0.003 + 0.5 * grid_layout(mesh)[2]
+    assert far.max() < 0.003 + 0.5 * float(build_sdf(mesh).spacing)
 
 
 def test_every_cut_makes_its_sides_smaller():

@@ -61,11 +61,11 @@ def test_gradients_of_the_losses(name: str, slope_errors: Callable[..., Tensor])
     assert slope_errors(function, x, step=1e-6).max() < 1e-5
 
 
-def random_poses(hand, scene, count: int, dtype: torch.dtype = torch.float64) -> Poses:
+def random_poses(hand, scene, count: int) -> Poses:
     """Starts pushed 2 cm towards the object, with joints anywhere in their limits, so that every term is at work."""
-    starts = draw_starts(scene, hand, count, 3, "cpu", dtype)
+    starts = draw_starts(scene, hand, count, 3, "cpu", torch.float64)
     lower, upper = torch.as_tensor(hand.lower), torch.as_tensor(hand.upper)
-    joints = (lower + (upper - lower) * draw(count, len(lower), seed=1)).to(dtype)
+    joints = lower + (upper - lower) * draw(count, len(lower), seed=1)
     inward = -starts.translation / starts.translation.norm(dim=-1, keepdim=True)
     return Poses(starts.translation + 0.02 * inward, starts.quaternion, joints)
 

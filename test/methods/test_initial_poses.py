@@ -77,12 +77,19 @@ def test_starts_face_the_object_from_outside_within_limits(hand, scenes, name):
     assert (distance > 0).all()
     # The stand-off is at most 50 mm along the hull's normal, and these objects are their own hulls.
     assert (distance < 0.052).all()
-    # The palm looks along the inward normal but for a tilt of 0.35 rad, and 3° of a sphere's facets; 60° leave room for
-    # normals near edges.
-    widest = 0.35 + 0.05 if name == "sphere" else np.pi / 3
-    assert ((normal * -outward).sum(-1) > np.cos(widest)).all()
+    # The palm looks along the inward normal but for a tilt of 0.35 rad; 60° leave room for normals near edges.
+    assert ((normal * -outward).sum(-1) > np.cos(np.pi / 3)).all()
     assert ((torch.as_tensor(hand.lower) <= starts.joints) & (starts.joints <= torch.as_tensor(hand.upper))).all()
     assert starts.quaternion.norm(dim=-1).numpy() == pytest.approx(np.ones(COUNT), abs=1e-12)
+
+
+def test_palms_look_at_the_middle_of_a_sphere(hand, scenes):
+    starts = draw_starts(scenes["sphere"], hand, COUNT, 1, "cpu", torch.float64)
+    rotation = rotation_from_quaternion(starts.quaternion)
+    palm = (rotation @ torch.as_tensor(hand.palm_center)) + starts.translation
+    cosine = ((rotation @ torch.as_tensor(hand.palm_normal)) * -palm).sum(-1) / palm.norm(dim=-1)
+    # A tilt of 0.35 rad, and 3° of the sphere's facets.
+    assert (cosine > np.cos(0.35 + 0.05)).all()
 
 
 @pytest.mark.parametrize("name", ["allegro_right", "leap_right", "barrett_like", "parallel_gripper"])

@@ -10,7 +10,7 @@ from expected import refused
 
 from graspd_core.errors import HandError
 from graspd_core.hands.kinematics import link_poses
-from graspd_core.hands.library import DEFAULT_EFFORT, DEFAULT_FORCE, hand_names, load_hand, read_hand_file
+from graspd_core.hands.library import DEFAULT_EFFORT, DEFAULT_FORCE, load_hand, read_hand_file
 from graspd_core.hands.model import HandModel, Mimic, all_joint_names, all_joint_positions
 
 BOX = '<collision><geometry><box size="0.02 0.02 0.04"/></geometry></collision>'
@@ -191,7 +191,7 @@ def test_what_a_hand_can_hardly_have_is_warned_of(tmp_path: Path, text: str, tol
 
 
 def test_what_is_as_it_should_be_is_not_warned_of(tmp_path: Path) -> None:
-    """A linkage whose joints follow, an effort that the description names, and every shipped hand."""
+    """A linkage whose joints follow, and an effort that the description names; shipped hands: test_boxed_hands.py."""
     (tmp_path / "a.urdf").write_text(
         f'<robot name="closed"><link name="palm">{BOX}</link>{KNUCKLES.format("", MIMIC, MIMIC)}</robot>'
     )
@@ -199,7 +199,6 @@ def test_what_is_as_it_should_be_is_not_warned_of(tmp_path: Path) -> None:
     (tmp_path / "tiny.urdf").write_text(HAND.replace('effort="2"', 'effort="6e4"'))
     (tmp_path / "tiny.yaml").write_text("urdf: tiny.urdf\neffort: 2.0\n")
     assert not [w for w in load_hand(tmp_path / "tiny.yaml", candidates=20).warnings if "effort" in w]
-    assert [load_hand(name, candidates=20).warnings for name in hand_names()] == [()] * len(hand_names())
 
 
 def test_a_xacro_file_is_named_with_the_command(tmp_path: Path) -> None:
