@@ -1,10 +1,10 @@
 """What every built-in hand must show, a new one too; the makers' figures of the Allegro and the LEAP hand."""
+# pyright: reportAttributeAccessIssue=false
 
-import importlib
 import re
 from pathlib import Path
-from typing import Any
 
+import mujoco
 import numpy as np
 import pytest
 import torch
@@ -36,9 +36,9 @@ LEAP_TIPS = [
     [0.02002, -0.06824, -0.09861],
     [-0.06132, 0.04303, -0.08248],
 ]
-ALLEGRO_ENDS = tuple(f"link_{number}.0_tip" for number in (3, 7, 11, 15))
+TIPS = tuple(f"link_{number}.0_tip" for number in (3, 7, 11, 15))
 GOLDEN = {
-    "allegro_right": (ALLEGRO_ENDS, np.array(ALLEGRO_TIPS)),
+    "allegro_right": (TIPS, np.array(ALLEGRO_TIPS)),
     "leap_right": (("fingertip", "fingertip_2", "fingertip_3", "thumb_fingertip"), np.array(LEAP_TIPS)),
 }
 
@@ -50,7 +50,6 @@ def tips(hand: HandModel, q: np.ndarray) -> np.ndarray:
 
 
 def test_forward_kinematics_agree_with_mujocos(hand: HandModel) -> None:
-    mujoco: Any = importlib.import_module("mujoco")  # it ships no type information
     keep = '<mujoco><compiler fusestatic="false" discardvisual="true"/></mujoco>'
     text = re.sub(r"<robot\b[^>]*>", lambda match: match.group() + keep, Path(hand.urdf).read_text(), count=1)
     model = mujoco.MjModel.from_xml_string(text)
@@ -121,8 +120,6 @@ def test_a_box_is_grasped(hand: HandModel) -> None:
     for posture in (best.pregrasp, best.grasp, best.squeeze):
         assert ((hand.lower <= posture.joint_positions) & (posture.joint_positions <= hand.upper)).all()
 
-
-TIPS = ("link_3.0_tip", "link_7.0_tip", "link_11.0_tip", "link_15.0_tip")
 
 # Extents of the makers' meshes in their link frames [m]: lower corner, upper corner.
 ALLEGRO = {

@@ -8,7 +8,6 @@ from functools import partial
 import numpy as np
 import pytest
 import torch
-from expected import some
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
@@ -54,21 +53,13 @@ def test_distances_are_those_of_the_primitives_and_pairs_are_entries_of_the_whol
     q, points = drawn(hand, seed)
     links = forward(kinematics, q)
     together = solid_distance(solids, links, points)
-    assert together.shape == (2, 12, len(hand.primitives))
-    for link in range(hand.num_links):
-        local = links[:, link].apply_inverse(points)
-        # The same formulas in another order: rounding of 0.1 m.
-        for number, primitive in enumerate(hand.primitives):
-            if primitive.link == link:
-                alone = primitive_sdf(primitive, local)
-                assert together[..., number].numpy() == pytest.approx(alone.numpy(), abs=1e-12)
-        own = solids.link == link
-        if own.any():
-            union = torch.stack([primitive_sdf(p, local) for p in hand.primitives_of[link]]).amin(0)
-            assert together[..., own].amin(-1).numpy() == pytest.approx(union.numpy(), abs=1e-12)
+    assert solids.link.tolist() == [primitive.link for primitive in hand.primitives]
+    alone = [primitive_sdf(primitive, links[:, primitive.link].apply_inverse(points)) for primitive in hand.primitives]
+    # The same formulas in another order: rounding of 0.1 m.
+    assert together.numpy() == pytest.approx(torch.stack(alone, -1).numpy(), abs=1e-12)
     which = torch.randint(len(solids.link), points.shape[:2], generator=torch.Generator().manual_seed(seed))
     pairs = pair_distance(solids, links, points, which)
-    whole = solid_distance(solids, links, points).gather(-1, which[..., None]).squeeze(-1)
+    whole = together.gather(-1, which[..., None]).squeeze(-1)
     assert pairs.numpy() == pytest.approx(whole.numpy(), abs=1e-12)
 
 
@@ -155,28 +146,6 @@ GOLDEN = [
 def test_golden_distance(name, point, expected):
     distance = KERNELS[name](torch.tensor(point, dtype=torch.float64))
     assert float(distance) == pytest.approx(expected, abs=1e-12)
-
-
-@pytest.mark.parametrize("name", KERNELS)
-def test_gradient_has_no_nan_on_centre_and_axis(name):
-    points = torch.tensor([[0.0, 0.0, 0.0], [0.0, 0.0, 0.1], [0.0, 0.0, 0.2], [0.0, 0.0, 0.9]], requires_grad=True)
-    KERNELS[name](points).sum().backward()
-    assert torch.isfinite(some(points.grad)).all()
-
-
-@pytest.mark.parametrize("name", KERNELS)
-@given(seed=st.integers(0, 10_000))
-def test_gradient_is_the_finite_difference(name, seed):
-    generator = torch.Generator().manual_seed(seed)
-    # Irregular offsets keep clear of the creases, where no derivative exists.
-    points = torch.rand(4, 3, generator=generator, dtype=torch.float64) - 0.5
-    points.requires_grad_()
-    (gradient,) = torch.autograd.grad(KERNELS[name](points).sum(), points)
-    step = 1e-6
-    shifts = step * torch.eye(3, dtype=torch.float64)
-    ahead, behind = (torch.stack([KERNELS[name](points.detach() + s * d) for d in shifts], -1) for s in (1, -1))
-    smooth = (ahead + behind - 2 * KERNELS[name](points.detach())[:, None]).abs() < 1e-9
-    assert torch.allclose(gradient[smooth], ((ahead - behind) / (2 * step))[smooth], atol=1e-5)
 
 
 @pytest.mark.parametrize("name", KERNELS)

@@ -4,8 +4,10 @@ The LEAP hand that its makers publish has fine meshes for collision shapes. A st
 the shipped hand here: every link is a shell of thin plates, each a fine mesh file.
 """
 
+import itertools
 import re
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -19,9 +21,8 @@ from graspd_core.hands.kinematics import link_poses
 from graspd_core.hands.library import load_hand, read_hand_file
 from graspd_core.hands.link_distance import bounds, make_collision_tensors, solid_distance
 from graspd_core.hands.model import HandModel, Primitive
-from graspd_core.hands.readers.xml_io import rotation_from_rpy
 from graspd_core.hands.self_collision import MOST_OF_GROUP, MOST_OF_HAND, collision_spheres
-from graspd_core.hands.surface_points import surface_points
+from graspd_core.hands.surface_points import surface_points, with_candidates
 from graspd_core.paths import config_dir
 from graspd_core.se3 import SE3
 
@@ -70,27 +71,19 @@ def fine_leap(folder: Path, fineness: int) -> Path:
     return path
 
 
-def cut_up(folder: Path, parts: tuple[int, int, int]) -> Path:
+def cut_up(parts: tuple[int, int, int]) -> HandModel:
     """The shipped Allegro hand with each of its boxes cut into many."""
-    text = (config_dir() / "hands" / "allegro_right.urdf").read_text()
-    shape = re.compile(
-        r'<collision>\s*(?:<origin(?: xyz="([^"]*)")?(?: rpy="([^"]*)")?\s*/>)?\s*<geometry>\s*'
-        r'<box size="([^"]*)"\s*/>\s*</geometry>\s*</collision>'
-    )
 
-    def pieces(found: re.Match[str]) -> str:
-        xyz, rpy = (np.array([float(x) for x in (text or "0 0 0").split()]) for text in (found[1], found[2]))
-        size = np.array([float(x) for x in found[3].split()])
-        turn = rotation_from_rpy(rpy)
-        return "".join(
-            '<collision><origin xyz="{} {} {}" rpy="{} {} {}"/><geometry><box size="{} {} {}"/></geometry></collision>'
-            .format(*(turn @ (((np.array(cell) + 0.5) / parts - 0.5) * size) + xyz), *rpy, *(size / parts))
-            for cell in np.ndindex(*parts)
-        )  # fmt: skip
+    def pieces(box: Primitive) -> list[Primitive]:
+        size = np.array(box.size) / parts
+        cells = (2 * np.array(list(np.ndindex(*parts))) + 1 - parts) * size
+        return [
+            replace(box, translation=box.translation + box.rotation @ cell, size=tuple(size.tolist())) for cell in cells
+        ]
 
-    path = folder / "cut_up.urdf"
-    path.write_text(shape.sub(pieces, text))
-    return path
+    hand = load_hand("allegro_right", candidates=1)
+    solids = [pieces(solid) if solid.kind == "box" else [solid] for solid in hand.primitives]
+    return replace(hand, primitives=tuple(itertools.chain.from_iterable(solids)))
 
 
 def by_group(hand: HandModel) -> np.ndarray:
@@ -112,10 +105,14 @@ def bareness(hand: HandModel) -> float:
 
 
 @pytest.mark.parametrize(
-    ("make", "bare"), [(lambda folder: fine_leap(folder, 1), 0.03), (lambda folder: cut_up(folder, (5, 5, 4)), 0.02)]
+    ("make", "bare"),
+    [(lambda folder: read_hand_file(fine_leap(folder, 1)), 0.03), (lambda _: cut_up((5, 5, 4)), 0.02)],
+    ids=["meshes", "boxes"],
 )
-def test_a_crowded_hand_has_as_many_spheres_as_any(make: Callable[[Path], Path], bare: float, tmp_path: Path) -> None:
-    hand = read_hand_file(make(tmp_path))
+def test_a_crowded_hand_has_as_many_spheres_as_any(
+    make: Callable[[Path], HandModel], bare: float, tmp_path: Path
+) -> None:
+    hand = make(tmp_path)
     counts = by_group(hand)
     assert counts.sum() <= MOST_OF_HAND
     assert counts.max() <= MOST_OF_GROUP
@@ -187,11 +184,11 @@ def test_a_flat_cone_is_a_hull_too(sections: int, tmp_path: Path) -> None:
     np.testing.assert_allclose(np.ptp(hull.vertices, axis=0)[0], 0.04, rtol=0.01)
 
 
-def test_distances_to_very_many_solids_are_those_to_each(tmp_path: Path) -> None:
-    hand = read_hand_file(cut_up(tmp_path, (5, 5, 4)))
+def test_distances_to_very_many_solids_are_those_to_each() -> None:
+    hand = cut_up((5, 5, 4))
     solids = make_collision_tensors(hand, "cpu", torch.float32)
     links = SE3(*(torch.as_tensor(a).float().expand(3, *a.shape) for a in link_poses(hand, hand.open_posture)))
-    points = torch.as_tensor(np.random.default_rng(0).uniform(-0.1, 0.1, (3, 2000, 3))).float()
+    points = torch.as_tensor(np.random.default_rng(0).uniform(-0.1, 0.1, (3, 400, 3))).float()
     together = solid_distance(solids, links, points)
     for row in range(3):
         alone = solid_distance(solids, links[row : row + 1], points[row : row + 1])
@@ -200,8 +197,12 @@ def test_distances_to_very_many_solids_are_those_to_each(tmp_path: Path) -> None
 
 @pytest.mark.slow
 @pytest.mark.timeout(900)
-@pytest.mark.parametrize("make", [lambda folder: fine_leap(folder, 4), lambda folder: cut_up(folder, (5, 5, 4))])
-def test_a_crowded_hand_holds_a_box(make: Callable[[Path], Path], tmp_path: Path) -> None:
-    hand = load_hand(make(tmp_path))
+@pytest.mark.parametrize(
+    "make",
+    [lambda folder: load_hand(fine_leap(folder, 4)), lambda _: with_candidates(cut_up((5, 5, 4)), 600)],
+    ids=["meshes", "boxes"],
+)
+def test_a_crowded_hand_holds_a_box(make: Callable[[Path], HandModel], tmp_path: Path) -> None:
+    hand = make(tmp_path)
     result = plan_grasps(load_scene("shape:box"), hand, count=1, seed=0, preset="fast")
     assert result.outcome is Outcome.SUCCEEDED

@@ -19,8 +19,6 @@ from graspd_core.hands.self_collision import adjacent_links, link_overlaps
 from graspd_core.hands.surface_points import dense_samples
 from graspd_core.paths import config_dir
 
-HANDS = [name for name in hand_names() if (config_dir() / "hands" / f"{name}.urdf").is_file()]
-
 
 @pytest.fixture(scope="module")
 def allegro() -> tuple[HandModel, HandModel]:
@@ -29,7 +27,7 @@ def allegro() -> tuple[HandModel, HandModel]:
     return load_hand("allegro_right", candidates=10), default_postures(default_palm(read_hand_file(path)))
 
 
-@pytest.mark.parametrize("name", HANDS)
+@pytest.mark.parametrize("name", hand_names())
 def test_the_palm_is_found(name: str) -> None:
     described = load_hand(name, candidates=10)
     guessed = default_palm(read_hand_file(Path(described.urdf)))
@@ -96,7 +94,7 @@ def test_a_description_overrides_what_it_names(tmp_path: Path) -> None:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("name", HANDS)
+@pytest.mark.parametrize("name", hand_names())
 def test_a_guessed_hand_holds_a_box(name: str) -> None:
     hand = load_hand(config_dir() / "hands" / f"{name}.urdf")
     result = plan_grasps(load_scene("shape:box"), hand, count=1, seed=0, preset="fast", deadline=100.0)

@@ -1,13 +1,15 @@
 """Problems that use every part of the kernel."""
 
 import os
+from collections.abc import Callable
 from dataclasses import replace
+from functools import cache
 
 import numpy as np
 import pytest
 import torch
 
-from graspd_core import HandModel, Problem, Scene, build_problem, draw_starts, hand_names, load_hand, load_scene
+from graspd_core import HandModel, Problem, Scene, build_problem, draw_starts, load_hand, load_scene
 from graspd_core.config import ProblemConfig
 from graspd_core.optimize.kernel.builds import kernel
 from graspd_core.optimize.loop import moved_along, pack
@@ -39,17 +41,18 @@ def scenes() -> dict[str, Scene]:
 
 
 @pytest.fixture(scope="session")
-def hands() -> dict[str, HandModel]:
-    return {name: load_hand(name, candidates=240) for name in hand_names()}
+def hands() -> Callable[[str], HandModel]:
+    return cache(lambda name: load_hand(name, candidates=240))
 
 
 @pytest.fixture(scope="session")
 def problem_of(hands, scenes):
-    """The problem of a hand and a scene by name."""
+    """The problem of a hand and a scene by name, built once."""
 
+    @cache
     def problem_of(hand: str, scene: str) -> Problem:
         settings = ProblemConfig(candidates=120, features=24, directions=12, friction=0.5)
-        return build_problem(scenes[scene], hands[hand], settings, seed=0)
+        return build_problem(scenes[scene], hands(hand), settings, seed=0)
 
     return problem_of
 
@@ -58,11 +61,11 @@ def problem_of(hands, scenes):
 def rows_of(hands, scenes):
     """Starts on their way to the object: rows of `AdamState.x`."""
 
-    def rows_of(hand: str, scene: str, problem: Problem, count: int = 12) -> torch.Tensor:
-        starts = draw_starts(scenes[scene], hands[hand], count, 3, "cpu", torch.float32)
+    def rows_of(hand: str, scene: str, problem: Problem) -> torch.Tensor:
+        starts = draw_starts(scenes[scene], hands(hand), 12, 3, "cpu", torch.float32)
         x = pack(moved_along(starts, problem.hand.pivot))
         # Some before the surface, some across it.
-        share = torch.linspace(1.0, 0.4, count)[:, None]
+        share = torch.linspace(1.0, 0.4, 12)[:, None]
         x[:, :3] = share * x[:, :3] + (1 - share) * problem.object.center
         return x
 

@@ -7,7 +7,6 @@ import torch
 
 from graspd_core.errors import ConfigError
 from graspd_core.optimize.kernel import builds
-from graspd_core.optimize.kernel import builds as structs
 
 
 def test_the_best_build_that_runs_here_is_taken(monkeypatch):
@@ -45,9 +44,9 @@ def test_a_machine_without_the_instructions_gets_the_baseline(monkeypatch):
 
 def test_other_structures_are_noticed(monkeypatch):
     class Grown(ctypes.Structure):
-        _fields_ = [*structs.Weights._fields_, ("more", ctypes.c_float)]
+        _fields_ = [*builds.Weights._fields_, ("more", ctypes.c_float)]
 
-    changed = tuple(Grown if s is structs.Weights else s for s in structs.STRUCTURES)
+    changed = tuple(Grown if s is builds.Weights else s for s in builds.STRUCTURES)
     monkeypatch.setattr(builds, "STRUCTURES", changed)
     assert builds.load("baseline").reason == "built from other sources: install graspd again"
 

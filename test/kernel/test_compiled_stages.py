@@ -16,8 +16,8 @@ def torch_alone(monkeypatch):
     return lambda: monkeypatch.setenv("GRASPD_KERNEL", "off")
 
 
-# Without obstacles, one branch falls away, the same for every hand.
-ON = [*((hand, "crowded") for hand in hand_names()), ("barrett_like", "mug")]
+# The left hand is the mirror image of the right. Without obstacles, one branch falls away, the same for every hand.
+ON = [*((hand, "crowded") for hand in hand_names() if hand != "allegro_left"), ("barrett_like", "mug")]
 
 
 def grasps_of(problem, rows) -> Poses:

@@ -72,7 +72,7 @@ def test_it_agrees_with_torch(problem_of, rows_of, hand, scene, look):
 @pytest.mark.parametrize("patch_size", [0, 4])
 def test_a_link_without_coarse_candidates_is_in_no_group(hands, scenes, rows_of, patch_size):
     settings = ProblemConfig(candidates=8, patch_size=patch_size)
-    problem = build_problem(scenes["box"], hands["allegro_right"], settings, seed=0)
+    problem = build_problem(scenes["box"], hands("allegro_right"), settings, seed=0)
     x, radius = rows_of("allegro_right", "box", problem), torch.full((12,), 0.003)
     distance = evaluate_compiled(some(problem.compiled), x, radius, DELTA, WEIGHTS, fine=True)[2].distance
     assert distance.tolist() == pytest.approx(by_torch(problem, x, radius, fine=True).distance.tolist(), rel=1e-4)

@@ -22,7 +22,7 @@ def problem(problem_of):
 
 @pytest.fixture(scope="module")
 def starts(hands, scenes) -> Poses:
-    return draw_starts(scenes["crowded"], hands["allegro_right"], 10, 0, "cpu", torch.float32)
+    return draw_starts(scenes["crowded"], hands("allegro_right"), 10, 0, "cpu", torch.float32)
 
 
 def search(problem, starts, keep: int = 10, config=CONFIG, **hooks) -> Solution:
@@ -55,13 +55,6 @@ def test_threads_and_neighbours_change_no_bit(problem, starts):
     assert torch.equal(pack(one.poses), pack(three.poses))
     assert torch.equal(one.loss, three.loss)
     assert torch.equal(pack(one.poses)[7], pack(alone.poses)[0])
-
-
-def test_hopeless_starts_are_dropped(problem, starts):
-    kept = search(problem, starts, keep=4)
-    every = search(problem, starts)
-    assert len(kept.loss) == 4
-    assert set(kept.loss.tolist()) < set(every.loss.tolist())
 
 
 def test_limits_hold_and_quaternions_are_unit(problem, starts):

@@ -405,7 +405,7 @@ def add_at(library: GraspLibrary, hand: HandModel, planned: GraspResult, mass: f
     library.add(entry_of(target, hand, "standard"), target, hand, load_preset("fast"), planned.tried[:count])
 
 
-def test_of_an_unknown_mass_the_heaviest_are_given_first_and_the_light_ones_never(library, scene, hand, planned):
+def test_of_an_unknown_mass_the_heaviest_are_given_first_and_the_light_ones_never(library, hand, planned):
     for mass in (0.05, 0.4, 0.8, 0.2):
         add_at(library, hand, planned, mass, 1)
     unknown = load_scene("shape:sphere")
@@ -413,7 +413,7 @@ def test_of_an_unknown_mass_the_heaviest_are_given_first_and_the_light_ones_neve
     assert [entry.mass for entry in library.of_mesh(entry_of(unknown.object, hand, "standard"))] == [0.8, 0.4]
 
 
-def test_what_was_stored_with_a_mass_is_not_verified_for_one_that_nobody_knows(library, hand, planned, ball):
+def test_what_was_stored_with_a_mass_is_not_verified_for_one_that_nobody_knows(library, hand, ball):
     unknown = load_scene(ball)
     assert known_grasps(library, unknown, hand).grasps == ()
     assert entry_by_file(library, hand, ball, 1.0, Physics(None, 0.6), required=False) is None

@@ -25,8 +25,6 @@ from graspd_core.mesh.shapes import (
     CAPSULE_RADIUS,
     CYLINDER_HALF,
     CYLINDER_RADIUS,
-    MUG_RADIUS,
-    MUG_WALL,
     PLATE_HALF,
     SHAPES,
     SPHERE_RADIUS,
@@ -85,7 +83,7 @@ def open_mug() -> TriangleMesh:
     return TriangleMesh(mug.vertices, mug.faces[~bottom])
 
 
-@pytest.mark.parametrize("resolution", [9, 30, 48])
+@pytest.mark.parametrize("resolution", [9, 30])
 @pytest.mark.parametrize("name", [*SHAPES, "open mug"])
 def test_nodes_are_exact_near_the_surface_and_off_by_half_a_cell_at_most(name, resolution):
     mesh = open_mug() if name == "open mug" else make_shape(name)
@@ -177,16 +175,6 @@ def test_precisions_agree_and_nothing_is_nan_at_nodes_centre_and_border(box):
     assert torch.isfinite(some(nodes.grad)).all()
 
 
-def test_the_mug_is_hollow_and_its_handle_is_joined():
-    sdf = build_sdf(make_shape("mug"), resolution=64)
-    axis, wall, root, hole = (0, 0, 0.01), (0, MUG_RADIUS - MUG_WALL / 2, 0), (0.042, 0, 0.028), (0.05, 0, 0)
-    found = phi(sdf, [axis, wall, root, hole])
-    assert found[0] == pytest.approx(MUG_RADIUS - MUG_WALL, abs=0.002)
-    assert found[1] < 0
-    assert found[2] < 0
-    assert found[3] > 0.005
-
-
 @pytest.mark.parametrize("change", ["invert", "double", "mix"])
 def test_damaged_surfaces_have_the_same_inside(change):
     sphere = make_shape("sphere")
@@ -240,9 +228,6 @@ def test_a_rod_is_seen_by_a_grid_of_as_many_nodes():
     # Halfway along, at its end, and beside it as far as the grid does not reach.
     assert phi(sdf, [(0.012, 0, 0.1), (0, 0, 0.6)]) == pytest.approx(0.0, abs=0.002)
     assert phi(sdf, [(0.1, 0.0, 0.3)]) == pytest.approx(0.088, abs=0.001)
-
-
-RADIUS, HEIGHT = 0.033, 0.08
 
 
 @pytest.mark.parametrize("wall", [5e-4, 9e-4, 1.5e-3])

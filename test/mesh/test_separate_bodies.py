@@ -1,5 +1,7 @@
 """Bodies apart, small components, and convex parts that fill the object, stay near it and leave hollows open."""
 
+from functools import cache
+
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -131,6 +133,11 @@ def parts_of(mesh: TriangleMesh, **settings) -> tuple[TriangleMesh, ...]:
     return convex_parts(mesh, build_sdf(mesh), **settings)
 
 
+@cache
+def parts_of_shape(name: str) -> tuple[TriangleMesh, ...]:
+    return parts_of(make_shape(name))
+
+
 def depth_outside(parts, points):
     """Distance past the nearest part's farthest plane: 0 or less inside some part."""
     planes = [ConvexHull(part.vertices).equations for part in parts]
@@ -145,7 +152,7 @@ def bulges(mesh, parts):
 
 @pytest.fixture(scope="module", params=["mug", "bowl"])
 def hollow(request) -> tuple[str, tuple[TriangleMesh, ...]]:
-    return request.param, parts_of(make_shape(request.param))
+    return request.param, parts_of_shape(request.param)
 
 
 def test_hollow_things_are_covered_and_hardly_exceeded(hollow):
@@ -170,10 +177,9 @@ def test_no_part_reaches_far_outside(name):
         "thin cup": lambda: thin_cup(5e-4),
     }
     mesh = meshes[name]() if name in meshes else make_shape(name)
-    sdf = build_sdf(mesh)
-    far = np.quantile(bulges(mesh, convex_parts(mesh, sdf)), 0.98, axis=1)
+    far = np.quantile(bulges(mesh, parts_of(mesh) if name in meshes else parts_of_shape(name)), 0.98, axis=1)
     # The tolerance, half of it again because the cuts go by 100 samples of a hull, and what the grid cannot see.
-    assert far.max() < 0.003 + 0.5 * float(sdf.spacing)
+    assert far.max() < 0.003 + 0.5 * float(build_sdf(mesh).spacing)
 
 
 def test_every_cut_makes_its_sides_smaller():
@@ -209,7 +215,7 @@ def test_convex_things_are_one_part(name):
 
 @pytest.mark.parametrize(("name", "most"), [("l_block", 4), ("hammer", 6), ("torus", 24)])
 def test_simple_things_need_few_parts(name, most):
-    parts = parts_of(make_shape(name))
+    parts = parts_of_shape(name)
     assert 2 <= len(parts) <= most
     assert sum(ConvexHull(part.vertices).volume for part in parts) == pytest.approx(shape_volume(name), rel=0.2)
 

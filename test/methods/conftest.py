@@ -36,15 +36,11 @@ def problem_of(hand: HandModel, scenes: dict[str, Scene]) -> Callable[[str, torc
 
 
 @pytest.fixture(scope="session")
-def solver_of(scenes: dict[str, Scene]) -> Callable[..., Graspd2022]:
-    """The solver of Grasp'D with given settings, for an object by name."""
-
-    def solver_of(config: Graspd2022Config, name: str = "box", dtype: torch.dtype = torch.float64) -> Graspd2022:
-        thing = scenes[name].object
-        body = make_body(thing.mass, thing.inertia, thing.center_of_mass, thing.radius, "cpu", dtype)
-        return Graspd2022(config, body)
-
-    return solver_of
+def solver_of(scenes: dict[str, Scene]) -> Callable[[Graspd2022Config], Graspd2022]:
+    """The solver of Grasp'D for the box, with given settings."""
+    box = scenes["box"].object
+    body = make_body(box.mass, box.inertia, box.center_of_mass, box.radius, "cpu", torch.float64)
+    return lambda config: Graspd2022(config, body)
 
 
 @pytest.fixture(scope="session")

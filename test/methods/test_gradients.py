@@ -1,9 +1,6 @@
 """Every differentiable term against central differences in float64, and the terms in single precision."""
 
-import subprocess
-import sys
 from collections.abc import Callable
-from pathlib import Path
 
 import pytest
 import torch
@@ -15,7 +12,6 @@ from graspd_core.optimize.initial_poses import draw_starts
 from graspd_core.optimize.loop import Poses, pack, unpack
 from graspd_core.optimize.problem import Terms, evaluate
 
-ROOT = Path(__file__).parents[2]
 RADIUS, DELTA = 0.002, 0.01
 # These scenes have no obstacles; their term has its own test in test_obstacles.py.
 TERMS = Terms._fields[:-1]
@@ -65,11 +61,11 @@ def test_gradients_of_the_losses(name: str, slope_errors: Callable[..., Tensor])
     assert slope_errors(function, x, step=1e-6).max() < 1e-5
 
 
-def random_poses(hand, scene, count: int, dtype: torch.dtype = torch.float64) -> Poses:
+def random_poses(hand, scene, count: int) -> Poses:
     """Starts pushed 2 cm towards the object, with joints anywhere in their limits, so that every term is at work."""
-    starts = draw_starts(scene, hand, count, 3, "cpu", dtype)
+    starts = draw_starts(scene, hand, count, 3, "cpu", torch.float64)
     lower, upper = torch.as_tensor(hand.lower), torch.as_tensor(hand.upper)
-    joints = (lower + (upper - lower) * draw(count, len(lower), seed=1)).to(dtype)
+    joints = lower + (upper - lower) * draw(count, len(lower), seed=1)
     inward = -starts.translation / starts.translation.norm(dim=-1, keepdim=True)
     return Poses(starts.translation + 0.02 * inward, starts.quaternion, joints)
 
@@ -116,31 +112,3 @@ def test_single_and_double_precision_agree(hand, scenes, problem_of, name, fine)
     # distances of self-collision cancel once more.
     for term, a, b in zip(TERMS, single[:-1], double[:-1], strict=True):
         assert a.double().numpy() == pytest.approx(b.numpy(), rel=1e-3, abs=1e-4), term
-
-
-EVALUATION = """
-import torch
-from graspd_core.perception.load_scene import load_scene
-from graspd_core.hands.library import load_hand
-from graspd_core.optimize.initial_poses import draw_starts
-from graspd_core.config import ProblemConfig
-from graspd_core.optimize.problem import build_problem, evaluate
-
-torch.set_num_threads(1)
-hand, scene = load_hand("allegro_right", candidates=80), load_scene("shape:box", resolution=24)
-settings = ProblemConfig(candidates=60, features=24, directions=12, friction=0.5)
-problem = build_problem(scene, hand, settings, seed=0, dtype=torch.float64)
-p = draw_starts(scene, hand, 2, 0, "cpu", torch.float64)
-arguments = (problem, p, torch.zeros(2, dtype=torch.float64), 0.004)
-traced = torch.compile(evaluate, backend="eager", fullgraph=True)
-for fine in (False, True):
-    look = {"fine": fine, "sharp": fine}
-    for a, b in zip(traced(*arguments, **look), evaluate(*arguments, **look), strict=True):
-        torch.testing.assert_close(a, b)
-"""
-
-
-def test_the_whole_evaluation_traces_in_one_graph():
-    # In a process of its own, without the run-time shape checks, which do not trace.
-    done = subprocess.run([sys.executable, "-c", EVALUATION], cwd=ROOT, capture_output=True, text=True, check=False)
-    assert done.returncode == 0, done.stderr

@@ -61,16 +61,23 @@ def draw(seed: int, *shape: int) -> Tensor:
     return torch.randn(*shape, generator=torch.Generator().manual_seed(seed), dtype=torch.float64)
 
 
-def test_adamax_by_hand():
-    state = adamax(torch.zeros(1, 2, dtype=torch.float64))
-    state = adamax_step(state, torch.tensor([[4.0, -0.5]], dtype=torch.float64), 0.1, 1)
-    # The first step has the size of the rate, whatever the gradient's.
-    assert state.value[0].tolist() == pytest.approx([-0.1, 0.1])
-    state = adamax_step(state, torch.tensor([[2.0, 1.0]], dtype=torch.float64), 0.1, 2)
-    # Means 0.9 · 0.4 + 0.2 and 0.9 · (−0.05) + 0.1, over 1 − 0.9²; maxima 0.999 · 4 and 1.
-    assert state.value[0].tolist() == pytest.approx([-0.1 - 0.056 / 0.19 / 3.996, 0.1 - 0.0055 / 0.19], rel=1e-6)
-    forgetful = adamax_step(state, torch.zeros(1, 2, dtype=torch.float64), 0.1, 3, memory=0.5)
-    assert forgetful.top[0].tolist() == pytest.approx([1.998, 0.5])
+@pytest.mark.parametrize(
+    ("step", "optimiser"), [(adam_step, torch.optim.Adam), (adamax_step, torch.optim.Adamax)], ids=["Adam", "Adamax"]
+)
+def test_steps_are_those_of_torch(step, optimiser):
+    x = torch.zeros(1, 3, dtype=torch.float64, requires_grad=True)
+    theirs, ours = optimiser([x], lr=0.1), adamax(torch.zeros(1, 3, dtype=torch.float64))
+    for count, gradient in enumerate(draw(0, 5, 1, 3), 1):
+        x.grad = gradient
+        theirs.step()
+        ours = step(ours, gradient, 0.1, count)
+    assert ours.value.numpy() == pytest.approx(x.detach().numpy(), rel=1e-6)
+
+
+def test_a_memory_fades_the_greatest_gradient():
+    state = adamax_step(adamax(torch.zeros(1, 2, dtype=torch.float64)), draw(0, 1, 2), 0.1, 1)
+    forgetful = adamax_step(state, torch.zeros(1, 2, dtype=torch.float64), 0.1, 2, memory=0.5)
+    assert forgetful.top.numpy() == pytest.approx(0.5 * state.top.numpy())
 
 
 @pytest.mark.parametrize("bound", [1.0, 10.0])
@@ -287,17 +294,6 @@ def test_presets_name_this_method_and_change_what_they_say():
     assert mine["graspd2022_no_coarse_to_fine"].settings.level_set.coarse_steps == 0
     assert not mine["graspd2022_no_relaxation"].settings.relaxation.enabled
     assert mine["graspd2022_no_leak"].settings.contact.leak == 0.0
-
-
-def test_adam_is_that_of_torch():
-    gradients = torch.randn(5, 1, 3, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
-    x = torch.zeros(1, 3, dtype=torch.float64, requires_grad=True)
-    theirs, ours = torch.optim.Adam([x], lr=0.1), adamax(torch.zeros(1, 3, dtype=torch.float64))
-    for count, gradient in enumerate(gradients, 1):
-        x.grad = gradient
-        theirs.step()
-        ours = adam_step(ours, gradient, 0.1, count)
-    assert ours.value.numpy() == pytest.approx(x.detach().numpy(), rel=1e-6)
 
 
 def test_step_sizes_of_pose_and_forces_warm_up_but_not_of_the_multipliers(problem, starts, solver_of):

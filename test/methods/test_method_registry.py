@@ -2,6 +2,7 @@
 
 import sys
 from dataclasses import dataclass, replace
+from functools import cache
 from pathlib import Path
 from types import ModuleType
 
@@ -154,12 +155,17 @@ def test_the_hard_solver_looks_no_farther_than_the_end_width(hand, scenes, probl
 CONFIG = load_preset("balanced")
 
 
-def searched(scale: float, searches: int, hooks: Hooks | None = None) -> tuple[Grasp, ...]:
-    """Candidates for four grasps of a ball of 70 mm times that scale."""
+def search_of(scale: float, searches: int, hooks: Hooks) -> PlannerInput:
+    """The search for four grasps of a ball of 70 mm times that scale."""
     config = replace(CONFIG, settings=replace(CONFIG.settings, searches=searches))
     scene = load_scene("shape:sphere", scale=scale, resolution=config.resolution)
     hand = load_hand("allegro_right", candidates=config.problem.fine_candidates)
-    return find_candidates(PlannerInput(scene, hand, count=4, seed=0, config=config, hooks=hooks or Hooks())).grasps
+    return PlannerInput(scene, hand, count=4, seed=0, config=config, hooks=hooks)
+
+
+@cache
+def searched(scale: float, searches: int) -> tuple[Grasp, ...]:
+    return find_candidates(search_of(scale, searches, Hooks())).grasps
 
 
 def scores(grasps: tuple[Grasp, ...]) -> list[float]:
@@ -188,7 +194,8 @@ def test_a_search_that_is_cancelled_is_the_last():
         """Once, when a second search has begun."""
         return len(steps) > 1 and steps[-1] < steps[-2] and next(stops, False)
 
-    found = searched(0.25, 3, Hooks(report=lambda step, of, loss: steps.append(step), stop=stop, interval=0.0))
+    hooks = Hooks(report=lambda step, of, loss: steps.append(step), stop=stop, interval=0.0)
+    found = find_candidates(search_of(0.25, 3, hooks)).grasps
     assert steps.count(max(steps)) == 1
     assert scores(found) == scores(once)
 

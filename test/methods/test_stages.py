@@ -43,20 +43,14 @@ def forces_at(directions: list[list[float]], active: list[bool] | None = None) -
     return forces[0], float(imbalance[0])
 
 
-def test_antipodal_contacts_balance():
-    forces, imbalance = forces_at([[1, 0, 0], [-1, 0, 0]])
-    # The ridge favours even loads, which balance here too: what is left is rounding.
-    assert imbalance < 1e-9
-    assert forces == pytest.approx(np.array([[-0.5, 0, 0], [0.5, 0, 0]]), abs=1e-9)
-
-
-def test_three_contacts_around_a_sphere_share_the_load():
-    turn = 2 * np.pi * np.arange(3) / 3
-    directions = np.column_stack([np.cos(turn), np.sin(turn), np.zeros(3)])
+@pytest.mark.parametrize(("count", "tolerance"), [(2, 1e-9), (3, 0.02)])
+def test_contacts_around_a_sphere_share_the_load(count: int, tolerance: float):
+    turn = 2 * np.pi * np.arange(count) / count
+    directions = np.column_stack([np.cos(turn), np.sin(turn), np.zeros(count)])
     forces, imbalance = forces_at(directions.tolist())
     # The eight cone edges are no multiple of three, so that the ridge pulls a little off the symmetric answer.
-    assert imbalance < 0.02
-    assert forces == pytest.approx(-directions / 3, abs=0.02)
+    assert imbalance < tolerance
+    assert forces == pytest.approx(-directions / count, abs=tolerance)
 
 
 def test_one_contact_or_one_side_does_not_balance():
@@ -97,7 +91,7 @@ def test_open_clear_opens_around_a_cylinder(problem_of, hand, scenes):
     assert ((opened.joints >= problem.hand.lower) & (opened.joints <= problem.hand.upper)).all()
 
 
-def fingertip_on_sphere(problem, hand) -> tuple[Poses, int, torch.Tensor, torch.Tensor]:
+def fingertip_on_sphere(hand) -> tuple[Poses, int, torch.Tensor, torch.Tensor]:
     """The open hand, unturned, with one candidate of a fingertip on the sphere: its link, the point and the normal."""
     link = hand.link_index["link_3.0_tip"]
     rotations, translations = link_poses(hand, hand.open_posture)
@@ -116,7 +110,7 @@ def fingertip_on_sphere(problem, hand) -> tuple[Poses, int, torch.Tensor, torch.
 
 
 def test_a_known_contact_is_found(problem_of, hand):
-    poses, link, contact, normal = fingertip_on_sphere(problem_of("sphere"), hand)
+    poses, link, contact, normal = fingertip_on_sphere(hand)
     contact_set = find_contacts(problem_of("sphere"), poses, reach=0.002)
     found = torch.nonzero(contact_set.active[0] & (contact_set.link == link)).flatten()
     assert len(found)
@@ -127,13 +121,6 @@ def test_a_known_contact_is_found(problem_of, hand):
     assert abs(float(contact_set.distance[0, slot])) < 1e-4
     assert contact_set.normal[0, slot] @ normal > np.cos(0.05)
     assert (contact_set.distance[contact_set.active].abs() <= 0.002).all()
-
-
-def test_nothing_touches_from_afar(problem_of, hand):
-    poses, *_ = fingertip_on_sphere(problem_of("box"), hand)
-    away = replace(poses, translation=poses.translation + 1.0)
-    for name in ("sphere", "box"):
-        assert not find_contacts(problem_of(name), away, reach=0.002).active.any()
 
 
 def test_torques_are_the_transposed_jacobian_times_forces(problem_of, hand, scenes):

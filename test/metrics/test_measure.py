@@ -309,12 +309,6 @@ def test_nothing_touched_is_all_zero(gripper):
     assert all(value in (0.0, None) for value in metrics.values())
 
 
-def test_the_same_posture_measures_the_same_by_any_judge(gripper):
-    posture = at((0.003, 0.001, -0.05), (0.016, 0.015))
-    contexts = [make_metrics_context(as_object(BOX), gripper) for _ in range(2)]
-    assert measure(contexts[0], posture) == measure(contexts[0], posture) == measure(contexts[1], posture)
-
-
 @settings(max_examples=8)
 @given(seed=st.integers(0, 2**31))
 def test_moving_object_and_hand_together_changes_nothing(seed, gripper):

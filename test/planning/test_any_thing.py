@@ -196,10 +196,11 @@ def test_failures_make_no_valid_number_invalid_and_a_search_in_vain_is_followed_
     assert 0 < vain < len(lost)
     assert sorted(starts) == [usual] * (len(lost) - vain) + [2 * usual] * vain
     # For one grasp, twice the starts would be no more than the fewest that a search has.
-    for times, more in ((1, 4), (2, 8), (3, 8)):
+    for one, other, more in ((1, 2, [4 * usual, 8 * usual]), (0, 3, [usual, 8 * usual])):
         starts.clear()
-        plan_any_thing(views, HAND, failures=[Failure(first[0].place)] * times, **ASKED)
-        assert sorted(starts) == [usual] * (len(first) - 1) + [more * usual]
+        failed = [Failure(first[0].place)] * one + [Failure(first[1].place)] * other
+        plan_any_thing(views, HAND, failures=failed, **ASKED)
+        assert sorted(starts) == more
 
 
 def test_nothing_on_the_table_is_no_thing_and_an_empty_cloud_is_told(views: tuple[PointCloud, ...]):

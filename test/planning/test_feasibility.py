@@ -7,7 +7,7 @@ import pytest
 import trimesh
 from made_meshes import box_of
 
-from graspd_core import Scene, hand_names, load_hand, load_scene, plan_grasps
+from graspd_core import Scene, hand_names, load_hand, load_preset, load_scene, override, plan_grasps
 from graspd_core.mesh.shapes import SHAPES, make_shape
 from graspd_core.planning.feasibility import out_of_reach, reach_of, why_trials_failed
 from graspd_core.types import Contact, Outcome, Plane, Stage, TrialResult, TriangleMesh, Verdict, joined
@@ -96,7 +96,8 @@ def card_on_table() -> Scene:
 
 
 def test_what_is_too_low_for_the_fingers_is_told_with_what_became_of_the_trials(hand, card_on_table):
-    result = plan_grasps(card_on_table, hand, count=2, preset="fast", measure=False)
+    one_round = override(load_preset("fast"), {"rounds.most": 1})
+    result = plan_grasps(card_on_table, hand, count=2, preset=one_round, measure=False)
     assert result.outcome is Outcome.TOO_FEW
     assert not any(grasp.verdict is Verdict.VERIFIED for grasp in result.tried)
     assert result.message.startswith(f"{len(result.tried)} grasps failed their trials: the object ")

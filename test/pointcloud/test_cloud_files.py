@@ -1,7 +1,5 @@
 """Clouds from files: every kind and every header comes back, and what is no cloud is named."""
 
-from pathlib import Path
-
 import numpy as np
 import pytest
 from expected import refused, some
@@ -188,15 +186,23 @@ _PLY = (
 _PCD = "VERSION .7\nFIELDS x y z\nSIZE 4 4 4\nTYPE F F F\nCOUNT 1 1 1\nWIDTH 1\nHEIGHT 2\nDATA binary\n"
 
 
-def read(path: Path, head: str, body: bytes) -> list[list[float]]:
-    path.write_bytes(head.encode() + body)
-    (view,) = load_views(path)
-    return view.points.tolist()
-
-
-def test_a_comment_may_name_the_end_of_the_header(tmp_path):
-    head = _PLY.format("comment up to end_header is text\n") + "end_header\n"
-    assert read(tmp_path / "cloud.ply", head, POINTS.tobytes()) == POINTS.tolist()
+@pytest.mark.parametrize(
+    ("name", "head", "body"),
+    [
+        ("a.ply", _PLY.format("comment up to end_header is text\n") + "end_header\n", POINTS.tobytes()),
+        (
+            "a.ply",
+            _PLY.format("") + 2 * "property uchar quality\n" + "end_header\n",
+            b"".join(row.tobytes() + b"\0\1" for row in POINTS),
+        ),
+        ("a.pcd", _PCD, POINTS.tobytes()),
+    ],
+    ids=["a comment names the end of the header", "two properties of one name", "width and height but no points"],
+)
+def test_headers_are_read(tmp_path, name: str, head: str, body: bytes):
+    (tmp_path / name).write_bytes(head.encode() + body)
+    (view,) = load_views(tmp_path / name)
+    assert view.points.tolist() == POINTS.tolist()
 
 
 def test_a_mesh_is_none_however_long_its_comments_are(tmp_path):
@@ -206,13 +212,3 @@ def test_a_mesh_is_none_however_long_its_comments_are(tmp_path):
     assert not is_cloud_file(tmp_path / "a.ply")
     (tmp_path / "a.ply").write_text(head.replace("face 1", "face 0"))
     assert is_cloud_file(tmp_path / "a.ply")
-
-
-def test_two_properties_may_have_one_name(tmp_path):
-    head = _PLY.format("") + "property uchar quality\nproperty uchar quality\nend_header\n"
-    body = b"".join(row.tobytes() + b"\0\1" for row in POINTS)
-    assert read(tmp_path / "cloud.ply", head, body) == POINTS.tolist()
-
-
-def test_width_and_height_say_how_many_points_there_are(tmp_path):
-    assert read(tmp_path / "cloud.pcd", _PCD, POINTS.tobytes()) == POINTS.tolist()

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 from expected import some
-from situations import sheet, sheet_in_world
+from situations import sheet
 
 from graspd_core import TriangleMesh, load_scene
 from graspd_core.errors import MeshError
@@ -23,11 +23,6 @@ def test_a_sheet_of_pixels_is_a_view_however_it_is_wound(turn):
 def test_the_camera_of_a_sheet_has_no_other_place():
     with pytest.raises(MeshError, match="view_point: given with mesh, a mesh; valid with clouds"):
         load_scene(sheet(), view_point=(0.0, 0.0, 1.0))
-
-
-def test_a_sheet_in_another_frame_is_refused_by_that_name():
-    with pytest.raises(MeshError, match=r"a.ply: an open mesh of one camera's view, .* the points as a cloud"):
-        view_in_mesh(sheet_in_world(), "a.ply")
 
 
 @pytest.mark.parametrize("name", sorted(SHAPES))

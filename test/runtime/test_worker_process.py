@@ -40,8 +40,14 @@ def test_modules_are_imported_before_the_first_call_and_those_that_cannot_be_do_
 
 def test_values_and_errors_come_back_and_the_child_lives_on(child: WorkerProcess):
     assert child(math.sqrt, 2.25) == 1.5
-    with pytest.raises(ValueError, match="math domain"):
+    with pytest.raises(ValueError, match="math domain") as caught:
         child(math.sqrt, -1.0)
+    assert "worker_process.py" in caught.value.__notes__[0]
+    # An error that cannot travel says what it was.
+    with pytest.raises(RuntimeError, match="Homebound: no luggage"):
+        child(exec, "class Homebound(Exception): pass\nraise Homebound('no luggage')")
+    with pytest.raises((AttributeError, pickle.PicklingError)):
+        child(lambda: 1)
     assert child(math.sqrt, 4.0) == 2.0
 
 
@@ -50,21 +56,6 @@ def test_arrays_tensors_and_named_arguments_travel(child: WorkerProcess):
     assert child(np.sum, points, axis=0).tolist() == [3.0, 5.0, 7.0]
     field = torch.arange(5.0)
     assert torch.equal(child(torch.mul, field, 2.0), 2.0 * field)
-
-
-def test_an_error_says_where_it_came_from_and_one_that_cannot_travel_what_it_was(child: WorkerProcess):
-    with pytest.raises(ValueError, match="math domain") as caught:
-        child(math.sqrt, -1.0)
-    assert "worker_process.py" in caught.value.__notes__[0]
-    with pytest.raises(RuntimeError, match="Homebound: no luggage"):
-        child(exec, "class Homebound(Exception): pass\nraise Homebound('no luggage')")
-    assert child(math.sqrt, 4.0) == 2.0
-
-
-def test_what_cannot_be_pickled_is_an_error_and_the_next_is_served(child: WorkerProcess):
-    with pytest.raises((AttributeError, pickle.PicklingError)):
-        child(lambda: 1)
-    assert child(math.sqrt, 4.0) == 2.0
 
 
 def test_only_a_process_that_asked_for_it_has_its_work_done_elsewhere():

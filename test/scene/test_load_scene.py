@@ -14,7 +14,7 @@ from graspd_core.errors import CloudError, MeshError
 from graspd_core.io.grasps_json import grasps_of, load_document, save_result
 from graspd_core.mesh.mesh_files import save_mesh, surface_samples
 from graspd_core.mesh.sdf import sample_sdf
-from graspd_core.mesh.topology import far_centre
+from graspd_core.mesh.topology import far_centre, moved_mesh
 from graspd_core.perception.cloud.free_space import FreeSpace, empty_depth, make_view_depths
 from graspd_core.perception.reconstruct.reconstruct import reconstruct
 from graspd_core.perception.scene import build_scene, moved_object, object_parts
@@ -65,9 +65,8 @@ def test_unknown_endings_list_meshes_and_clouds(tmp_path):
 MAP = np.array([512_345.25, 5_401_234.5, 370.0])
 
 
-def at(place, shape: str = "box") -> TriangleMesh:
-    mesh = make_shape(shape)
-    return TriangleMesh(mesh.vertices + np.asarray(place, dtype=float), mesh.faces)
+def at(place) -> TriangleMesh:
+    return moved_mesh(make_shape("box"), np.asarray(place, dtype=float))
 
 
 def test_far_is_a_hundred_times_the_size_and_near_the_origin_nothing_is_moved():

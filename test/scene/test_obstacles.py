@@ -169,8 +169,7 @@ def test_a_tray_in_one_piece_leaves_the_object_s_place_free(scene):
     assert depth(found, *(centre + np.array([size.max() + 0.005, 0, 0]))) > -1e-3
 
 
-def test_what_does_not_rise_above_the_support_is_the_support():
-    scene = load_scene("shape:box", mass=0.1)
+def test_what_does_not_rise_above_the_support_is_the_support(scene):
     bottom = float(scene.object.mesh.vertices[:, 2].min())
     stands = Scene(scene.object, scene.sdf, scene.timing, support=Plane(np.array([0.0, 0.0, 1.0]), bottom))
     table = box_between([-1.0, -1.0, bottom - 0.05], [1.0, 1.0, bottom + 0.002])

@@ -15,11 +15,11 @@ from graspd_core.perception.segment.planes import find_planes
 EYE = np.array([[0.0, 0.0, 0.0]])
 
 
-def sheet(rng, noise: float, count: int = 8000) -> tuple[np.ndarray, np.ndarray]:
+def sheet(rng, noise: float) -> tuple[np.ndarray, np.ndarray]:
     """A table 0.4 m below the camera, up to 1.5 m away, with noise that grows with the square of the distance."""
-    points = np.column_stack([rng.uniform(0.2, 1.4, count), rng.uniform(-0.3, 0.3, count), np.full(count, -0.4)])
+    points = np.column_stack([rng.uniform(0.2, 1.4, 8000), rng.uniform(-0.3, 0.3, 8000), np.full(8000, -0.4)])
     distance = np.linalg.norm(points, axis=1)
-    points[:, 2] += noise * distance**2 * rng.standard_normal(count)
+    points[:, 2] += noise * distance**2 * rng.standard_normal(8000)
     return points, distance
 
 

@@ -240,22 +240,17 @@ def test_an_empty_table_says_what_was_seen():
 
 
 @pytest.mark.parametrize(
-    ("target", "complaint"),
+    ("target", "largest", "complaint"),
     [
-        (Target(point=np.array([0.0, 0.0, 0.5])), r"no object within 0.05 m of the point .* 3 objects are seen, the l"),
-        (Target(box=(np.array([0.2, 0.2, 0.2]), np.array([0.3, 0.3, 0.3]))), r"nothing in the box .* 3 objects"),
+        (Target(np.array([0.0, 0.0, 0.5])), 0.35, r"no object within 0.05 m of the point .* 3 objects are seen, the l"),
+        (Target(box=(np.full(3, 0.2), np.full(3, 0.3))), 0.35, r"nothing in the box .* 3 objects"),
+        (None, 0.03, r"3 objects are seen, .* longer than largest_object=0.03 m"),
     ],
 )
-def test_nothing_at_the_target_lists_what_there_is(target, complaint):
+def test_nothing_at_the_target_or_small_enough_lists_what_there_is(target, largest, complaint):
     view, _ = seen(THREE.meshes)
     with pytest.raises(NoObjectError, match=complaint):
-        segment([view], target=target)
-
-
-def test_what_is_too_large_to_be_grasped_is_told_as_that():
-    view, _ = seen(THREE.meshes)
-    with pytest.raises(NoObjectError, match=r"3 objects are seen, .* longer than largest_object=0.03 m"):
-        segment([view], settings=SegmentationConfig(largest_object=0.03))
+        segment([view], target=target, settings=SegmentationConfig(largest_object=largest))
 
 
 @pytest.mark.parametrize("blind", [np.zeros((0, 3)), np.full((40, 3), np.nan)], ids=["empty", "all NaN"])

@@ -8,7 +8,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from graspd_core import HandModel, PlanConfig, Scene, draw_starts, load_scene
+from graspd_core import PlanConfig, Scene, draw_starts, load_scene
 from graspd_core.mesh.sdf import sample_sdf
 from graspd_core.optimize.candidates import PlannerInput, assemble
 from graspd_core.optimize.closed_form.closed_form import ClosedForm
@@ -27,13 +27,9 @@ def scene() -> Scene:
     return load_scene("shape:box")
 
 
-def problem(scene: Scene, hand: HandModel, dtype: torch.dtype = torch.float32) -> Problem:
-    return PlannerInput(scene, hand, 4, 0, PLAN, Hooks(), dtype=dtype).problem
-
-
 @pytest.fixture(scope="module")
 def sound(scene, hand) -> Problem:
-    return problem(scene, hand)
+    return PlannerInput(scene, hand, 4, 0, PLAN, Hooks()).problem
 
 
 @pytest.fixture(scope="module")
@@ -70,7 +66,7 @@ def test_a_start_goes_the_same_way_alone_and_among_many(sound, starts, clean):
     assert torch.equal(pack(alone.poses)[0], clean[3])
 
 
-def test_starts_in_the_middle_of_the_object_escape(hand, scene, sound, starts):
+def test_starts_in_the_middle_of_the_object_escape(hand, sound, starts):
     rotation = rotation_from_quaternion(starts.quaternion)
     palm = starts.translation + rotation @ torch.as_tensor(hand.palm_center, dtype=torch.float32)
     inside = replace(starts, translation=starts.translation + sound.object.center - palm)

@@ -22,9 +22,12 @@ def pressed(closing, normal: float):
 
 
 @pytest.mark.parametrize("normal", [2.0, 5.0])
-def test_the_payload_is_what_friction_carries(normal, world, closing):
-    found = payload(world, pressed(closing, normal), STANDARD)
-    assert found == pytest.approx(2 * STANDARD.friction[0] * normal / STANDARD.pull, rel=NEAR)
+def test_payload_and_least_friction_are_those_of_coulombs_law(normal, world, cube, closing):
+    grasp = pressed(closing, normal)
+    carried = 2 * STANDARD.friction[0] * normal / STANDARD.pull
+    assert payload(world, grasp, STANDARD) == pytest.approx(carried, rel=NEAR)
+    needed = STANDARD.pull * cube.mass / (2 * normal)
+    assert least_friction(world, grasp, STANDARD) == pytest.approx(needed, rel=NEAR)
 
 
 def test_the_payload_is_where_the_trial_s_verdict_changes(world, closing):
@@ -52,12 +55,6 @@ def test_what_does_not_close_carries_nothing(world, closing):
     assert payload(world, closing(0.04, 0.04, (0.04, 0.04)), STANDARD) == 0.0
     assert payload(world, closing(0.015, 0.025, (0.04, 0.04), height=-0.145), STANDARD) == 0.0
     assert payload(world, pressed(closing, 4.0), STANDARD, stop=lambda: True) == 0.0
-
-
-@pytest.mark.parametrize("normal", [2.0, 5.0])
-def test_the_least_friction_is_what_the_weight_needs(normal, world, cube, closing):
-    found = least_friction(world, pressed(closing, normal), STANDARD)
-    assert found == pytest.approx(STANDARD.pull * cube.mass / (2 * normal), rel=NEAR)
 
 
 @pytest.fixture(scope="module")

@@ -66,7 +66,7 @@ def test_all_ways_in_refuse_crossed_fingers(allegro, cube, posture):
 
 
 @pytest.mark.parametrize("where", ["pregrasp", "grasp"])
-def test_a_joint_beyond_its_limit_is_refused_by_name(allegro, cube, posture, where):
+def test_a_joint_beyond_its_limit_is_refused_by_name(allegro, posture, where):
     clear = Grasp(posture(0.0), posture(0.0), posture(0.0), (), 0.0)
     for angle, refused in ((allegro.upper[0] + 5e-4, False), (allegro.upper[0] + 0.05, True)):
         joints = np.array(clear.grasp.joint_positions)

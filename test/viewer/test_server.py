@@ -22,6 +22,7 @@ from graspd_viewer.plan_tab import PlanRequest, Upload, check, load_object
 from graspd_viewer.server import may_connect
 
 viser = pytest.importorskip("viser", reason="viser is not installed: pip install 'graspd[view]'")
+from viser import _messages  # noqa: E402
 
 GOOD = PlanRequest("box", None, "m", False, "parallel_gripper", "fast", 0.6, 2)
 
@@ -70,8 +71,6 @@ def test_a_page_of_another_site_is_sent_away(viewer, origin):
 
 def transfer(viewer, size: int, parts: int = 1, name: str = "a") -> bool:
     """Begin to send a file as visitor 7; whether the server takes it."""
-    from viser import _messages
-
     gui = viewer._server.gui
     (start,) = gui._websock_interface._incoming_handlers[_messages.FileTransferStartUpload]
     before = len(gui._current_file_upload_states)
@@ -96,8 +95,6 @@ def test_large_files_and_many_at_once_are_not_taken(viewer):
 
 
 def test_a_transfer_that_sends_more_than_it_said_ends(viewer):
-    from viser import _messages
-
     gui = viewer._server.gui
     (part,) = gui._websock_interface._incoming_handlers[_messages.FileTransferPart]
     assert transfer(viewer, 1000, parts=3)
@@ -109,8 +106,6 @@ def test_a_transfer_that_sends_more_than_it_said_ends(viewer):
 
 
 def test_no_tunnel_is_opened(viewer):
-    from viser import _messages
-
     handlers = viewer._server._websock_server._incoming_handlers
     assert not handlers.get(_messages.ShareUrlRequest)
 

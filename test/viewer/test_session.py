@@ -115,7 +115,7 @@ def test_a_grasp_that_is_less_sure_is_said_with_its_probability(result):
     assert "probability" not in figures_html(untried, 2)
 
 
-def test_the_way_goes_through_its_stages(result, grasps_file):
+def test_the_way_goes_through_its_stages(grasps_file):
     session = open_grasps(grasps_file)
     hand, grasp = session.hand, session.grasps[0]
     for at, stage in ((1.0, grasp.pregrasp), (2.0, grasp.grasp), (3.0, grasp.squeeze), (9.0, grasp.squeeze)):

@@ -1,10 +1,10 @@
 """MJCF and trees at random move as in MuJoCo and are given a palm and postures; what is not read is refused by name."""
+# pyright: reportAttributeAccessIssue=false
 
-import importlib
 import re
 from pathlib import Path
-from typing import Any
 
+import mujoco
 import numpy as np
 import pytest
 from expected import refused
@@ -275,10 +275,8 @@ DRAWS = {
 
 
 def _check_against_mujoco(
-    hand: HandModel, model: Any, base: str | None, values: dict[str, float], q: np.ndarray
+    hand: HandModel, model: mujoco.MjModel, base: str | None, values: dict[str, float], q: np.ndarray
 ) -> None:
-    mujoco: Any = importlib.import_module("mujoco")  # it ships no type information
-
     data = mujoco.MjData(model)
     for name, value in values.items():
         data.joint(name).qpos[0] = value
@@ -298,7 +296,6 @@ def _check_against_mujoco(
 @settings(max_examples=12, **DRAWS)
 @given(data=st.data(), seed=st.integers(0, 2**31))
 def test_any_tree_moves_as_in_mujoco(folder: Path, data: st.DataObject, seed: int) -> None:
-    mujoco: Any = importlib.import_module("mujoco")
     text, couplings = data.draw(urdfs())
     path = folder / "zoo.urdf"
     path.write_text(text)
@@ -324,7 +321,6 @@ def test_any_tree_moves_as_in_mujoco(folder: Path, data: st.DataObject, seed: in
 
 @pytest.mark.parametrize("seed", range(3))
 def test_an_mjcf_file_moves_as_in_mujoco(folder: Path, seed: int) -> None:
-    mujoco: Any = importlib.import_module("mujoco")
     path = folder / "tri.xml"
     path.write_text(MJCF)
     hand = read_hand_file(path)

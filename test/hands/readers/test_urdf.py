@@ -10,9 +10,8 @@ from expected import refused
 
 from graspd_core.errors import HandError
 from graspd_core.hands.kinematics import link_poses
-from graspd_core.hands.library import DEFAULT_EFFORT, DEFAULT_FORCE, hand_names, load_hand, read_hand_file
+from graspd_core.hands.library import DEFAULT_EFFORT, DEFAULT_FORCE, load_hand, read_hand_file
 from graspd_core.hands.model import HandModel, Mimic, all_joint_names, all_joint_positions
-from graspd_core.hands.readers.urdf import read_urdf
 
 BOX = '<collision><geometry><box size="0.02 0.02 0.04"/></geometry></collision>'
 HINGE = (
@@ -192,7 +191,7 @@ def test_what_a_hand_can_hardly_have_is_warned_of(tmp_path: Path, text: str, tol
 
 
 def test_what_is_as_it_should_be_is_not_warned_of(tmp_path: Path) -> None:
-    """A linkage whose joints follow, an effort that the description names, and every shipped hand."""
+    """A linkage whose joints follow, and an effort that the description names; shipped hands: test_boxed_hands.py."""
     (tmp_path / "a.urdf").write_text(
         f'<robot name="closed"><link name="palm">{BOX}</link>{KNUCKLES.format("", MIMIC, MIMIC)}</robot>'
     )
@@ -200,7 +199,6 @@ def test_what_is_as_it_should_be_is_not_warned_of(tmp_path: Path) -> None:
     (tmp_path / "tiny.urdf").write_text(HAND.replace('effort="2"', 'effort="6e4"'))
     (tmp_path / "tiny.yaml").write_text("urdf: tiny.urdf\neffort: 2.0\n")
     assert not [w for w in load_hand(tmp_path / "tiny.yaml", candidates=20).warnings if "effort" in w]
-    assert [load_hand(name, candidates=20).warnings for name in hand_names()] == [()] * len(hand_names())
 
 
 def test_a_xacro_file_is_named_with_the_command(tmp_path: Path) -> None:
@@ -318,7 +316,6 @@ def test_other_formats_are_named(tmp_path: Path) -> None:
         read_hand_file(tmp_path / "none" / "tiny.urdf")
 
 
-SMALL_BOX = '<collision><geometry><box size="0.01 0.01 0.01"/></geometry></collision>'
 LIMIT = '<limit lower="{}" upper="{}" effort="{}" velocity="{}"/>'
 
 
@@ -331,7 +328,7 @@ def joint(name: str, parent: str, child: str, *, kind: str = "revolute", limit: 
 
 
 def robot(*joints: str) -> str:
-    links = "".join(f'<link name="{name}">{SMALL_BOX}</link>' for name in ("base", "a", "b", "c", "d"))
+    links = "".join(f'<link name="{name}">{BOX}</link>' for name in ("base", "a", "b", "c", "d"))
     return f'<robot name="linkage">{links}{"".join(joints)}</robot>'
 
 
@@ -348,15 +345,9 @@ LINKAGE = robot(
 )
 
 
-def write(folder: Path, text: str) -> Path:
-    path = folder / "linkage.urdf"
-    path.write_text(text)
-    return path
-
-
 @pytest.fixture(scope="module")
 def hand(tmp_path_factory: pytest.TempPathFactory) -> HandModel:
-    return read_urdf(write(tmp_path_factory.mktemp("linkage"), LINKAGE))
+    return _read(tmp_path_factory.mktemp("linkage"), LINKAGE)
 
 
 def test_only_joints_that_lead_are_variables_and_keep_their_followers_within_limits(hand: HandModel) -> None:
@@ -378,7 +369,7 @@ def test_only_joints_that_lead_are_variables_and_keep_their_followers_within_lim
 def test_a_leader_is_no_faster_than_its_followers_can_be(tmp_path: Path) -> None:
     fast = robot(joint("first", "base", "a"), joint("second", "a", "b", mimic=follows("first", multiplier=-4)),
                  joint("w", "a", "c", kind="fixed"), joint("v", "a", "d", kind="fixed"))  # fmt: skip
-    assert read_urdf(write(tmp_path, fast)).velocity.tolist() == [0.5]
+    assert _read(tmp_path, fast).velocity.tolist() == [0.5]
 
 
 def test_limits_of_the_wrong_sign_are_given_up_with_a_warning_but_not_the_speed(tmp_path: Path) -> None:
@@ -389,7 +380,7 @@ def test_limits_of_the_wrong_sign_are_given_up_with_a_warning_but_not_the_speed(
         joint("third", "a", "c", kind="continuous", mimic=follows("first", multiplier=9), limit=fast),
         joint("still", "base", "d", kind="fixed"),
     )
-    hand = read_urdf(write(tmp_path, wrong))
+    hand = _read(tmp_path, wrong)
     assert (hand.lower.tolist(), hand.upper.tolist(), hand.velocity.tolist()) == ([0.0], [0.8], [0.25])
     assert len(hand.warnings) == 1
     assert "'second'" in hand.warnings[0]
@@ -400,8 +391,8 @@ def test_a_follower_in_another_unit_is_refused(tmp_path: Path) -> None:
         "rail", "base", "d", kind="prismatic", mimic=follows("first", multiplier=50), limit=LIMIT.format(-50, 50, 1, 9)
     )
     millimetres = robot(joint("first", "base", "a"), slide, joint("b", "a", "b"), joint("c", "a", "c"))
-    with pytest.raises(HandError, match=r"linkage.urdf: joint 'rail' has a travel of 100 m; .* at most 2 m"):
-        read_urdf(write(tmp_path, millimetres))
+    with pytest.raises(HandError, match=r"tiny.urdf: joint 'rail' has a travel of 100 m; .* at most 2 m"):
+        _read(tmp_path, millimetres)
 
 
 @pytest.mark.parametrize(
@@ -423,11 +414,12 @@ def test_a_bad_coupling_is_refused_by_name(tmp_path: Path, mimic: str, message: 
         joint("weld2", "base", "d", kind="fixed"),
     )
     with pytest.raises(HandError, match=message):
-        read_urdf(write(tmp_path, text))
+        _read(tmp_path, text)
 
 
 def test_a_sliding_joint_has_its_own_scale_and_default_force(tmp_path: Path) -> None:
-    hand = load_hand(write(tmp_path, LINKAGE), candidates=20)
+    (tmp_path / "linkage.urdf").write_text(LINKAGE)
+    hand = load_hand(tmp_path / "linkage.urdf", candidates=20)
     assert hand.slides.tolist() == [False, True]
     assert hand.joint_scale.tolist() == [1.0, 0.05]
     assert hand.effort.tolist() == [DEFAULT_EFFORT, DEFAULT_FORCE]

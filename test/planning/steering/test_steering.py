@@ -260,8 +260,8 @@ def test_distances_never_change_faster_than_the_point(values: list[float]):
         assert change <= np.linalg.norm(a - b) + 1e-12
 
 
-def posture(hand, position=(0.0, 0.0, 0.0), quaternion=(1.0, 0.0, 0.0, 0.0)) -> Posture:
-    return Posture(np.array(position), np.array(quaternion), hand.open_posture)
+def posture(hand, position=(0.0, 0.0, 0.0)) -> Posture:
+    return Posture(np.array(position), np.array([1.0, 0.0, 0.0, 0.0]), hand.open_posture)
 
 
 @pytest.mark.parametrize("name", hand_names())
