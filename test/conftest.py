@@ -137,6 +137,23 @@ def bytecodes() -> Callable[[Callable[[], Any]], int]:
     return bytecodes
 
 
+@pytest.fixture
+def refusal_of(capsys: pytest.CaptureFixture[str]) -> Callable[..., str]:
+    """Runs a command in this process, which has to end as one with bad input does, and gives its line of stderr."""
+
+    def refusal_of(*words: object) -> str:
+        from graspd_core.cli import main
+        from graspd_core.cli.running import EXIT_BAD_INPUT
+
+        capsys.readouterr()
+        assert main([str(word) for word in words]) == EXIT_BAD_INPUT
+        out, line = capsys.readouterr()
+        assert (out, line.count("\n"), line.startswith("graspd: ")) == ("", 1, True), out + line
+        return line
+
+    return refusal_of
+
+
 @pytest.fixture(scope="session")
 def hand() -> Any:
     """The hand of the tests that name none."""

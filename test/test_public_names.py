@@ -77,21 +77,16 @@ UNUSED += ["graspd_core.perception.reconstruct.reconstruct", "graspd_core.percep
 # Who gives no arm, no library and no MANO hand loads nothing of them, nor a package beside the pipeline.
 UNUSED += ["pytorch_kinematics", "graspd_core.arms", "graspd_core.library", "sqlite3", "graspd_core.hands.mano"]
 UNUSED += ["graspd_bench", "graspd_dataset", "graspd_viewer"]
-LIBRARY = """
-from graspd_core import load_hand, load_scene, plan_grasps
-result = plan_grasps(load_scene("shape:mug"), load_hand("allegro_right"), count=1, preset="fast")
-assert result.timing.verify > 0
-"""
+# What the library imports for a plan, the command imports too.
 COMMAND = """
 from graspd_core.cli import main
-assert main(["synthesize", "shape:mug", "-n", "1", "--preset", "fast"]) in (0, 3)
+assert main(["synthesize", "shape:mug", "-n", "1", "--preset", "fast"]) == 0
 """
 
 
-@pytest.mark.parametrize("program", [LIBRARY, COMMAND], ids=["library", "command"])
-def test_a_plan_on_a_mesh_imports_what_it_uses(program, tmp_path):
+def test_a_plan_on_a_mesh_imports_what_it_uses(tmp_path):
     environment = {**os.environ, "XDG_CACHE_HOME": str(tmp_path), "GRASPD_CACHE": ""}
-    ask = f"{program}\nimport sys\nprint([name for name in {UNUSED!r} if name in sys.modules])"
+    ask = f"{COMMAND}\nimport sys\nprint([name for name in {UNUSED!r} if name in sys.modules])"
     # With nothing on disk, and with all of it there.
     for _ in range(2):
         run = subprocess.run([sys.executable, "-c", ask], env=environment, capture_output=True, text=True, check=False)

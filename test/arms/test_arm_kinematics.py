@@ -1,6 +1,7 @@
 """Arm descriptions, one error for each mistake; an arm's tip and Jacobian against tables, differences and itself."""
 
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -184,11 +185,13 @@ ROBOT = """<robot name="cell">
   <link name="jaw"><collision><geometry><box size="0.1 0.1 0.1"/></geometry></collision></link>
 </robot>
 """
+CAMERA = '<collision><geometry><box size="0.1 0.02 0.02"/></geometry></collision>'
+COUPLED = ROBOT.replace('<origin xyz="0.4 0 0"/>', '<mimic joint="j1"/>')
 
 
-def write(folder: Path, **keys: object) -> Path:
+def write(folder: Path, robot: str = ROBOT, **keys: object) -> Path:
     """A description of the robot above, with keys as given; None leaves one out."""
-    (folder / "cell.urdf").write_text(ROBOT)
+    (folder / "cell.urdf").write_text(robot)
     entries = {"urdf": "cell.urdf", "tip": "flange", **keys}
     path = folder / "cell.yaml"
     path.write_text(yaml.safe_dump({key: value for key, value in entries.items() if value is not None}))
@@ -249,22 +252,13 @@ def test_a_base_that_is_the_world_keeps_the_place_of_what_stands_in_it(tmp_path:
         ({"mounts": {"x": {"yaw": 1}}}, r"cell.yaml.mounts.x: unknown key 'yaw'; valid: position, quat"),
         ({"mounts": {"x": {"quaternion_wxyz": [1, 1, 0, 0]}}}, r"mounts.x.quaternion_wxyz: length 1.41; valid: a unit"),
         ({"tip": "pedestal", "base": "pedestal"}, r"has no joint that moves"),
+        ({"robot": ROBOT.replace(CAMERA, "")}, r"cell.urdf: no moving link has a <collision> or <visual> shape"),
+        ({"robot": COUPLED}, r"cell.yaml: joint 'j2' is coupled by <mimic>; valid: independent joints"),
     ],
 )
-def test_a_wrong_description_is_refused_in_one_line(tmp_path: Path, keys: dict[str, object], told: str):
+def test_a_wrong_description_is_refused_in_one_line(tmp_path: Path, keys: dict[str, Any], told: str):
     with refused(GraspdError, match=told):
         load_arm(write(tmp_path, **keys))
-
-
-def test_an_arm_that_could_hit_nothing_or_has_a_joint_that_follows_is_refused(tmp_path: Path):
-    path = write(tmp_path)
-    camera = '<collision><geometry><box size="0.1 0.02 0.02"/></geometry></collision>'
-    (tmp_path / "cell.urdf").write_text(ROBOT.replace(camera, ""))
-    with pytest.raises(ConfigError, match=r"cell.urdf: no moving link has a <collision> or <visual> shape"):
-        load_arm(path)
-    (tmp_path / "cell.urdf").write_text(ROBOT.replace('<origin xyz="0.4 0 0"/>', '<mimic joint="j1"/>'))
-    with pytest.raises(ConfigError, match=r"cell.yaml: joint 'j2' is coupled by <mimic>; valid: independent joints"):
-        load_arm(path)
 
 
 def test_an_unknown_arm_and_a_file_that_is_no_yaml_are_refused(tmp_path: Path):

@@ -67,18 +67,22 @@ def test_rows_follow_the_arms_path_and_the_three_postures_in_the_order_of_the_ga
     assert made.rows_to("lifted") == slice(gates["squeezed"], len(made.times))
 
 
-@pytest.mark.parametrize("speeds", [[0.5, 0.0, 2.0], [0.5, np.nan, 2.0], [0.5, 1.0], [0.5, -1.0, 2.0]])
-def test_speeds_that_no_motion_can_have_are_refused(speeds: list[float]):
-    with pytest.raises(ConfigError, match=r"arm_speeds: .*; valid: one positive number for each of a, b, c"):
-        execution_of(reached_grasp(), HAND, arm_speeds=np.array(speeds))
+SPEED = r"arm_speeds: .*; valid: one positive number for each of a, b, c"
 
 
-@pytest.mark.parametrize("mass", [float("nan"), -0.1])
-def test_a_mass_that_no_object_has_is_refused(mass: float):
-    """With NaN, all times of the lift would be NaN."""
+@pytest.mark.parametrize(
+    ("speeds", "mass", "told"),
+    [
+        *(([0.5, speed, 2.0], None, SPEED) for speed in (0.0, np.nan, -1.0)),
+        ([0.5, 1.0], None, SPEED),
+        # With NaN, all times of the lift would be NaN.
+        *((SPEEDS, mass, f"mass: {mass} kg; valid: a number from 0, or None") for mass in (np.nan, -0.1)),
+    ],
+)
+def test_speeds_and_masses_that_cannot_be_are_refused(speeds: list[float], mass: float | None, told: str):
     grasp = replace(reached_grasp(), metrics=GraspMetrics({"payload": 1.0}))
-    with pytest.raises(ConfigError, match=f"mass: {mass} kg; valid: a number from 0, or None"):
-        execution_of(grasp, HAND, arm_speeds=SPEEDS, mass=mass)
+    with pytest.raises(ConfigError, match=told):
+        execution_of(grasp, HAND, arm_speeds=np.array(speeds), mass=mass)
 
 
 def test_joints_press_within_their_limits_and_only_once_the_hand_is_closed():

@@ -19,7 +19,6 @@ from bag_writer import (
 from expected import refused
 
 from graspd_bench.rendering.render import look_at, render_depth
-from graspd_core.cli import main
 from graspd_core.cli.options import bag_views
 from graspd_core.errors import BagError, CloudError, TransformError
 from graspd_core.io.bags import bag_topics, is_bag, read_frames, read_raw, read_transforms
@@ -135,8 +134,6 @@ def test_a_rectified_image_of_a_fisheye_camera_has_no_distortion_left():
     info = camera_info_message(CAMERA, OPTICAL, START)
     info.distortion_model = "equidistant"
     assert camera_from_message(info, rectified=True).distortion == ()
-    with pytest.raises(CloudError, match="unknown distortion model 'equidistant'"):
-        camera_from_message(info)
 
 
 @pytest.mark.parametrize("encoding", ["16UC1", "32FC1"])
@@ -219,10 +216,9 @@ def test_a_cloud_without_a_stamp_was_seen_when_it_was_recorded(tmp_path):
     assert frame.view(read_transforms(tmp_path / "bag"), "world").viewpoint == pytest.approx([0.4, 0, 0.2], abs=1e-6)
 
 
-def test_clouds_of_a_moving_camera_are_fused_in_a_fixed_frame_only(tmp_path, capsys):
+def test_clouds_of_a_moving_camera_are_fused_in_a_fixed_frame_only(tmp_path, refusal_of):
     write_bag(tmp_path / "bag", flown_records([(0.4, 0, 0.2), (0, -0.4, 0.2)]))
-    assert main(["replay", str(tmp_path / "bag"), "--fuse"]) == 2
-    told = capsys.readouterr().err
+    told = refusal_of("replay", tmp_path / "bag", "--fuse")
     assert f"frame {OPTICAL} moved by 566 mm and 90.0° between views" in told
     assert "--frame" in told
 
@@ -298,7 +294,7 @@ def test_a_topic_that_is_missing_or_ambiguous_is_named(tmp_path, topics, options
         list(read_frames(path, **options))
 
 
-def test_a_frame_that_only_a_refused_transform_names_is_told_with_the_fault(tmp_path, capsys):
+def test_a_frame_that_only_a_refused_transform_names_is_told_with_the_fault(tmp_path, refusal_of):
     """Some drivers send a quaternion of four zeros."""
     tree = transforms_message([("base", OPTICAL, np.eye(4)), ("elbow", "wrist", np.eye(4))], START)
     tree.transforms[0].transform.rotation.w = 0.0
@@ -308,8 +304,8 @@ def test_a_frame_that_only_a_refused_transform_names_is_told_with_the_fault(tmp_
     (frame,) = read_frames(tmp_path / "bag")
     with pytest.raises(TransformError, match=f"unknown frame 'base'; known: elbow, wrist; {said}"):
         frame.view(read_transforms(tmp_path / "bag"), "base")
-    assert main(["reconstruct", str(tmp_path / "bag"), "--frame", "base", "--out", str(tmp_path / "m.ply")]) == 2
-    assert f"no frame 'base'; frames of its transforms: elbow, wrist; {said}" in capsys.readouterr().err
+    line = refusal_of("reconstruct", tmp_path / "bag", "--frame", "base", "--out", tmp_path / "m.ply")
+    assert f"no frame 'base'; frames of its transforms: elbow, wrist; {said}" in line
 
 
 def test_a_bag_without_transforms_says_so(tmp_path):
@@ -350,9 +346,8 @@ def test_what_is_no_bag_is_named(tmp_path, make, culprit):
         bag_topics(tmp_path / "bag")
 
 
-def test_a_bag_of_ros_1_is_named_by_every_command_with_what_converts_it(tmp_path, capsys):
+def test_a_bag_of_ros_1_is_named_by_every_command_with_what_converts_it(tmp_path, refusal_of):
     (tmp_path / "old.bag").write_bytes(b"#ROSBAG V2.0\n")
-    for words in (["replay"], ["synthesize"], ["reconstruct", "--out", str(tmp_path / "m.ply")]):
-        assert main([words[0], str(tmp_path / "old.bag"), *words[1:]]) == 2
-        told = "old.bag: is a bag of ROS 1; convert it first: rosbags-convert --src old.bag --dst old"
-        assert told in capsys.readouterr().err
+    told = "old.bag: is a bag of ROS 1; convert it first: rosbags-convert --src old.bag --dst old"
+    for words in (["replay"], ["synthesize"], ["reconstruct", "--out", tmp_path / "m.ply"]):
+        assert told in refusal_of(words[0], tmp_path / "old.bag", *words[1:])

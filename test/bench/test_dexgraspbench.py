@@ -60,9 +60,9 @@ def checkout(folder: Path, ending: str = "") -> Path:
     return folder
 
 
-def bench(folder: Path, *words: Any, python: str = sys.executable) -> int:
+def bench_words(folder: Path, *words: Any, python: str = sys.executable) -> list[str]:
     asked = ("--objects", "shape:sphere", "--presets", "fast", "--count", 2, "--out", folder.parent / "out")
-    return main([str(word) for word in ("bench", "dexgraspbench", folder, "--python", python, *asked, *words)])
+    return [str(word) for word in ("bench", "dexgraspbench", folder, "--python", python, *asked, *words)]
 
 
 def test_fingers_and_object_stand_about_the_centre_of_mass_in_its_frame(tmp_path: Path):
@@ -114,7 +114,7 @@ def test_every_joint_of_the_copy_has_the_armature_and_its_meshes_are_found(tmp_p
 
 
 def test_both_verdicts_stand_side_by_side(tmp_path: Path, capsys):
-    assert bench(checkout(tmp_path / "bench"), "--armature") == 0
+    assert main(bench_words(checkout(tmp_path / "bench"), "--armature")) == 0
     told = capsys.readouterr().out
     for variant in (AS_IS, ARMATURE):
         assert re.search(rf"\| sphere \| {variant} \| \d+ \| 2 \| 1 \| 1 \| \d+ \| \d+ \| 50% \|", told)
@@ -132,10 +132,9 @@ def test_grasps_of_a_file_are_taken(tmp_path: Path):
     assert tried == len(record["ours"]) == len(record["theirs"][AS_IS]) > 2
 
 
-def test_what_is_not_there_is_told_in_a_line(tmp_path: Path, capsys):
+def test_what_is_not_there_is_told_in_a_line(tmp_path: Path, refusal_of):
     def told(*words: Any, **other: Any) -> str:
-        assert bench(*words, **other) == 2
-        return capsys.readouterr().err.strip()
+        return refusal_of(*bench_words(*words, **other))
 
     assert "not a checkout of DexGraspBench: src/main.py is missing" in told(tmp_path / "none")
     folder = checkout(tmp_path / "bench")
@@ -143,9 +142,7 @@ def test_what_is_not_there_is_told_in_a_line(tmp_path: Path, capsys):
     assert "python: not given; give --python PATH" in told(folder, python="")
     assert "hand 'leap_right'; valid: allegro_right" in told(folder, "--hand", "leap_right")
     (folder / "src" / "main.py").write_text("import no_such_library\n")
-    line = told(folder)
-    assert "ended with an error: ModuleNotFoundError: No module named 'no_such_library'" in line
-    assert "\n" not in line
+    assert "ended with an error: ModuleNotFoundError: No module named 'no_such_library'" in told(folder)
 
 
 @pytest.mark.parametrize(

@@ -22,7 +22,7 @@ from graspd_bench.study_registry import STUDIES
 from graspd_bench.suites import main_suite
 from graspd_bench.tables import sourced, written
 from graspd_core.cli import main
-from graspd_core.cli.running import EXIT_BAD_INPUT, EXIT_INTERRUPTED, EXIT_OK
+from graspd_core.cli.running import EXIT_INTERRUPTED, EXIT_OK
 from graspd_core.errors import ConfigError
 from graspd_core.mesh.mesh_files import save_mesh
 from graspd_core.mesh.shapes import make_shape
@@ -135,13 +135,8 @@ def test_scans_count_by_content_and_need_a_mass(tmp_path: Path):
         return case_key("cameras", cameras.cases(Request(objects=(str(scan),), seeds=(100,)))[-1])
 
     save_mesh(scan, make_shape("box"))
-    with pytest.raises(ConfigError, match=r"no mass of thing\.obj; its csv files name none; columns: name, mass_kg"):
-        key()
     (tmp_path / "stats.csv").write_text("name,mass_kg\nother,0.3\n")
     with pytest.raises(ConfigError, match=r"no mass of thing\.obj; its csv files name other; columns"):
-        key()
-    (tmp_path / "stats.csv").write_text("name,mass_kg\nthing,nan\n")
-    with pytest.raises(ConfigError, match="the mass of 'thing' is nan; valid: more than zero"):
         key()
     (tmp_path / "stats.csv").write_text("name,mass_kg\nthing,0.3\n")
     keys = [key()]
@@ -198,21 +193,17 @@ BAD: list[tuple[list[str], str]] = [
 
 
 @pytest.mark.parametrize(("options", "culprit"), BAD, ids=lambda value: str(value)[:40])
-def test_a_bad_option_is_named_in_one_line(tmp_path, capsys, options, culprit):
-    assert main(["bench", "--out", str(tmp_path / "out"), *options]) == EXIT_BAD_INPUT
-    out, err = capsys.readouterr()
-    assert (out, err.count("\n")) == ("", 1)
-    assert culprit in err
+def test_a_bad_option_is_named_in_one_line(tmp_path, refusal_of, options, culprit):
+    assert culprit in refusal_of("bench", "--out", tmp_path / "out", *options)
     assert not (tmp_path / "out").exists()
 
 
-def test_an_empty_folder_of_objects_and_a_file_for_a_folder_are_named(tmp_path, capsys):
+def test_an_empty_folder_of_objects_and_a_file_for_a_folder_are_named(tmp_path, refusal_of):
     (tmp_path / "none").mkdir()
-    assert main(["bench", "--objects", str(tmp_path / "none")]) == EXIT_BAD_INPUT
-    assert "none: no mesh in this folder; valid endings: dae" in capsys.readouterr().err
+    line = refusal_of("bench", "--objects", tmp_path / "none")
+    assert "none: no mesh in this folder; valid endings: dae" in line
     (tmp_path / "file").write_text("")
-    assert main(["bench", *SMALL, "--out", str(tmp_path / "file" / "out")]) == EXIT_BAD_INPUT
-    assert "cannot be written" in capsys.readouterr().err
+    assert "cannot be written" in refusal_of("bench", *SMALL, "--out", tmp_path / "file" / "out")
 
 
 def test_cells_that_raise_are_named_at_the_end_and_the_others_kept(tmp_path, record, monkeypatch, capsys):

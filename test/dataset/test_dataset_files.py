@@ -9,6 +9,7 @@ import sys
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import pytest
 from small_dataset import REQUEST, make_here
@@ -42,12 +43,6 @@ def test_what_is_missing_is_found_by_listing(copied: DatasetStore, blocks: tuple
     assert missing_blocks(blocks, store) == []
 
 
-def test_a_whole_data_set_has_no_fault(made: DatasetStore):
-    assert list(faults_of_dataset(made)) == []
-    rows, different = count_by_content(made)
-    assert rows == different >= 4
-
-
 def _rewritten(store: DatasetStore, change: Callable[..., object]) -> None:
     path, _, table, told = next(iter(tables_of(store)))
     kept = {key: value for key, value in told.items() if key not in ("format", "version")}
@@ -77,24 +72,10 @@ def test_a_file_that_says_wrong_things_is_found(copied: DatasetStore, spoil: Cal
     assert any(told in fault for fault in faults_of_dataset(copied))
 
 
-def _last_of_a_page(file: Path) -> int:
-    """Return where the last byte of a column lies. A checksum covers it, as it does no header of a page."""
-    import pyarrow.parquet as pq
-
-    column = pq.ParquetFile(file).metadata.row_group(0).column(0)
-    start = column.dictionary_page_offset if column.has_dictionary_page else column.data_page_offset
-    return start + column.total_compressed_size - 1
-
-
 def test_spoilt_moved_doubled_and_missing_files_are_found(copied: DatasetStore, graspd: Run, capsys):
     root = Path(copied.where)
     first, second = (root / path for path in copied.list("grasps"))
     content = first.read_bytes()
-    changed = bytearray(content)
-    changed[_last_of_a_page(first)] ^= 0xFF
-    first.write_bytes(changed)
-    assert graspd("dataset", "validate", root) == 1
-    assert f"{first.name}: not a complete Parquet file" in capsys.readouterr().out
     first.write_bytes(content[: len(content) // 3])
     assert graspd("dataset", "validate", root) == 1
     assert f"{first.name}: not a complete Parquet file" in capsys.readouterr().out
@@ -110,9 +91,9 @@ def test_spoilt_moved_doubled_and_missing_files_are_found(copied: DatasetStore, 
     assert "is missing" in fault
 
 
-def _recorded(store: DatasetStore) -> None:
+def _recorded(store: DatasetStore, **changes: Any) -> None:
     """Write the record that a run of the command leaves."""
-    write_run(store, with_unrecorded(store, begin_run(store, REQUEST, 2)))
+    write_run(store, with_unrecorded(store, replace(begin_run(store, REQUEST, 2), **changes)))
 
 
 def test_a_byte_that_changed_anywhere_is_found(copied: DatasetStore, graspd: Run, capsys):
@@ -146,8 +127,7 @@ def test_a_merged_data_set_has_the_hashes_of_all(made: DatasetStore, copied: Dat
     shutil.copytree(copied.where, other.where)
     for store, path in zip((copied, other), made.list("grasps"), strict=True):
         (Path(store.where) / path).unlink()
-        record = replace(begin_run(store, REQUEST, 2), command="graspd dataset shape:sphere --out here")
-        write_run(store, with_unrecorded(store, record))
+        _recorded(store, command="graspd dataset shape:sphere --out here")
     out = DatasetStore(str(tmp_path / "out"))
     merge([copied, other], out)
     assert {*out.list("grasps"), *out.list("objects")} == recorded_hashes(out).keys()
@@ -242,6 +222,9 @@ def test_a_block_without_a_candidate_is_a_block(copied: DatasetStore):
     assert list(faults_of_dataset(copied)) == []
 
 
+ONE = ["shape:sphere", "--out", "out", "--per-object", "1"]
+
+
 @pytest.mark.parametrize(
     ("words", "told"),
     [
@@ -253,14 +236,30 @@ def test_a_block_without_a_candidate_is_a_block(copied: DatasetStore):
         (["sample", "a", "--out", "x.csv"], "ends with .parquet"),
         (["merge", "a"], "--out is missing"),
         (["shape:box", "--out", "nowhere://x"], "nowhere://x"),
-        (["shape:box", "--out", "x", "--address", "127.0.0.1:9"], "127.0.0.1:9: Connection refused; start Ray"),
+        ([*ONE, "--random-scales", "nan", "1", "2"], "random-scales: nan 1 2; valid: N >= 0"),
+        ([*ONE, "--random-scales", "2.5", "1", "2"], "random-scales: 2.5 1 2; valid: N >= 0"),
+        ([*ONE, "--patience", "-1"], "patience: -1; valid: a positive number"),
+        ([*ONE, "--patience", "nan"], "patience: nan; valid: a positive number"),
+        ([*ONE, "--memory", "0"], "memory: 0; valid: a positive number"),
     ],
 )
-def test_wrong_words_are_one_line(words: list[str], told: str, graspd: Run, capsys, tmp_path, monkeypatch):
+def test_wrong_words_are_one_line(words: list[str], told: str, refusal_of, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    assert graspd("dataset", *words) == 2
-    error = capsys.readouterr().err
-    assert told in error
+    assert told in refusal_of("dataset", *words)
+    assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize(
+    ("words", "told"),
+    [
+        (["--address", "127.0.0.1:9"], "127.0.0.1:9: Connection refused; start Ray"),
+        (["--memory", "1", "--dry-run"], "more than 1 MB; change --memory or --patience"),
+    ],
+)
+def test_a_run_that_cannot_begin_says_why(words: list[str], told: str, graspd: Run, capsys, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    assert graspd("dataset", *ONE, *words) == 2
+    assert told in capsys.readouterr().err
     assert not list(tmp_path.iterdir())
 
 
@@ -317,23 +316,6 @@ def test_a_record_or_a_file_that_lacks_an_entry_is_one_line(copied: DatasetStore
         assert ("its columns are not those" if status == 1 else "z.parquet: not a block") in told.out + told.err
 
 
-@pytest.mark.parametrize(
-    ("words", "told"),
-    [
-        (["--random-scales", "nan", "1", "2"], "random-scales: nan 1 2; valid: N >= 0"),
-        (["--random-scales", "2.5", "1", "2"], "random-scales: 2.5 1 2; valid: N >= 0"),
-        (["--patience", "-1"], "patience: -1; valid: a positive number"),
-        (["--patience", "nan"], "patience: nan; valid: a positive number"),
-        (["--memory", "0"], "memory: 0; valid: a positive number"),
-        (["--memory", "1", "--dry-run"], "more than 1 MB; change --memory or --patience"),
-    ],
-)
-def test_a_number_that_makes_no_sense_is_one_line(words: list[str], told: str, graspd: Run, capsys, tmp_path: Path):
-    assert graspd("dataset", "shape:sphere", "--out", tmp_path / "out", "--per-object", "1", *words) == 2
-    assert told in capsys.readouterr().err
-    assert not list(tmp_path.iterdir())
-
-
 def test_the_recorded_command_has_every_digit():
     request = replace(REQUEST, mass=0.123456789, scales=(1.0, 0.3333333333333333), per_object=1)
     words = shlex.split(command_of(request, "out"))
@@ -350,7 +332,6 @@ def test_the_hashes_of_a_merged_record_are_those_of_the_kept_files(made: Dataset
     table, header = read_parquet(other.read(path), path)
     other.write(path, parquet_bytes(table, {**header, "writer": "another"}))
     for store in (copied, other):
-        record = replace(begin_run(store, REQUEST, 2), command="graspd dataset shape:sphere --out here")
-        write_run(store, with_unrecorded(store, record))
+        _recorded(store, command="graspd dataset shape:sphere --out here")
     merge([other], copied)
     assert list(faults_of_dataset(copied)) == []

@@ -6,6 +6,7 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
+from expected import refused
 from s3_server import Server, s3_server
 
 from graspd_dataset import dataset_store
@@ -56,9 +57,8 @@ def test_a_server_that_refuses_one_request_in_ten_loses_and_doubles_nothing(serv
 def test_a_server_that_is_gone_or_a_bucket_that_is_not_there_is_one_line_and_tells_no_secret(monkeypatch):
     monkeypatch.setattr(dataset_store, "_TRIES", 1)
     gone = DatasetStore("s3://a:b@bucket/x?region=us-east-1&scheme=http&endpoint_override=127.0.0.1:9")
-    with pytest.raises(StorageError, match="bucket") as caught:
+    with refused(StorageError, "bucket"):
         gone.write("runs/a.json", b"{}")
-    assert "\n" not in str(caught.value)
     with pytest.raises(StorageError, match="nowhere://x"):
         DatasetStore("nowhere://x").list("grasps")
     remote = DatasetStore("s3://key:secret@bucket/x?region=us-east-1")

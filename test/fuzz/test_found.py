@@ -6,9 +6,9 @@ import pickle
 import struct
 import zipfile
 from pathlib import Path
-from types import ModuleType
 from typing import Any
 
+import fuzz_targets as fuzz
 import numpy as np
 import pytest
 
@@ -40,14 +40,14 @@ def archive(**changed: int) -> bytes:
     return bytes(data)
 
 
-def seed(fuzz: ModuleType, name: str, old: str, new: str) -> bytes:
+def seed(name: str, old: str, new: str) -> bytes:
     """The target's first seed with a part of it replaced."""
     text = fuzz.TARGETS[name].seeds()[0].decode()
     assert old in text
     return text.replace(old, new, 1).encode()
 
 
-def refusal(fuzz: ModuleType, name: str, data: bytes, folder: Path) -> str:
+def refusal(name: str, data: bytes, folder: Path) -> str:
     """Why a target refuses an input; fails where it does not, or not as it should."""
     told = fuzz.try_input(fuzz.TARGETS[name], data, folder)
     assert told is not None, "it was taken"
@@ -93,8 +93,8 @@ def pcd(points: int, kind: str, data: bytes = b"", *, size: str = "4", form: str
     ],
     ids=str,
 )
-def test_cloud_files(fuzz: ModuleType, folder: Path, data: bytes, message: str) -> None:
-    assert message in refusal(fuzz, "cloud", data, folder)
+def test_cloud_files(tmp_path: Path, data: bytes, message: str) -> None:
+    assert message in refusal("cloud", data, tmp_path)
 
 
 def test_points_are_read_in_every_order_and_beside_other_things(tmp_path: Path) -> None:
@@ -133,8 +133,8 @@ def test_points_are_read_in_every_order_and_beside_other_things(tmp_path: Path) 
     ],
     ids=lambda value: value[:20],
 )
-def test_grasp_documents(fuzz: ModuleType, folder: Path, old: str, new: str, message: str) -> None:
-    assert message in refusal(fuzz, "document", seed(fuzz, "document", old, new), folder)
+def test_grasp_documents(tmp_path: Path, old: str, new: str, message: str) -> None:
+    assert message in refusal("document", seed("document", old, new), tmp_path)
 
 
 NEST = "&b0 [1, 1]"
@@ -159,8 +159,8 @@ DOUBLED = "k0: &k0 {a: 1}\n" + "".join(f"k{n}: &k{n} {{<<: [*k{n - 1}, *k{n - 1}
     ],
     ids=lambda value: value[:24],
 )
-def test_presets(fuzz: ModuleType, folder: Path, text: str, message: str) -> None:
-    assert message in refusal(fuzz, "preset", text.encode(), folder)
+def test_presets(tmp_path: Path, text: str, message: str) -> None:
+    assert message in refusal("preset", text.encode(), tmp_path)
 
 
 @pytest.mark.parametrize(
@@ -177,12 +177,12 @@ def test_presets(fuzz: ModuleType, folder: Path, text: str, message: str) -> Non
     ],
     ids=lambda value: value[:24],
 )
-def test_hand_descriptions(fuzz: ModuleType, folder: Path, text: str, message: str) -> None:
-    assert message in refusal(fuzz, "description", f"urdf: g.urdf\n{text}\n".encode(), folder)
+def test_hand_descriptions(tmp_path: Path, text: str, message: str) -> None:
+    assert message in refusal("description", f"urdf: g.urdf\n{text}\n".encode(), tmp_path)
 
 
-def test_an_effort_may_be_a_whole_number(fuzz: ModuleType, folder: Path) -> None:
-    assert not fuzz.try_input(fuzz.TARGETS["description"], b"urdf: g.urdf\neffort: 1\n", folder)
+def test_an_effort_may_be_a_whole_number(tmp_path: Path) -> None:
+    assert not fuzz.try_input(fuzz.TARGETS["description"], b"urdf: g.urdf\neffort: 1\n", tmp_path)
 
 
 FOLLOWS = (
@@ -190,12 +190,12 @@ FOLLOWS = (
 )
 
 
-def test_a_chain_of_couplings_beyond_all_numbers(fuzz: ModuleType, folder: Path) -> None:
+def test_a_chain_of_couplings_beyond_all_numbers(tmp_path: Path) -> None:
     text = ""
     for n, (parent, leader) in enumerate((("left", "one"), ("right", "f0"))):
         mimic = f'<mimic joint="{leader}" multiplier="1e200"/>'
         text += f'<link name="f{n}"/>' + FOLLOWS.format(n=n, parent=parent, mimic=mimic)
-    told = refusal(fuzz, "urdf", seed(fuzz, "urdf", "</robot>", text + "</robot>"), folder)
+    told = refusal("urdf", seed("urdf", "</robot>", text + "</robot>"), tmp_path)
     assert "mimics 'one' with multiplier" in told
 
 
@@ -212,13 +212,13 @@ def test_a_chain_of_couplings_beyond_all_numbers(fuzz: ModuleType, folder: Path)
     ],
     ids=["elements", "attributes", "classes"],
 )
-def test_hand_files_that_would_take_gigabytes(fuzz, folder, name, text, message):
-    assert message in refusal(fuzz, name, text.encode(), folder)
+def test_hand_files_that_would_take_gigabytes(tmp_path, name, text, message):
+    assert message in refusal(name, text.encode(), tmp_path)
 
 
-def test_limits_up_to_the_largest_float_are_none(fuzz: ModuleType, folder: Path) -> None:
-    data = seed(fuzz, "urdf", 'lower="-0.5" upper="1"', 'lower="-1e308" upper="1e308"')
-    assert not fuzz.try_input(fuzz.TARGETS["urdf"], data, folder)
+def test_limits_up_to_the_largest_float_are_none(tmp_path: Path) -> None:
+    data = seed("urdf", 'lower="-0.5" upper="1"', 'lower="-1e308" upper="1e308"')
+    assert not fuzz.try_input(fuzz.TARGETS["urdf"], data, tmp_path)
 
 
 @pytest.mark.parametrize(
@@ -235,17 +235,17 @@ def test_limits_up_to_the_largest_float_are_none(fuzz: ModuleType, folder: Path)
     ],
     ids=lambda value: value[:16],
 )
-def test_collada_files(fuzz: ModuleType, folder: Path, old: str, new: str, message: str) -> None:
-    text = seed(fuzz, "dae", old, new).decode()
+def test_collada_files(tmp_path: Path, old: str, new: str, message: str) -> None:
+    text = seed("dae", old, new).decode()
     if "#g" in old:
         text = text.replace("0 0 3\n", "0 0 3\n" + "1 2 3 " * 60_000)
-    assert message in refusal(fuzz, "dae", text.encode(), folder)
+    assert message in refusal("dae", text.encode(), tmp_path)
 
 
-def test_entities_are_refused_in_every_encoding(fuzz: ModuleType, folder: Path) -> None:
-    text = seed(fuzz, "dae", '<?xml version="1.0"?>', '<!DOCTYPE x [<!ENTITY a "1">]>').decode()
+def test_entities_are_refused_in_every_encoding(tmp_path: Path) -> None:
+    text = seed("dae", '<?xml version="1.0"?>', '<!DOCTYPE x [<!ENTITY a "1">]>').decode()
     for encoding in ("utf-8", "utf-16"):
-        assert "document type" in refusal(fuzz, "dae", text.encode(encoding), folder)
+        assert "document type" in refusal("dae", text.encode(encoding), tmp_path)
 
 
 def test_a_bag_that_gives_a_known_type_other_fields(tmp_path: Path) -> None:
@@ -265,25 +265,25 @@ SIGNALLING = struct.pack("<I", 0x7FA00000)
 
 
 @pytest.mark.parametrize("name", ["layout", "message", "cloud"])
-def test_a_signalling_nan_is_a_nan_like_others(fuzz: ModuleType, folder: Path, name: str) -> None:
+def test_a_signalling_nan_is_a_nan_like_others(tmp_path: Path, name: str) -> None:
     data = fuzz.TARGETS[name].seeds()[0]
     at = data.index(struct.pack("<f", 0.01))
-    assert not fuzz.try_input(fuzz.TARGETS[name], data[:at] + SIGNALLING + data[at + 4 :], folder)
+    assert not fuzz.try_input(fuzz.TARGETS[name], data[:at] + SIGNALLING + data[at + 4 :], tmp_path)
 
 
-def test_a_rotation_with_a_signalling_nan_is_refused_like_others(fuzz: ModuleType, folder: Path) -> None:
+def test_a_rotation_with_a_signalling_nan_is_refused_like_others(tmp_path: Path) -> None:
     data = fuzz.TARGETS["message"].seeds()[3]
     at = data.index(struct.pack("<d", 1.0))
     spoilt = data[:at] + struct.pack("<Q", 0x7FF4000000000000) + data[at + 8 :]
-    assert fuzz.try_input(fuzz.TARGETS["message"], spoilt, folder) is None
+    assert fuzz.try_input(fuzz.TARGETS["message"], spoilt, tmp_path) is None
 
 
-def test_a_mano_file_tells_little_of_what_it_holds(fuzz: ModuleType, folder: Path) -> None:
-    told = refusal(fuzz, "mano", b"F" * 10_000 + b"\n.", folder)
+def test_a_mano_file_tells_little_of_what_it_holds(tmp_path: Path) -> None:
+    told = refusal("mano", b"F" * 10_000 + b"\n.", tmp_path)
     assert len(told) < 400
     whole: dict[str, Any] = pickle.loads(fuzz.TARGETS["mano"].seeds()[0])
     whole["weights"] = np.frombuffer(SIGNALLING * 256, np.float32).reshape(16, 16)
-    assert "weights has entries that are not finite" in refusal(fuzz, "mano", pickle.dumps(whole, 2), folder)
+    assert "weights has entries that are not finite" in refusal("mano", pickle.dumps(whole, 2), tmp_path)
 
 
 def test_what_is_shown_is_short() -> None:

@@ -1,8 +1,8 @@
-"""What tests of many folders expect: an error of one line, a value that is there."""
+"""What tests of many folders expect, an error of one line, a value that is there, and a pickle that runs code."""
 
 from collections.abc import Iterator
 from contextlib import contextmanager
-from typing import TypeVar
+from typing import Any, TypeVar
 
 import pytest
 
@@ -24,3 +24,13 @@ def some(value: T | None) -> T:
     """Return a value that is not None, for pyright too."""
     assert value is not None
     return value
+
+
+class Evil:
+    """Pickles as a call of a function of one's choice."""
+
+    def __init__(self, function: Any, *arguments: Any) -> None:
+        self.call = function, arguments
+
+    def __reduce__(self) -> Any:
+        return self.call

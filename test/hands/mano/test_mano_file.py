@@ -11,9 +11,8 @@ import numpy as np
 import pytest
 import torch
 import trimesh
-from expected import refused
+from expected import Evil, refused
 from hypothesis import given
-from inputs_made import Evil
 from scipy.sparse import csr_matrix
 from scipy.spatial.transform import Rotation
 

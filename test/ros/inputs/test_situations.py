@@ -8,10 +8,9 @@ from typing import Any
 import pytest
 from geometry_msgs.msg import Point
 from graspd_msgs.msg import GraspArray, GraspRequest
-from inputs_made import Situation, camera_place, recorded
 from rclpy.serialization import deserialize_message
 from sensor_msgs.msg import CameraInfo, Image, PointCloud2
-from situations import FILE_ONLY, MESHES, SITUATIONS
+from situations import FILE_ONLY, MESHES, SITUATIONS, Situation, camera_place, recorded
 
 from graspd_core.io.bags import read_raw
 
@@ -39,7 +38,7 @@ def point(values: tuple[float, ...]) -> Point:
 
 def source_of(row: Situation, path: Path, show: Callable[[dict[str, Any]], None]) -> dict[str, Any]:
     """Return the request's fields that give a row's object."""
-    if row in MESHES:
+    if row in MESHES.values():
         return {"source": GraspRequest.MESH, "mesh_uri": str(path), "mesh_scale": row.options.get("scale", 1.0)}
     found = messages(recorded(path))
     if "points" in found:
@@ -48,7 +47,10 @@ def source_of(row: Situation, path: Path, show: Callable[[dict[str, Any]], None]
     return {"source": GraspRequest.LATEST_CLOUD}
 
 
-@pytest.mark.parametrize("row", [row for row in SITUATIONS if row.name not in FILE_ONLY], ids=lambda row: row.name)
+MESSAGES = {name: row for name, row in SITUATIONS.items() if name not in FILE_ONLY}
+
+
+@pytest.mark.parametrize("row", MESSAGES.values(), ids=MESSAGES)
 def test_the_node_answers_the_same(row: Situation, client, node, tmp_path: Path):
     def show(found: dict[str, Any]) -> None:
         publishers = {name: client.node.create_publisher(KINDS[name], f"/depth/{name}", 10) for name in found}
