@@ -114,23 +114,6 @@ _DENSITY = 1100.0
 
 
 @dataclass(frozen=True, eq=False)
-class _Rest:
-    """A shape at rest in model axes [m]. `owner` is the body of each vertex, `frames` are the anatomical frames."""
-
-    data: ManoData
-    vertices: Float[np.ndarray, "vertices 3"]
-    joints: Float[np.ndarray, "16 3"]
-    owner: Int[np.ndarray, "vertices"]
-    tips: Float[np.ndarray, "5 3"]
-    normal: Float[np.ndarray, "3"]
-    frames: Float[np.ndarray, "16 3 3"]
-
-    def in_body(self, body: int) -> Float[np.ndarray, "vertices 3"]:
-        """Return the skin's vertices in the frame of a body [m]."""
-        return (self.vertices - self.joints[body]) @ self.frames[body]
-
-
-@dataclass(frozen=True, eq=False)
 class ManoHand:
     """A MANO model of one shape, as a hand model and as a skin.
 
@@ -166,12 +149,8 @@ def load_mano(path: str | Path, betas: Sequence[float] = (), *, candidates: int 
     shape[: len(betas)] = betas
     vertices, joints = rest(data, shape)
     closed_faces(data)  # Called only to raise, before any planning, if the mesh cannot be closed.
-    owner = data.weights.argmax(1)
-    tips = _fingertips(vertices, joints, owner)
-    normal = palm_normal(data, joints)
-    still = _Rest(data, vertices, joints, owner, tips, normal, anatomical_frames(joints, tips, normal))
-    hand = _bare_hand(still)
-    hand = replace(hand, adjacent=adjacent_links(hand), skins=_skins(hand, still))
+    hand = _bare_hand(data, vertices, joints)
+    hand = replace(hand, adjacent=adjacent_links(hand))
     return ManoHand(with_candidates(hand, candidates), data, vertices - joints[0])
 
 
@@ -185,41 +164,41 @@ def _fingertips(
     return np.array(tips)
 
 
-def _bare_hand(still: _Rest) -> HandModel:
-    """Return the hand without candidates. Two massless links lie between each body and its parent."""
-    links, joints, hulls = list[LinkSpec](), list[JointSpec](), list[Primitive]()
-    limits = _all_fingers(_FINGER_LIMITS, _THUMB_LIMITS)
-    torques = efforts(still.joints, still.tips)
+def _bare_hand(
+    data: ManoData, vertices: Float[np.ndarray, "vertices 3"], joints: Float[np.ndarray, "16 3"]
+) -> HandModel:
+    """Return the hand of a shape at rest [m], without candidates and adjacent pairs.
+
+    Two massless links lie between each body and its parent. A body's skin has all faces with a vertex of the body.
+    """
+    owner, normal = data.weights.argmax(1), palm_normal(data, joints)
+    tips = _fingertips(vertices, joints, owner)
+    frames = anatomical_frames(joints, tips, normal)
+    torques, limits = efforts(joints, tips), _all_fingers(_FINGER_LIMITS, _THUMB_LIMITS)
+    links, hinges, hulls, skins = list[LinkSpec](), list[JointSpec](), list[Primitive](), dict[str, TriangleMesh]()
     for body, name in enumerate(BODIES):
-        hulls.append(_hull(still.data, name, still.in_body(body)[still.owner == body]))
+        points = (vertices - joints[body]) @ frames[body]
+        skins[name] = TriangleMesh(points, data.faces[(owner[data.faces] == body).any(1)])
+        hulls.append(_hull(data, name, points[owner == body]))
         links.append(LinkSpec(name, *_inertial(hulls[body]), (hulls[body],)))
         if body == 0:
             continue
-        above, into = BODIES[PARENTS[body]], still.frames[PARENTS[body]].T
-        pose = into @ still.frames[body], into @ (still.joints[body] - still.joints[PARENTS[body]])
+        above, into = BODIES[PARENTS[body]], frames[PARENTS[body]].T
+        pose = into @ frames[body], into @ (joints[body] - joints[PARENTS[body]])
         links += [LinkSpec(f"{name}_{hinge}") for hinge in HINGES[:2]]
         for axis, (hinge, child) in enumerate(zip(HINGES, (links[-2].name, links[-1].name, name), strict=True)):
             limit = *limits[body - 1, axis], torques[body - 1, axis]
-            joints.append(JointSpec(f"{name}_{hinge}", above, child, "revolute", *pose, np.eye(3)[axis], *limit))
+            hinges.append(JointSpec(f"{name}_{hinge}", above, child, "revolute", *pose, np.eye(3)[axis], *limit))
             above, pose = child, (np.eye(3), np.zeros(3))
+    hand = assemble(data.path, data.path.stem, links, hinges, {})
     return replace(
-        assemble(still.data.path, still.data.path.stem, links, joints, {}),
+        hand,
         open_posture=_posture(*_OPEN),
         closed_posture=_posture(*_CLOSED),
-        palm_center=_palm_center(hulls[0], still.joints, still.normal),
-        palm_normal=still.normal,
-        approach=still.normal,
-    )
-
-
-def _skins(hand: HandModel, still: _Rest) -> tuple[tuple[int, TriangleMesh], ...]:
-    """Return the link and skin mesh of each body, link frame [m]. A mesh has all faces with a vertex of the body."""
-    faces = still.data.faces
-    own = [faces[(still.owner[faces] == body).any(1)] for body in range(len(BODIES))]
-    return tuple(
-        (hand.link_index[name], TriangleMesh(still.in_body(body), own[body]))
-        for body, name in enumerate(BODIES)
-        if len(own[body])
+        palm_center=_palm_center(hulls[0], joints, normal),
+        palm_normal=normal,
+        approach=normal,
+        skins=tuple((hand.link_index[name], skin) for name, skin in skins.items() if len(skin.faces)),
     )
 
 
