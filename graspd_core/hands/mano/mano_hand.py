@@ -187,8 +187,10 @@ def _bare_hand(
         pose = into @ frames[body], into @ (joints[body] - joints[PARENTS[body]])
         links += [LinkSpec(f"{name}_{hinge}") for hinge in HINGES[:2]]
         for axis, (hinge, child) in enumerate(zip(HINGES, (links[-2].name, links[-1].name, name), strict=True)):
-            limit = *limits[body - 1, axis], torques[body - 1, axis]
-            hinges.append(JointSpec(f"{name}_{hinge}", above, child, "revolute", *pose, np.eye(3)[axis], *limit))
+            (lower, upper), effort = limits[body - 1, axis], torques[body - 1, axis]
+            hinges.append(
+                JointSpec(f"{name}_{hinge}", above, child, "revolute", *pose, np.eye(3)[axis], lower, upper, effort)
+            )
             above, pose = child, (np.eye(3), np.zeros(3))
     hand = assemble(data.path, data.path.stem, links, hinges, {})
     return replace(
