@@ -65,10 +65,10 @@ def yaml_values(path: Path) -> Iterator[Any]:
         text = str(error).removeprefix(path.name)
         unknown = re.search(r"unknown key '([^']*)'", text)
         keys = [*re.sub(r"\[.*", "", text.partition(":")[0]).split("."), *(unknown.groups() if unknown else ())]
-        raise ConfigError(f"{path}:{_line_of(node, [key for key in keys if key])}: {text.lstrip('.: ')}") from None
+        raise ConfigError(f"{path}:{line_of(node, [key for key in keys if key])}: {text.lstrip('.: ')}") from None
 
 
-def _line_of(node: yaml.Node | None, keys: list[str]) -> int:
+def line_of(node: yaml.Node | None, keys: list[str]) -> int:
     """Follow nested `keys` as far as the file holds them. Return the line of the last found key, or 1."""
     line = 1
     for key in keys:

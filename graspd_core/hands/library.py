@@ -41,8 +41,6 @@ def load_hand(name_or_path: str | Path, *, candidates: int = 600, prefix: str = 
     Raises:
         HandError: the hand or file does not exist or cannot be used. The message names the file and the fault.
     """
-    if candidates < 1:
-        raise HandError(f"candidates: {candidates}; valid: 1 or more")
     if Path(name_or_path).suffix == ".pkl":
         from graspd_core.hands.mano.mano_hand import load_mano
 

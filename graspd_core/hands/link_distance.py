@@ -5,9 +5,9 @@ or an axis the gradient is zero (see `se3.safe_norm`). There are two approximati
 greatest depth in a single primitive, which may be too small. For a hull, the result is the greatest distance to its
 face planes. It is exact inside the hull, and may be too small outside near edges and corners.
 
-`CollisionTensors` holds the primitives of a hand, to compute the distance of object points to every link. Hulls are
-left out, or replaced by a box with round edges that fills the hull as well as possible. Between this box and the hull's
-surface, only the hand's contact candidates are tested. A thin wall passes between candidates, but not through the box.
+`CollisionTensors` holds the primitives of a hand, to compute the distance of object points to every link. Each hull is
+replaced by a box with round edges that fills the hull as well as possible. Between this box and the hull's surface,
+only the hand's contact candidates are tested. A thin wall passes between candidates, but not through the box.
 """
 
 from __future__ import annotations
@@ -140,11 +140,6 @@ def _boxes_inside(hulls: Sequence[Primitive]) -> Float[np.ndarray, "hulls 16"]:
     return cache.remember(f"boxes-{cache.digest(hulls)}", build, valid)["boxes"]
 
 
-def corner_sdf(past: Float[Tensor, "*batch n"]) -> _Distances:
-    """Return the signed distance [m] to a corner where `n` orthogonal faces meet. `past`: distance to each face [m]."""
-    return safe_norm(past.clamp_min(0.0)) + past.amax(-1).clamp_max(0.0)
-
-
 # Number of distances computed at once on a CPU and on an accelerator. Each distance needs a few hundred bytes.
 _AT_ONCE, _AT_ONCE_ELSEWHERE = 2**21, 2**25
 
@@ -171,14 +166,9 @@ class CollisionTensors:
 
 
 @lru_cache(maxsize=8)
-def make_collision_tensors(
-    hand: HandModel, device: torch.device | str, dtype: torch.dtype, *, filled: bool = False
-) -> CollisionTensors:
-    """Return the hand's primitives as tensors: without hulls, or `filled`, each hull as a box inside it.
-
-    The most recent results are cached.
-    """
-    solids = [p for p in hand.primitives if filled or p.kind != "hull"]
+def make_collision_tensors(hand: HandModel, device: torch.device | str, dtype: torch.dtype) -> CollisionTensors:
+    """Return the hand's primitives as tensors, each hull as a box inside it. The most recent results are cached."""
+    solids = hand.primitives
     n, hull = len(solids), [p.kind == "hull" for p in solids]
     rows = np.reshape([[*p.rotation.flat, *p.translation, *core_of(p)[0], core_of(p)[1]] for p in solids], (n, 16))
     if any(hull):
@@ -237,14 +227,6 @@ def pair_distance(
     rows = torch.arange(len(points), device=points.device)[:, None]
     in_link = links[rows, solids.link[which]].apply_inverse(points[..., None, :])
     local = SE3(solids.rotation, solids.translation)[which].apply_inverse(in_link).squeeze(-2)
-    return local_distance(solids, local, which)
-
-
-def local_distance(solids: CollisionTensors, local: _Places, which: Int[Tensor, "*batch"]) -> _Distances:
-    """Return the signed distance [m] of each point to one primitive.
-
-    `which` is the index of each point's primitive. `local` has each point in the frame of its primitive [m].
-    """
     return _distance(local, solids.core[which], solids.radius[which], solids.is_round[which])
 
 
@@ -254,4 +236,5 @@ def _distance(local: _Places, core: Tensor, radius: Tensor | float, is_round: Te
     x = torch.where(is_round > 0, radial, reach[..., 0])
     y = torch.where(is_round > 0, torch.zeros_like(radial), reach[..., 1])
     past = torch.stack([x, y, reach[..., 2]], -1) - core
-    return corner_sdf(past) - radius
+    # Three orthogonal faces meet in a corner. Outside the corner, the distance is Euclidean.
+    return safe_norm(past.clamp_min(0.0)) + past.amax(-1).clamp_max(0.0) - radius

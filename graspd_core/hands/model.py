@@ -187,9 +187,8 @@ class HandModel:
     @cached_property
     def fingertip_groups(self) -> Int[np.ndarray, "tips"]:
         """The rigid groups without a child group. They are at the ends of the fingers."""
-        groups, parents = self.link_group, self.link_parent
-        inner = {int(groups[p]) for link, p in enumerate(parents) if p >= 0 and groups[link] != groups[p]}
-        return np.array(sorted(set(groups.tolist()) - inner), dtype=int)
+        groups = np.unique(self.link_group)
+        return np.setdiff1d(groups, self.link_group[self.link_parent[groups[1:]]])
 
     @cached_property
     def link_joint_names(self) -> tuple[str, ...]:

@@ -175,7 +175,7 @@ def make_hand_tensors(
         return PointSet(placement(hand.num_links, points, index(links)), index(links), index(members))
 
     far = np.linalg.norm(hand.palm_center) > _PALM_RADIUS
-    solids = make_collision_tensors(hand, device, dtype, filled=True)
+    solids = make_collision_tensors(hand, device, dtype)
     same = hand.link_group[solids.link.cpu().numpy()][:, None] == of_link[first]
     place = np.where(same.any(1), same.argmax(1), len(present))
     return HandTensors(

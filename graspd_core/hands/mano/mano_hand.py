@@ -20,17 +20,18 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import torch
 from jaxtyping import Float, Int
-from torch import Tensor
+from scipy.spatial.transform import Rotation
 
 from graspd_core.errors import HandError
+from graspd_core.hands.kinematics import link_poses
 from graspd_core.hands.mano.mano_file import BODIES, FINGERS, PARENTS, ManoData, read_mano
-from graspd_core.hands.mano.mano_skin import close_wrist, closed_faces, rest, rotation_from_vector, skin_vertices
+from graspd_core.hands.mano.mano_skin import close_wrist, closed_faces, rest, skin_vertices
 from graspd_core.hands.model import HandModel, Primitive
+from graspd_core.hands.readers.build_model import JointSpec, LinkSpec, assemble
 from graspd_core.hands.self_collision import adjacent_links
 from graspd_core.hands.surface_points import with_candidates
 from graspd_core.mesh.convex_parts import limited_hull
@@ -72,26 +73,21 @@ def _posture(finger: tuple[float, ...], thumb: tuple[float, ...]) -> Float[np.nd
     return np.column_stack([_all_fingers(finger, thumb), np.zeros((15, 2))]).ravel()
 
 
-def efforts(joints: Float[np.ndarray, "16 3"], tips: Float[np.ndarray, "5 3"]) -> Float[np.ndarray, "45"]:
+def efforts(joints: Float[np.ndarray, "16 3"], tips: Float[np.ndarray, "5 3"]) -> Float[np.ndarray, "15 3"]:
     """Return the joint torque limits [N·m] at which the tip of a straight finger presses with `_TIP_FORCE`."""
     reach = np.linalg.norm(np.repeat(tips, 3, axis=0) - joints[1:], axis=1)
-    lever = np.maximum(np.column_stack([reach, reach, np.zeros(15)]), _LEAST_LEVER)
-    return (_TIP_FORCE * lever).ravel()
+    return _TIP_FORCE * np.maximum(np.column_stack([reach, reach, np.zeros(15)]), _LEAST_LEVER)
 
 
 def palm_normal(data: ManoData, joints: Float[np.ndarray, "16 3"]) -> Float[np.ndarray, "3"]:
     """Return the unit direction out of the palm at rest, model frame. In the mean pose, fingers bend to this side."""
-    wrist, index, little = joints[0], joints[1], joints[7]
-    normal = np.cross(index - wrist, little - wrist)
-    normal /= np.linalg.norm(normal)
-    zero = torch.zeros(1, data.shape_directions.shape[-1], dtype=torch.float64)
-    mean = torch.as_tensor(data.mean).reshape(1, 15, 3)
-    turned = torch.cat([torch.eye(3).to(zero).expand(1, 1, 3, 3), rotation_from_vector(mean)], 1)
-    flat = torch.eye(3).to(zero).expand(1, 16, 3, 3)
-    bent, straight = (skin_vertices(data, zero, r, zero.new_zeros(1, 3))[1][0].numpy() for r in (turned, flat))
-    ends = [3, 6, 9, 12]
+    normal = _unit(np.cross(joints[1] - joints[0], joints[7] - joints[0]))
+    shape, mean, knuckles = data.joint_regressor @ data.template, data.mean.reshape(15, 3), np.array([1, 4, 7, 10])
+    first, second = (shape[knuckles + n] - shape[knuckles + n - 1] for n in (1, 2))
+    turn, further = (Rotation.from_rotvec(mean[knuckles + n]) for n in (-1, 0))
+    bend = turn.apply(first + further.apply(second)) - (first + second)
     # If the mean pose is flat, it does not show the palm's side. Then a right hand is assumed.
-    return -normal if float(((bent - straight)[ends] @ normal).mean()) < -1e-4 else normal
+    return -normal if float((bend @ normal).mean()) < -1e-4 else normal
 
 
 def anatomical_frames(
@@ -109,26 +105,6 @@ def anatomical_frames(
     return frames
 
 
-def rotations_from_joints(
-    frames: Float[Tensor, "16 3 3"], values: Float[Tensor, "batch 45"]
-) -> Float[Tensor, "batch 16 3 3"]:
-    """Return the rotation of every body relative to its parent, in model axes. The wrist's rotation is the identity."""
-    sine, cosine = values.sin().unflatten(-1, (15, 3)), values.cos().unflatten(-1, (15, 3))
-    (sx, sy, sz), (cx, cy, cz) = sine.unbind(-1), cosine.unbind(-1)
-    # Entries of the matrix product Rx Ry Rz, row by row.
-    local = torch.stack(
-        [
-            cy * cz, -cy * sz, sy,
-            sx * sy * cz + cx * sz, cx * cz - sx * sy * sz, -sx * cy,
-            sx * sz - cx * sy * cz, cx * sy * sz + sx * cz, cx * cy,
-        ],
-        -1,
-    ).unflatten(-1, (3, 3))  # fmt: skip
-    turned = frames[1:] @ local @ frames[1:].transpose(-1, -2)
-    base = torch.eye(3, dtype=values.dtype, device=values.device).expand(len(values), 1, 3, 3)
-    return torch.cat([base, turned], 1)
-
-
 def _unit(vector: Float[np.ndarray, "3"]) -> Float[np.ndarray, "3"]:
     return vector / max(float(np.linalg.norm(vector)), 1e-12)
 
@@ -138,47 +114,27 @@ _DENSITY = 1100.0
 
 
 @dataclass(frozen=True, eq=False)
-class _Rest:
-    """A shape at rest in model axes [m]. `owner` is the body of each vertex, `frames` are the anatomical frames."""
-
-    data: ManoData
-    vertices: Float[np.ndarray, "vertices 3"]
-    joints: Float[np.ndarray, "16 3"]
-    owner: Int[np.ndarray, "vertices"]
-    tips: Float[np.ndarray, "5 3"]
-    normal: Float[np.ndarray, "3"]
-    frames: Float[np.ndarray, "16 3 3"]
-
-    def in_body(self, body: int) -> Float[np.ndarray, "vertices 3"]:
-        """Return the skin's vertices in the frame of a body [m]."""
-        return (self.vertices - self.joints[body]) @ self.frames[body]
-
-
-@dataclass(frozen=True, eq=False)
 class ManoHand:
     """A MANO model of one shape, as a hand model and as a skin.
 
     Attributes:
         model: hand model for planning.
         data: content of the file.
-        betas: shape coefficients.
-        frames: anatomical frames at rest, in model axes (`anatomical_frames`).
+        vertices: vertices at rest, base frame [m].
     """
 
     model: HandModel
     data: ManoData
-    betas: Float[np.ndarray, "shapes"]
-    frames: Float[np.ndarray, "16 3 3"]
+    vertices: Float[np.ndarray, "vertices 3"]
 
     def skinned_mesh(self, posture: Posture) -> TriangleMesh:
         """Return MANO's own surface at a posture [m], closed at the wrist, in the frame of the posture's position."""
-        betas = torch.as_tensor(self.betas)[None]
-        rotations = rotations_from_joints(torch.as_tensor(self.frames), torch.as_tensor(posture.joint_positions)[None])
-        origin = rest(self.data, betas)[1][:, 0]
-        vertices, _ = skin_vertices(self.data, betas, rotations, -origin)
-        turn = rotation_from_quaternion(torch.as_tensor(posture.quaternion_wxyz, dtype=torch.float64))
-        placed = close_wrist(self.data, vertices)[0] @ turn.T + torch.as_tensor(posture.position)
-        return TriangleMesh(placed.numpy(), closed_faces(self.data))
+        bodies = [self.model.link_index[name] for name in BODIES]
+        frames, joints = (part[bodies] for part in link_poses(self.model, np.zeros(45)))
+        turned, places = (part[bodies] for part in link_poses(self.model, posture.joint_positions))
+        vertices = skin_vertices(self.data, self.vertices, joints, turned @ frames.transpose(0, 2, 1), places)
+        turn = rotation_from_quaternion(torch.as_tensor(posture.quaternion_wxyz, dtype=torch.float64)).numpy()
+        return TriangleMesh(close_wrist(self.data, vertices) @ turn.T + posture.position, closed_faces(self.data))
 
 
 def load_mano(path: str | Path, betas: Sequence[float] = (), *, candidates: int = 600) -> ManoHand:
@@ -191,15 +147,11 @@ def load_mano(path: str | Path, betas: Sequence[float] = (), *, candidates: int 
     if len(betas) > len(shape) or not np.isfinite(list(betas)).all():
         raise HandError(f"{path}: betas has {len(betas)} numbers; valid: at most {len(shape)} finite numbers")
     shape[: len(betas)] = betas
-    vertices, joints = (t[0].numpy() for t in rest(data, torch.as_tensor(shape)[None]))
+    vertices, joints = rest(data, shape)
     closed_faces(data)  # Called only to raise, before any planning, if the mesh cannot be closed.
-    owner = data.weights.argmax(1)
-    tips = _fingertips(vertices, joints, owner)
-    normal = palm_normal(data, joints)
-    still = _Rest(data, vertices, joints, owner, tips, normal, anatomical_frames(joints, tips, normal))
-    hand = _bare_hand(still)
-    hand = replace(hand, adjacent=adjacent_links(hand), skins=_skins(hand, still))
-    return ManoHand(with_candidates(hand, candidates), data, shape, still.frames)
+    hand = _bare_hand(data, vertices, joints)
+    hand = replace(hand, adjacent=adjacent_links(hand))
+    return ManoHand(with_candidates(hand, candidates), data, vertices - joints[0])
 
 
 def _fingertips(
@@ -212,83 +164,51 @@ def _fingertips(
     return np.array(tips)
 
 
-def _bare_hand(still: _Rest) -> HandModel:
-    """Return the hand without candidates. Two massless links lie between each body and its parent."""
-    data, normal = still.data, still.normal
-    tree, link_of = _tree(still.joints, still.frames)
-    count = len(tree["link_names"])
-    hulls = {
-        body: _hull(data, BODIES[body], link_of[body], still.in_body(body)[still.owner == body])
-        for body in range(len(BODIES))
-    }
-    mass, com, inertia = np.zeros(count), np.zeros((count, 3)), np.zeros((count, 3, 3))
-    for body, hull in hulls.items():
-        mass[link_of[body]], com[link_of[body]], inertia[link_of[body]] = _inertial(hull)
-    limits = _all_fingers(_FINGER_LIMITS, _THUMB_LIMITS)
-    return HandModel(
-        name=data.path.stem,
-        urdf=str(data.path),
-        **tree,
-        joint_names=tuple(f"{name}_{hinge}" for name in BODIES[1:] for hinge in HINGES),
-        lower=limits[..., 0].ravel(),
-        upper=limits[..., 1].ravel(),
-        effort=efforts(still.joints, still.tips),
-        velocity=np.full(count - 1, np.inf),
+def _bare_hand(
+    data: ManoData, vertices: Float[np.ndarray, "vertices 3"], joints: Float[np.ndarray, "16 3"]
+) -> HandModel:
+    """Return the hand of a shape at rest [m], without candidates and adjacent pairs.
+
+    Two massless links lie between each body and its parent. A body's skin has all faces with a vertex of the body.
+    """
+    owner, normal = data.weights.argmax(1), palm_normal(data, joints)
+    tips = _fingertips(vertices, joints, owner)
+    frames = anatomical_frames(joints, tips, normal)
+    torques, limits = efforts(joints, tips), _all_fingers(_FINGER_LIMITS, _THUMB_LIMITS)
+    links, hinges, hulls, skins = list[LinkSpec](), list[JointSpec](), list[Primitive](), dict[str, TriangleMesh]()
+    for body, name in enumerate(BODIES):
+        points = (vertices - joints[body]) @ frames[body]
+        skins[name] = TriangleMesh(points, data.faces[(owner[data.faces] == body).any(1)])
+        hulls.append(_hull(data, name, points[owner == body]))
+        links.append(LinkSpec(name, *_inertial(hulls[body]), (hulls[body],)))
+        if body == 0:
+            continue
+        above, into = BODIES[PARENTS[body]], frames[PARENTS[body]].T
+        pose = into @ frames[body], into @ (joints[body] - joints[PARENTS[body]])
+        links += [LinkSpec(f"{name}_{hinge}") for hinge in HINGES[:2]]
+        for axis, (hinge, child) in enumerate(zip(HINGES, (links[-2].name, links[-1].name, name), strict=True)):
+            (lower, upper), effort = limits[body - 1, axis], torques[body - 1, axis]
+            hinges.append(
+                JointSpec(f"{name}_{hinge}", above, child, "revolute", *pose, np.eye(3)[axis], lower, upper, effort)
+            )
+            above, pose = child, (np.eye(3), np.zeros(3))
+    hand = assemble(data.path, data.path.stem, links, hinges, {})
+    return replace(
+        hand,
         open_posture=_posture(*_OPEN),
         closed_posture=_posture(*_CLOSED),
-        palm_center=_palm_center(hulls[0], still.joints, normal),
+        palm_center=_palm_center(hulls[0], joints, normal),
         palm_normal=normal,
         approach=normal,
-        link_joint=np.arange(-1, count - 1),
-        link_group=np.arange(count),
-        link_mass=mass,
-        link_com=com,
-        link_inertia=inertia,
-        primitives=tuple(hulls.values()),
-        adjacent=np.eye(count, dtype=bool),
+        skins=tuple((hand.link_index[name], skin) for name, skin in skins.items() if len(skin.faces)),
     )
 
 
-def _skins(hand: HandModel, still: _Rest) -> tuple[tuple[int, TriangleMesh], ...]:
-    """Return the link and skin mesh of each body, link frame [m]. A mesh has all faces with a vertex of the body."""
-    faces = still.data.faces
-    own = [faces[(still.owner[faces] == body).any(1)] for body in range(len(BODIES))]
-    return tuple(
-        (hand.link_index[name], TriangleMesh(still.in_body(body), own[body]))
-        for body, name in enumerate(BODIES)
-        if len(own[body])
-    )
-
-
-def _tree(joints: Float[np.ndarray, "16 3"], frames: Float[np.ndarray, "16 3 3"]) -> tuple[dict[str, Any], list[int]]:
-    """Return the fields of a hand model that describe its tree, and the link index of each body."""
-    names, parents, axes = [BODIES[0]], [-1], [np.zeros(3)]
-    offsets = [(np.eye(3), np.zeros(3))]
-    link_of = [0]
-    for body in range(1, len(BODIES)):
-        above = PARENTS[body]
-        turn = frames[above].T
-        offsets += [(turn @ frames[body], turn @ (joints[body] - joints[above])), *[(np.eye(3), np.zeros(3))] * 2]
-        parents += [link_of[above], len(names), len(names) + 1]
-        names += [f"{BODIES[body]}_{hinge}" for hinge in HINGES[:2]] + [BODIES[body]]
-        axes += list(np.eye(3))
-        link_of.append(len(names) - 1)
-    tree = {
-        "link_names": tuple(names),
-        "link_parent": np.array(parents),
-        "link_offset_rotation": np.array([rotation for rotation, _ in offsets]),
-        "link_offset_translation": np.array([translation for _, translation in offsets]),
-        "joint_axis": np.array(axes),
-        "joint_kind": ("fixed", *["revolute"] * (len(names) - 1)),
-    }
-    return tree, link_of
-
-
-def _hull(data: ManoData, name: str, link: int, points: Float[np.ndarray, "points 3"]) -> Primitive:
+def _hull(data: ManoData, name: str, points: Float[np.ndarray, "points 3"]) -> Primitive:
     if len(points) < 4 or np.linalg.matrix_rank(points - points.mean(0)) < 3:
         raise HandError(f"{data.path}: weights: the vertices of {name} span no solid")
     hull = limited_hull(points, len(points))
-    return Primitive(link, "hull", np.eye(3), np.zeros(3), (), hull.vertices, hull.faces)
+    return Primitive(0, "hull", np.eye(3), np.zeros(3), (), hull.vertices, hull.faces)
 
 
 def _inertial(hull: Primitive) -> tuple[float, Float[np.ndarray, "3"], Float[np.ndarray, "3 3"]]:

@@ -1,7 +1,6 @@
-"""Compute MANO's forward function in torch: blend shapes and linear blend skinning, batched and differentiable.
+"""Compute MANO's skin: blend shapes, linear blend skinning, and the closed wrist.
 
-Sources: Romero, Tzionas and Black, "Embodied Hands", 2017, after SMPL (Loper et al. 2015). Gradients in shape, pose and
-translation are exact, also at zero rotation.
+Sources: Romero, Tzionas and Black, "Embodied Hands", 2017, after SMPL (Loper et al. 2015).
 """
 
 from __future__ import annotations
@@ -9,59 +8,42 @@ from __future__ import annotations
 import numpy as np
 import torch
 from jaxtyping import Float, Int
-from torch import Tensor
 
 from graspd_core.errors import HandError
 from graspd_core.hands.mano.mano_file import PARENTS, ManoData
 from graspd_core.mesh.topology import face_edges
-from graspd_core.se3 import rotation_from_quaternion, safe_norm
 
 
 def rest(
-    data: ManoData, betas: Float[Tensor, "batch shapes"]
-) -> tuple[Float[Tensor, "batch vertices 3"], Float[Tensor, "batch 16 3"]]:
-    """Return the vertices and joint positions of a shape at rest [m]. Missing betas are zero."""
-    arrays = data.template, data.shape_directions[..., : betas.shape[-1]], data.joint_regressor
-    template, directions, regressor = (torch.as_tensor(array).to(betas) for array in arrays)
-    shaped = template + torch.einsum("vcs,bs->bvc", directions, betas)
-    return shaped, regressor @ shaped
+    data: ManoData, betas: Float[np.ndarray, "shapes"]
+) -> tuple[Float[np.ndarray, "vertices 3"], Float[np.ndarray, "16 3"]]:
+    """Return the vertices and joint positions of a shape at rest [m]."""
+    arrays = data.template, data.shape_directions, data.joint_regressor, betas
+    template, directions, regressor, coefficients = map(torch.as_tensor, arrays)
+    shaped = template + directions @ coefficients
+    return shaped.numpy(), (regressor @ shaped).numpy()
 
 
 def skin_vertices(
     data: ManoData,
-    betas: Float[Tensor, "batch shapes"],
-    rotations: Float[Tensor, "batch 16 3 3"],
-    translation: Float[Tensor, "batch 3"],
-) -> tuple[Float[Tensor, "batch vertices 3"], Float[Tensor, "batch 16 3"]]:
-    """Return the vertices and joint positions of the posed hand [m].
+    vertices: Float[np.ndarray, "vertices 3"],
+    joints: Float[np.ndarray, "16 3"],
+    turns: Float[np.ndarray, "16 3 3"],
+    places: Float[np.ndarray, "16 3"],
+) -> Float[np.ndarray, "vertices 3"]:
+    """Return the vertices of the posed hand [m].
 
     Args:
         data: MANO model.
-        betas: shape coefficients.
-        rotations: rotation of every body relative to its parent, in model axes. Rotation 0 turns the whole hand.
-        translation: shift of all vertices and joints [m].
+        vertices, joints: vertices and joint positions at rest [m].
+        turns: rotation of every body from its orientation at rest, in model axes.
+        places: joint positions of the posed hand [m].
     """
-    shaped, joints = rest(data, betas)
-    feature = (rotations[:, 1:] - torch.eye(3, dtype=rotations.dtype, device=rotations.device)).flatten(1)
-    posed = shaped + torch.einsum("vcp,bp->bvc", torch.as_tensor(data.pose_directions).to(betas), feature)
-    turns, places = [rotations[:, 0]], [joints[:, 0]]
-    for body in range(1, len(PARENTS)):
-        parent = PARENTS[body]
-        bone = joints[:, body] - joints[:, parent]
-        places.append(places[parent] + (turns[parent] @ bone[..., None]).squeeze(-1))
-        turns.append(turns[parent] @ rotations[:, body])
-    turn, place = torch.stack(turns, 1), torch.stack(places, 1)
-    shift = place - (turn @ joints[..., None]).squeeze(-1)
-    weights = torch.as_tensor(data.weights).to(betas)
-    mixed = torch.einsum("vj,bjrc->bvrc", weights, torch.cat([turn, shift[..., None]], -1))
-    vertices = (mixed[..., :3] @ posed[..., None]).squeeze(-1) + mixed[..., 3]
-    return vertices + translation[:, None], place + translation[:, None]
-
-
-def rotation_from_vector(vector: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch 3 3"]:
-    """Return the rotation matrices of axis-angle vectors [rad]. The function is smooth at zero."""
-    half = 0.5 * safe_norm(vector)[..., None]
-    return rotation_from_quaternion(torch.cat([half.cos(), 0.5 * torch.sinc(half / torch.pi) * vector], -1))
+    from_parent = turns[list(PARENTS[1:])].transpose(0, 2, 1) @ turns[1:]
+    posed = vertices + data.pose_directions @ (from_parent - np.eye(3)).ravel()
+    shifts = places - np.einsum("jrc,jc->jr", turns, joints)
+    mixed = np.einsum("vj,jrc->vrc", data.weights, turns)
+    return np.einsum("vrc,vc->vr", mixed, posed) + data.weights @ shifts
 
 
 def wrist_loop(data: ManoData) -> Int[np.ndarray, "loop"]:
@@ -93,9 +75,7 @@ def closed_faces(data: ManoData) -> Int[np.ndarray, "faces 3"]:
     return np.concatenate([data.faces, np.column_stack([np.roll(loop, -1), loop, hub])])
 
 
-def close_wrist(data: ManoData, vertices: Float[Tensor, "batch vertices 3"]) -> Float[Tensor, "batch closed 3"]:
+def close_wrist(data: ManoData, vertices: Float[np.ndarray, "vertices 3"]) -> Float[np.ndarray, "closed 3"]:
     """Return the vertices for `closed_faces`, with the hub of the fan appended. The hub is the mean of the loop."""
     loop = wrist_loop(data)
-    if len(loop) == 0:
-        return vertices
-    return torch.cat([vertices, vertices[:, loop].mean(1, keepdim=True)], 1)
+    return np.vstack([vertices, vertices[loop].mean(0)]) if len(loop) else vertices

@@ -11,7 +11,7 @@ import numpy as np
 import yaml
 from jaxtyping import Float
 
-from graspd_core.config.mapping import YamlError, parse_yaml
+from graspd_core.config.mapping import YamlError, line_of, parse_yaml
 from graspd_core.errors import HandError, choices, short_repr
 from graspd_core.hands.default_postures import default_palm, default_postures
 from graspd_core.hands.kinematics import link_poses
@@ -25,15 +25,15 @@ _LARGEST = 1e9
 
 @dataclass(frozen=True, eq=False)
 class Source:
-    """A file and the line of each key. Nested keys are written like `palm.center`. The methods check values."""
+    """A file and its YAML nodes. Nested keys are written like `palm.center`. The methods check values."""
 
     path: Path
-    lines: Mapping[str, int]
+    node: yaml.Node | None
 
     def error(self, key: str, message: str) -> HandError:
         """Return an error about a key. The message names the file, the line and the key."""
-        line = self.lines.get(key, self.lines.get(key.partition(".")[0], 1))
-        return HandError(f"{self.path}:{line}: {key}: {message}")
+        # Only the first dot separates two keys, because names of joints may contain dots.
+        return HandError(f"{self.path}:{line_of(self.node, key.split('.', 1))}: {key}: {message}")
 
     def mapping(self, key: str, value: Any) -> dict[str, Any]:
         """Check a mapping, and convert its keys to text, because some joints have numbers as names."""
@@ -43,14 +43,14 @@ class Source:
 
     def section(self, key: str, value: Any, known: tuple[str, ...], required: tuple[str, ...]) -> dict[str, Any]:
         """Check a mapping for unknown and missing keys. An empty `key` means the whole file."""
-        data, prefix = self.mapping(key or "the file", value), f"{key}." if key else ""
+        data, above = self.mapping(key or "the file", value), [key] if key else []
         for name in data:
             if name not in known:
-                line = self.lines.get(f"{prefix}{name}", 1)
+                line = line_of(self.node, [*above, name])
                 raise HandError(f"{self.path}:{line}: unknown key {name!r}; {choices(name, known)}")
         for name in required:
             if name not in data:
-                raise HandError(f"{self.path}:{self.lines.get(key, 1)}: {prefix}{name} is missing")
+                raise HandError(f"{self.path}:{line_of(self.node, above)}: {'.'.join([*above, name])} is missing")
         return data
 
     def text(self, key: str, value: Any) -> str:
@@ -107,7 +107,7 @@ class HandDescription:
     """The checked content of a description.
 
     Attributes:
-        source: the file, and the line of each key.
+        source: the file and its YAML nodes.
         name: name of the hand. The default is the stem of the file name.
         urdf: path of the URDF or MJCF file.
         palm_link: link in whose frame palm_center and palm_normal are given. None for the base link.
@@ -152,7 +152,7 @@ def read_description(path: Path) -> HandDescription:
         raise HandError(f"{path}:{error.line}: not well-formed YAML: {error.problem}") from error
     except UnicodeDecodeError as error:
         raise HandError(f"{path}:1: not well-formed YAML: {type(error).__name__}") from error
-    source = Source(path, _key_lines(node))
+    source = Source(path, node)
     root = source.section("", data, _KEYS, ("urdf",))
     palm = source.section("palm", root["palm"], _PALM_KEYS, _PALM_KEYS[1:]) if "palm" in root else {}
 
@@ -242,15 +242,3 @@ def _check_joints(hand: HandModel, description: HandDescription, key: str, value
     for name in values:
         if name not in hand.joint_names:
             raise description.source.error(f"{key}.{name}", f"no such joint; joints: {', '.join(hand.joint_names)}")
-
-
-def _key_lines(node: yaml.Node | None, prefix: str = "") -> dict[str, int]:
-    """Return the line of every key on the first two levels. A nested key is written with a dot, as in `palm.center`."""
-    lines: dict[str, int] = {}
-    if isinstance(node, yaml.MappingNode):
-        for key, value in node.value:
-            name = f"{prefix}{key.value}"
-            lines[name] = key.start_mark.line + 1
-            # Deeper levels are not read, because a YAML alias may put a mapping into itself.
-            lines |= {} if prefix else _key_lines(value, f"{name}.")
-    return lines

@@ -10,6 +10,7 @@ import codecs
 import re
 import xml.etree.ElementTree as ET
 from pathlib import Path
+from typing import cast
 from xml.parsers import expat
 from xml.sax.saxutils import quoteattr
 
@@ -59,38 +60,32 @@ def parse_xml(path: Path, text: str) -> Element:
     text = _blanked(text, "<!--", "-->")
     for space in " \t\r\n":
         text = _blanked(text, f"<?xml{space}", "?>")
-    top: list[Element] = []
-    stack: list[Element] = []
-    count = 0
+    document, count = Element(""), 0
+    stack = [document]
     parser = expat.ParserCreate(encoding="utf-8")
 
     def start(tag: str, attributes: dict[str, str]) -> None:
         nonlocal count
         count += 1
         element = Element(tag, attributes)
-        element.line = parser.CurrentLineNumber
+        element.line, element.owner = parser.CurrentLineNumber, stack[-1].owner
         if tag in _OWNERS and "name" in attributes:
             element.owner = f"{tag} {attributes['name']!r}"
-        elif stack:
-            element.owner = stack[-1].owner
         if tag in _OWNERS and not attributes.get("name", "").isprintable():
             raise wrong(path, element, "has a name with a line end or an unprintable character; use another name")
-        if len(stack) >= DEEPEST:
+        if len(stack) > DEEPEST:
             raise wrong(path, element, f"<{tag}> is nested more than {DEEPEST} deep")
         if count > _MOST_ELEMENTS or len(attributes) > _MOST_ATTRIBUTES:
             limits = f"{_MOST_ELEMENTS} elements, nor more than {_MOST_ATTRIBUTES} attributes of one element"
             raise wrong(path, element, f"a hand file must not have more than {limits}")
-        (stack[-1] if stack else top).append(element)
+        stack[-1].append(element)
         stack.append(element)
-
-    def end(tag: str) -> None:
-        del tag
-        stack.pop()
 
     def refuse(*_: object) -> None:
         raise HandError(f"{path}:{parser.CurrentLineNumber}: a <!DOCTYPE> is refused, because it may define entities")
 
-    parser.StartElementHandler, parser.EndElementHandler, parser.StartDoctypeDeclHandler = start, end, refuse
+    parser.StartElementHandler, parser.StartDoctypeDeclHandler = start, refuse
+    parser.EndElementHandler = lambda _: stack.pop()
     try:
         body = text.lstrip()
         # The leading line ends are kept, so that line numbers stay correct.
@@ -98,7 +93,7 @@ def parse_xml(path: Path, text: str) -> Element:
         parser.Parse(("\n" * before + body).encode("utf-8", errors="replace"), True)
     except expat.ExpatError as error:
         raise HandError(f"{path}: not well-formed XML: {error}") from error
-    return top[0]
+    return cast(Element, document[0])
 
 
 def as_text(root: ET.Element) -> str:

@@ -6,13 +6,10 @@ import runpy
 from pathlib import Path
 from typing import Any
 
-import hypothesis.strategies as st
 import numpy as np
 import pytest
-import torch
 import trimesh
 from expected import Evil, refused
-from hypothesis import given
 from scipy.sparse import csr_matrix
 from scipy.spatial.transform import Rotation
 
@@ -20,22 +17,16 @@ from graspd_bench.studies.human_hand import measure_skin
 from graspd_core import Posture, Verdict, load_hand, load_scene, plan_grasps
 from graspd_core.errors import HandError
 from graspd_core.hands.kinematics import in_base, link_poses
-from graspd_core.hands.mano import mano_hand as mano_joints
 from graspd_core.hands.mano.mano_file import ADMITTED, BODIES, PARENTS, ManoData, numbers, read_mano, read_pickle
 from graspd_core.hands.mano.mano_hand import ManoHand, load_mano
-from graspd_core.hands.mano.mano_skin import (
-    close_wrist,
-    closed_faces,
-    rest,
-    rotation_from_vector,
-    skin_vertices,
-    wrist_loop,
-)
+from graspd_core.hands.mano.mano_skin import closed_faces, wrist_loop
 from graspd_core.hands.self_collision import deepest_overlap
 from graspd_core.hands.surface_points import with_candidates
 from graspd_core.mesh.surface_queries import make_distance_query, signed_distance
 from graspd_core.runtime.inert_pickle import Maker
 
+# Shape coefficients of the fixture `mano`.
+BETAS = np.array([0.7, -1.0, 0.5, *[0.0] * 7])
 SYNTHETIC = runpy.run_path(str(Path(__file__).parents[3] / "benchmarks" / "mano_synthetic.py"))
 
 
@@ -261,13 +252,8 @@ def path(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.fixture(scope="module")
-def data(path: Path) -> ManoData:
-    return read_mano(path)
-
-
-@pytest.fixture(scope="module")
 def mano(path: Path) -> ManoHand:
-    return load_mano(path, [0.7, -1.0, 0.5], candidates=200)
+    return load_mano(path, BETAS[:3].tolist(), candidates=200)
 
 
 def by_the_paper(data: ManoData, betas: np.ndarray, pose: np.ndarray, shift: np.ndarray) -> np.ndarray:
@@ -289,54 +275,27 @@ def by_the_paper(data: ManoData, betas: np.ndarray, pose: np.ndarray, shift: np.
     return np.einsum("vb,bij,vj->vi", data.weights, chain, homogeneous)[:, :3] + shift
 
 
-def draw(seed: int, shapes: int, batch: int = 2) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
-    rng = np.random.default_rng(seed)
-    sizes = ((batch, shapes), (batch, 16, 3), (batch, 3))
-    betas, pose, shift = (
-        torch.as_tensor(rng.normal(scale=s, size=n)) for s, n in zip((1, 0.6, 0.2), sizes, strict=True)
-    )
-    return betas, pose, shift
+@pytest.mark.parametrize("seed", range(3))
+def test_the_skin_is_that_of_the_paper(mano: ManoHand, seed: int) -> None:
+    """The hinges turn every body by B Rx Ry Rz Bᵀ in its parent. The paper's equations give the vertices."""
+    hand, rng = mano.model, np.random.default_rng(seed)
+    q, at, turn = rng.uniform(hand.lower, hand.upper), rng.normal(scale=0.2, size=3), Rotation.random(rng=rng)
+    frames = link_poses(hand, np.zeros(45))[0][[hand.link_index[name] for name in BODIES[1:]]]
+    local = frames @ Rotation.from_euler("XYZ", q.reshape(15, 3)).as_matrix() @ frames.transpose(0, 2, 1)
+    pose = np.vstack([turn.as_rotvec(), Rotation.from_matrix(local).as_rotvec()])
+    wrist = mano.data.joint_regressor[0] @ (mano.data.template + mano.data.shape_directions @ BETAS)
+    mesh = mano.skinned_mesh(Posture(at, turn.as_quat(scalar_first=True), q))
+    np.testing.assert_allclose(mesh.vertices[:-1], by_the_paper(mano.data, BETAS, pose, at - wrist), atol=1e-12)
 
 
-def test_forward_agrees_with_the_paper(data: ManoData) -> None:
-    betas, pose, shift = draw(0, 10)
-    vertices, _ = skin_vertices(data, betas, rotation_from_vector(pose), shift)
-    for row in range(2):
-        expected = by_the_paper(data, betas[row].numpy(), pose[row].numpy(), shift[row].numpy())
-        np.testing.assert_allclose(vertices[row], expected, atol=1e-12)
-    single, _ = skin_vertices(data, betas.float(), rotation_from_vector(pose.float()), shift.float())
-    np.testing.assert_allclose(single, vertices, atol=2e-6)  # float32 over four joints in a row
-
-
-def test_gradients_are_those_of_finite_differences(data: ManoData) -> None:
-    weights = torch.as_tensor(np.random.default_rng(1).normal(size=data.template.shape))
-    betas, pose, shift = (x[:1].requires_grad_(True) for x in draw(2, 10))
-
-    def value(betas: torch.Tensor, pose: torch.Tensor, shift: torch.Tensor) -> torch.Tensor:
-        return (skin_vertices(data, betas, rotation_from_vector(pose), shift)[0] * weights).sum()
-
-    assert torch.autograd.gradcheck(value, (betas, pose, shift), eps=1e-6, atol=1e-6)
-    # At the zero rotation, where Rodrigues' formula divides nothing by nothing.
-    assert torch.autograd.gradcheck(value, (betas, torch.zeros_like(pose).requires_grad_(True), shift), atol=1e-6)
-
-
-@given(seed=st.integers(0, 10_000), length=st.sampled_from([0.0, 1e-12, 1e-7, 1e-3, 1.0, 3.1]))
-def test_rotation_vectors_are_those_of_scipy(seed: int, length: float) -> None:
-    direction = np.random.default_rng(seed).normal(size=3)
-    vector = length * direction / np.linalg.norm(direction)
-    rotation = rotation_from_vector(torch.as_tensor(vector))
-    np.testing.assert_allclose(rotation, Rotation.from_rotvec(vector).as_matrix(), atol=1e-12)
-
-
-def test_the_wrist_is_closed(data: ManoData) -> None:
-    faces, loop = closed_faces(data), wrist_loop(data)
+def test_the_wrist_is_closed(mano: ManoHand) -> None:
+    faces, loop = closed_faces(mano.data), wrist_loop(mano.data)
     assert len(loop) >= 8
-    assert len(faces) == len(data.faces) + len(loop)
-    betas, pose, shift = draw(6, 10, batch=1)
-    for scale in (0.0, 0.3):
-        rotations = rotation_from_vector(scale * pose)
-        vertices, _ = skin_vertices(data, betas, rotations, shift)
-        mesh = trimesh.Trimesh(close_wrist(data, vertices)[0].numpy(), faces, process=False)
+    assert len(faces) == len(mano.data.faces) + len(loop)
+    for q in (np.zeros(45), mano.model.open_posture, mano.model.closed_posture):
+        skin = mano.skinned_mesh(Posture(np.full(3, 0.2), np.array([0.6, 0.8, 0, 0]), q))
+        np.testing.assert_array_equal(skin.faces, faces)
+        mesh = trimesh.Trimesh(skin.vertices, faces, process=False)
         assert mesh.is_watertight
         assert mesh.is_winding_consistent
         assert 1e-4 < mesh.volume < 1e-3  # a hand has some 0.4 l
@@ -359,24 +318,6 @@ def test_a_mesh_that_is_not_open_at_one_place_is_refused(model: dict[str, Any], 
     closed = write(tmp_path / "closed.pkl", content)
     assert len(wrist_loop(read_mano(closed))) == 0
     np.testing.assert_array_equal(closed_faces(read_mano(closed)), closed_faces(data))
-
-
-@given(seed=st.integers(0, 10_000))
-def test_the_hands_links_are_the_skins_bodies(mano: ManoHand, seed: int) -> None:
-    """The tree of hinges puts every body where MANO's own chain puts it."""
-    hand = mano.model
-    q = np.random.default_rng(seed).uniform(hand.lower, hand.upper)
-    rotations, translations = link_poses(hand, q)
-    betas = torch.as_tensor(mano.betas)[None]
-    turned = mano_joints.rotations_from_joints(torch.as_tensor(mano.frames), torch.as_tensor(q)[None])
-    origin = rest(mano.data, betas)[1][:, 0]
-    _, joints = skin_vertices(mano.data, betas, turned, -origin)
-    links = [hand.link_index[name] for name in BODIES]
-    np.testing.assert_allclose(translations[links], joints[0], atol=1e-12)
-    whole = np.eye(3)
-    for body in (1, 2, 3):
-        whole = whole @ turned[0, body].numpy()
-        np.testing.assert_allclose(rotations[links[body]], whole @ mano.frames[body], atol=1e-12)
 
 
 def test_hulls_hold_the_skin_at_rest(mano: ManoHand) -> None:
