@@ -117,7 +117,8 @@ def plan_grasps(
     support, bound = scene.support, BoundRestrictions(tuple(one.bind(scene, hand) for one in restrictions))
     scene, hand, message, rounds = _prepared(run, scene, hand, config, verify, bound)
     prefetched = prefetch(run, scene, hand, verify, config.certainty) if rounds and verify != "none" else None
-    found = run_rounds(run, scene, hand, rounds, prefetched, bound.moved(run.origin), measure=measure, **request)
+    moved = replace(bound, origin=run.origin)
+    found = run_rounds(run, scene, hand, rounds, prefetched, moved, measure=measure, **request)
     tried = tuple(moved_grasp(grasp, run.origin) for grasp in on_surface(scene, _ranked(run, found, config, seed)))
     warnings = (*scene.object.warnings, *hand.named_warnings, *_lifted_less(scene, found.mass))
     masses = {"mass": found.mass, "tried_mass": found.mass or scene.object.mass}

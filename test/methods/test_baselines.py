@@ -266,8 +266,8 @@ def test_what_asks_for_more_links_than_touch_gives_nothing(scenes, hand):
 
 def test_its_poses_become_ranked_grasps(scenes, hand):
     candidates = find_candidates(PlannerInput(scenes["cylinder"], hand, count=3, seed=0, config=CLOSURE, hooks=Hooks()))
-    assert 1 <= len(candidates.grasps) <= 3
-    scores = [grasp.score for grasp in candidates.grasps]
+    assert 1 <= len(candidates) <= 3
+    scores = [grasp.score for grasp in candidates]
     assert scores == sorted(scores, reverse=True)
 
 

@@ -159,7 +159,7 @@ def searched(scale: float, searches: int, hooks: Hooks | None = None) -> tuple[G
     config = replace(CONFIG, settings=replace(CONFIG.settings, searches=searches))
     scene = load_scene("shape:sphere", scale=scale, resolution=config.resolution)
     hand = load_hand("allegro_right", candidates=config.problem.fine_candidates)
-    return find_candidates(PlannerInput(scene, hand, count=4, seed=0, config=config, hooks=hooks or Hooks())).grasps
+    return find_candidates(PlannerInput(scene, hand, count=4, seed=0, config=config, hooks=hooks or Hooks()))
 
 
 def scores(grasps: tuple[Grasp, ...]) -> list[float]:
