@@ -246,4 +246,4 @@ def object_cases(request: Request, objects: Sequence[str], count: int, quick_cou
 
 def raw_grasps(scene: Scene, hand: HandModel, config: PlanConfig, count: int, seed: int) -> tuple[Grasp, ...]:
     """Return the first `count` grasps in the method's own ranking. No trial has filtered them."""
-    return find_candidates(PlannerInput(scene, hand, count, seed, config, Hooks())).grasps[:count]
+    return find_candidates(PlannerInput(scene, hand, count, seed, config, Hooks()))[:count]

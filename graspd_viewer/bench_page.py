@@ -125,7 +125,7 @@ def plan_again(record: Record, show: Callable[[Session], None], report: ShowProg
     session = make_session(title, hand, (), scene, config, np.zeros((0, 3)), ())
     show(session)
     count, hooks = record["count"], Hooks(lambda step, of, _: report(f"searching {step} of {of}", step / of), stop)
-    found = find_candidates(PlannerInput(scene, hand, count, record["seed"], config, hooks)).grasps[:count]
+    found = find_candidates(PlannerInput(scene, hand, count, record["seed"], config, hooks))[:count]
     worlds = trial_context(scene, hand, "standard")
     context, grasps = make_metrics_context(scene.object, hand), []
     for grasp in found:

@@ -88,28 +88,20 @@ class PlannerOutput:
     interrupted: str = ""
 
 
-@dataclass(frozen=True)
-class Candidates:
-    """Grasps before their trials, best first. `interrupted` is "cancelled", "deadline", or empty for a full run."""
-
-    grasps: tuple[Grasp, ...]
-    interrupted: str
-
-
-def find_candidates(task: PlannerInput, *, searches: int | None = None) -> Candidates:
-    """Run the configured method and return its ranked candidates, perhaps fewer than `task.count`.
+def find_candidates(task: PlannerInput, *, searches: int | None = None) -> tuple[Grasp, ...]:
+    """Run the configured method and return its candidates, best first, perhaps fewer than `task.count`.
 
     If too few candidates are expected to pass the hold trial, the search is repeated from new starts. This helps on
     small, large and long objects. `searches` limits the number of searches. By default the method's settings limit it.
     This function restricts only the starts. The caller must check the candidates against the restrictions.
     """
     config, count = task.config, task.count
-    found = _searched(task)
+    found, interrupted = _searched(task)
     for again in range(1, searches or method_row(config.method).searches(config.settings)):
-        if found.interrupted or expected_to_hold(found.grasps[:count]) >= _LEAST_EXPECTED * count:
+        if interrupted or expected_to_hold(found[:count]) >= _LEAST_EXPECTED * count:
             break
-        more = _searched(replace(task, seed=task.seed + _SEED_STEP * again))
-        found = Candidates(_best_first((*found.grasps, *more.grasps)), more.interrupted)
+        more, interrupted = _searched(replace(task, seed=task.seed + _SEED_STEP * again))
+        found = _best_first((*found, *more))
     return found
 
 
@@ -118,13 +110,13 @@ def expected_to_hold(grasps: Sequence[Grasp]) -> float:
     return sum((0.5 + 0.5 * math.tanh(0.5 * grasp.score) for grasp in grasps), 0.0)
 
 
-def _searched(task: PlannerInput) -> Candidates:
+def _searched(task: PlannerInput) -> tuple[tuple[Grasp, ...], str]:
     found = method_row(task.config.method).plan(task)
     # One pose that is not finite would end the whole run.
     poses = found.poses[pack(found.poses).isfinite().all(-1) & (found.poses.quaternion.norm(dim=-1) > 0)]
     if found.interrupted == "cancelled" or len(poses.translation) == 0:
-        return Candidates((), found.interrupted)
-    return Candidates(assemble(task.problem, task.hand, poses, task.config, task.hooks.stop), found.interrupted)
+        return (), found.interrupted
+    return assemble(task.problem, task.hand, poses, task.config, task.hooks.stop), found.interrupted
 
 
 def _best_first(grasps: Iterable[Grasp]) -> tuple[Grasp, ...]:

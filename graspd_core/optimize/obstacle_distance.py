@@ -9,7 +9,7 @@ interpolated distance to obstacles.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from functools import lru_cache
+from functools import lru_cache, partial
 
 import numpy as np
 import torch
@@ -86,10 +86,7 @@ def make_obstacle_tensors(
     reached = [solid for solid, gap in zip(scene.obstacles, gaps, strict=True) if gap < reach]
     if scene.support is None and not reached:
         return None
-
-    def tensor(values: np.ndarray) -> Tensor:
-        return torch.as_tensor(values, device=device, dtype=dtype)
-
+    tensor = partial(torch.as_tensor, device=device, dtype=dtype)
     corners = extreme_points(hand)
     points, radii, links = map(np.concatenate, zip(corners, collision_spheres(hand), strict=True))
     around = _balls_about(hand.num_links, points, radii, links)

@@ -157,12 +157,7 @@ def make_hand_tensors(
     patches of about `patch_size` coarse candidates. The tensors of recent hands are cached.
     """
 
-    def tensor(values: np.ndarray) -> Tensor:
-        return torch.as_tensor(values, device=device, dtype=dtype)
-
-    def index(values: np.ndarray) -> Tensor:
-        return torch.as_tensor(values, device=device, dtype=torch.long)
-
+    tensor, index = (partial(torch.as_tensor, device=device, dtype=kind) for kind in (dtype, torch.long))
     kinematics, of_link = make_kinematics(hand, device, dtype), hand.link_group[hand.candidate_link]
     groups = _patches(hand, candidates, patch_size) if patch_size else of_link
     present, first = np.unique(groups[:candidates], return_index=True)
@@ -207,6 +202,7 @@ def _sphere_tensors(hand: HandModel, device: str, dtype: torch.dtype) -> SphereT
 @lru_cache(maxsize=4)
 def make_object_tensors(scene: Scene, settings: ProblemConfig, device: str, dtype: torch.dtype) -> ObjectTensors:
     """Convert the scene's object to tensors. A cache keeps the tensors of the last scenes, by scene identity."""
+    tensor = partial(torch.as_tensor, device=device, dtype=dtype)
     sharp, thin_share = object_sharp_points(scene.object, 2 * settings.features)
     thin = thin_share > THIN_WALLED
     floor, confidence = settings.confidence_floor, None
@@ -223,12 +219,10 @@ def make_object_tensors(scene: Scene, settings: ProblemConfig, device: str, dtyp
     features = [part[neighbours_together(part)] for part in (sharp[:coarse], sharp[coarse:])]
     return ObjectTensors(
         sdf=sdf,
-        features=torch.as_tensor(
-            np.concatenate(features) if thin else sharp[: settings.features], device=device, dtype=dtype
-        ),
-        surface=torch.as_tensor(surface, device=device, dtype=dtype),
+        features=tensor(np.concatenate(features) if thin else sharp[: settings.features]),
+        surface=tensor(surface),
         coarse_features=coarse,
-        center=torch.as_tensor(scene.object.center_of_mass, device=device, dtype=dtype),
+        center=tensor(scene.object.center_of_mass),
         mass=scene.object.mass,
         length=scene.object.radius,
         confidence=confidence,
@@ -338,6 +332,10 @@ def build_problem(
     )
 
 
+# Contact weights from distances of points [m], and the padding of the object [m].
+Activation = Callable[..., Distances]
+
+
 class HandPlacement(NamedTuple):
     """A batch of hands: `T_object_base`, `T_base_link` of every link, contact candidates in the object frame [m]."""
 
@@ -385,13 +383,7 @@ def feature_distance(
 
 
 def _wrench_resistance(
-    problem: Problem,
-    points: Points,
-    distance: Distances,
-    normal: Points,
-    *,
-    radius: Values,
-    activate: Callable[..., Tensor],
+    problem: Problem, points: Points, distance: Distances, normal: Points, radius: Values, activate: Activation
 ) -> Values:
     """Return the wrench resistance loss from the `TASK_POINTS` points nearest to the padded surface."""
     near = (distance.detach() - radius[:, None]).abs().topk(min(TASK_POINTS, distance.shape[-1]), largest=False).indices
@@ -413,7 +405,7 @@ def evaluate(
     *,
     fine: bool = False,
     sharp: bool = False,
-    activate: Callable[..., Tensor] = losses.soft_contact,
+    activate: Activation = losses.soft_contact,
 ) -> Terms:
     """Compute all loss terms of a batch of poses at padding `radius` [m] and contact width `delta` [m].
 
@@ -435,13 +427,11 @@ def evaluate(
         start = gap.new_full((len(gap), gap.shape[-1] + 1), torch.inf)
         nearest = start.scatter_reduce(1, problem.hand.group_of_solid[solids], edge, "amin")
         gap = torch.minimum(gap, nearest[:, :-1])
+    active = partial(activate, delta=delta)
+    reach = torch.full_like(problem.hand.reach, REACH_WHEN_SHARP) if sharp else problem.hand.reach
     return Terms(
-        wrench_resistance=_wrench_resistance(
-            problem, placed.points, distance, normal, radius=radius, activate=partial(activate, delta=delta)
-        ),
-        distance=losses.touch(
-            gap, torch.full_like(problem.hand.reach, REACH_WHEN_SHARP) if sharp else problem.hand.reach
-        ),
+        wrench_resistance=_wrench_resistance(problem, placed.points, distance, normal, radius, active),
+        distance=losses.touch(gap, reach),
         penetration=sunk,
         self_collision=self_collision(problem, placed.links),
         posture=losses.posture(poses.joints, problem.hand.lower, problem.hand.upper),

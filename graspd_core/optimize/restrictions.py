@@ -139,10 +139,6 @@ class BoundRestrictions:
     each: tuple[BoundRestriction, ...] = ()
     origin: Float[np.ndarray, "3"] = field(default_factory=lambda: np.zeros(3))
 
-    def moved(self, origin: Float[np.ndarray, "3"]) -> BoundRestrictions:
-        """Return the same restrictions for poses relative to another origin [m]."""
-        return replace(self, origin=origin)
-
     @property
     def impossible(self) -> str:
         """The reason of the first restriction that can admit no grasp. Empty if every restriction may admit grasps."""

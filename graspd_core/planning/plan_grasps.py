@@ -11,13 +11,12 @@ from typing import Any
 import numpy as np
 import torch
 from jaxtyping import Float
-from torch import Tensor
 
 from graspd_core.config import VERIFICATIONS
 from graspd_core.errors import ConfigError
 from graspd_core.hands.model import HandModel
 from graspd_core.hands.surface_points import with_candidates
-from graspd_core.mesh.sdf import GridSDF, grid_layout
+from graspd_core.mesh.sdf import grid_layout
 from graspd_core.mesh.surface_queries import make_surface, pressed_points
 from graspd_core.optimize.plan_config import PlanConfig, load_preset
 from graspd_core.optimize.restrictions import BoundRestrictions, Restriction, restrictions_in_words
@@ -63,14 +62,10 @@ def planning_scene(scene: Scene, resolution: int) -> tuple[Scene, Float[np.ndarr
     sdf = object_sdf(scene.object, resolution).to(scene.sdf.field.device, scene.sdf.field.dtype)
     confidence = scene.confidence
     if confidence is not None and not same_grid:
-        confidence = sample_confidence(confidence, scene.sdf, _nodes(sdf)).reshape(sdf.field.shape[1:])
+        nodes = torch.cartesian_prod(*map(torch.arange, sdf.field.shape[1:])).to(sdf.field)
+        places = (sdf.origin + sdf.spacing * nodes)[None]
+        confidence = sample_confidence(confidence, scene.sdf, places).reshape(sdf.field.shape[1:])
     return replace(scene, sdf=sdf, confidence=confidence), far
-
-
-def _nodes(sdf: GridSDF) -> Float[Tensor, "x yz 3"]:
-    x, y, z = sdf.field.shape[1:]
-    index = torch.cartesian_prod(*(torch.arange(n) for n in (x, y, z))).to(sdf.field)
-    return (sdf.origin + sdf.spacing * index).reshape(x, y * z, 3)
 
 
 def plan_grasps(
@@ -117,7 +112,8 @@ def plan_grasps(
     support, bound = scene.support, BoundRestrictions(tuple(one.bind(scene, hand) for one in restrictions))
     scene, hand, message, rounds = _prepared(run, scene, hand, config, verify, bound)
     prefetched = prefetch(run, scene, hand, verify, config.certainty) if rounds and verify != "none" else None
-    found = run_rounds(run, scene, hand, rounds, prefetched, bound.moved(run.origin), measure=measure, **request)
+    moved = replace(bound, origin=run.origin)
+    found = run_rounds(run, scene, hand, rounds, prefetched, moved, measure=measure, **request)
     tried = tuple(moved_grasp(grasp, run.origin) for grasp in on_surface(scene, _ranked(run, found, config, seed)))
     warnings = (*scene.object.warnings, *hand.named_warnings, *_lifted_less(scene, found.mass))
     masses = {"mass": found.mass, "tried_mass": found.mass or scene.object.mass}

@@ -108,17 +108,15 @@ class RoundsResult:
         return sum(grasp.usable for grasp in self.grasps)
 
 
-def poses_seen(poses: Poses) -> Snapshot:
-    """Return a snapshot of the optimiser's poses."""
-    return Snapshot(*(rows.detach().double().cpu().numpy() for rows in vars(poses).values()))
-
-
 def _hooks(run: Run, good: int) -> Hooks:
+    def show(poses: Poses) -> None:
+        run.show(Snapshot(*(rows.detach().double().cpu().numpy() for rows in vars(poses).values())))
+
     return Hooks(
         report=lambda step, of, loss: run.report(Stage.OPTIMISE, step, of, loss, good),
         # When the run is over, stop at once, because the poses of an unfinished search are no grasps.
         stop=run.over,
-        watch=None if run.watch is None else lambda poses: run.show(poses_seen(poses)),
+        watch=None if run.watch is None else show,
     )
 
 
@@ -148,7 +146,7 @@ def run_rounds(
         seek = enough - good if good or not attempt else max(enough, _MANY)
         with enough_memory(f"{seek} grasps at once"):
             task = PlannerInput(scene, hand, seek, seed + _SEED_STEP * attempt, **options)
-            candidates = find_candidates(task, searches=batch.searches).grasps
+            candidates = find_candidates(task, searches=batch.searches)
         # Count the time here, because the loop below does not run if the search found nothing.
         state, began = _searched_since(state, began), time.perf_counter()
         for some in _in_rank_order(candidates, enough - good, restrictions):

@@ -162,7 +162,7 @@ def pushed(velocity: list[float], contact: list[float]) -> tuple[list[float], li
     velocities = torch.tensor([velocity], dtype=torch.float64)
     forces = contact_forces(torch.tensor([[-0.001]], dtype=torch.float64), normal, velocities, PUBLISHED)
     force, torque = net_wrench(forces, (RADIUS - 0.001) * normal)
-    linear, angular = euler_step(ball(), velocities, torch.zeros_like(velocities), force, torque, STEP)
+    linear, angular = euler_step(ball(), velocities, force, torque, STEP)
     return linear[0, 0].tolist(), angular[0, 0].tolist()
 
 
@@ -183,29 +183,19 @@ def test_momentum_grows_by_the_impulse(seed):
     inertia = MASS * RADIUS**2 * (np.eye(3) + 0.2 * (a @ a.T).numpy())
     body = make_body(MASS, inertia, np.zeros(3), RADIUS, "cpu", torch.float64)
     forces, arms = drawn(seed, 2, 5, 3, 3), RADIUS * drawn(seed + 1, 2, 5, 3)
-    before, rest = drawn(seed + 2, 2, 3, 3), torch.zeros(2, 3, 3, dtype=torch.float64)
+    before = drawn(seed + 2, 2, 3, 3)
     force, torque = net_wrench(forces, arms)
-    after, turning = euler_step(body, before, rest, force, torque, STEP)
+    after, turning = euler_step(body, before, force, torque, STEP)
     by_hand = torch.linalg.cross(arms[:, :, None], forces).sum(1)
     assert torque.numpy() == pytest.approx(by_hand.numpy(), abs=1e-12)
     assert (MASS * (after - before)).numpy() == pytest.approx((STEP * forces.sum(1)).numpy(), abs=1e-12)
-    assert (turning @ body.inertia).numpy() == pytest.approx((STEP * by_hand).numpy(), abs=1e-12)
-
-
-def test_a_turning_body_keeps_its_angular_momentum_to_first_order():
-    body = make_body(MASS, INERTIA * np.diag([1.0, 2.0, 3.0]), np.zeros(3), RADIUS, "cpu", torch.float64)
-    still, turning = torch.zeros(1, 3, dtype=torch.float64), torch.tensor([[3.0, -2.0, 1.0]], dtype=torch.float64)
-    _, after = euler_step(body, still, turning, still, still, STEP)
-    change = (after - turning) @ body.inertia / STEP + torch.linalg.cross(turning, turning @ body.inertia)
-    assert change.abs().max() < 1e-12
+    assert turning.numpy() @ inertia == pytest.approx((STEP * by_hand).numpy(), abs=1e-12)
 
 
 def test_a_needle_does_not_spin_beyond_bound():
     # A body without thickness has no moment about its axis; a tenth of its length is kept as radius of gyration.
     body = make_body(MASS, np.diag([1e-4, 1e-4, 0.0]), np.zeros(3), 0.1, "cpu", torch.float64)
-    moments = torch.linalg.eigvalsh(body.inertia)
-    assert moments.tolist() == pytest.approx([1e-5, 1e-4, 1e-4])
-    assert (body.inertia @ body.inverse_inertia).numpy() == pytest.approx(np.eye(3), abs=1e-12)
+    assert body.inverse_inertia.numpy() == pytest.approx(np.diag([1e4, 1e4, 1e5]))
 
 
 def test_speed_counts_turning_at_the_bodys_length():
@@ -216,10 +206,10 @@ def test_speed_counts_turning_at_the_bodys_length():
 def test_gradients_of_the_step():
     body = make_body(MASS, INERTIA * np.diag([1.0, 2.0, 3.0]), np.zeros(3), RADIUS, "cpu", torch.float64)
 
-    def motion(forces: Tensor, arms: Tensor, linear: Tensor, angular: Tensor) -> Tensor:
-        return speed_left(body, *euler_step(body, linear, angular, *net_wrench(forces, arms), 1e-3))
+    def motion(forces: Tensor, arms: Tensor, linear: Tensor) -> Tensor:
+        return speed_left(body, *euler_step(body, linear, *net_wrench(forces, arms), 1e-3))
 
-    inputs = drawn(0, 2, 4, 3, 3), RADIUS * drawn(1, 2, 4, 3), drawn(2, 3, 3), drawn(3, 3, 3)
+    inputs = drawn(0, 2, 4, 3, 3), RADIUS * drawn(1, 2, 4, 3), drawn(2, 3, 3)
     assert gradcheck(motion, tuple(x.requires_grad_(True) for x in inputs))
 
 

@@ -165,7 +165,7 @@ def search_of(scale: float, searches: int, hooks: Hooks) -> PlannerInput:
 
 @cache
 def searched(scale: float, searches: int) -> tuple[Grasp, ...]:
-    return find_candidates(search_of(scale, searches, Hooks())).grasps
+    return find_candidates(search_of(scale, searches, Hooks()))
 
 
 def scores(grasps: tuple[Grasp, ...]) -> list[float]:

@@ -210,10 +210,10 @@ def test_no_candidate_reaches_through_the_table_or_a_wall(hand, scenes):
     short = ClosedFormConfig(explore_steps=15, refine_steps=10, polish_steps=15)
     config = PlanConfig(settings=short, problem=ProblemConfig(candidates=60, fine_candidates=120))
     found = find_candidates(PlannerInput(scene, hand, count=6, seed=0, config=config, hooks=Hooks()))
-    assert found.grasps
+    assert found
     obstacles = some(make_obstacle_tensors(scene, hand, "cpu", DOUBLE))
     kinematics = small_problem(scene, hand).hand.kinematics
-    for grasp in found.grasps:
+    for grasp in found:
         for posture in (grasp.pregrasp, grasp.grasp):
             assert lowest(hand, posture, some(scene.support)) > -0.0016
         ends = [

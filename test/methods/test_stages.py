@@ -245,7 +245,7 @@ CONFIG = load_preset("fast")
 def some(problem_of, hand, scenes) -> tuple[Problem, Staged]:
     """Eight good poses on a box, and a few that were only drawn."""
     problem = problem_of("box", torch.float32)
-    found = find_candidates(PlannerInput(scenes["box"], hand, count=8, seed=0, config=CONFIG, hooks=Hooks())).grasps[:8]
+    found = find_candidates(PlannerInput(scenes["box"], hand, count=8, seed=0, config=CONFIG, hooks=Hooks()))[:8]
     rows = [(g.grasp.position, g.grasp.quaternion_wxyz, g.grasp.joint_positions) for g in found]
     good = [torch.as_tensor(np.stack(part)).float() for part in zip(*rows, strict=True)]
     drawn = vars(draw_starts(scenes["box"], hand, 4, 0, "cpu", torch.float32)).values()

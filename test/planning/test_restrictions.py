@@ -81,7 +81,7 @@ def test_restrictions_apply_one_after_the_other_in_the_frame_that_they_were_boun
     grasps = plan_grasps(scene, hand, count=4, verify="none", preset="fast", measure=False).grasps
     bound = BoundRestrictions((Side(9.9), Every(2)))
     assert bound.admit(grasps) == ((), {"on the wrong side": len(grasps)})
-    there = bound.moved(np.array([10.0, 0, 0]))
+    there = replace(bound, origin=np.array([10.0, 0, 0]))
     admitted, refused = there.admit(grasps)
     assert set(refused) <= {"by number", "on the wrong side"}
     assert refused["by number"] >= 1

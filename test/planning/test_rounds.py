@@ -14,7 +14,6 @@ from graspd_core import TriangleMesh, load_hand, load_scene, make_shape, plan_gr
 from graspd_core.config import CertaintyConfig, RobustConfig
 from graspd_core.errors import ConfigError
 from graspd_core.io.grasps_json import result_document
-from graspd_core.optimize.candidates import Candidates
 from graspd_core.optimize.plan_config import PlanConfig, load_preset
 from graspd_core.perception.scene import Obstacle, Scene, make_obstacle, object_parts
 from graspd_core.planning import rounds as planning_rounds
@@ -56,7 +55,7 @@ def test_where_nothing_is_found_more_is_sought_however_few_are_asked_for(scene, 
 
     def none_found(task, searches):
         asked.append(task.count)
-        return Candidates((), "")
+        return ()
 
     monkeypatch.setattr(planning_rounds, "find_candidates", none_found)
     plan_grasps(scene, load_hand("parallel_gripper"), count=1)

@@ -111,7 +111,7 @@ def candidates() -> tuple[VerificationContext, tuple[Grasp, ...]]:
     """Grasps of a box, good and bad by turns, and what they are tried with."""
     config, hand = load_preset("fast"), load_hand("allegro_right")
     scene = load_scene("shape:box", resolution=config.resolution)
-    found = find_candidates(PlannerInput(scene, hand, count=4, seed=0, config=config, hooks=Hooks())).grasps[:4]
+    found = find_candidates(PlannerInput(scene, hand, count=4, seed=0, config=config, hooks=Hooks()))[:4]
     errors = pose_errors(1, len(found))
     moved = [displaced(g, *e, scene.object.center_of_mass) for g, e in zip(found, errors, strict=True)]
     worlds = build_worlds(scene, hand, object_parts(scene.object), PROTOCOLS["standard"])

@@ -182,7 +182,7 @@ def real() -> tuple[Scene, Any, list[Grasp]]:
     """Grasps that the method found on a mug-sized box, each once more out of place, and an open hand far above."""
     config, hand = load_preset("fast"), load_hand("allegro_right")
     scene = load_scene("shape:box", resolution=config.resolution)
-    found = find_candidates(PlannerInput(scene, hand, count=3, seed=0, config=config, hooks=Hooks())).grasps[:3]
+    found = find_candidates(PlannerInput(scene, hand, count=3, seed=0, config=config, hooks=Hooks()))[:3]
     center = scene.object.center_of_mass
     away = [displaced(g, *e, center) for g, e in zip(found, pose_errors(1, 3), strict=True)]
     # An open hand may yet lift the box as a shovel does; this one is far above it.

@@ -88,14 +88,12 @@ class FreeBody:
 
     Attributes:
         mass: mass [kg].
-        inertia: inertia about the centre of mass [kg·m²].
-        inverse_inertia: inverse of `inertia`.
+        inverse_inertia: inverse of the inertia about the centre of mass [1/(kg·m²)].
         center: centre of mass [m].
         length: characteristic length that makes angular and linear velocity comparable [m].
     """
 
     mass: float
-    inertia: Float[Tensor, "3 3"]
     inverse_inertia: Float[Tensor, "3 3"]
     center: Float[Tensor, "3"]
     length: float
@@ -112,9 +110,9 @@ def make_body(
     """Build the body. Thin objects get a radius of gyration of at least `length` / 10 about every axis."""
     moments, axes = np.linalg.eigh(inertia)
     moments = np.maximum(moments, mass * (0.1 * length) ** 2)
-    arrays = axes @ np.diag(moments) @ axes.T, axes @ np.diag(1 / moments) @ axes.T, center
-    about, inverse, middle = (torch.as_tensor(array, device=device, dtype=dtype) for array in arrays)
-    return FreeBody(mass, about, inverse, middle, length)
+    arrays = axes @ np.diag(1 / moments) @ axes.T, center
+    inverse, middle = (torch.as_tensor(array, device=device, dtype=dtype) for array in arrays)
+    return FreeBody(mass, inverse, middle, length)
 
 
 def net_wrench(
@@ -131,17 +129,12 @@ def net_wrench(
 def euler_step(
     body: FreeBody,
     linear: Float[Tensor, "*#batch 3"],
-    angular: Float[Tensor, "*#batch 3"],
     force: Float[Tensor, "*#batch 3"],
     torque: Float[Tensor, "*#batch 3"],
     time_step: float,
 ) -> tuple[Float[Tensor, "*batch 3"], Float[Tensor, "*batch 3"]]:
-    """Return linear [m/s] and angular [rad/s] velocity after `time_step` [s] of a force [N] and a torque [N·m]."""
-    gyroscopic = torch.linalg.cross(angular, angular @ body.inertia)
-    return (
-        linear + (time_step / body.mass) * force,
-        angular + time_step * ((torque - gyroscopic) @ body.inverse_inertia),
-    )
+    """Return linear [m/s] and angular [rad/s] velocity after `time_step` [s]. The body does not turn before."""
+    return linear + (time_step / body.mass) * force, time_step * (torque @ body.inverse_inertia)
 
 
 def speed_left(
@@ -177,7 +170,7 @@ def motion_left(
     else:
         force, torque = forces.sum(1).split(3, -1)
         torque = torque * body.length
-    linear, angular = euler_step(body, velocities, torch.zeros_like(velocities), force, torque, time_step)
+    linear, angular = euler_step(body, velocities, force, torque, time_step)
     return speed_left(body, linear, angular) / (velocities * velocities).sum(-1).mean()
 
 
@@ -264,24 +257,15 @@ def published_starts(problem: Problem, scene: Scene, hand: HandModel, count: int
 
 
 class Evaluation(NamedTuple):
-    """Loss terms with one value per start, and the outward normals at the hand's points."""
+    """Values per start, and the outward normals at the hand's points.
 
-    physics: Values
-    task: Values
-    motion: Values
-    limit: Values
-    range: Values
-    inter: Values
-    normals: Points
-
-
-class Slope(NamedTuple):
-    """Cost, constraint violations, the Lagrangian's gradients and normals. `by_force` is None if `pose_only` is set."""
+    `cost` is L_phys + L_range + L_inter, weighted. Without relaxation, a loss on the motion replaces L_phys. `task` and
+    `limit` are L_task and L_limit.
+    """
 
     cost: Values
-    broken: Float[Tensor, "batch constraints"]
-    by_pose: Rows
-    by_force: Forces | None
+    task: Values
+    limit: Values
     normals: Points
 
 
@@ -359,50 +343,54 @@ class Graspd2022:
     def step(self, problem: Problem, state: RelaxedState, index: int) -> RelaxedState:
         config = self.config
         remaining = max(0.0, 1.0 - index / config.level_set.coarse_steps) if config.level_set.coarse_steps else 0.0
-        slope = self.slope(problem, state, index, remaining * state.radius)
-        loss = slope.cost + damped(slope.broken, torch.ones_like(slope.broken), 1.0).sum(-1)
-        finite = torch.isfinite(slope.by_pose).all(-1) & torch.isfinite(loss)
+        found, broken, by_pose, by_force = self.slope(problem, state, remaining * state.radius)
+        loss = found.cost.detach() + damped(broken, torch.ones_like(broken), 1.0).sum(-1)
+        finite = torch.isfinite(by_pose).all(-1) & torch.isfinite(loss)
         loss = torch.where(finite, loss, torch.inf)
         # An iterate on a padded surface cannot become the best iterate.
         better = (loss < state.best_loss) & (remaining == 0.0)
         rate = self.rate(index) * config.relaxation.force_rate
         pulled, count = state.forces, index + 1
-        if slope.by_force is not None:
-            pulled = adamax_step(pulled, _clean(slope.by_force, finite), rate, count, config.beta2)
+        if by_force is not None:
+            pulled = adamax_step(pulled, _clean(by_force, finite), rate, count, config.beta2)
             if config.relaxation.desired == "cone":
-                cone = into_cone(pulled.value, slope.normals, config.contact.friction)
+                cone = into_cone(pulled.value, found.normals, config.contact.friction)
                 pulled = replace(pulled, value=cone)
         climb = -config.constraints.multiplier_rate
         stepped = replace(
             state,
-            pose=self.moved(problem, state.pose, _clean(slope.by_pose, finite), (index, 0)),
+            pose=self.moved(problem, state.pose, _clean(by_pose, finite), (index, 0)),
             forces=pulled,
-            multipliers=adamax_step(state.multipliers, _clean(slope.broken, finite), climb, count),
+            multipliers=adamax_step(state.multipliers, _clean(broken, finite), climb, count),
             best=torch.where(better[:, None], state.pose.value, state.best),
             best_loss=torch.where(better, loss, state.best_loss),
             loss=loss,
         )
         if config.pose_steps.in_turns:
-            by_pose = self.slope(problem, stepped, index, remaining * state.radius, pose_only=True).by_pose
+            _, _, by_pose, _ = self.slope(problem, stepped, remaining * state.radius, pose_only=True)
             clean = _clean(by_pose, finite & torch.isfinite(by_pose).all(-1))
             stepped = replace(stepped, pose=self.moved(problem, stepped.pose, clean, (index, 1)))
         return stepped
 
     def slope(
-        self, problem: Problem, state: RelaxedState, index: int, radius: Values, *, pose_only: bool = False
-    ) -> Slope:
-        """Compute the gradients of the Lagrangian at an iterate, for contact with the level set φ = `radius` [m]."""
+        self, problem: Problem, state: RelaxedState, radius: Values, *, pose_only: bool = False
+    ) -> tuple[Evaluation, Float[Tensor, "batch constraints"], Rows, Forces | None]:
+        """Evaluate an iterate, for contact with the level set φ = `radius` [m].
+
+        Returns:
+            The evaluation, the constraint violations, and the Lagrangian's gradients in the pose and in the forces. The
+            last is None without relaxation, or with `pose_only`.
+        """
         bounds = self.config.constraints
         pose = state.pose.value.detach().requires_grad_(True)
         forces = state.forces.value.detach().requires_grad_(not pose_only)
         found = self.evaluate(problem, pose, forces, radius)
         task, limit = excess(found.task, bounds.task_bound), excess(found.limit, bounds.limit_bound)
         broken = torch.stack([task, limit], -1)
-        cost = self.cost(found)
-        lagrangian = cost + damped(broken, state.multipliers.value, bounds.damping).sum(-1)
+        lagrangian = found.cost + damped(broken, state.multipliers.value, bounds.damping).sum(-1)
         wanted = (pose,) if pose_only else (pose, forces)
         by_pose, *by_force = torch.autograd.grad(lagrangian.sum(), wanted, allow_unused=True)
-        return Slope(cost.detach(), broken.detach(), by_pose, by_force[0] if by_force else None, found.normals.detach())
+        return found, broken.detach(), by_pose, by_force[0] if by_force else None
 
     def rate(self, index: int) -> float:
         """Return the factor of the step sizes at step `index`: a linear warm-up times a half-cosine decay."""
@@ -434,12 +422,6 @@ class Graspd2022:
         x = torch.where(scored[:, None], state.best, state.pose.value)
         return unpack(x), torch.where(scored, state.best_loss, state.loss)
 
-    def cost(self, found: Evaluation) -> Values:
-        """Return L_phys + L_range + L_inter, weighted. Without relaxation, a loss on the motion replaces L_phys."""
-        config = self.config
-        goal = config.weights.physics * found.physics if config.relaxation.enabled else found.motion
-        return goal + config.weights.range * found.range + config.weights.inter * found.inter
-
     def evaluate(self, problem: Problem, pose: Rows, desired: Forces, radius: Values) -> Evaluation:
         """Compute all loss terms at a pose with desired forces, for contact with the level set φ = `radius` [m]."""
         config, body, poses, velocities = self.config, self.body, unpack(pose), self.velocities
@@ -447,28 +429,20 @@ class Graspd2022:
         distance, normals = sample_sdf(problem.object.sdf, placed.points)
         arms = placed.points - body.center
         supplied = contact_forces(distance - radius[:, None], normals, velocities, config.contact)
-        none = torch.zeros_like(radius)
         if config.relaxation.enabled:
-            difference = physics(desired, actual(supplied, arms, body.length, desired.shape[-1]))
+            goal = config.weights.physics * physics(desired, actual(supplied, arms, body.length, desired.shape[-1]))
             # As in the released code, L_task depends on the forces alone. `detach` drops its dependence on the pose.
-            left = motion_left(body, desired, arms.detach(), velocities, self.time_step)
-            task, motion = _ALL_MOTION * left.mean(-1), none
+            task = _ALL_MOTION * motion_left(body, desired, arms.detach(), velocities, self.time_step).mean(-1)
         else:
-            left = motion_left(body, supplied, arms, velocities, self.time_step)
-            difference, task, motion = none, none, _ALL_MOTION * left.mean(-1)
+            goal = _ALL_MOTION * motion_left(body, supplied, arms, velocities, self.time_step).mean(-1)
+            task = torch.zeros_like(radius)
         inter = self_collision(problem, placed.links)
         if problem.obstacles is not None:
             inter = inter + obstacle_depth(problem.obstacles, placed.base, placed.links)
         beyond = (poses.joints - problem.hand.upper).clamp_min(0.0) + (problem.hand.lower - poses.joints).clamp_min(0.0)
-        return Evaluation(
-            difference,
-            task,
-            motion,
-            beyond.sum(-1),
-            losses.posture(poses.joints, problem.hand.lower, problem.hand.upper),
-            inter,
-            normals,
-        )
+        spread = losses.posture(poses.joints, problem.hand.lower, problem.hand.upper)
+        cost = goal + config.weights.range * spread + config.weights.inter * inter
+        return Evaluation(cost, task, beyond.sum(-1), normals)
 
 
 def move_shares(steps: PoseStepsConfig, turn: int, joints: int) -> list[float]:

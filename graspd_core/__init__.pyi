@@ -1,0 +1,69 @@
+"""The public names, for type checkers. `__init__.py` reads this list and loads each name on first use (SPEC 1)."""
+
+from graspd_core.arms.arm import Arm as Arm
+from graspd_core.arms.arm import arm_names as arm_names
+from graspd_core.arms.arm import load_arm as load_arm
+from graspd_core.arms.reach import Reach as Reach
+from graspd_core.config import SceneConfig as SceneConfig
+from graspd_core.errors import GraspdError as GraspdError
+from graspd_core.hands.kinematics import hand_mesh as hand_mesh
+from graspd_core.hands.library import hand_names as hand_names
+from graspd_core.hands.library import load_hand as load_hand
+from graspd_core.hands.model import HandModel as HandModel
+from graspd_core.io.grasps_json import load_grasps as load_grasps
+from graspd_core.io.grasps_json import save_result as save_result
+from graspd_core.library.grasp_library import GraspLibrary as GraspLibrary
+from graspd_core.library.known_grasps import known_grasps as known_grasps
+from graspd_core.library.known_grasps import known_or_planned as known_or_planned
+from graspd_core.mesh.mesh_files import load_mesh as load_mesh
+from graspd_core.mesh.mesh_files import save_mesh as save_mesh
+from graspd_core.mesh.shapes import make_shape as make_shape
+from graspd_core.optimize.candidates import PlannerInput as PlannerInput
+from graspd_core.optimize.candidates import PlannerOutput as PlannerOutput
+from graspd_core.optimize.initial_poses import draw_starts as draw_starts
+from graspd_core.optimize.loop import Poses as Poses
+from graspd_core.optimize.plan_config import METHODS as METHODS
+from graspd_core.optimize.plan_config import Method as Method
+from graspd_core.optimize.plan_config import PlanConfig as PlanConfig
+from graspd_core.optimize.plan_config import load_preset as load_preset
+from graspd_core.optimize.plan_config import override as override
+from graspd_core.optimize.plan_config import preset_names as preset_names
+from graspd_core.optimize.problem import Problem as Problem
+from graspd_core.optimize.problem import build_problem as build_problem
+from graspd_core.perception.cloud.camera import PinholeCamera as PinholeCamera
+from graspd_core.perception.cloud.camera import cloud_from_depth as cloud_from_depth
+from graspd_core.perception.cloud.camera import depth_in_metres as depth_in_metres
+from graspd_core.perception.cloud.depth_files import load_depth_view as load_depth_view
+from graspd_core.perception.cloud.point_cloud import PointCloud as PointCloud
+from graspd_core.perception.load_scene import load_scene as load_scene
+from graspd_core.perception.obstacles import with_neighbours as with_neighbours
+from graspd_core.perception.scene import Scene as Scene
+from graspd_core.perception.scene_from_views import scene_from_views as scene_from_views
+from graspd_core.perception.segment.target_selection import Target as Target
+from graspd_core.planning.plan_grasps import plan_grasps as plan_grasps
+from graspd_core.planning.plan_grasps import warm_up as warm_up
+from graspd_core.planning.regions import Box as Box
+from graspd_core.planning.regions import NearPoints as NearPoints
+from graspd_core.planning.regions import Sphere as Sphere
+from graspd_core.planning.steering import Steering as Steering
+from graspd_core.types import ArmPath as ArmPath
+from graspd_core.types import Grasp as Grasp
+from graspd_core.types import GraspResult as GraspResult
+from graspd_core.types import Outcome as Outcome
+from graspd_core.types import Posture as Posture
+from graspd_core.types import Progress as Progress
+from graspd_core.types import TrialResult as TrialResult
+from graspd_core.types import TriangleMesh as TriangleMesh
+from graspd_core.types import Verdict as Verdict
+from graspd_core.verify.metrics import METRICS as METRICS
+from graspd_core.verify.metrics import Metric as Metric
+from graspd_core.verify.prepared_grasp import MetricsContext as MetricsContext
+from graspd_core.verify.prepared_grasp import PreparedGrasp as PreparedGrasp
+from graspd_core.verify.trial_registry import TRIALS as TRIALS
+from graspd_core.verify.trial_registry import Trial as Trial
+from graspd_core.verify.trial_registry import TrialContext as TrialContext
+from graspd_core.verify.verification import verify_grasps as verify_grasps
+
+__all__: list[str]
+_MOVED: dict[str, str]
+_MOVED_TO: dict[str, str]
