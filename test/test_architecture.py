@@ -184,7 +184,7 @@ def length_faults(path: str, source: str) -> list[str]:
 
 def public_names() -> dict[str, str]:
     """The module of each name that graspd_core offers."""
-    offered = ast.parse((ROOT / "graspd_core" / "__init__.pyi").read_text())
+    offered = ast.parse((ROOT / "graspd_core" / "__init__.py").read_text())
     imports = [node for node in ast.walk(offered) if isinstance(node, ast.ImportFrom) and node.module]
     return {alias.name: str(node.module) for node in imports for alias in node.names}
 
