@@ -195,7 +195,7 @@ def test_a_search_that_is_cancelled_is_the_last():
         return len(steps) > 1 and steps[-1] < steps[-2] and next(stops, False)
 
     hooks = Hooks(report=lambda step, of, loss: steps.append(step), stop=stop, interval=0.0)
-    found = find_candidates(search_of(0.25, 3, hooks)
+    found = find_candidates(search_of(0.25, 3, hooks))
     assert steps.count(max(steps)) == 1
     assert scores(found) == scores(once)
 
