@@ -55,14 +55,11 @@ class Capsules:
 
 def capsules_about(primitives: Sequence[Primitive]) -> Capsules:
     """Return an enclosing capsule of each primitive. Spheres and capsules are not enlarged."""
-    rows = [_about(primitive) for primitive in primitives]
-    turned = [
-        [primitive.rotation @ point + primitive.translation for point in row[:2]]
-        for primitive, row in zip(primitives, rows, strict=True)
-    ]
+    rows = [(solid, *_about(solid)) for solid in primitives]
+    turned = [[solid.rotation @ point + solid.translation for point in (start, end)] for solid, start, end, _ in rows]
     ends = np.array(turned, dtype=float).reshape(-1, 2, 3)
-    link = np.array([primitive.link for primitive in primitives], dtype=np.int64)
-    return Capsules(link, ends[:, 0], ends[:, 1], np.array([row[2] for row in rows], dtype=float))
+    link = np.array([solid.link for solid in primitives], dtype=np.int64)
+    return Capsules(link, ends[:, 0], ends[:, 1], np.array([radius for *_, radius in rows], dtype=float))
 
 
 def _about(primitive: Primitive) -> tuple[Float[np.ndarray, "3"], Float[np.ndarray, "3"], float]:
@@ -261,13 +258,11 @@ def load_arm(name_or_path: str | Path, robot_description: str = "") -> Arm:
         HandError: the URDF cannot be used.
     """
     path, entries = read_arm_file(name_or_path)
-    urdf = path.parent / entries.urdf
-    if not from_robot_description(entries):
-        return _make_arm(entries, urdf, read_xml(urdf), str(path))
-    if not robot_description:
+    urdf, given = path.parent / entries.urdf, from_robot_description(entries)
+    if given and not robot_description:
         hint = "known only to a node with the parameter arm; without a node, give the path of a URDF"
         raise ConfigError(f"{path}.urdf: {ROBOT_DESCRIPTION} is {hint}")
-    return _make_arm(entries, urdf, parse_xml(urdf, robot_description), str(path))
+    return _make_arm(entries, urdf, parse_xml(urdf, robot_description) if given else read_xml(urdf), str(path))
 
 
 def from_robot_description(entries: ArmFile) -> bool:
@@ -307,11 +302,10 @@ def _make_arm(entries: ArmFile, urdf: Path, root: ET.Element, where: str) -> Arm
         raise ConfigError(f"{urdf}: no moving link has a <collision> or <visual> shape; valid: at least one shape")
     lower, upper = _limits(chain, entries.limits, where)
     seed = 0.5 * (lower + upper)
-    for joint, value in _by_joint(chain, entries.seed, f"{where}.seed").items():
-        index = chain.joint_names.index(joint)
+    for index, key, value in _by_joint(chain, entries.seed, f"{where}.seed"):
         if not is_number(value) or not lower[index] <= value <= upper[index]:
             limits = f"[{lower[index]:g}, {upper[index]:g}]"
-            raise ConfigError(f"{where}.seed.{joint}: {short_repr(value)}; valid: a number within the limits {limits}")
+            raise ConfigError(f"{key}: {short_repr(value)}; valid: a number within the limits {limits}")
         seed[index] = value
     name = entries.name or Path(where).stem
     mounts = {str(hand): _mount(given, entries.tip, f"{where}.mounts.{hand}") for hand, given in entries.mounts.items()}
@@ -348,23 +342,23 @@ def _limits(
 ) -> tuple[Float[np.ndarray, "joints"], Float[np.ndarray, "joints"]]:
     """Return lower and upper joint limits: the description's limits if given, else the URDF's limits."""
     lower, upper = chain.lower.copy(), chain.upper.copy()
-    for joint, given in _by_joint(chain, narrower, f"{where}.limits").items():
-        index = chain.joint_names.index(joint)
+    for index, key, given in _by_joint(chain, narrower, f"{where}.limits"):
         if not isinstance(given, list) or len(given) != 2 or not all(map(is_number, given)):
-            raise ConfigError(f"{where}.limits.{joint}: expected a lower and an upper number, got {short_repr(given)}")
+            raise ConfigError(f"{key}: expected a lower and an upper number, got {short_repr(given)}")
         low, high = given
         if not chain.lower[index] <= low < high <= chain.upper[index]:
             limits = f"[{chain.lower[index]:g}, {chain.upper[index]:g}]"
-            raise ConfigError(f"{where}.limits.{joint}: [{low:g}, {high:g}]; valid: a range within the URDF's {limits}")
+            raise ConfigError(f"{key}: [{low:g}, {high:g}]; valid: a range within the URDF's {limits}")
         lower[index], upper[index] = low, high
     return lower, upper
 
 
-def _by_joint(chain: HandModel, values: Mapping[str, Any], where: str) -> Mapping[str, Any]:
+def _by_joint(chain: HandModel, values: Mapping[str, Any], where: str) -> list[tuple[int, str, Any]]:
+    """Return the joint index, the key for messages and the value of each entry."""
     for joint in values:
         if joint not in chain.joint_names:
             raise ConfigError(f"{where}: no joint {short_repr(joint)}; joints: {', '.join(chain.joint_names)}")
-    return values
+    return [(chain.joint_names.index(joint), f"{where}.{joint}", value) for joint, value in values.items()]
 
 
 def _mount(given: Any, tip: str, where: str) -> Mount:
