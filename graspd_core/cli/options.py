@@ -356,10 +356,9 @@ def restrictions_of(options: argparse.Namespace) -> tuple[Restriction, ...]:
 
 
 def _steering(options: argparse.Namespace) -> tuple[Steering, ...]:
-    if options.approach is None:
-        _refuse_alone("approach-angle", options.approach_angle, "approach")
-    if options.roll is None:
-        _refuse_alone("roll-tolerance", options.roll_tolerance, "roll")
+    for name, other in (("approach_angle", "approach"), ("roll_tolerance", "roll")):
+        if getattr(options, name) is not None and getattr(options, other) is None:
+            raise ConfigError(f"--{name.replace('_', '-')} needs --{other}; give both or neither")
     given = (options.approach, options.roll, options.region)
     if all(value is None for value in given) and not options.avoid:
         return ()
@@ -371,11 +370,6 @@ def _steering(options: argparse.Namespace) -> tuple[Steering, ...]:
     region = None if options.region is None else _region(options.region)
     avoid = [Box(values[:3], values[3:]) for values in options.avoid]
     return (Steering(approach_direction=options.approach, region=region, avoid=avoid, **radians),)
-
-
-def _refuse_alone(name: str, value: float | None, other: str) -> None:
-    if value is not None:
-        raise ConfigError(f"--{name} needs --{other}; give both or neither")
 
 
 def _region(words: list[str]) -> Region:

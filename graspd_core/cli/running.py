@@ -138,11 +138,6 @@ class Watched:
     show: Callable[[GraspResult], None] = lambda result: None
 
 
-# Commands outside graspd_core, and the package that each command needs.
-SIBLINGS = {"view": "graspd_viewer", "bench": "graspd_bench", "dataset": "graspd_dataset", "import": "graspd_dataset"}
-SIBLINGS |= {"cell": "graspd_cell"}
-
-
 def sibling(module: str) -> Any:
     """Import a module of another graspd package. Raises ConfigError: the package is not installed."""
     package = module.partition(".")[0]

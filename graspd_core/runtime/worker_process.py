@@ -32,20 +32,18 @@ _M_ARENA_MAX, _ARENAS = -8, 2
 
 def trim_heap() -> None:
     """Return freed memory to the system. Only glibc needs this call."""
-    try:
-        trim = ctypes.CDLL(None).malloc_trim
-    except (OSError, AttributeError, TypeError):  # no glibc
-        return
-    trim(ctypes.c_size_t(0))
+    _call_libc("malloc_trim", ctypes.c_size_t(0))
 
 
 def limit_malloc_arenas() -> None:
     """Let all threads share two memory arenas (glibc only). One arena per thread would keep much freed memory."""
-    try:
-        mallopt = ctypes.CDLL(None).mallopt
-    except (OSError, AttributeError, TypeError):
-        return
-    mallopt(_M_ARENA_MAX, _ARENAS)
+    _call_libc("mallopt", _M_ARENA_MAX, _ARENAS)
+
+
+def _call_libc(name: str, *arguments: Any) -> None:
+    # Not every C library has these functions.
+    with contextlib.suppress(OSError, AttributeError, TypeError):
+        getattr(ctypes.CDLL(None), name)(*arguments)
 
 
 T = TypeVar("T")
@@ -210,8 +208,7 @@ def _result(reply: bytes) -> Any:
 
 
 def _end_with(parent: int) -> None:
-    with contextlib.suppress(OSError, AttributeError):
-        ctypes.CDLL(None).prctl(_PR_SET_PDEATHSIG, signal.SIGKILL)
+    _call_libc("prctl", _PR_SET_PDEATHSIG, signal.SIGKILL)
     if os.getppid() != parent:
         os._exit(1)
 
