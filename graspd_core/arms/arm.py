@@ -302,10 +302,11 @@ def _make_arm(entries: ArmFile, urdf: Path, root: ET.Element, where: str) -> Arm
         raise ConfigError(f"{urdf}: no moving link has a <collision> or <visual> shape; valid: at least one shape")
     lower, upper = _limits(chain, entries.limits, where)
     seed = 0.5 * (lower + upper)
-    for index, key, value in _by_joint(chain, entries.seed, f"{where}.seed"):
+    for joint, value in _by_joint(chain, entries.seed, f"{where}.seed").items():
+        index = chain.joint_names.index(joint)
         if not is_number(value) or not lower[index] <= value <= upper[index]:
             limits = f"[{lower[index]:g}, {upper[index]:g}]"
-            raise ConfigError(f"{key}: {short_repr(value)}; valid: a number within the limits {limits}")
+            raise ConfigError(f"{where}.seed.{joint}: {short_repr(value)}; valid: a number within the limits {limits}")
         seed[index] = value
     name = entries.name or Path(where).stem
     mounts = {str(hand): _mount(given, entries.tip, f"{where}.mounts.{hand}") for hand, given in entries.mounts.items()}
@@ -342,23 +343,23 @@ def _limits(
 ) -> tuple[Float[np.ndarray, "joints"], Float[np.ndarray, "joints"]]:
     """Return lower and upper joint limits: the description's limits if given, else the URDF's limits."""
     lower, upper = chain.lower.copy(), chain.upper.copy()
-    for index, key, given in _by_joint(chain, narrower, f"{where}.limits"):
+    for joint, given in _by_joint(chain, narrower, f"{where}.limits").items():
+        index = chain.joint_names.index(joint)
         if not isinstance(given, list) or len(given) != 2 or not all(map(is_number, given)):
-            raise ConfigError(f"{key}: expected a lower and an upper number, got {short_repr(given)}")
+            raise ConfigError(f"{where}.limits.{joint}: expected a lower and an upper number, got {short_repr(given)}")
         low, high = given
         if not chain.lower[index] <= low < high <= chain.upper[index]:
             limits = f"[{chain.lower[index]:g}, {chain.upper[index]:g}]"
-            raise ConfigError(f"{key}: [{low:g}, {high:g}]; valid: a range within the URDF's {limits}")
+            raise ConfigError(f"{where}.limits.{joint}: [{low:g}, {high:g}]; valid: a range within the URDF's {limits}")
         lower[index], upper[index] = low, high
     return lower, upper
 
 
-def _by_joint(chain: HandModel, values: Mapping[str, Any], where: str) -> list[tuple[int, str, Any]]:
-    """Return the joint index, the key for messages and the value of each entry."""
+def _by_joint(chain: HandModel, values: Mapping[str, Any], where: str) -> Mapping[str, Any]:
     for joint in values:
         if joint not in chain.joint_names:
             raise ConfigError(f"{where}: no joint {short_repr(joint)}; joints: {', '.join(chain.joint_names)}")
-    return [(chain.joint_names.index(joint), f"{where}.{joint}", value) for joint, value in values.items()]
+    return values
 
 
 def _mount(given: Any, tip: str, where: str) -> Mount:

@@ -279,7 +279,8 @@ class GraspLibrary:
 def _entry_of_row(row: Sequence[Any]) -> LibraryEntry:
     values: dict[str, Any] = dict(zip(_COLUMNS, row, strict=True))
     # SQLite has no type for truth values.
-    return LibraryEntry(**values | {"mass_assumed": bool(values["mass_assumed"])})
+    values["mass_assumed"] = bool(values["mass_assumed"])
+    return LibraryEntry(**values)
 
 
 def with_mass(entries: Iterable[LibraryEntry], mass: float | None) -> list[LibraryEntry]:
