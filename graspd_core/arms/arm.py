@@ -55,14 +55,11 @@ class Capsules:
 
 def capsules_about(primitives: Sequence[Primitive]) -> Capsules:
     """Return an enclosing capsule of each primitive. Spheres and capsules are not enlarged."""
-    rows = [_about(primitive) for primitive in primitives]
-    turned = [
-        [primitive.rotation @ point + primitive.translation for point in row[:2]]
-        for primitive, row in zip(primitives, rows, strict=True)
-    ]
+    rows = [(solid, *_about(solid)) for solid in primitives]
+    turned = [[solid.rotation @ point + solid.translation for point in (start, end)] for solid, start, end, _ in rows]
     ends = np.array(turned, dtype=float).reshape(-1, 2, 3)
-    link = np.array([primitive.link for primitive in primitives], dtype=np.int64)
-    return Capsules(link, ends[:, 0], ends[:, 1], np.array([row[2] for row in rows], dtype=float))
+    link = np.array([solid.link for solid in primitives], dtype=np.int64)
+    return Capsules(link, ends[:, 0], ends[:, 1], np.array([radius for *_, radius in rows], dtype=float))
 
 
 def _about(primitive: Primitive) -> tuple[Float[np.ndarray, "3"], Float[np.ndarray, "3"], float]:
@@ -261,13 +258,11 @@ def load_arm(name_or_path: str | Path, robot_description: str = "") -> Arm:
         HandError: the URDF cannot be used.
     """
     path, entries = read_arm_file(name_or_path)
-    urdf = path.parent / entries.urdf
-    if not from_robot_description(entries):
-        return _make_arm(entries, urdf, read_xml(urdf), str(path))
-    if not robot_description:
+    urdf, given = path.parent / entries.urdf, from_robot_description(entries)
+    if given and not robot_description:
         hint = "known only to a node with the parameter arm; without a node, give the path of a URDF"
         raise ConfigError(f"{path}.urdf: {ROBOT_DESCRIPTION} is {hint}")
-    return _make_arm(entries, urdf, parse_xml(urdf, robot_description), str(path))
+    return _make_arm(entries, urdf, parse_xml(urdf, robot_description) if given else read_xml(urdf), str(path))
 
 
 def from_robot_description(entries: ArmFile) -> bool:

@@ -111,10 +111,8 @@ def tip_poses(task: ArmTask, hand_poses: SE3) -> SE3:
 @torch.no_grad()
 def arm_paths(task: ArmTask, grasps: Sequence[Grasp]) -> list[ArmPath | str]:
     """Return the arm path through each grasp. If there is none, return the reason, e.g. "beyond joint_4's limit"."""
-    found: list[ArmPath | str] = []
-    for first in range(0, len(grasps), _AT_ONCE):
-        found += _some_paths(task, grasps[first : first + _AT_ONCE])
-    return found
+    parts = (grasps[first : first + _AT_ONCE] for first in range(0, len(grasps), _AT_ONCE))
+    return [found for part in parts for found in _some_paths(task, part)]
 
 
 def _some_paths(task: ArmTask, grasps: Sequence[Grasp]) -> list[ArmPath | str]:
@@ -122,20 +120,12 @@ def _some_paths(task: ArmTask, grasps: Sequence[Grasp]) -> list[ArmPath | str]:
     q, owner = _postures(task, paths[:, STAGE_ROWS[2]])
     joints = torch.as_tensor(stacked([grasp.pregrasp for grasp in grasps])[2])[owner]
     followed = _followed(task, paths[owner], q, joints)
-    best = _best_of_each(followed, owner, len(grasps))
+    rows_of_each = [torch.nonzero(owner == grasp).flatten().tolist() for grasp in range(len(grasps))]
+    # The row of each grasp's first valid path. Else the grasp's first row, or -1 if there is no row.
+    best = [next(filter(followed.good, rows), rows[0] if rows else -1) for rows in rows_of_each]
     reasons, names, chain = _why_lost(task, paths, followed, best), task.arm.joint_names, task.arm.chain
     made = partial(ArmPath, names, stages=STAGE_ROWS, velocity=chain.velocity, slides=chain.slides)
     return [reasons[grasp] if grasp in reasons else made(followed.path[row].numpy()) for grasp, row in enumerate(best)]
-
-
-def _best_of_each(followed: _Followed, owner: Int[Tensor, "postures"], count: int) -> list[int]:
-    """Return the row of each grasp's first valid path. Else return the grasp's first row, or -1 if there is no row."""
-    best = [-1] * count
-    for row in reversed(range(len(owner))):
-        grasp, good = int(owner[row]), followed.good(row)
-        if good or best[grasp] < 0 or not followed.good(best[grasp]):
-            best[grasp] = row
-    return best
 
 
 def _why_lost(task: ArmTask, paths: SE3, followed: _Followed, best: Sequence[int]) -> dict[int, str]:

@@ -133,7 +133,7 @@ def execution_of(
     )
     times, rows, speeds, gates = [np.zeros(1)], [moves[0][0][:1]], [np.zeros((1, len(limits)))], [0]
     for move, seconds, least in moves:
-        time, speed = _from_rest_to_rest(move, limits, PEAK_SPEED * seconds, max(least, pace.shortest))
+        time, speed = _from_rest_to_rest(move, limits, max(PEAK_SPEED * seconds, least, pace.shortest))
         times.append(times[-1][-1] + time[1:])
         rows.append(move[1:])
         speeds.append(speed[1:])
@@ -166,9 +166,9 @@ def _both(arm: np.ndarray, hand: np.ndarray) -> np.ndarray:
 
 
 def _from_rest_to_rest(
-    rows: np.ndarray, limits: np.ndarray, least: float, shortest: float
+    rows: np.ndarray, limits: np.ndarray, shortest: float
 ) -> tuple[Float[np.ndarray, "rows"], Float[np.ndarray, "rows joints"]]:
-    """Return times and speeds of evenly spaced `rows` within `limits`, over at least max(`least`, `shortest`) [s]."""
+    """Return times and speeds of evenly spaced `rows` within `limits`, over at least `shortest` [s]."""
     share = np.linspace(0.0, 1.0, len(rows))
     # At time t from 0 to 1, the cubic covers the fraction 3t² − 2t³ of the path. Solve for t.
     time = 0.5 - np.sin(np.arcsin(1.0 - 2.0 * share) / 3.0)
@@ -176,5 +176,5 @@ def _from_rest_to_rest(
     # A controller's cubic may be faster between the rows than at the rows.
     checked = np.concatenate([time, np.linspace(0.0, 1.0, _SAMPLES)])
     fastest = np.abs(CubicHermiteSpline(time, rows, speed)(checked, 1)).max(0)
-    span = max(shortest, least, float((fastest / limits).max()))
+    span = max(shortest, float((fastest / limits).max()))
     return span * time, speed / span

@@ -13,7 +13,6 @@ objects at 0.3 to 0.95 m, the bounds of graspd's two arms accept 99.3 and 99.7 %
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import lru_cache
 from typing import TYPE_CHECKING
@@ -87,7 +86,10 @@ def solve(
         steps: greatest number of steps.
         limited: whether joints stay within their limits.
     """
-    limits = [torch.as_tensor(limit).float() for limit in (arm.lower, arm.upper)]
+    limits = [torch.as_tensor(limit) for limit in (arm.lower, arm.upper)]
+    if not limited:
+        limits = [torch.full_like(limit, sign * torch.inf) for limit, sign in zip(limits, (-1, 1), strict=True)]
+    low, high = (limit.float() for limit in limits)
     target, now, chain = SE3(target.rotation.float(), target.translation.float()), start.float(), tip_chain(arm)
     q, reached = torch.empty(now.shape), torch.zeros(len(now), dtype=torch.bool)
     rows = torch.arange(len(now))
@@ -104,27 +106,24 @@ def solve(
                 break
             rows, now, wrong, jacobian = (x[ahead] for x in (rows, now, wrong, jacobian))
             target = target[ahead]
-        now = now + _step(jacobian, wrong, now, limits if limited else None)
-        now = now.clamp(*limits) if limited else now
-    q = q.to(start)
+        now = (now + _step(jacobian, wrong, now, low, high)).clamp(low, high)
     # Conversion from float32 may exceed a limit by rounding.
-    q = q.clamp(*map(torch.as_tensor, (arm.lower, arm.upper))) if limited else q
-    return q, reached
+    return q.to(start).clamp(*limits), reached
 
 
 def _step(
     jacobian: Float[Tensor, "batch 6 joints"],
     wrong: Float[Tensor, "batch 6"],
     q: Float[Tensor, "batch joints"],
-    limits: Sequence[Tensor] | None,
+    low: Float[Tensor, "joints"],
+    high: Float[Tensor, "joints"],
 ) -> Float[Tensor, "batch joints"]:
     """Return the step `Jᵀ (J Jᵀ + λ I)⁻¹ e` with weighted J and e = `wrong`. Joints at a limit do not pass it."""
     weight = wrong.new_tensor(_WEIGHTS)
     jacobian, wrong = jacobian * weight[:, None], wrong * weight
-    if limits is not None:
-        downhill = (jacobian * wrong[..., None]).sum(1)
-        held = ((q <= limits[0]) & (downhill < 0)) | ((q >= limits[1]) & (downhill > 0))
-        jacobian = torch.where(held[:, None], 0.0, jacobian)
+    downhill = (jacobian * wrong[..., None]).sum(1)
+    held = ((q <= low) & (downhill < 0)) | ((q >= high) & (downhill > 0))
+    jacobian = torch.where(held[:, None], 0.0, jacobian)
     damping = _DAMPING * (wrong * wrong).sum(-1) + _LEAST_DAMPING
     matrix = jacobian @ jacobian.transpose(1, 2) + damping[:, None, None] * torch.eye(6, dtype=q.dtype)
     solved = torch.linalg.solve_ex(matrix, wrong)[0]

@@ -18,7 +18,7 @@ from importlib.metadata import entry_points
 from typing import Any, NoReturn
 
 from graspd_core.cli.output import add_output_options, flush_output, output_of, print_error
-from graspd_core.cli.running import EXIT_BAD_INPUT, EXIT_INTERRUPTED, EXIT_PIPE, SIBLINGS, process_began
+from graspd_core.cli.running import EXIT_BAD_INPUT, EXIT_INTERRUPTED, EXIT_PIPE, process_began
 from graspd_core.errors import ConfigError, GraspdError, Parser, choices
 
 # A garbage collection starts after this number of new objects. Python's default is 700. Collections during imports free
@@ -78,37 +78,29 @@ class _Commands(argparse._SubParsersAction):
     """Subparsers with a summary for each command. Shell completion hides commands without a summary."""
 
     def add_parser(self, name: str, **settings: Any) -> argparse.ArgumentParser:
-        return super().add_parser(name, help=_SUMMARIES.get(name, ""), **settings)
+        return super().add_parser(name, help=_summary(name), **settings)
 
 
-# The commands of graspd_core, in the order of `graspd --help`.
+# Commands in the order of `graspd --help`: module in graspd_core, or other package. Summary, which needs no import.
 _COMMANDS = {
-    "synthesize": "graspd_core.cli.synthesize_command",
-    "replay": "graspd_core.cli.replay_command",
-    "reconstruct": "graspd_core.cli.reconstruct_command",
-    "library": "graspd_core.cli.library_command",
-    "hands": "graspd_core.cli.hands_command",
-    **dict.fromkeys(("methods", "presets", "metrics"), "graspd_core.cli.names_command"),
-    "doctor": "graspd_core.doctor",
-    "completion": "graspd_core.cli.completion_command",
-}
-# Summaries for `graspd --help`, which imports no command.
-_SUMMARIES = {
-    "synthesize": "plan grasps on a mesh, a cloud or a built-in shape",
-    "replay": "plan grasps on the clouds or depth images of a rosbag2 recording",
-    "reconstruct": "reconstruct a closed mesh from a point cloud",
-    "library": "keep verified grasps of known objects in a file",
-    "hands": "list the built-in hands, or inspect one",
-    "methods": "list the methods that find grasps",
-    "presets": "list the built-in presets",
-    "metrics": "list the metrics of a grasp",
-    "doctor": "check the installation",
-    "completion": "print a script that lets bash, zsh or tcsh complete commands and options",
-    "view": "show hands, grasps and results in a browser",
-    "bench": "measure presets and methods on objects, with tables and charts",
-    "dataset": "make or inspect a data set of grasps",
-    "import": "convert grasps of other tools to grasps.json",
-    "cell": "let a simulated arm, hand and camera empty a bin",
+    "synthesize": ("cli.synthesize_command", "plan grasps on a mesh, a cloud or a built-in shape"),
+    "replay": ("cli.replay_command", "plan grasps on the clouds or depth images of a rosbag2 recording"),
+    "reconstruct": ("cli.reconstruct_command", "reconstruct a closed mesh from a point cloud"),
+    "library": ("cli.library_command", "keep verified grasps of known objects in a file"),
+    "hands": ("cli.hands_command", "list the built-in hands, or inspect one"),
+    "methods": ("cli.names_command", "list the methods that find grasps"),
+    "presets": ("cli.names_command", "list the built-in presets"),
+    "metrics": ("cli.names_command", "list the metrics of a grasp"),
+    "doctor": ("doctor", "check the installation"),
+    "completion": (
+        "cli.completion_command",
+        "print a script that lets bash, zsh or tcsh complete commands and options",
+    ),
+    "view": ("graspd_viewer", "show hands, grasps and results in a browser"),
+    "bench": ("graspd_bench", "measure presets and methods on objects, with tables and charts"),
+    "dataset": ("graspd_dataset", "make or inspect a data set of grasps"),
+    "import": ("graspd_dataset", "convert grasps of other tools to grasps.json"),
+    "cell": ("graspd_cell", "let a simulated arm, hand and camera empty a bin"),
 }
 
 
@@ -117,7 +109,7 @@ def _overview() -> argparse.ArgumentParser:
     parser = _parser()
     commands = parser.add_subparsers(metavar="COMMAND", dest="command")
     for name in _modules():
-        commands.add_parser(name, help=_SUMMARIES.get(name, ""))
+        commands.add_parser(name, help=_summary(name))
     return parser
 
 
@@ -126,10 +118,10 @@ def build_parser(command: str = "") -> argparse.ArgumentParser:
 
     Raises ConfigError: the command is unknown or its package is not installed.
     """
-    parser, modules = _parser(), _COMMANDS if command in _COMMANDS else _modules()
+    parser, modules = _parser(), _modules(command)
     if command and command not in modules:
-        if command in SIBLINGS:
-            raise ConfigError(f"{command}: {SIBLINGS[command]} is not installed; run: pip install graspd")
+        if command in _COMMANDS:
+            raise ConfigError(f"{command}: {_COMMANDS[command][0]} is not installed; run: pip install graspd")
         raise ConfigError(f"unknown command {command!r}; {choices(command, modules)}")
     commands = parser.add_subparsers(required=True, metavar="COMMAND", dest="command", action=_Commands)
     # One module may hold several commands.
@@ -153,5 +145,11 @@ def _parser() -> _Parser:
     return _Parser(prog="graspd", description="Verified grasps for multi-fingered hands.")
 
 
-def _modules() -> dict[str, str]:
-    return _COMMANDS | {point.name: point.value for point in entry_points(group="graspd.commands")}
+def _modules(command: str = "") -> dict[str, str]:
+    """Return the module of each command, but only those of graspd_core if `command` is one. Entry points are slow."""
+    own = {name: f"graspd_core.{module}" for name, (module, _) in _COMMANDS.items() if not module.startswith("graspd_")}
+    return own if command in own else own | {point.name: point.value for point in entry_points(group="graspd.commands")}
+
+
+def _summary(name: str) -> str:
+    return _COMMANDS[name][1] if name in _COMMANDS else ""

@@ -45,10 +45,9 @@ def run(options: argparse.Namespace) -> int:
     torch.set_num_threads(1)
     names, listed = hand_names(), []
     for hand in waiting(map(load_hand, names), "hand", len(names)):
-        listed.append({"name": hand.name, "joints": hand.num_joints, "candidates": len(hand.candidate_points)})
-        text = "{name}: {joints} joints, {candidates} contact candidates".format(**listed[-1])
-        print(f"{text}, {hand.urdf}", flush=True)
-        listed[-1]["urdf"] = hand.urdf
+        numbers = {"joints": hand.num_joints, "candidates": len(hand.candidate_points)}
+        listed.append({"name": hand.name, **numbers, "urdf": hand.urdf})
+        print("{name}: {joints} joints, {candidates} contact candidates, {urdf}".format(**listed[-1]), flush=True)
     answer(listed)
     return EXIT_OK
 

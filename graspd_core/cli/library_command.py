@@ -12,6 +12,7 @@ from graspd_core.cli.running import EXIT_INTERRUPTED, EXIT_OK, EXIT_TOO_FEW, Int
 from graspd_core.errors import ConfigError, MeshError
 
 if TYPE_CHECKING:
+    from graspd_core.hands.model import HandModel
     from graspd_core.library.grasp_library import GraspLibrary, LibraryEntry
 
 
@@ -45,11 +46,12 @@ def _build(options: argparse.Namespace) -> int:
     library.checked()
     short, objects = 0, []
     with Interrupt() as interrupt:
+        request |= {"preset": config, "stop": interrupt.is_interrupted}
         for source, scale in [(source, scale) for source in sources for scale in options.scales]:
             if interrupt.is_interrupted():
                 break
             try:
-                has = _add_object(options, library, source, scale, hand, config, request, interrupt.is_interrupted)
+                has = _add_object(options, library, source, scale, hand, request)
             except MeshError as error:
                 print_error(error)
                 has = 0
@@ -59,17 +61,15 @@ def _build(options: argparse.Namespace) -> int:
     return EXIT_INTERRUPTED if interrupt.is_interrupted() else EXIT_TOO_FEW if short else EXIT_OK
 
 
-def _add_object(options: argparse.Namespace, library: GraspLibrary, source: str, scale: float, *rest: Any) -> int:
-    """Plan the grasps that the library lacks for an object, and add them. Return the object's new number of grasps.
-
-    `rest` holds hand, config, request and stop hook.
-    """
+def _add_object(
+    options: argparse.Namespace, library: GraspLibrary, source: str, scale: float, hand: HandModel, request: dict
+) -> int:
+    """Plan the grasps that the library lacks for an object, and add them. Return the object's new number of grasps."""
     from graspd_core.library.grasp_library import entry_of
     from graspd_core.library.known_grasps import add_planned
     from graspd_core.perception.load_scene import load_scene
     from graspd_core.planning.plan_grasps import plan_grasps
 
-    hand, config, request, stop = rest
     with busy("load"):
         scene = load_scene(source, mass=options.mass, friction=options.friction, scale=scale)
     for warning in (*scene.object.warnings, *hand.named_warnings):
@@ -88,11 +88,10 @@ def _add_object(options: argparse.Namespace, library: GraspLibrary, source: str,
         return has
     missing = {**request, "count": options.count - has, "seed": options.seed + has}
     with Reporter() as reporter:
-        hooks = {"progress": reporter, "stop": stop}
-        result = plan_grasps(scene, hand, preset=config, deadline=options.deadline, **hooks, **missing)
+        result = plan_grasps(scene, hand, deadline=options.deadline, progress=reporter, **missing)
     for warning in result.warnings[len(scene.object.warnings) + len(hand.named_warnings) :]:
         print_note(warning)
-    add_planned(library, scene, hand, config, result, options.verify)
+    add_planned(library, scene, hand, request["preset"], result, options.verify)
     has = stored()
     print(f"{entry.name}: {has} of {options.count} grasps, {result.timing.total:.1f} s", flush=True)
     return has

@@ -35,6 +35,8 @@ if TYPE_CHECKING:
 _SHOWN = ("payload", "least_friction", "penetration", "contact_area", "epsilon", "robustness")
 # Number of grasps that a summary lists.
 _FIRST = 3
+# Arguments of options that take a point or a direction.
+_XYZ: dict[str, Any] = {"type": float, "nargs": 3, "metavar": ("X", "Y", "Z")}
 
 
 def add_plugin_option(parser: argparse._ActionsContainer) -> None:
@@ -49,18 +51,14 @@ def add_planning_options(parser: argparse.ArgumentParser) -> None:
     """Add the options for hand, grasps, method, trials, and the object's mass and friction."""
     parser.add_argument("--hand", default="allegro_right", metavar="NAME|PATH", help="a hand (see graspd hands)")
     parser.add_argument("-n", "--count", type=int, default=16, help="number of verified grasps (default 16)")
-    parser.add_argument("--method", default=None, metavar="NAME", help="method at its defaults (default: the preset's)")
+    parser.add_argument("--method", metavar="NAME", help="method at its defaults (default: the preset's)")
     add_plugin_option(parser)
     parser.add_argument("--preset", default="balanced", help=f"{', '.join(preset_names())}, or a .yaml file")
     parser.add_argument("--seed", type=int, default=0)
-    parser.add_argument(
-        "--mass", type=float, default=None, metavar="KG",
-        help="mass of the object (default: the greatest mass that its volume allows)",
-    )  # fmt: skip
+    about = "mass of the object (default: the greatest mass that its volume allows)"
+    parser.add_argument("--mass", type=float, metavar="KG", help=about)
     parser.add_argument("--friction", type=float, default=0.6, metavar="MU", help="friction coefficient (default 0.6)")
-    parser.add_argument(
-        "--deadline", type=float, default=None, metavar="SEC", help="time limit with loading; found grasps are kept"
-    )
+    parser.add_argument("--deadline", type=float, metavar="SEC", help="time limit with loading; found grasps are kept")
     parser.add_argument("--verify", choices=VERIFICATIONS, default="standard")
     parser.add_argument("--robust", action="store_true", help="rank grasps by trials with a misplaced hand")
     parser.add_argument("--least-friction", action="store_true", help="measure the least friction for each grasp")
@@ -145,12 +143,12 @@ MOST_VIEWS = 100
 
 def add_bag_options(parser: argparse.ArgumentParser) -> None:
     """Add the options that choose the messages of a bag and the frame of their clouds."""
-    parser.add_argument("--topic", default=None, help="topic of the clouds or depth images, if a bag has several")
-    parser.add_argument("--camera-info", default=None, metavar="TOPIC", help="CameraInfo of the depth images")
-    parser.add_argument("--frame", default=None, help="transform clouds to this frame by the bag's /tf and /tf_static")
+    parser.add_argument("--topic", help="topic of the clouds or depth images, if a bag has several")
+    parser.add_argument("--camera-info", metavar="TOPIC", help="CameraInfo of the depth images")
+    parser.add_argument("--frame", help="transform clouds to this frame by the bag's /tf and /tf_static")
     parser.add_argument("--sensor-frame", default="", metavar="FRAME", help="frame of the clouds' camera in /tf")
     parser.add_argument("--every", type=int, default=1, metavar="N", help="use every N-th cloud")
-    parser.add_argument("--limit", type=int, default=None, metavar="N", help="use at most N clouds")
+    parser.add_argument("--limit", type=int, metavar="N", help="use at most N clouds")
 
 
 def add_object_options(parser: argparse.ArgumentParser, *, any_object: bool = False) -> None:
@@ -158,27 +156,19 @@ def add_object_options(parser: argparse.ArgumentParser, *, any_object: bool = Fa
     which = parser.add_mutually_exclusive_group()
     if any_object:
         which.add_argument("--any", action="store_true", help="choose the object with the surest grasp")
-    which.add_argument(
-        "--target", type=float, nargs=3, default=None, metavar=("X", "Y", "Z"),
-        help="a point on the object [m]; by default the object nearest the camera's axis",
-    )  # fmt: skip
+    about = "a point on the object [m]; by default the object nearest the camera's axis"
+    which.add_argument("--target", **_XYZ, help=about)
     which.add_argument("--alone", action="store_true", help="the clouds show only the object")
-    parser.add_argument(
-        "--view-point", type=float, nargs=3, default=None, metavar=("X", "Y", "Z"),
-        help="position of a cloud's camera in the cloud's frame [m] (default: the origin)",
-    )  # fmt: skip
-    parser.add_argument(
-        "--scene", type=Path, default=None, metavar="FILE.yaml",
-        help="settings for segmentation, reconstruction and obstacles (docs/clouds.md)",
-    )  # fmt: skip
+    about = "position of a cloud's camera in the cloud's frame [m] (default: the origin)"
+    parser.add_argument("--view-point", **_XYZ, help=about)
+    about = "settings for segmentation, reconstruction and obstacles (docs/clouds.md)"
+    parser.add_argument("--scene", type=Path, metavar="FILE.yaml", help=about)
 
 
 def add_camera_option(parser: argparse.ArgumentParser) -> None:
     """Add `--camera`, the camera of a depth image."""
-    parser.add_argument(
-        "--camera", type=Path, default=None, metavar="camera.json",
-        help="camera of the depth image (png, tiff, npy, npz): width, height, K (docs/clouds.md)",
-    )  # fmt: skip
+    about = "camera of the depth image (png, tiff, npy, npz): width, height, K (docs/clouds.md)"
+    parser.add_argument("--camera", type=Path, metavar="camera.json", help=about)
 
 
 def target_of(options: argparse.Namespace):
@@ -342,32 +332,19 @@ _FORMS = "box X Y Z SX SY SZ, sphere X Y Z R, or FILE [R]"
 
 def add_restriction_options(parser: argparse.ArgumentParser) -> None:
     group = parser.add_argument_group("steering (docs/usage.md)")
-    group.add_argument(
-        "--approach", type=float, nargs=3, default=None, metavar=("X", "Y", "Z"),
-        help="direction in which the hand moves towards the object",
-    )  # fmt: skip
-    group.add_argument("--approach-angle", type=float, default=None, metavar="DEG", help="tolerance (default 30)")
-    group.add_argument("--roll", type=float, default=None, metavar="DEG", help="angle of the hand about its approach")
-    group.add_argument("--roll-tolerance", type=float, default=None, metavar="DEG", help="tolerance (default 15)")
-    group.add_argument(
-        "--region", nargs="+", default=None, metavar="REGION",
-        help=f"where contacts may be: {_FORMS} (a cloud, and the distance from it) [m]",
-    )  # fmt: skip
+    group.add_argument("--approach", **_XYZ, help="direction in which the hand moves towards the object")
+    group.add_argument("--approach-angle", type=float, metavar="DEG", help="tolerance (default 30)")
+    group.add_argument("--roll", type=float, metavar="DEG", help="angle of the hand about its approach")
+    group.add_argument("--roll-tolerance", type=float, metavar="DEG", help="tolerance (default 15)")
+    about = f"where contacts may be: {_FORMS} (a cloud, and the distance from it) [m]"
+    group.add_argument("--region", nargs="+", metavar="REGION", help=about)
     group.add_argument(
         "--avoid", type=float, nargs=6, action="append", default=[], metavar=("X", "Y", "Z", "SX", "SY", "SZ"),
         help="a box that no link enters: centre and edge lengths [m] (repeatable)",
     )  # fmt: skip
-    parser.add_argument(
-        "--arm", default=None, metavar="NAME|FILE", help="find only grasps that this arm reaches (docs/arms.md)"
-    )
-    parser.add_argument(
-        "--arm-base",
-        type=float,
-        nargs="+",
-        default=None,
-        metavar="N",
-        help="pose of the arm's base in the object's or the cloud's frame: X Y Z [QW QX QY QZ]",
-    )
+    parser.add_argument("--arm", metavar="NAME|FILE", help="find only grasps that this arm reaches (docs/arms.md)")
+    about = "pose of the arm's base in the object's or the cloud's frame: X Y Z [QW QX QY QZ]"
+    parser.add_argument("--arm-base", type=float, nargs="+", metavar="N", help=about)
 
 
 def restrictions_of(options: argparse.Namespace) -> tuple[Restriction, ...]:
@@ -379,10 +356,9 @@ def restrictions_of(options: argparse.Namespace) -> tuple[Restriction, ...]:
 
 
 def _steering(options: argparse.Namespace) -> tuple[Steering, ...]:
-    if options.approach is None:
-        _refuse_alone("approach-angle", options.approach_angle, "approach")
-    if options.roll is None:
-        _refuse_alone("roll-tolerance", options.roll_tolerance, "roll")
+    for name, other in (("approach_angle", "approach"), ("roll_tolerance", "roll")):
+        if getattr(options, name) is not None and getattr(options, other) is None:
+            raise ConfigError(f"--{name.replace('_', '-')} needs --{other}; give both or neither")
     given = (options.approach, options.roll, options.region)
     if all(value is None for value in given) and not options.avoid:
         return ()
@@ -394,11 +370,6 @@ def _steering(options: argparse.Namespace) -> tuple[Steering, ...]:
     region = None if options.region is None else _region(options.region)
     avoid = [Box(values[:3], values[3:]) for values in options.avoid]
     return (Steering(approach_direction=options.approach, region=region, avoid=avoid, **radians),)
-
-
-def _refuse_alone(name: str, value: float | None, other: str) -> None:
-    if value is not None:
-        raise ConfigError(f"--{name} needs --{other}; give both or neither")
 
 
 def _region(words: list[str]) -> Region:

@@ -65,7 +65,7 @@ def add_command(commands: Any) -> None:
     parser.add_argument("--fuse", action="store_true", help="use all clouds as views of one scene")
     add_object_options(parser, any_object=True)
     add_planning_options(parser)
-    parser.add_argument("--out", type=Path, default=None, metavar="DIR", help="folder, or .json file for one result")
+    parser.add_argument("--out", type=Path, metavar="DIR", help="folder, or .json file for one result")
 
 
 def run(options: argparse.Namespace) -> int:

@@ -134,20 +134,8 @@ class Watched:
     """Hooks that show a run in a browser, and `show`, which shows the result until Ctrl-C. Unset hooks do nothing."""
 
     watch: WatchHook | None = None
-    progress_hook: ProgressHook | None = None
+    progress: ProgressHook = lambda progress: None
     show: Callable[[GraspResult], None] = lambda result: None
-
-    def progress(self, reporter: ProgressHook) -> ProgressHook:
-        """Return a progress hook that calls both `reporter` and the browser's hook."""
-        hook = self.progress_hook
-        if hook is None:
-            return reporter
-        return lambda progress: (reporter(progress), hook(progress))[0]
-
-
-# Commands outside graspd_core, and the package that each command needs.
-SIBLINGS = {"view": "graspd_viewer", "bench": "graspd_bench", "dataset": "graspd_dataset", "import": "graspd_dataset"}
-SIBLINGS |= {"cell": "graspd_cell"}
 
 
 def sibling(module: str) -> Any:

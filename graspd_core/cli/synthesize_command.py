@@ -47,11 +47,11 @@ def add_command(commands: Any) -> None:
     add_object_options(parser, any_object=True)
     add_restriction_options(parser)
     sizes = parser.add_mutually_exclusive_group()
-    sizes.add_argument("--scale", type=float, default=None, metavar="S", help="metres per unit of file or depth")
-    sizes.add_argument("--units", choices=tuple(_UNITS), default=None, help="unit of the file's coordinates")
-    parser.add_argument("--out", type=Path, default=None, metavar="grasps.json", help="grasps file (docs/format.md)")
-    parser.add_argument("--html", type=Path, default=None, metavar="view.html", help="write a page with the grasps")
-    parser.add_argument("--picture", type=Path, default=None, metavar="grasp.png", help="draw the best grasp")
+    sizes.add_argument("--scale", type=float, metavar="S", help="metres per unit of file or depth")
+    sizes.add_argument("--units", choices=tuple(_UNITS), help="unit of the file's coordinates")
+    parser.add_argument("--out", type=Path, metavar="grasps.json", help="grasps file (docs/format.md)")
+    parser.add_argument("--html", type=Path, metavar="view.html", help="write a page with the grasps")
+    parser.add_argument("--picture", type=Path, metavar="grasp.png", help="draw the best grasp")
     parser.add_argument("--view", action="store_true", help="show the run in a browser (docs/viewer.md)")
     add_address(parser)
 
@@ -102,7 +102,8 @@ def run(options: argparse.Namespace) -> int:
         page_of_run = sibling("graspd_viewer.view_command").watched(options, scene, hand, config)
     with page_of_run as page:
         with Reporter() as reporter, Interrupt() as interrupt:
-            hooks = {"progress": page.progress(reporter), "watch": page.watch, "stop": interrupt.is_interrupted}
+            tell = lambda progress: (reporter(progress), page.progress(progress))[0]  # noqa: E731
+            hooks = {"progress": tell, "watch": page.watch, "stop": interrupt.is_interrupted}
             result = plan_grasps(scene, hand, preset=config, deadline=deadline.left(), **hooks, **request)
         for warning in result.warnings[len(known) :]:
             print_note(warning)

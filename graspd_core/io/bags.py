@@ -213,15 +213,10 @@ def _messages(path: str | Path, reader: Any, connections: list[Any]) -> Iterator
     """Yield messages by receive time. Messages with equal times keep the order of the file."""
     if not connections:
         return
-    messages = reader.messages(connections=connections)
-    while True:
-        try:
-            item = next(messages, None)
-        except Exception as error:
-            raise BagError(f"{path}: broken or cut short ({first_line(error)})") from error
-        if item is None:
-            return
-        yield item
+    try:
+        yield from reader.messages(connections=connections)
+    except Exception as error:
+        raise BagError(f"{path}: broken or cut short ({first_line(error)})") from error
 
 
 def _decode(path: str | Path, reader: Any, connection: Any, raw: Any) -> Any:

@@ -11,7 +11,7 @@ import os
 import sqlite3
 import zlib
 from collections.abc import Iterable, Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import closing, contextmanager
 from dataclasses import astuple, dataclass, fields, replace
 from functools import lru_cache
 from pathlib import Path
@@ -149,7 +149,7 @@ class GraspLibrary:
         if self.path.exists() and self.path.stat().st_size:
             return
         self.path.parent.mkdir(parents=True, exist_ok=True)
-        with self._own_errors(), _opened(self.path, "rwc") as base:
+        with self._opened("rwc") as base:
             base.execute("PRAGMA journal_mode = WAL")
             head = f"PRAGMA application_id = {_APPLICATION}; PRAGMA user_version = {VERSION};"
             base.executescript(f"BEGIN IMMEDIATE; {head} {_SCHEMA} COMMIT;")
@@ -190,8 +190,7 @@ class GraspLibrary:
         Raises FormatError: the library or the record is damaged.
         """
         with self._reading() as base:
-            row = base.execute("SELECT document FROM records WHERE key = ?", (entry.key,)).fetchone()
-        return self._read(row[0], entry, hand) if row else ()
+            return self._read(base, entry, hand)
 
     def add(
         self, entry: LibraryEntry, target: ObjectModel, hand: HandModel, config: PlanConfig, grasps: Sequence[Grasp]
@@ -203,8 +202,7 @@ class GraspLibrary:
         """
         new = [replace(grasp, arm=None) for grasp in grasps if grasp.verdict is Verdict.VERIFIED]
         with self._reading(write=True) as base:
-            row = base.execute("SELECT document FROM records WHERE key = ?", (entry.key,)).fetchone()
-            kept = (*(self._read(row[0], entry, hand) if row else ()), *new)[:MOST_GRASPS]
+            kept = (*self._read(base, entry, hand), *new)[:MOST_GRASPS]
             result = GraspResult(Outcome.SUCCEEDED, kept, Timing(), 0, config.method)
             document = result_document(result, target, hand, config) | {"link_names": hand.link_names}
             packed = zlib.compress(json.dumps(document, allow_nan=False).encode())
@@ -217,9 +215,12 @@ class GraspLibrary:
             )
         return len(kept)
 
-    def _read(self, packed: bytes, entry: LibraryEntry, hand: HandModel) -> tuple[Grasp, ...]:
+    def _read(self, base: sqlite3.Connection, entry: LibraryEntry, hand: HandModel) -> tuple[Grasp, ...]:
+        row = base.execute("SELECT document FROM records WHERE key = ?", (entry.key,)).fetchone()
+        if row is None:
+            return ()
         try:
-            document = json.loads(zlib.decompress(packed))
+            document = json.loads(zlib.decompress(row[0]))
             grasps = grasps_of(document)
             names = dict(zip(document["link_names"], hand.link_names, strict=True))
             # The hand's link names may have another prefix now than when the record was written.
@@ -233,7 +234,7 @@ class GraspLibrary:
         """Open the file, check its version, yield the connection. With `write`, the work inside is one transaction."""
         if not self.path.is_file():
             raise FormatError(f"{self.path}: no such file; `graspd library build --out {self.path}` creates a library")
-        with self._own_errors(), _opened(self.path, "rw" if os.access(self.path, os.W_OK) else "ro") as base:
+        with self._opened("rw" if os.access(self.path, os.W_OK) else "ro") as base:
             if write:
                 base.execute("BEGIN IMMEDIATE")
             (application,), (version,) = (
@@ -251,10 +252,15 @@ class GraspLibrary:
                 base.execute("COMMIT")
 
     @contextmanager
-    def _own_errors(self) -> Iterator[None]:
-        """Convert errors of SQLite and of the file system to FormatError."""
+    def _opened(self, mode: str) -> Iterator[sqlite3.Connection]:
+        """Open the file. Convert errors of SQLite and of the file system to FormatError."""
+        # In a read-only folder SQLite cannot keep its log beside the file. No other process writes, so none is needed.
+        still = "&immutable=1" if mode == "ro" and not os.access(self.path.parent, os.W_OK) else ""
+        file = f"file:{quote(str(self.path.absolute()))}?mode={mode}{still}"
         try:
-            yield
+            with closing(sqlite3.connect(file, uri=True, timeout=_PATIENCE, isolation_level=None)) as base:
+                base.execute("PRAGMA synchronous = FULL")
+                yield base
         # Causes: another process locks the file for long, the disk is full, or the file is read-only.
         except sqlite3.OperationalError as error:
             raise FormatError(f"{self.path}: the library cannot be used: {error}") from None
@@ -289,17 +295,3 @@ def strict_enough(entries: Sequence[LibraryEntry], verify: str) -> list[LibraryE
         raise ConfigError(f"verify: {verify!r}; valid: {', '.join(STRICTNESS)}")
     enough = [entry for entry in entries if STRICTNESS[entry.verify] >= STRICTNESS[verify]]
     return sorted(enough, key=lambda entry: -STRICTNESS[entry.verify])
-
-
-@contextmanager
-def _opened(path: Path, mode: str) -> Iterator[sqlite3.Connection]:
-    # In a read-only folder SQLite cannot keep its log beside the file. No other process writes, so none is needed.
-    still = "&immutable=1" if mode == "ro" and not os.access(path.parent, os.W_OK) else ""
-    base = sqlite3.connect(
-        f"file:{quote(str(path.absolute()))}?mode={mode}{still}", uri=True, timeout=_PATIENCE, isolation_level=None
-    )
-    try:
-        base.execute("PRAGMA synchronous = FULL")
-        yield base
-    finally:
-        base.close()

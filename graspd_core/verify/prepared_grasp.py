@@ -15,7 +15,7 @@ import numpy as np
 import torch
 from jaxtyping import Bool, Float, Int
 
-from graspd_core.hands.kinematics import Kinematics, forward, make_kinematics
+from graspd_core.hands.kinematics import in_base, link_poses
 from graspd_core.hands.link_distance import bounds, depth_inside, primitive_sdf
 from graspd_core.hands.model import HandModel, Primitive
 from graspd_core.hands.surface_points import samples_with_edges
@@ -53,14 +53,12 @@ class HandSurface:
         points: sample positions in the frame of their link [m].
         links: link index of each sample.
         areas: surface area that each sample represents [m²].
-        kinematics: the hand's kinematics in float64.
         order: int32 indices of the samples, sorted so that near samples follow each other.
     """
 
     points: Float[np.ndarray, "samples 3"]
     links: Int[np.ndarray, "samples"]
     areas: Float[np.ndarray, "samples"]
-    kinematics: Kinematics
     order: Int[np.ndarray, "samples"]
 
 
@@ -96,7 +94,7 @@ def hand_surface(hand: HandModel) -> HandSurface:
     points, links, areas = samples_with_edges(hand, count=_SAMPLES, seed=_SEED)
     of_link = [np.flatnonzero(links == link) for link in range(hand.num_links)]
     order = np.concatenate([rows[neighbours_together(points[rows])] for rows in of_link]).astype(np.int32)
-    return HandSurface(points, links, areas, make_kinematics(hand, "cpu", torch.float64), order)
+    return HandSurface(points, links, areas, order)
 
 
 # A hand sample is in contact if it is at most this far from the object's surface, or inside the object [m].
@@ -134,12 +132,10 @@ class PlacedHand:
 def placed_hand(context: MetricsContext, posture: Posture) -> PlacedHand:
     """Return the hand's samples at a posture, with each sample's distance to the object."""
     surface = context.surface
-    joints = torch.as_tensor(posture.joint_positions, dtype=torch.float64)[None]
-    links = forward(surface.kinematics, joints)[0]
+    rotations, translations = link_poses(context.hand, posture.joint_positions)
     base = rotation_from_quaternion(torch.as_tensor(posture.quaternion_wxyz, dtype=torch.float64)).numpy()
-    rotations = base @ links.rotation.numpy()
-    translations = links.translation.numpy() @ base.T + posture.position
-    placed = np.einsum("nij,nj->ni", rotations[surface.links], surface.points) + translations[surface.links]
+    rotations, translations = base @ rotations, translations @ base.T + posture.position
+    placed = in_base((rotations, translations), surface.points, surface.links)
     distance = signed_distance(context.query, placed, order=surface.order, reach=_REACH)
     return PlacedHand(placed, surface.links, surface.areas, distance, rotations, translations)
 
@@ -154,9 +150,9 @@ def contact_links(placed: PlacedHand) -> int:
     return len(np.unique(placed.links[touching(placed)]))
 
 
-def touching(placed: PlacedHand, within: float = CONTACT_DISTANCE) -> Bool[np.ndarray, "samples"]:
-    """Return for each sample whether it is at most `within` [m] from the object, or inside the object."""
-    return placed.distance <= within
+def touching(placed: PlacedHand) -> Bool[np.ndarray, "samples"]:
+    """Return for each sample whether it touches the object (`CONTACT_DISTANCE`) or is inside the object."""
+    return placed.distance <= CONTACT_DISTANCE
 
 
 # Width of the grid cells of the shared volume [m].
@@ -197,17 +193,18 @@ def arrival(
     # Verified postures may be a little deep in an obstacle, whose hull is padded.
     low = np.minimum(*(gaps(placed_hand(context, posture)) for posture in (grasp.pregrasp, grasp.grasp))).clip(max=0)
 
-    def clear(share: float, at: float) -> bool:
+    def moved(share: float, at: float) -> Posture:
         joints = open_joints + share * closing
-        posture = replace(grasp.grasp, position=grasp.grasp.position + at * back, joint_positions=joints)
+        return replace(grasp.grasp, position=grasp.grasp.position + at * back, joint_positions=joints)
+
+    def clear(posture: Posture) -> bool:
         placed = placed_hand(context, posture)
         return bool((gaps(placed) >= low - _SUNK).all()) and penetration(context, placed) <= _SUNK
 
     for drawn in (min(drawn / length, 1.0) if length else 0.0 for drawn in _DRAWN_BACK):
         for share in _CLOSED:
-            if clear(share, drawn) and all(clear(share, part) for part in _WAY_BACK):
-                joints = open_joints + share * closing
-                return replace(grasp.grasp, position=grasp.grasp.position + drawn * back, joint_positions=joints)
+            if all(clear(moved(share, at)) for at in (drawn, *_WAY_BACK)):
+                return moved(share, drawn)
     return None
 
 

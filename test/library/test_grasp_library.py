@@ -29,7 +29,6 @@ from graspd_core.config.planning_config import light_end
 from graspd_core.errors import ConfigError, FormatError, MeshError
 from graspd_core.hands.kinematics import hand_mesh
 from graspd_core.io.grasps_json import result_document
-from graspd_core.library import grasp_library
 from graspd_core.library import known_grasps as module
 from graspd_core.library.grasp_library import GraspLibrary, LibraryEntry, entry_of, hand_hash
 from graspd_core.library.known_grasps import (
@@ -118,14 +117,14 @@ def test_grasps_come_back_as_they_were_put_in(library: GraspLibrary, planned: Gr
 
 
 def test_another_process_may_create_the_library_at_the_same_time(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
-    library, opened = GraspLibrary(tmp_path / "known.grasps"), grasp_library._opened
+    library, opened = GraspLibrary(tmp_path / "known.grasps"), GraspLibrary._opened
 
-    def opened_second(path: Path, mode: str):
-        monkeypatch.setattr(grasp_library, "_opened", opened)
+    def opened_second(self: GraspLibrary, mode: str):
+        monkeypatch.setattr(GraspLibrary, "_opened", opened)
         library.create()
-        return opened(path, mode)
+        return opened(self, mode)
 
-    monkeypatch.setattr(grasp_library, "_opened", opened_second)
+    monkeypatch.setattr(GraspLibrary, "_opened", opened_second)
     library.create()
     assert library.checked().names() == []
 
