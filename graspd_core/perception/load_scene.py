@@ -72,7 +72,7 @@ def load_scene(
     if not isinstance(source, TriangleMesh) and (camera is not None or is_depth_image(source) or is_cloud_file(source)):
         views = scaled_views(source, camera, scale, view_point)
     else:
-        mesh, warnings = _read_mesh(source, scale)
+        mesh, warnings = _read_mesh(source, given, scale)
         view = view_in_mesh(mesh, given)
         if view_point is not None:
             raise _clouds_only("view_point", given)
@@ -110,13 +110,11 @@ def scaled_views(
     return list(load_views(source, None if view_point is None else np.asarray(view_point, dtype=float), scale))
 
 
-def _read_mesh(source: str | Path | TriangleMesh, scale: float) -> tuple[TriangleMesh, tuple[str, ...]]:
+def _read_mesh(source: str | Path | TriangleMesh, name: str, scale: float) -> tuple[TriangleMesh, tuple[str, ...]]:
+    if name.startswith(SHAPE_PREFIX):
+        source = make_shape(name.removeprefix(SHAPE_PREFIX))
     if isinstance(source, TriangleMesh):
         return TriangleMesh(source.vertices * scale, source.faces), ()
-    name = str(source)
-    if name.startswith(SHAPE_PREFIX):
-        shape = make_shape(name.removeprefix(SHAPE_PREFIX))
-        return TriangleMesh(shape.vertices * scale, shape.faces), ()
     endings = sorted({*MESH_ENDINGS, *CLOUD_ENDINGS})
     if Path(source).suffix.lower().lstrip(".") in RECORDINGS:
         raise MeshError(f"{name}: {recording_message(Path(source))}")

@@ -158,12 +158,12 @@ def with_neighbours(
             doubts.append(f"collision object {name!r} reaches {1e3 * deep:.0f} mm into the object to grasp")
         found += [p for p in points if len(p) and (support is None or (p @ support.normal).max() > level)]
     obstacles = make_obstacles(found, None, mesh, reach, settings.obstacles) if found else ()
-    warnings, evidence = (*scene.object.warnings, *same), scene.evidence
+    evidence = scene.evidence
     if doubts and evidence is None:
         raise ConfigError(f"{doubts[0]}; valid: at most {1e3 * DEEPEST:.0f} mm; correct its pose or the object's")
     evidence = evidence and replace(evidence, doubts=(*evidence.doubts, *doubts))
-    scene = replace(scene, object=replace(scene.object, warnings=warnings), evidence=evidence)
-    return replace(scene, obstacles=(*scene.obstacles, *obstacles))
+    warned = replace(scene.object, warnings=(*scene.object.warnings, *same))
+    return replace(scene, object=warned, evidence=evidence, obstacles=(*scene.obstacles, *obstacles))
 
 
 def _depths_in(shapes: Sequence[TriangleMesh], points: Points) -> Float[np.ndarray, "points"]:

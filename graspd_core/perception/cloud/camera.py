@@ -181,8 +181,7 @@ def reaches_image_border(
     ahead = local[:, 2] > 1e-3
     plane, mine = local[ahead, :2] / local[ahead, 2:], mine[ahead]
     own, others, some = plane[mine], plane[~mine], convex_hull(plane[:: 1 + len(plane) // HULL_POINTS])
-    sides = [] if some is None else some.equations
-    if some is not None and all((own @ side[:2] + side[2]).max(initial=-np.inf) < -width for side in sides):
+    if some is not None and all((own @ s[:2] + s[2]).max(initial=-np.inf) < -width for s in some.equations):
         return False
     hull = convex_hull(plane)
     if hull is None:
@@ -254,12 +253,11 @@ def cloud_from_depth(
 def _check_image(depth: Float[np.ndarray, "pixels"], camera: PinholeCamera) -> None:
     """Raise CloudError if depth was cut to 8 bits (255 mm), or if the camera matrix is for another image size."""
     known = depth[np.isfinite(depth) & (depth > 0)]
-    if known.size and abs(float(known.max()) - _MOST_OF_8_BITS) < 1e-6:
-        share = float((known > _MOST_OF_8_BITS - 1e-6).mean())
-        if share > _CUT_SHARE:
-            raise CloudError(
-                f"depth image: {100 * share:.0f} % of pixels are 255 mm: cut to 8 bits; send 16 bits (mm) or floats (m)"
-            )
+    share = float((known > _MOST_OF_8_BITS - 1e-6).mean()) if known.size else 0.0
+    if share > _CUT_SHARE and abs(float(known.max()) - _MOST_OF_8_BITS) < 1e-6:
+        raise CloudError(
+            f"depth image: {100 * share:.0f} % of pixels are 255 mm: cut to 8 bits; send 16 bits (mm) or floats (m)"
+        )
     across, down = (2 * camera.cx + 1) / camera.width, (2 * camera.cy + 1) / camera.height
     off = min(abs(across - 1), abs(down - 1))
     scaled = off > _OFF_MIDDLE and max(across, down) < _MOST_SCALED

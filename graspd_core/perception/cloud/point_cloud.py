@@ -74,8 +74,8 @@ def transform_cloud(cloud: PointCloud, T_a_b: Float[np.ndarray, "4 4"]) -> Point
     points = cloud.points @ rotation.T
     points += position
     forward = None if cloud.forward is None else rotation @ cloud.forward
-    moved = {"points": points, "viewpoint": rotation @ cloud.viewpoint + position, "forward": forward}
-    return replace(cloud, **moved, ends=cloud.ends @ rotation.T + position)
+    viewpoint, ends = rotation @ cloud.viewpoint + position, cloud.ends @ rotation.T + position
+    return replace(cloud, points=points, viewpoint=viewpoint, forward=forward, ends=ends)
 
 
 def crop(cloud: PointCloud, low: Sequence[float], high: Sequence[float]) -> tuple[PointCloud, Bool[np.ndarray, "n"]]:
@@ -103,9 +103,7 @@ def _continued(
         if len(front) == 0 or len(more) == 0:
             break
         across = [np.delete(points, axis, axis=1) for points in (front, more)]
-        apart, nearest = (
-            np.asarray(values) for values in KDTree(across[0]).query(across[1], distance_upper_bound=_ASIDE)
-        )
+        apart, nearest = map(np.asarray, KDTree(across[0]).query(across[1], distance_upper_bound=_ASIDE))
         origin, front = origin[nearest[apart < np.inf]], more[apart < np.inf]
         if begin >= _BEYOND[0]:
             found.append(np.stack([origin, front], 1))
@@ -159,6 +157,12 @@ def least_axes(spreads: Float[np.ndarray, "n 3 3"]) -> Points:
     unclear = longest <= 1e-9 * mean**2
     found[unclear] = np.linalg.eigh(spreads[unclear])[1][:, :, 0]
     return found
+
+
+def plane_normals(groups: Float[np.ndarray, "n k 3"]) -> Points:
+    """Return the unit normal of the plane through each group of points. The sign is arbitrary."""
+    spread = groups - groups.mean(1, keepdims=True)
+    return least_axes(np.swapaxes(spread, 1, 2) @ spread)
 
 
 def clean_cloud(points: Points) -> Float[np.ndarray, "kept 3"]:

@@ -328,8 +328,6 @@ def things_behind(points: Points, viewpoint: Vector) -> bool:
     Return True as well if the viewpoint lies in the table's plane, as the origin of a robot's base often does.
     """
     rng = np.random.default_rng(0)
-    if len(points) <= NEIGHBOURS:
-        return False
     corners = points[rng.integers(len(points), size=(PLANE_TRIALS, 3))]
     normals: np.ndarray = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     lengths = np.linalg.norm(normals, axis=1)

@@ -20,6 +20,13 @@ from graspd_core.perception.cloud.point_cloud import MIN_POINTS, PointCloud, Poi
 Mask = Bool[np.ndarray, "voxels"]
 Labels = Int[np.ndarray, "voxels"]
 
+
+def rows_of(label: Int[np.ndarray, "n"]) -> list[Int[np.ndarray, "_"]]:
+    """Return the rows of each object, in the order of the objects' numbers. The number -1 marks no object."""
+    order = np.argsort(label, kind="stable")
+    return np.split(order, np.searchsorted(label[order], np.arange(label.max(initial=-1) + 1)))[1:]
+
+
 # If there are more points than this, only every second (third, ...) point is used.
 MAX_SCENE_POINTS = 5_000_000
 # Units that clouds have by mistake, how many of them make a metre, and the least plausible camera distance [m].
@@ -74,8 +81,10 @@ def voxel_downsample(views: Sequence[PointCloud], settings: SegmentationConfig) 
     stride = -(-given // MAX_SCENE_POINTS)
     kept = [_inside(view, stride, settings) for view in views]
     finite = sum(number for *_, number in kept)
+    if finite == 0 and any(np.isfinite(view.points).all(1).any() for view in views):
+        raise CloudError(f"cloud: all {given} points are zero or at the camera, as a driver fills in for missing depth")
     if finite == 0:
-        raise CloudError(_unmeasured(views, given))
+        raise CloudError(f"cloud: all {given} points are NaN or infinite")
     rows = tuple(row for row, *_ in kept)
     _refuse_far_apart(views, rows, settings.max_range)
     points, distance, ends = (np.concatenate([part[k] for part in kept]) for k in (1, 2, 3))
@@ -123,12 +132,6 @@ def _refuse_far_apart(views: Sequence[PointCloud], rows: Sequence[Int[np.ndarray
                 f"cloud: the cameras of views {first + 1} and {k + 1} are {apart:.3g} m apart, but each sees at most "
                 f"max_range={farthest:g} m far: are all poses in metres, and in one frame?"
             )
-
-
-def _unmeasured(views: Sequence[PointCloud], given: int) -> str:
-    if any(np.isfinite(view.points).all(1).any() for view in views):
-        return f"cloud: all {given} points are zero or at the camera, as a driver fills in for missing depth"
-    return f"cloud: all {given} points are NaN or infinite"
 
 
 def unit_hint(views: Sequence[PointCloud], farthest: float) -> str:

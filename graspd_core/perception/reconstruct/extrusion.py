@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Bool, Float
 from scipy.ndimage import binary_closing, binary_erosion, distance_transform_edt, gaussian_filter, maximum_filter
 from scipy.spatial import KDTree
 
@@ -51,18 +51,19 @@ def extrude(seen: Surfels, free_space: FreeSpace, step: float) -> Surfels:
         facing(free_space, seen.points, seen.normals)[nearest] > MIN_FACING_COSINE
     )
     proven = (empty_depth(free_space, place + OUTLINE_STEP_M * outward) > free_space.slack) & level
-    levels = np.arange(0.5 * step, max(float(height.max()), step), step)
-    row, level = np.nonzero((levels[None] < height[:, None] - 0.5 * step) & proven[:, None])
-    points = np.column_stack([place[row, :2], levels[level]])
-    bad = _contradicted(points, row, len(place), free_space)
-    return take(Surfels(points, outward[row]), ~bad[row])
+    return _lowered(place[proven], outward[proven], 0.0, free_space, step)[0]
 
 
-def _contradicted(
-    points: Points, line: Int[np.ndarray, "n"], lines: int, free_space: FreeSpace
-) -> Bool[np.ndarray, "lines"]:
-    wrong = empty_depth(free_space, points) > free_space.slack
-    return np.bincount(line, wrong, lines) > MAX_CONTRADICTED_WALL * np.bincount(line, minlength=lines)
+def _lowered(
+    top: Points, outward: Points, bottom: float, free_space: FreeSpace, step: float
+) -> tuple[Surfels, Bool[np.ndarray, "n"]]:
+    """Return vertical walls from points down to the height `bottom` [m], and beneath which points cameras allow one."""
+    levels = np.arange(bottom + 0.5 * step, top[:, 2].max(initial=bottom + step), step)
+    row, level = np.nonzero(levels < top[:, 2:] - 0.5 * step)
+    points = np.column_stack([top[row, :2], levels[level]])
+    wrong = np.bincount(row, empty_depth(free_space, points) > free_space.slack, len(top))
+    good = wrong <= MAX_CONTRADICTED_WALL * np.bincount(row, minlength=len(top))
+    return take(Surfels(points, outward[row]), good[row]), good
 
 
 def with_foot(surfels: Surfels, free_space: FreeSpace, step: float) -> Surfels:
@@ -117,12 +118,9 @@ def _walls(
     rim = corners[edge] + along[:, None] * edges[edge]
     # The corners run counter-clockwise, so outwards is to the right of an edge.
     outward = np.column_stack([edges[:, 1], -edges[:, 0], np.zeros(len(edges))])[edge] / length[edge, None]
-    top = surfels.points[KDTree(surfels.points[:, :2]).query(rim)[1], 2]
-    levels = np.arange(bottom + 0.5 * step, max(float(top.max()), bottom + step), step)
-    row, level = np.nonzero(levels[None] < top[:, None] - 0.5 * step)
-    points = np.column_stack([rim[row], levels[level]])
-    bad = _contradicted(points, row, len(rim), free_space)
-    return take(Surfels(points, outward[row]), ~bad[row]), rim[~bad]
+    top = np.column_stack([rim, surfels.points[KDTree(surfels.points[:, :2]).query(rim)[1], 2]])
+    walls, good = _lowered(top, outward, bottom, free_space, step)
+    return walls, rim[good]
 
 
 def _base(feet: Float[np.ndarray, "n 2"], free_space: FreeSpace, step: float) -> Surfels:

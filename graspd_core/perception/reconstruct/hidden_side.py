@@ -20,7 +20,6 @@ from graspd_core.perception.reconstruct.merge_views import Evidence, thin
 from graspd_core.perception.reconstruct.poisson import grid_poisson_field
 from graspd_core.perception.reconstruct.reconstruct import closed_mesh
 from graspd_core.perception.reconstruct.shape_completion import RULES, guess_by
-from graspd_core.se3 import perpendicular
 from graspd_core.types import TriangleMesh
 
 # Elevations above the support [rad], and number of azimuths, of the candidate views.
@@ -80,8 +79,9 @@ def _visible(mesh: TriangleMesh, eye: Vector, points: Points, normals: Points) -
 
 
 def _looking(eye: Vector, forward: Vector, up: Vector) -> Float[np.ndarray, "4 4"]:
+    # No candidate looks straight down, so the two are never parallel.
     right = np.cross(forward, up)
-    right = right / np.linalg.norm(right) if np.linalg.norm(right) > 1e-9 else perpendicular(forward)
+    right /= np.linalg.norm(right)
     pose = np.eye(4)
     pose[:3] = np.column_stack([right, np.cross(forward, right), forward, eye])
     return pose
@@ -99,13 +99,13 @@ def other_shape(evidence: Evidence, rule: str, than: TriangleMesh) -> TriangleMe
     Return None if the rule makes no guess, if no closed surface fits, or if the shape is almost that of `than`.
     """
     step = max(evidence.step, _STEP_M)
-    seen = thin(evidence.seen, step)
-    guess = guess_by(rule, seen, evidence.free_space, step)
+    settings = replace(evidence.settings, max_faces=min(evidence.settings.max_faces, _FACES))
+    evidence = replace(evidence, seen=thin(evidence.seen, step), step=step, settings=settings)
+    guess = guess_by(rule, evidence.seen, evidence.free_space, step)
     if guess is None:
         return None
-    settings = replace(evidence.settings, max_faces=min(evidence.settings.max_faces, _FACES))
     try:
-        mesh = closed_mesh(seen, guess, evidence.free_space, step, settings, grid_poisson_field, _CELLS)
+        mesh = closed_mesh(evidence, guess, grid_poisson_field, _CELLS)
     except GraspdError:
         return None
     mesh = TriangleMesh(mesh.vertices @ evidence.rotation.T + evidence.origin, mesh.faces)

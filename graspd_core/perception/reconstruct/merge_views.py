@@ -30,6 +30,7 @@ from graspd_core.perception.cloud.point_cloud import (
     clean_cloud,
     least_axes,
     measured,
+    plane_normals,
 )
 from graspd_core.se3 import perpendicular
 
@@ -128,8 +129,6 @@ def orient_view(view: PointCloud, step: float, settings: ReconstructionConfig) -
 
 def thin(surfels: Surfels, step: float) -> Surfels:
     """Return the mean surfel of each group. A group shares a cube of side `step` [m] and one of six directions."""
-    if len(surfels.points) == 0:
-        return surfels
     facing = np.abs(surfels.normals).argmax(1)
     side = 2 * facing + (np.take_along_axis(surfels.normals, facing[:, None], 1)[:, 0] > 0)
     cells = np.column_stack([np.floor(surfels.points / step).astype(int), side])
@@ -211,21 +210,16 @@ def orient_unposed(view: PointCloud, step: float) -> Surfels:
     points = view.thinned(step * UNPOSED_THINNING).points
     seen_from, place, many = _seen_from(points), KDTree(points), min(NORMAL_NEIGHBOURS, len(points))
     near = np.asarray(place.query(points, k=many)[1])
-    normals = _least_axes_of(points[near])
+    normals = plane_normals(points[near])
     for _ in range(UNPOSED_PASSES):
         # A point faces the directions from which its neighbours on the same plane, to within noise, are seen.
         deep = np.einsum("nkd,nd->nk", points[near] - points[:, None], normals)
         ways = np.einsum("nk,nkd->nd", np.exp(-np.square(deep / (UNPOSED_DEPTH * step))), seen_from[near])
         normals *= np.where((normals * ways).sum(1) < 0, -1.0, 1.0)[:, None]
         tree = KDTree(np.hstack([points, UNPOSED_FACING * step * normals]))
-        alike = _least_axes_of(points[np.asarray(tree.query(tree.data, k=many)[1])])
+        alike = plane_normals(points[np.asarray(tree.query(tree.data, k=many)[1])])
         normals = alike * np.where((alike * normals).sum(1) < 0, -1.0, 1.0)[:, None]
     return thin(Surfels(points, normals), step)
-
-
-def _least_axes_of(groups: Float[np.ndarray, "n k 3"]) -> Points:
-    spread = groups - groups.mean(1, keepdims=True)
-    return least_axes(np.swapaxes(spread, 1, 2) @ spread)
 
 
 def _seen_from(points: Points) -> Points:

@@ -95,11 +95,13 @@ def reconstruct(
     by_eye = _by_eye(whole)
     around = [_in_frame(by_eye[tuple(view.viewpoint)], rotation, origin) for view in views] if whole else ()
     step = point_step(local)
-    standing = support is not None
+    standing, cells = support is not None, poisson.GRID_CELLS
     unposed = len(local) == 1 and is_unposed(local[0], axis_known)
     if unposed:
         seen, free_space = orient_unposed(local[0], step), FreeSpace((), standing, 0.0, settings.outline_slack)
         guess = Completion("", nothing(), 0.0)
+        if _has_thin_walls(seen, settings.min_cell):
+            settings, cells = replace(settings, min_cell=_WALL_CELL * settings.min_cell), _WALL_CELLS
     else:
         seen = merge_views(local, step, settings)
         lowest = float(np.clip(np.percentile(seen.points[:, 2], 0.5), 0.0, MAX_FOOT_HEIGHT_M)) if standing else 0.0
@@ -107,18 +109,15 @@ def reconstruct(
             make_view_depths(local, around), standing, lowest, settings.outline_slack, settings.surface_tolerance
         )
         guess = complete_shape(seen, free_space, step, settings)
-    cells = poisson.GRID_CELLS
-    if unposed and _has_thin_walls(seen, settings.min_cell):
-        settings, cells = replace(settings, min_cell=_WALL_CELL * settings.min_cell), _WALL_CELLS
-    mesh = _closed(seen, guess.surfels, free_space, step, settings, cells)
+    evidence = Evidence(seen, free_space, step, rotation, origin, guess.method, settings, hidden=False)
+    mesh = _closed(evidence, guess.surfels, cells)
     confidence = _confidence(mesh, np.concatenate([view.points for view in local]), settings)
-    hidden = not unposed and _is_guessed(mesh, seen, guess, confidence, len(local), standing, settings)
+    hidden = not unposed and _is_guessed(mesh, evidence, guess, confidence, len(local))
     by = guess.method or "closing the surface smoothly within the cameras' outlines"
     sides = "one side only" if len(views) == 1 else f"{len(views)} sides, not all round"
     warnings = (f"cloud: seen from {sides}; the rest is guessed by {by}",) if hidden else ()
-    evidence = Evidence(seen, free_space, step, rotation, origin, guess.method, settings, hidden)
     mesh = TriangleMesh(mesh.vertices @ rotation.T + origin, mesh.faces)
-    return Reconstruction(mesh, confidence, warnings, evidence)
+    return Reconstruction(mesh, confidence, warnings, replace(evidence, hidden=hidden))
 
 
 def _by_eye(whole: Sequence[PointCloud]) -> dict[tuple[float, ...], PointCloud]:
@@ -139,27 +138,17 @@ def _has_thin_walls(seen: Surfels, least: float) -> bool:
     return float(moved.any(1).mean()) > _THIN_SHARE
 
 
-def _closed(
-    seen: Surfels, guess: Surfels, free_space: FreeSpace, step: float, settings: ReconstructionConfig, cells: int
-) -> TriangleMesh:
-    """Close the surface by the grid solver. Use Open3D's solver if `settings` ask for it or no surface fits."""
-    adaptive = partial(poisson.poisson_field, finest=settings.poisson_cell)
-    small = float(np.ptp(seen.points, axis=0).max()) < _LEAST_CELLS * settings.min_cell
+def _closed(evidence: Evidence, guess: Surfels, cells: int) -> TriangleMesh:
+    """Close the surface by the grid solver. Use Open3D's solver if the settings ask for it or no surface fits."""
+    settings = evidence.settings
+    small = float(np.ptp(evidence.seen.points, axis=0).max()) < _LEAST_CELLS * settings.min_cell
     if settings.poisson == "grid" and not small:
         with suppress(CloudError):
-            return closed_mesh(seen, guess, free_space, step, settings, poisson.grid_poisson_field, cells)
-    return closed_mesh(seen, guess, free_space, step, settings, adaptive, cells)
+            return closed_mesh(evidence, guess, poisson.grid_poisson_field, cells)
+    return closed_mesh(evidence, guess, partial(poisson.poisson_field, finest=settings.poisson_cell), cells)
 
 
-def closed_mesh(
-    seen: Surfels,
-    guess: Surfels,
-    free_space: FreeSpace,
-    step: float,
-    settings: ReconstructionConfig,
-    field: poisson.Field,
-    cells: int,
-) -> TriangleMesh:
+def closed_mesh(evidence: Evidence, guess: Surfels, field: poisson.Field, cells: int) -> TriangleMesh:
     """Return a closed mesh through the seen and the guessed surfels, down to the support if there is one.
 
     Args:
@@ -169,10 +158,11 @@ def closed_mesh(
     Raises:
         CloudError: no closed surface fits the seen points.
     """
-    known = with_foot(join(seen, guess), free_space, step)
-    known = poisson.part_walls(known, poisson.grid_cell(known, settings.min_cell, cells))
-    cell = poisson.grid_cell(known, settings.min_cell, cells)
-    return _finished(poisson.close_surface(known, field, free_space, cell), seen, settings)
+    free_space, least = evidence.free_space, evidence.settings.min_cell
+    known = with_foot(join(evidence.seen, guess), free_space, evidence.step)
+    known = poisson.part_walls(known, poisson.grid_cell(known, least, cells))
+    cell = poisson.grid_cell(known, least, cells)
+    return _finished(poisson.close_surface(known, field, free_space, cell), evidence.seen, evidence.settings)
 
 
 def _clean(views: Sequence[PointCloud], settings: ReconstructionConfig) -> list[PointCloud]:
@@ -263,34 +253,21 @@ def _confidence(mesh: TriangleMesh, seen: Points, settings: ReconstructionConfig
 
 
 def _is_guessed(
-    mesh: TriangleMesh,
-    seen: Surfels,
-    guess: Completion,
-    confidence: Float[np.ndarray, "vertices"],
-    views: int,
-    standing: bool,
-    settings: ReconstructionConfig,
+    mesh: TriangleMesh, evidence: Evidence, guess: Completion, confidence: Float[np.ndarray, "vertices"], views: int
 ) -> bool:
     """Return True if much surface was unseen, or a rule completed a single view. Surface on the support is known."""
+    seen, settings = evidence.seen, evidence.settings
+    area, normals = _open_area(mesh, evidence.free_space.standing)
     if views > 1:
         # The rule does not matter here. Openness is no measure for several views: normals of opposite sides cancel.
-        return _unseen_share(mesh, seen, standing, settings.seen_distance) > settings.open_share
+        # Surface is seen if position and normal are near. Normals 60° apart count like a distance of `reach`.
+        reach = settings.seen_distance
+        place = np.hstack([mesh.vertices[mesh.faces].mean(1), reach * normals])
+        unseen = KDTree(np.hstack([seen.points, reach * seen.normals])).query(place)[0] > reach
+        return float((area * unseen).sum() / max(area.sum(), 1e-12)) > settings.open_share
     # In a view from above, the normals of top and foot cancel although no side was seen. So guessed area counts too.
-    area = _open_area(mesh, standing)[0]
     guessed = float((area * (1.0 - confidence[mesh.faces].mean(1))).sum() / max(area.sum(), 1e-12))
     return bool(guess.method) or max(guess.openness, guessed) > settings.open_share
-
-
-def _unseen_share(mesh: TriangleMesh, seen: Surfels, standing: bool, reach: float) -> float:
-    """Return the fraction of a surface that is not near to seen surface in position and normal.
-
-    Args:
-        reach: largest distance that counts as near [m]. Normals 60° apart count like a distance of `reach`.
-    """
-    area, normals = _open_area(mesh, standing)
-    place = np.hstack([mesh.vertices[mesh.faces].mean(1), reach * normals])
-    far = KDTree(np.hstack([seen.points, reach * seen.normals])).query(place)[0] > reach
-    return float((area * far).sum() / max(area.sum(), 1e-12))
 
 
 def _open_area(mesh: TriangleMesh, standing: bool) -> tuple[Float[np.ndarray, "faces"], Float[np.ndarray, "faces 3"]]:

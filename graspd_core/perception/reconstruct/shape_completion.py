@@ -92,16 +92,11 @@ def plausible(guess: Surfels, known: Surfels, free_space: FreeSpace, step: float
 
 def _symmetric(seen: Surfels, free_space: FreeSpace, least: float) -> tuple[str, Surfels]:
     mirrors, centre = find_mirrors(seen, free_space), find_centre(seen, free_space)
-    value = {MIRROR: 0.0, POINT_SYMMETRY: 0.0}
-    if mirrors and mirrors[0].wrong < MAX_SYMMETRY_FAULTS:
-        value[MIRROR] = mirrors[0].worth
-    if centre.wrong < MAX_SYMMETRY_FAULTS:
-        value[POINT_SYMMETRY] = centre.worth
+    mirror, point = (one.worth if one.wrong < MAX_SYMMETRY_FAULTS else 0.0 for one in (mirrors[0], centre))
     # Rounding must not decide a near tie. Grasps are also tried on the shape by the other rule.
-    best = POINT_SYMMETRY if value[POINT_SYMMETRY] > TIE * value[MIRROR] else MIRROR
-    if value[best] < least:
-        return "", nothing()
-    return best, image(centre, seen) if best == POINT_SYMMETRY else _mirrored(mirrors, seen)
+    if point > TIE * mirror:
+        return (POINT_SYMMETRY, image(centre, seen)) if point >= least else ("", nothing())
+    return (MIRROR, _mirrored(mirrors, seen)) if mirror >= least else ("", nothing())
 
 
 def _mirrored(mirrors: list[Symmetry], seen: Surfels) -> Surfels:

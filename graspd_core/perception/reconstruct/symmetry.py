@@ -8,7 +8,6 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 from jaxtyping import Float
@@ -165,8 +164,7 @@ def _closes(linear: Float[np.ndarray, "k 3 3"], side: Vector, standing: bool) ->
 
 def _sample(surfels: Surfels) -> _Sample:
     """Return random points and random rim points, by fixed seeds. A rim point has neighbours on one side only."""
-    answer: Any = KDTree(surfels.points).query(surfels.points, k=17)
-    distance, near = answer
+    distance, near = map(np.asarray, KDTree(surfels.points).query(surfels.points, k=17))
     aside = np.linalg.norm(surfels.points[near[:, 1:]].mean(1) - surfels.points, axis=1)
     rim = surfels.points[aside > 0.45 * distance[:, 1:].mean(1)]
     spread = np.random.default_rng(1).permutation(len(rim))[: FINE_SAMPLES // 3]

@@ -22,7 +22,8 @@ from scipy.spatial import KDTree
 from graspd_core.config import SegmentationConfig
 from graspd_core.mesh.components import connected_parts
 from graspd_core.mesh.convex_parts import convex_hull
-from graspd_core.perception.cloud.point_cloud import Eyes, Points, Vector, least_axes, longest_side
+from graspd_core.perception.cloud.point_cloud import Eyes, Points, Vector, longest_side, plane_normals
+from graspd_core.perception.cloud.voxel_downsample import rows_of
 from graspd_core.perception.segment.planes import FlatPart
 
 # Flying pixels lie along lines of sight between two surfaces. The weight around a flying pixel is below this fraction
@@ -122,12 +123,9 @@ def extent(points: Points) -> float:
 
 def renumber(label: Int[np.ndarray, "n"]) -> Int[np.ndarray, "n"]:
     """Renumber clusters by falling size, from 0 without gaps. Noise stays -1."""
-    answer = np.full(len(label), -1)
-    known = label >= 0
-    count = np.bincount(label[known])
-    rank = np.zeros(len(count), dtype=int)
-    rank[np.argsort(-count, kind="stable")] = np.arange(len(count))
-    answer[known] = np.take(rank, label[known])
+    answer, known = np.full(len(label), -1), label >= 0
+    rank = np.argsort(np.argsort(-np.bincount(label[known]), kind="stable"))
+    answer[known] = rank[label[known]]
     return answer
 
 
@@ -184,8 +182,7 @@ def heaped_things(points: Points, eyes: Eyes, spacing: float) -> Int[np.ndarray,
 
 def _normals(points: Points, near: Int[np.ndarray, "n near"], eyes: Eyes) -> Points:
     """Return unit normals of planes fitted to neighbours, oriented to the camera that sees the plane most frontally."""
-    spread = points[near] - points[near].mean(1, keepdims=True)
-    normals = least_axes(spread.transpose(0, 2, 1) @ spread)
+    normals = plane_normals(points[near])
     way = eyes[:, None] - points
     facing = (way * normals).sum(-1) / np.linalg.norm(way, axis=-1)
     best = np.take_along_axis(facing, np.abs(facing).argmax(0)[None], 0)[0]
@@ -248,12 +245,10 @@ def merge_occluded(
         settings: sizes and distances. Clusters are not joined if the result would exceed the largest object.
         support: support plane, or None if not seen. Clusters that end well above it are joined to other clusters.
     """
-    many = min(int(label.max(initial=-1)) + 1, MAX_PIECES)
-    pieces = [points[label == k] for k in range(many)]
+    members = rows_of(label)[:MAX_PIECES]
+    pieces, many = [points[rows] for rows in members], len(members)
     small = [k for k in range(many) if extent(pieces[k]) <= settings.largest_object]
-    hangs = [
-        support is not None and _hangs(pieces[k], distance[label == k], support, viewpoints, link) for k in range(many)
-    ]
+    hangs = [support is not None and _hangs(points[m], distance[m], support, viewpoints, link) for m in members]
     owner = list(range(many))
     for apart, a, b in sorted((_apart(pieces[a], pieces[b]), a, b) for a, b in combinations(small, 2)):
         group = [pieces[k] for k in small if owner[k] in (owner[a], owner[b])]
@@ -284,7 +279,7 @@ def _near(
     """Return True if clusters `apart` [m] are near enough for one object. A cluster that hangs may be farther away."""
     if support is None:  # One object behind another looks like a second side of the first object.
         return apart <= settings.unsupported_reach
-    if apart <= max(link, settings.gap) or _share_within(b, a, support) >= OUTLINE_SHARE:
+    if apart <= max(link, settings.gap) or share_within(b @ support.axes, a @ support.axes) >= OUTLINE_SHARE:
         return True
     reach = [
         NEAR_LINKS * link if _may_stand(piece, other, support) else settings.hanging_reach
@@ -296,10 +291,9 @@ def _near(
 
 def _hangs(piece: Points, distance: Float[np.ndarray, "n"], support: FlatPart, viewpoints: Eyes, link: float) -> bool:
     """Return True if a cluster floats above the support and does not hide the place below it from any camera."""
-    height = support.height(piece)
-    if (height - support.tolerance(distance)).min() <= FLOATING_LINKS * link:
+    if support.clearance(piece, distance).min() <= FLOATING_LINKS * link:
         return False
-    below = piece - height[:, None] * support.plane.normal
+    below = piece - support.height(piece)[:, None] * support.plane.normal
     for eye in viewpoints:
         (seen, near), (foot, far) = directions(piece, eye), directions(below, eye)
         apart, which = KDTree(seen).query(foot)
@@ -330,9 +324,8 @@ def _apart(a: Points, b: Float[np.ndarray, "m 3"]) -> float:
     return float(KDTree(a).query(b)[0].min())
 
 
-def _share_within(small: Points, large: Float[np.ndarray, "m 3"], support: FlatPart) -> float:
-    hull = convex_hull(large @ support.axes)
-    if hull is None:
+def share_within(points: Float[np.ndarray, "n k"], corners: Float[np.ndarray, "m k"]) -> float:
+    """Return the fraction of points in the convex hull of `corners`, 0 for a flat hull."""
+    if (hull := convex_hull(corners)) is None:
         return 0.0
-    edges = hull.equations
-    return float(((small @ support.axes) @ edges[:, :2].T + edges[:, 2] <= 0).all(1).mean())
+    return float((points @ hull.equations[:, :-1].T + hull.equations[:, -1] <= 0).all(1).mean())

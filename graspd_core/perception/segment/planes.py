@@ -72,6 +72,10 @@ class FlatPart:
         """Return the height up to which a point belongs to the plane [m], for its distance from the camera [m]."""
         return np.clip(INLIER_DEVIATIONS * self.noise * distance**2, self.least, self.most)
 
+    def clearance(self, points: Points, distance: Float[np.ndarray, "n"]) -> Float[np.ndarray, "n"]:
+        """Return the height of points above the tolerance [m], for their distances from the camera [m]."""
+        return self.height(points) - self.tolerance(distance)
+
     def as_support(self, distance: Float[np.ndarray, "n"]) -> Plane:
         """Return the plane as a support. Its `margin` is the noise [m] at an object's distances from the camera [m]."""
         return replace(self.plane, margin=float(np.median(self.tolerance(distance))) / INLIER_DEVIATIONS)
@@ -185,9 +189,8 @@ def _measure(
     kept = np.zeros(len(points), dtype=bool)
     kept[rows[largest]] = True
     _, turn = np.linalg.eigh(np.cov(flat.T))
-    sides = np.ptp(np.percentile(flat @ turn, [1, 99], axis=0), axis=0)
+    short, long = sorted(np.ptp(np.percentile(flat @ turn, [1, 99], axis=0), axis=0).tolist())
     area = float(hull.volume)
     seen = len(np.unique(packed_rows(cell[largest]))) * width**2
     least, most = settings.plane_tolerance, settings.max_plane_tolerance
-    length, width = float(sides.max()), float(sides.min())
-    return FlatPart(plane, axes, noise, least, most, kept, (length, width), hull.equations, area, seen / area)
+    return FlatPart(plane, axes, noise, least, most, kept, (long, short), hull.equations, area, seen / area)

@@ -15,10 +15,10 @@ from graspd_core.config import SegmentationConfig
 from graspd_core.errors import CloudError, NoObjectError
 from graspd_core.perception.cloud.camera import MIN_BORDER_POINTS, reaches_image_border
 from graspd_core.perception.cloud.point_cloud import MIN_POINTS, Eyes, PointCloud, Vector, measured
-from graspd_core.perception.cloud.voxel_downsample import Labels, Mask, VoxelScene, voxel_downsample
+from graspd_core.perception.cloud.voxel_downsample import Labels, Mask, VoxelScene, rows_of, voxel_downsample
 from graspd_core.perception.segment import clusters
-from graspd_core.perception.segment.planes import find_planes
-from graspd_core.perception.segment.support_plane import Ground, find_ground, stands_on
+from graspd_core.perception.segment.planes import FlatPart, find_planes
+from graspd_core.perception.segment.support_plane import find_ground, stands_on
 from graspd_core.perception.segment.target_selection import (
     SURFACE_VOXELS,
     Target,
@@ -80,7 +80,7 @@ def segment(
     """
     settings, target = settings or SegmentationConfig(), target or Target()
     parted = _parted(views, settings, target)
-    scene, ground, label = parted.scene, parted.ground, parted.label
+    scene, label = parted.scene, parted.label
     free = _candidates(parted)
     marked = target.box is not None or target.mask is not None
     named = marked or target.point is not None
@@ -92,13 +92,13 @@ def segment(
         chosen = select_part(scene, parts, target, views, settings)
     if not free and not marked and clusters.extent(scene.mean[chosen]) > settings.largest_object:
         raise NoObjectError(_nothing(parted))
-    found = _cut_out(views, scene, chosen, ground)
+    found = _cut_out(views, scene, chosen, parted.support)
     total = sum(len(view.points) for view in found.values())
     if total < MIN_POINTS:
         raise CloudError(f"cloud: only {total} points show the object; at least {MIN_POINTS} are needed")
     obstacles = _obstacles(parted, chosen, parts)
     warnings = _warnings(parted, bool(obstacles))
-    support = ground.support and ground.support.as_support(scene.mean_distance[chosen])
+    support = parted.support and parted.support.as_support(scene.mean_distance[chosen])
     touching = () if marked else _touching(scene, chosen, parts)
     beside = "" if target.point is None or len(views) > 1 else _beside(parted, chosen, target.point)
     if parted.settings.piled and target.point is not None and touching:
@@ -126,25 +126,25 @@ def find_things(
     scene, label, most = parted.scene, parted.label, parted.settings.largest_object
     known, found = _candidates(parted), []
     # If a cluster is too large for an object, its parts between seams may be objects.
-    large = [k for k in range(int(label.max(initial=-1)) + 1) if clusters.extent(scene.mean[label == k]) > most]
+    large = [k for k, rows in enumerate(rows_of(label)) if clusters.extent(scene.mean[rows]) > most]
     for k in [*known, *(k for k in large if k not in known)]:
         part = _parts(parted, label == k)
-        for mine in (part == number for number in range(int(part.max()) + 1)):
-            if clusters.extent(scene.mean[mine]) <= most:
-                found.append(scene.points[mine[scene.voxel]])
+        small = [n for n, rows in enumerate(rows_of(part)) if clusters.extent(scene.mean[rows]) <= most]
+        found += [scene.points[part[scene.voxel] == n] for n in small]
     return tuple(found)
 
 
 @dataclass(frozen=True)
 class _Parted:
-    """A scene with its camera positions `eyes` [m], its support and the object number of each voxel (`label`).
+    """A scene with its camera positions `eyes` [m], its flat parts and the object number of each voxel (`label`).
 
     Objects are numbered from the largest. Background and noise are -1. `parts` caches the results of `_parts`.
     """
 
     scene: VoxelScene
     eyes: Eyes
-    ground: Ground
+    support: FlatPart | None
+    background: tuple[FlatPart, ...]
     label: Labels
     settings: SegmentationConfig
     parts: dict[bytes, Labels] = field(default_factory=dict)
@@ -163,34 +163,36 @@ def _parted(views: Sequence[PointCloud], settings: SegmentationConfig, target: T
     if parted is None:
         eyes = np.array([view.viewpoint for view in views], dtype=float)
         parts = find_planes(scene.mean, scene.mean_distance, eyes, settings)
-        ground = find_ground(scene, parts, eyes, settings)
-        parted = _Parted(scene, eyes, ground, _things(scene, ground, eyes, settings), settings)
+        support, background, left = find_ground(scene, parts, eyes, settings)
+        label = _things(scene, left, support, eyes, settings)
+        parted = _Parted(scene, eyes, support, background, label, settings)
         _LAST.clear()
         _LAST[key] = parted
     return parted
 
 
-def _things(scene: VoxelScene, ground: Ground, eyes: Eyes, settings: SegmentationConfig) -> Labels:
-    points, distance = scene.mean[ground.left], scene.mean_distance[ground.left]
+def _things(
+    scene: VoxelScene, left: Mask, support: FlatPart | None, eyes: Eyes, settings: SegmentationConfig
+) -> Labels:
+    points, distance = scene.mean[left], scene.mean_distance[left]
     link = clusters.link_length(points, settings)
-    found = clusters.link_points(points, scene.weight[ground.left], link, settings.neighbour_share)
-    found = clusters.merge_occluded(points, distance, found, eyes, link=link, settings=settings, support=ground.support)
-    label = np.full(len(ground.left), -1)
-    label[ground.left] = found
-    for k in range(int(label.max(initial=-1)) + 1):
-        rows = np.flatnonzero(label == k)
-        own, part = scene.mean[rows], ground.support
+    found = clusters.link_points(points, scene.weight[left], link, settings.neighbour_share)
+    found = clusters.merge_occluded(points, distance, found, eyes, link=link, settings=settings, support=support)
+    label = np.full(len(left), -1)
+    label[left] = found
+    for rows in rows_of(label):
+        own = scene.mean[rows]
         small = scene.count[rows].sum() < settings.min_points or clusters.extent(own) < settings.smallest_object
-        if small or (part is not None and part.height(own).max() < settings.smallest_object):
+        if small or (support is not None and support.height(own).max() < settings.smallest_object):
             label[rows] = -1
     return clusters.renumber(label)
 
 
 def _candidates(parted: _Parted) -> list[int]:
     """Return indices of objects of graspable size that stand on the support. If none does, ignore the support."""
-    scene, label, settings, part = parted.scene, parted.label, parted.settings, parted.ground.support
-    things = {k: label == k for k in range(int(label.max(initial=-1)) + 1)}
-    fits = [k for k, mine in things.items() if clusters.extent(scene.mean[mine]) <= settings.largest_object]
+    scene, label, settings, part = parted.scene, parted.label, parted.settings, parted.support
+    things = rows_of(label)
+    fits = [k for k, rows in enumerate(things) if clusters.extent(scene.mean[rows]) <= settings.largest_object]
     if part is None:
         return fits
     distance = scene.mean_distance
@@ -198,13 +200,13 @@ def _candidates(parted: _Parted) -> list[int]:
     return standing or fits
 
 
-def _cut_out(views: Sequence[PointCloud], scene: VoxelScene, chosen: Mask, ground: Ground) -> dict[int, PointCloud]:
+def _cut_out(
+    views: Sequence[PointCloud], scene: VoxelScene, chosen: Mask, support: FlatPart | None
+) -> dict[int, PointCloud]:
     """Return the object's points in every view that shows the object, by the index of the view."""
     wanted = chosen[scene.voxel]
-    if ground.support is not None:
-        rows = np.flatnonzero(wanted)
-        height = ground.support.height(scene.points[rows])
-        wanted[rows] = height > ground.support.tolerance(scene.distance[rows])
+    if support is not None:
+        wanted[wanted] = support.clearance(scene.points[wanted], scene.distance[wanted]) > 0
     found = {}
     for k, view in enumerate(views):
         part = scene.of_view(k)
@@ -222,15 +224,14 @@ def _obstacles(parted: _Parted, chosen: Mask, part: Labels) -> tuple[Float[np.nd
     mine = mean[chosen]
     low, high = mine.min(0) - reach, mine.max(0) + reach
     near = ((mean >= low) & (mean <= high)).all(1) & ~chosen
-    masks = [near & (part == k) for k in range(int(part.max()) + 1)]
-    masks += [near & (label == k) & (part < 0) for k in range(int(label.max()) + 1)]
-    masks += [near & part.inliers & (label < 0) for part in parted.ground.background]
-    return tuple(mean[mask] for mask in masks if mask.any())
+    others = [*rows_of(part), *rows_of(np.where(part < 0, label, -1))]
+    others += [np.flatnonzero(flat.inliers & (label < 0)) for flat in parted.background]
+    return tuple(mean[rows[near[rows]]] for rows in others if near[rows].any())
 
 
 def _warnings(parted: _Parted, crowded: bool) -> tuple[str, ...]:
     """Return warnings about the segmentation. `crowded` is True if there are obstacles."""
-    scene, ground, settings = parted.scene, parted.ground, parted.settings
+    scene, settings = parted.scene, parted.settings
     warnings = []
     if scene.size > 0.5 * settings.gap:
         warnings.append(
@@ -239,24 +240,23 @@ def _warnings(parted: _Parted, crowded: bool) -> tuple[str, ...]:
     blind = [str(k) for k, rows in enumerate(scene.rows, 1) if len(rows) == 0]
     if blind:
         warnings.append(f"cloud: of {len(scene.rows)} views these show nothing within range: {', '.join(blind)}")
-    if ground.support is None and crowded:
+    if parted.support is None and crowded:
         warnings.append("cloud: no support is seen; the object may include what is behind it in the image")
     return tuple(warnings)
 
 
 def _cut(parted: _Parted, chosen: Mask, views: Sequence[PointCloud]) -> str:
     """Return why the object may extend beyond what the views show, or ""."""
-    scene, ground, settings = parted.scene, parted.ground, parted.settings
+    scene, width = parted.scene, parted.settings.border_width
     if _cut_off(parted, chosen):
         return "the object reaches the border of the workspace; the rest of it is not seen"
     # Without surroundings, the object's own outline is the outline of the view.
-    if ground.support is None and not ground.background:
+    if parted.support is None and not parted.background:
         return ""
     for k, view in enumerate(views):
         # The points outside the workspace count too, because its border is no border of the image.
         mine, seen = np.zeros(len(view.points), dtype=bool), measured(view.points, view.viewpoint)
         mine[scene.rows[k]] = chosen[scene.voxel[scene.of_view(k)]]
-        width = settings.border_width
         if mine.any() and not reaches_image_border(view.points[seen], parted.eyes[k], mine[seen], width):
             return ""
     return "the object reaches the border of the image, and may extend beyond it"
@@ -264,7 +264,7 @@ def _cut(parted: _Parted, chosen: Mask, views: Sequence[PointCloud]) -> str:
 
 def _parts(parted: _Parted, chosen: Mask) -> Labels:
     """Split the chosen object at seams if there is a support. Return each voxel's part number, -1 outside."""
-    scene, support, key = parted.scene, parted.ground.support, chosen.tobytes()
+    scene, support, key = parted.scene, parted.support, chosen.tobytes()
     if key in parted.parts:
         return parted.parts[key]
     part = parted.parts[key] = np.where(chosen, 0, -1)
@@ -279,11 +279,11 @@ def _parts(parted: _Parted, chosen: Mask) -> Labels:
 
 def _touching(scene: VoxelScene, chosen: Mask, part: Labels) -> tuple[str, ...]:
     """Return a warning that the object may be several objects, or that parts beyond a seam were left out."""
-    parts = [part == k for k in range(int(part.max(initial=-1)) + 1)]
-    apart = [mine for mine in parts if not (mine & chosen).any()]
+    parts = rows_of(part)
+    apart = [rows for rows in parts if not chosen[rows].any()]
     if len(parts) < 2:
         return ()
-    places = " and ".join("({:.3f}, {:.3f}, {:.3f})".format(*scene.mean[mine].mean(0)) for mine in apart or parts)
+    places = " and ".join("({:.3f}, {:.3f}, {:.3f})".format(*scene.mean[rows].mean(0)) for rows in apart or parts)
     if apart:
         return (f"cloud: the target touches another object, about {places} m; the target ends at the seam",)
     return (
@@ -316,7 +316,7 @@ def _beside(parted: _Parted, chosen: Mask, point: Vector) -> str:
     A target point on the surface may be anywhere on the object. A point inside should be the object's middle, because
     pose estimators give the middle.
     """
-    points, part = parted.scene.mean[chosen], parted.ground.support
+    points, part = parted.scene.mean[chosen], parted.support
     if part is None or np.linalg.norm(points - point, axis=1).min() <= SURFACE_VOXELS * parted.scene.size:
         return ""
     flat, middle = (one @ part.axes for one in (points, point))
@@ -337,7 +337,7 @@ def _beside(parted: _Parted, chosen: Mask, point: Vector) -> str:
 
 def _cut_off(parted: _Parted, chosen: Mask) -> bool:
     """Return True if the object reaches `max_range`, or is seen beyond the workspace too."""
-    scene, support, ends = parted.scene, parted.ground.support, parted.scene.ends
+    scene, support, ends = parted.scene, parted.support, parted.scene.ends
     if (scene.mean_distance[chosen] > parted.settings.max_range - 2 * scene.size).any():
         return True
     if support is not None:
@@ -348,18 +348,17 @@ def _cut_off(parted: _Parted, chosen: Mask) -> bool:
 
 def _nothing(parted: _Parted) -> str:
     """Return the error message for a scene without a graspable object. It describes what was seen instead."""
-    scene, label, ground, settings = parted.scene, parted.label, parted.ground, parted.settings
+    scene, label, settings = parted.scene, parted.label, parted.settings
     told = f"cloud: no graspable object among {len(scene.points)} points:"
     if label.max(initial=-1) >= 0:
-        sizes = [clusters.extent(scene.mean[label == k]) for k in range(int(label.max()) + 1)]
+        sizes = [clusters.extent(scene.mean[rows]) for rows in rows_of(label)]
         limit = f"longer than largest_object={settings.largest_object:g} m (the shortest {min(sizes):.2f} m)"
         return f"{told} {seen(scene, label)}, {limit}; give the wanted part as a box or a mask"
-    flat = ([] if ground.support is None else [ground.support]) + list(ground.background)
-    if not flat:
+    part = parted.support or next(iter(parted.background), None)
+    if part is None:
         near = float(np.median(scene.mean_distance))
         unit = f"; half of them are within {1e3 * near:.2g} mm of the camera: are they in metres?"
         return f"{told} {seen(scene, label)}{unit if near < MIN_SCENE_DISTANCE_M else ''}"
-    part = flat[0]
     away = float(np.median(scene.mean_distance[part.inliers]))
     return (
         f"{told} a plane of {part.sides[0]:.2f} by {part.sides[1]:.2f} m "

@@ -8,8 +8,7 @@ because the rim is not smaller than the floor.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass
+from functools import cache
 
 import numpy as np
 from jaxtyping import Float
@@ -18,7 +17,7 @@ from scipy.spatial import KDTree
 from graspd_core.config import SegmentationConfig
 from graspd_core.mesh.convex_parts import convex_hull
 from graspd_core.perception.cloud.point_cloud import Eyes, Points
-from graspd_core.perception.cloud.voxel_downsample import Mask, VoxelScene
+from graspd_core.perception.cloud.voxel_downsample import Mask, VoxelScene, rows_of
 from graspd_core.perception.segment.clusters import extent, link_length, link_points
 from graspd_core.perception.segment.planes import FlatPart
 
@@ -40,53 +39,40 @@ NEIGHBOUR_SAMPLES = 50
 MAX_CLUSTERS = 20
 
 
-@dataclass(frozen=True)
-class Ground:
-    """Support and background of a scene.
+def find_ground(
+    scene: VoxelScene, parts: list[FlatPart], viewpoints: Eyes, settings: SegmentationConfig
+) -> tuple[FlatPart | None, tuple[FlatPart, ...], Mask]:
+    """Find the support and the background among the flat parts of a scene. `viewpoints` are camera positions [m].
 
-    Attributes:
-        support: the support plane. None if no object stands on a visible plane.
-        background: large flat parts that are not the support, such as walls, floors and empty tables.
-        left: which of the scene's voxels may belong to objects.
+    Return the support, None if no object stands on a visible plane, and the large flat parts that are not the support,
+    such as walls, floors and empty tables. Return also which voxels may belong to objects.
     """
-
-    support: FlatPart | None
-    background: tuple[FlatPart, ...]
-    left: Mask
-
-
-def find_ground(scene: VoxelScene, parts: list[FlatPart], viewpoints: Eyes, settings: SegmentationConfig) -> Ground:
-    """Find the support and the background among the flat parts of a scene. `viewpoints` are camera positions [m]."""
     margin = settings.support_margin
     parts = [part for part in parts if part.filled > MIN_SEEN_SHARE and not _falls_off(scene, part, margin)]
     large = [part for part in parts if part.sides[0] > settings.largest_object]
-    # Covered voxels are computed only when needed. For a support that is the only large flat part, they are not needed.
-    known: dict[int, Mask] = {}
 
-    def covered(others: Sequence[FlatPart]) -> list[Mask]:
-        known.update({id(part): _covered(scene, part, margin) for part in others if id(part) not in known})
-        return [known[id(part)] for part in others]
+    # For a support that is the only large flat part, no covered voxels are needed.
+    @cache
+    def covered(k: int) -> Mask:
+        return _covered(scene, large[k], margin)
+
+    def left(support: FlatPart | None) -> Mask:
+        """Return which voxels are above the support and on no other large part."""
+        above = np.ones(len(scene.mean), dtype=bool)
+        if support is not None:
+            above = support.clearance(scene.mean, scene.mean_distance) > 0
+        for k, other in enumerate(large):
+            above &= other is support or ~covered(k)
+        return above
 
     best, most = None, (0, 0)
     for part in parts:
         if (viewpoints @ part.plane.normal <= part.plane.offset).any():
             continue
-        others = covered([x for x in large if x is not part])
-        standing = _standing(scene, part, _left(scene, part, others), viewpoints, settings)
+        standing = _standing(scene, part, left(part), viewpoints, settings)
         if standing > most:
             best, most = part, standing
-    background = tuple(part for part in large if part is not best)
-    return Ground(best, background, _left(scene, best, covered(background)))
-
-
-def _left(scene: VoxelScene, support: FlatPart | None, background: Sequence[Mask]) -> Mask:
-    """Return which voxels are above the support and not part of the background."""
-    left = np.ones(len(scene.mean), dtype=bool)
-    if support is not None:
-        left = support.height(scene.mean) > support.tolerance(scene.mean_distance)
-    for covered in background:
-        left &= ~covered
-    return left
+    return best, tuple(part for part in large if part is not best), left(best)
 
 
 def _covered(scene: VoxelScene, part: FlatPart, margin: float) -> Mask:
@@ -124,11 +110,10 @@ def _standing(
     points, distance = scene.mean[left], scene.mean_distance[left]
     label = link_points(points, scene.weight[left], link_length(points, settings), settings.neighbour_share)
     touching, standing = 0, 0
-    for k in range(min(int(label.max(initial=-1)) + 1, MAX_CLUSTERS)):
-        rows = np.flatnonzero(label == k)
+    for rows in rows_of(label)[:MAX_CLUSTERS]:
         if stands_on(part, points[rows], distance[rows], viewpoints, settings):
             standing += len(rows)
-            touching += len(rows) if _clearance(part, points[rows], distance[rows]) <= settings.contact else 0
+            touching += len(rows) if part.clearance(points[rows], distance[rows]).min() <= settings.contact else 0
     return touching, standing
 
 
@@ -145,13 +130,7 @@ def stands_on(
     sight = viewpoints - thing.mean(0)
     upright = (sight @ part.plane.normal > MIN_UPRIGHT_COSINE * np.linalg.norm(sight, axis=1)).all()
     hidden = settings.largest_object if upright else max(settings.contact, hidden)
-    if _clearance(part, thing, distance) > hidden:
-        return False
-    if part.beneath(thing, settings.gap).mean() < 0.5:
+    if part.clearance(thing, distance).min() > hidden or part.beneath(thing, settings.gap).mean() < 0.5:
         return False
     hull = None if settings.piled else convex_hull(flat)
     return hull is None or part.area >= settings.support_area_ratio * float(hull.volume)
-
-
-def _clearance(part: FlatPart, thing: Points, distance: Float[np.ndarray, "n"]) -> float:
-    return float((part.height(thing) - part.tolerance(distance)).min())

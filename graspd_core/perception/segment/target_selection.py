@@ -10,10 +10,9 @@ from jaxtyping import Bool, Float
 
 from graspd_core.config import SegmentationConfig
 from graspd_core.errors import CloudError, NoObjectError
-from graspd_core.mesh.convex_parts import convex_hull
 from graspd_core.perception.cloud.point_cloud import PointCloud, Points, Vector
-from graspd_core.perception.cloud.voxel_downsample import Labels, Mask, VoxelScene
-from graspd_core.perception.segment.clusters import extent
+from graspd_core.perception.cloud.voxel_downsample import Labels, Mask, VoxelScene, rows_of
+from graspd_core.perception.segment.clusters import extent, share_within
 
 # Greatest number of objects in an error message.
 MAX_LISTED_THINGS = 4
@@ -76,7 +75,7 @@ def select_target(
     views: Sequence[PointCloud],
     settings: SegmentationConfig,
 ) -> Mask:
-    """Return the voxels of the selected object.
+    """Return the voxels of the selected object: the one most covered by a box or mask, and others half masked.
 
     Args:
         label: object number of each voxel, -1 for none.
@@ -87,20 +86,24 @@ def select_target(
     Raises:
         NoObjectError: no object is at the target. The message lists the objects.
     """
-    many = int(label.max(initial=-1)) + 1
     if target.point is not None:
         return label == _thing_of(target.point, scene, label, views, settings)
-    if target.box is not None:
-        meant = _meant(scene, target)
-        inside = np.bincount(label[(label >= 0) & meant], minlength=many)
-        if not inside.any():
-            low, high = (_place(corner) for corner in target.box)
-            raise NoObjectError(f"target: nothing in the box from {low} to {high}; {seen(scene, label)}")
-        share = inside / np.bincount(label[label >= 0], minlength=many)
-        return _covered(label, meant, [int(inside.argmax())], share, settings.target_share)
+    if target.box is None and target.mask is None:
+        return label == min(free, key=lambda k: _off_axis(scene.mean[label == k], scene, views))
+    meant, many = _meant(scene, target), int(label.max(initial=-1)) + 1
+    # A box covers voxels of all views, a mask points of the first view.
+    rows = np.arange(len(label)) if target.mask is None else scene.voxel[scene.of_view(0)]
+    rows = rows[label[rows] >= 0]
+    shown, covered = (np.bincount(label[part], minlength=many) for part in (rows, rows[meant[rows]]))
+    if not covered.any() and target.box is not None:
+        low, high = (_place(corner) for corner in target.box)
+        raise NoObjectError(f"target: nothing in the box from {low} to {high}; {seen(scene, label)}")
+    if not covered.any():
+        raise NoObjectError(f"target: nothing but background under the mask; {seen(scene, label)}")
+    share, things = covered / np.maximum(shown, 1), [int(covered.argmax())]
     if target.mask is not None:
-        return _masked(scene, label, many, _meant(scene, target), settings.target_share)
-    return label == min(free, key=lambda k: _off_axis(scene.mean[label == k], scene, views))
+        things += np.flatnonzero(share >= 0.5).tolist()
+    return _covered(label, meant, things, share, settings.target_share)
 
 
 def select_part(
@@ -140,7 +143,7 @@ def seen(scene: VoxelScene, label: Labels) -> str:
     many = int(label.max(initial=-1)) + 1
     if many == 0:
         return "no object is seen"
-    places = [_place(scene.mean[label == k].mean(0)) for k in range(min(many, MAX_LISTED_THINGS))]
+    places = [_place(scene.mean[rows].mean(0)) for rows in rows_of(label)[:MAX_LISTED_THINGS]]
     told = f"{many} objects are seen, the largest" if many > 1 else "one object is seen,"
     return f"{told} at {', '.join(places)} m"
 
@@ -154,7 +157,7 @@ def _thing_of(
     point deeper than `MIDDLE_SHARE` of the length, the nearest object within `target_reach` is preferred.
     """
     away = np.linalg.norm(scene.mean - point, axis=1)
-    things = [np.flatnonzero(label == k) for k in range(int(label.max(initial=-1)) + 1)]
+    things = rows_of(label)
     depth = [float(away[rows].min()) for rows in things]
     order = sorted(range(len(things)), key=depth.__getitem__)
     if order and depth[order[0]] <= SURFACE_VOXELS * scene.size:
@@ -164,7 +167,7 @@ def _thing_of(
     inside = [
         k
         for k, rows in enumerate(things)
-        if depth[k] <= 0.5 * length[k] and (hiding[rows].any() or _holds(scene.mean[rows], point))
+        if depth[k] <= 0.5 * length[k] and (hiding[rows].any() or share_within(point[None], scene.mean[rows]))
     ]
     near = [k for k in order[:1] if depth[k] <= settings.target_reach]
     if not inside + near:
@@ -190,25 +193,8 @@ def _hiding(point: Vector, scene: VoxelScene, views: Sequence[PointCloud]) -> Ma
     return hiding
 
 
-def _holds(points: Points, point: Vector) -> bool:
-    hull = convex_hull(points)
-    return hull is not None and bool((hull.equations[:, :3] @ point + hull.equations[:, 3] <= 0).all())
-
-
-def _masked(scene: VoxelScene, label: Labels, many: int, meant: Mask, least: float) -> Mask:
-    """Take objects at least half masked or with most masked points. Below `least`, take only the masked voxels."""
-    of_first = scene.voxel[scene.of_view(0)]
-    shown, covered = (
-        np.bincount(label[rows][label[rows] >= 0], minlength=many) for rows in (of_first, of_first[meant[of_first]])
-    )
-    if not covered.any():
-        raise NoObjectError(f"target: nothing but background under the mask; {seen(scene, label)}")
-    share = covered / np.maximum(shown, 1)
-    main = int(covered.argmax())
-    return _covered(label, meant, [main, *(k for k in range(many) if k != main and share[k] >= 0.5)], share, least)
-
-
 def _covered(label: Labels, meant: Mask, things: list[int], share: Float[np.ndarray, "things"], least: float) -> Mask:
+    """Take objects whole if the target covers at least the fraction `least` of them, else only their voxels in it."""
     whole = [k for k in things if share[k] >= least]
     return np.isin(label, whole) | (np.isin(label, things) & meant)
 
