@@ -125,10 +125,7 @@ class GraspNode(Node):
         self.create_service(Trigger, "~/reset_views", self._on_reset_views)
 
     def _create_actions(self) -> list[GoalServer]:
-        def cancel(request_id: str) -> bool:
-            return self._worker.cancel(request_id) > 0
-
-        take = lambda goal, listener: self._take_request(goal.request, "goal", listener)  # noqa: E731
+        take, cancel = self._on_goal, self._worker.cancel
         servers = [GoalServer(self, SynthesizeGrasps, "~/synthesize", SynthesizeMessages, take, cancel)]
         try:
             from grasping_msgs.action import GraspPlanning
@@ -158,6 +155,9 @@ class GraspNode(Node):
     def _on_mesh(self, message: String) -> None:
         name, builder = self._request_builder.new_id("mesh"), self._request_builder
         self._take("mesh", name, lambda settings: builder.from_mesh(name, settings, message.data))
+
+    def _on_goal(self, goal: SynthesizeGrasps.Goal, listener: Goal) -> str:
+        return self._take_request(goal.request, "goal", listener)
 
     def _on_planning_goal(self, goal: Any, listener: Goal) -> str:
         from graspd_ros.grasp_planning import request_from_goal
@@ -261,19 +261,17 @@ class GraspNode(Node):
             self._submit(request)
 
     def _on_sensor(self, read: Callable[[int], SensorFrame | None]) -> None:
+        builder, settings = self._request_builder, self._settings.now
         try:
             sensor_frame = read(nanoseconds(self._now()))
-            if sensor_frame is not None:
-                self._see(sensor_frame)
+            if sensor_frame is None:
+                return
+            self._responses.counters.count(RECEIVED)
+            builder.newest = sensor_frame
+            if settings.cloud_policy != "off":
+                self._submit(builder.from_sensor_frame(builder.new_id("cloud"), settings, sensor_frame))
         except GraspdError as error:
-            self._responses.cloud_not_taken(self._request_builder.new_id("cloud"), error)
-
-    def _see(self, sensor_frame: SensorFrame) -> None:
-        self._responses.counters.count(RECEIVED)
-        builder, settings = self._request_builder, self._settings.now
-        builder.newest = sensor_frame
-        if settings.cloud_policy != "off":
-            self._submit(builder.from_sensor_frame(builder.new_id("cloud"), settings, sensor_frame))
+            self._responses.cloud_not_taken(builder.new_id("cloud"), error)
 
     def _submit(self, request: Request) -> None:
         if self._collision_objects:
@@ -356,7 +354,7 @@ class GoalServer:
     Args:
         make_messages: makes the message converter of a new goal, for example `SynthesizeMessages`.
         submit: submits a goal's request with its listener and returns the request's id.
-        cancel: cancels the request with a given id. Returns True if the request existed.
+        cancel: cancels the request with a given id. Returns the number of cancelled requests.
     """
 
     def __init__(
@@ -366,7 +364,7 @@ class GoalServer:
         name: str,
         make_messages: Callable[[], Any],
         submit: Callable[[Any, Goal], str],
-        cancel: Callable[[str], bool],
+        cancel: Callable[[str], int],
     ) -> None:
         self._node = node
         self._make_messages = make_messages

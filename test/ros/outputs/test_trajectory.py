@@ -170,7 +170,9 @@ def test_all_movable_joints_are_in_every_message(mounted: HandModel, carried: Gr
     message = grasp_message(carried, 0, "r", Header(frame_id="camera", stamp=Time()), mounted, Pace())
     names = [f"f{finger}_{joint}" for finger in (1, 2, 3) for joint in ("spread", "proximal", "distal")]
     names.remove("f3_spread")
-    assert list(message.grasp_joints.name) == names
+    for joints in (message.pregrasp_joints, message.grasp_joints, message.squeeze_joints):
+        assert (list(joints.name), joints.header.frame_id) == (names, mounted.base_link)
+        assert (len(joints.position), list(joints.velocity), list(joints.effort)) == (len(names), [], [])
     # Controllers refuse joints that have no command of their own.
     assert list(message.trajectory.joint_names) == list(mounted.joint_names)
     assert set(mounted.joint_names) < set(names)
