@@ -228,9 +228,6 @@ def test_solids_have_the_sizes_of_the_message_and_stand_about_their_middle(kind,
 
 BAD = {
     "primitives: dimensions [0.1], valid: 3": box(0.1),
-    "primitives: dimensions [-1.0, 1.0, 1.0]": box(-1.0, 1.0, 1.0),
-    "primitives: type 9": Object(primitives=[SolidPrimitive(type=9)]),
-    "primitive_poses: 2 poses for 1 shapes": Object(primitives=[SolidPrimitive()], primitive_poses=[Pose(), Pose()]),
     "meshes: 0 vertices and 0 triangles": Object(meshes=[Mesh()]),
     "surface: [0.0, 0.0, 0.0, 1.0] is no plane": box(0.1, 0.1, 0.1, surface=Plane(coef=[0.0, 0.0, 0.0, 1.0])),
 }

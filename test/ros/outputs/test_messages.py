@@ -27,8 +27,9 @@ from graspd_core.hands.model import Primitive
 from graspd_core.paths import config_dir
 from graspd_core.types import ROBUSTNESS, Contact, GraspMetrics, Timing
 from graspd_ros.convert import array_of, matrix_of_pose, moved_result
-from graspd_ros.outputs.messages import COLOURS, IDS_OF_A_GRASP, PARTS, Pace, array_message, ending_of, result_markers
+from graspd_ros.outputs.messages import COLOURS, IDS_OF_A_GRASP, PARTS, array_message, ending_of, result_markers
 from graspd_ros.outputs.responses import presentable
+from graspd_ros.parameters import Settings
 from graspd_ros.request_planner import Planned
 
 FEW = {"num_grasps": 2, "preset": "fast", "time_budget": 100.0}
@@ -218,7 +219,7 @@ def test_a_grasp_that_is_less_sure_is_told_with_the_next_view_and_not_presented(
     result = GraspResult(Outcome.TOO_FEW, (grasp,), Timing(), 0, "closed_form", next_view=view)
     assert presentable(result) is None
     ending = ending_of(Planned(moved_result(result, T_table_camera)))
-    message = array_message(ending, "mine", Header(frame_id="table"), 1.0, hand, Pace())
+    message = array_message(ending, "mine", Header(frame_id="table"), 1.0, hand, Settings())
     assert message.status == GraspArray.PARTIAL
     (told,) = message.grasps
     assert (told.verdict, told.probability, told.reason) == (GraspMessage.UNVERIFIED, 0.51, "fails with 3")

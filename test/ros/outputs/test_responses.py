@@ -221,7 +221,7 @@ def test_figures_are_readable_and_absent_where_unknown():
     assert values(GOOD, memory=0)["memory [MB]"] == ""
 
 
-WORDS = st.text(st.characters(codec="utf-8", exclude_characters="\0"))  # DDS strings end at a zero
+WORDS = st.text(st.characters(codec="utf-8", exclude_characters="\0"), max_size=20)  # DDS strings end at a zero
 
 
 @given(st.builds(Health, name=WORDS, hand=WORDS, running=WORDS, last_error=WORDS))
