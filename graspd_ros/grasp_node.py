@@ -162,10 +162,10 @@ class GraspNode(Node):
     def _on_planning_goal(self, goal: Any, listener: Goal) -> str:
         from graspd_ros.grasp_planning import request_from_goal
 
-        name, builder, hand = self._request_builder.new_id("planning"), self._request_builder, self._hand.name
+        name, builder = self._request_builder.new_id("planning"), self._request_builder
 
         def make(settings: Settings) -> Request:
-            return listener.messages.watching(request_from_goal(builder, hand, name, settings, goal, listener), goal)
+            return listener.messages.watching(request_from_goal(builder, name, settings, goal), goal)
 
         self._take("grasp_planning", name, make, listener)
         return name
@@ -247,7 +247,7 @@ class GraspNode(Node):
     def _take_request(self, message: GraspRequest, kind: str, listener: Listener | None = None) -> str:
         name, builder = message.id or self._request_builder.new_id(kind), self._request_builder
         source = SOURCES[message.source].name if message.source in SOURCES else "request"
-        self._take(source, name, lambda settings: builder.from_message(name, settings, message, listener), listener)
+        self._take(source, name, lambda settings: builder.from_message(name, settings, message), listener)
         return name
 
     def _take(
@@ -258,7 +258,7 @@ class GraspNode(Node):
         except Exception as error:  # no request may stop the executor
             self._responses.not_made(request_id, source, error, listener)
         else:
-            self._submit(request)
+            self._submit(replace(request, listener=listener))
 
     def _on_sensor(self, read: Callable[[int], SensorFrame | None]) -> None:
         builder, settings = self._request_builder, self._settings.now
