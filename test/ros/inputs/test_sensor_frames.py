@@ -275,7 +275,7 @@ def builder(T_base_camera: np.ndarray) -> RequestBuilder:
     return RequestBuilder("allegro_right", lambda: NOW, lookup)
 
 
-def asked(T_base_camera: np.ndarray, settings: Settings = ANY_AGE, **fields: Any) -> Request:
+def asked(T_base_camera: np.ndarray, settings: Settings = ANY_AGE, /, **fields: Any) -> Request:
     return builder(T_base_camera).from_message("r", settings, GraspRequest(**fields))
 
 
