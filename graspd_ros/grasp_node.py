@@ -261,17 +261,19 @@ class GraspNode(Node):
             self._submit(replace(request, listener=listener))
 
     def _on_sensor(self, read: Callable[[int], SensorFrame | None]) -> None:
-        builder, settings = self._request_builder, self._settings.now
         try:
             sensor_frame = read(nanoseconds(self._now()))
-            if sensor_frame is None:
-                return
-            self._responses.counters.count(RECEIVED)
-            builder.newest = sensor_frame
-            if settings.cloud_policy != "off":
-                self._submit(builder.from_sensor_frame(builder.new_id("cloud"), settings, sensor_frame))
+            if sensor_frame is not None:
+                self._see(sensor_frame)
         except GraspdError as error:
-            self._responses.cloud_not_taken(builder.new_id("cloud"), error)
+            self._responses.cloud_not_taken(self._request_builder.new_id("cloud"), error)
+
+    def _see(self, sensor_frame: SensorFrame) -> None:
+        self._responses.counters.count(RECEIVED)
+        builder, settings = self._request_builder, self._settings.now
+        builder.newest = sensor_frame
+        if settings.cloud_policy != "off":
+            self._submit(builder.from_sensor_frame(builder.new_id("cloud"), settings, sensor_frame))
 
     def _submit(self, request: Request) -> None:
         if self._collision_objects:
