@@ -34,7 +34,7 @@ from visualization_msgs.msg import Marker, MarkerArray
 from graspd_core import ArmPath, Grasp, HandModel, Outcome, Posture, Progress, Verdict
 from graspd_core.hands.kinematics import RETREAT, link_poses
 from graspd_core.hands.model import Mount, Primitive, all_joint_names, all_joint_positions
-from graspd_core.types import Contact, Stage
+from graspd_core.types import Contact, Stage, TrialResult
 from graspd_ros.convert import (
     Matrix,
     duration_of,
@@ -162,16 +162,7 @@ def grasp_message(
             for name, value in (grasp.metrics or {}).items()
             if value is not None and math.isfinite(value)
         ],
-        trials=[
-            TrialMessage(
-                name=trial.name,
-                passed=trial.passed,
-                displacement=_number(trial.displacement),
-                rotation=_number(trial.rotation),
-                reason=trial.reason,
-            )
-            for trial in grasp.trials
-        ],
+        trials=[_trial_message(trial) for trial in grasp.trials],
         contacts=[_contact_message(contact) for contact in grasp.contacts],
         trajectory=trajectory_of(grasp, hand, settings),
         trajectory_base_poses=base_poses(grasp, header.frame_id, header.stamp),
@@ -188,6 +179,11 @@ def grasp_message(
         message.mount_pregrasp_pose = mount_pose(grasp.pregrasp, hand.mount)
         message.mount_grasp_pose = mount_pose(grasp.grasp, hand.mount)
     return message
+
+
+def _trial_message(trial: TrialResult) -> TrialMessage:
+    moved, turned = _number(trial.displacement), _number(trial.rotation)
+    return TrialMessage(name=trial.name, passed=trial.passed, displacement=moved, rotation=turned, reason=trial.reason)
 
 
 def _contact_message(contact: Contact) -> ContactMessage:
