@@ -125,10 +125,7 @@ class GraspNode(Node):
         self.create_service(Trigger, "~/reset_views", self._on_reset_views)
 
     def _create_actions(self) -> list[GoalServer]:
-        def cancel(request_id: str) -> bool:
-            return self._worker.cancel(request_id) > 0
-
-        take = lambda goal, listener: self._take_request(goal.request, "goal", listener)  # noqa: E731
+        take, cancel = self._on_goal, self._worker.cancel
         servers = [GoalServer(self, SynthesizeGrasps, "~/synthesize", SynthesizeMessages, take, cancel)]
         try:
             from grasping_msgs.action import GraspPlanning
@@ -159,13 +156,16 @@ class GraspNode(Node):
         name, builder = self._request_builder.new_id("mesh"), self._request_builder
         self._take("mesh", name, lambda settings: builder.from_mesh(name, settings, message.data))
 
+    def _on_goal(self, goal: SynthesizeGrasps.Goal, listener: Goal) -> str:
+        return self._take_request(goal.request, "goal", listener)
+
     def _on_planning_goal(self, goal: Any, listener: Goal) -> str:
         from graspd_ros.grasp_planning import request_from_goal
 
-        name, builder, hand = self._request_builder.new_id("planning"), self._request_builder, self._hand.name
+        name, builder = self._request_builder.new_id("planning"), self._request_builder
 
         def make(settings: Settings) -> Request:
-            return listener.messages.watching(request_from_goal(builder, hand, name, settings, goal, listener), goal)
+            return listener.messages.watching(request_from_goal(builder, name, settings, goal), goal)
 
         self._take("grasp_planning", name, make, listener)
         return name
@@ -247,7 +247,7 @@ class GraspNode(Node):
     def _take_request(self, message: GraspRequest, kind: str, listener: Listener | None = None) -> str:
         name, builder = message.id or self._request_builder.new_id(kind), self._request_builder
         source = SOURCES[message.source].name if message.source in SOURCES else "request"
-        self._take(source, name, lambda settings: builder.from_message(name, settings, message, listener), listener)
+        self._take(source, name, lambda settings: builder.from_message(name, settings, message), listener)
         return name
 
     def _take(
@@ -258,7 +258,7 @@ class GraspNode(Node):
         except Exception as error:  # no request may stop the executor
             self._responses.not_made(request_id, source, error, listener)
         else:
-            self._submit(request)
+            self._submit(replace(request, listener=listener))
 
     def _on_sensor(self, read: Callable[[int], SensorFrame | None]) -> None:
         try:
@@ -356,7 +356,7 @@ class GoalServer:
     Args:
         make_messages: makes the message converter of a new goal, for example `SynthesizeMessages`.
         submit: submits a goal's request with its listener and returns the request's id.
-        cancel: cancels the request with a given id. Returns True if the request existed.
+        cancel: cancels the request with a given id. Returns the number of cancelled requests.
     """
 
     def __init__(
@@ -366,7 +366,7 @@ class GoalServer:
         name: str,
         make_messages: Callable[[], Any],
         submit: Callable[[Any, Goal], str],
-        cancel: Callable[[str], bool],
+        cancel: Callable[[str], int],
     ) -> None:
         self._node = node
         self._make_messages = make_messages

@@ -24,7 +24,7 @@ from graspd_ros.inputs.sensor_frames import cloud_frame
 from graspd_ros.inputs.solids import bad_message, placed_shapes, plane_of, with_support
 from graspd_ros.outputs.moveit import moveit_grasp
 from graspd_ros.parameters import Settings
-from graspd_ros.request import Listener, Request
+from graspd_ros.request import Request
 
 
 class PlanningMessages:
@@ -76,12 +76,10 @@ class PlanningMessages:
         return moveit_grasp(message, **retreat, effort=self._hand.effort.tolist(), touch=self._touch)
 
 
-def request_from_goal(
-    builder: RequestBuilder, hand: str, request_id: str, settings: Settings, goal: Any, listener: Listener | None = None
-) -> Request:
+def request_from_goal(builder: RequestBuilder, request_id: str, settings: Settings, goal: Any) -> Request:
     """Return a goal's request. Raises GraspdError if the goal names another hand or its object has no usable shape."""
-    if goal.group_name not in ("", hand):
-        fault = f"group_name: unknown hand {goal.group_name[:128]!r}; this node plans for {hand!r}"
+    if goal.group_name not in ("", builder.hand):
+        fault = f"group_name: unknown hand {goal.group_name[:128]!r}; this node plans for {builder.hand!r}"
         raise RequestError(ErrorCode.WRONG_HAND, fault)
     target, plane = goal.object, plane_of(goal.object.surface)
     header, cluster, settings = target.header, target.point_cluster, replace(settings, segment=False)
@@ -99,7 +97,7 @@ def request_from_goal(
             raise bad_message("object", fault)
         load = builder.loader_of(settings, cloud_frame(cluster, nanoseconds(builder.now())))
     frame, load = header.frame_id or settings.mesh_frame, with_support(load, plane)
-    return builder.request(request_id, "grasp_planning", frame, header.stamp, settings, load, listener=listener)
+    return builder.request(request_id, "grasp_planning", frame, header.stamp, settings, load)
 
 
 def _loader(shapes: list[TriangleMesh], settings: Settings) -> Callable[[], Scene]:

@@ -212,29 +212,25 @@ class LiveSettings:
         # Convert integers of float parameters once, so that clients always see a float.
         given = [node.get_parameter(setting.name) for setting in fields if not setting.metadata["read_only"]]
         node.set_parameters(_of_their_types(given))
-        self._warnings: list[str] = []
-        self._read([])
-        for warning in [*unknown_names(node), *self._warnings]:
+        for warning in unknown_names(node):
             node.get_logger().warning(warning)
+        self._warnings: list[str] = []
+        self._changed([])
         node.add_pre_set_parameters_callback(_of_their_types)
         node.add_on_set_parameters_callback(check_parameters)
         node.add_post_set_parameters_callback(self._changed)
 
     def _changed(self, changed: list[Parameter]) -> None:
-        before = self._warnings
-        self._read(changed)
-        for warning in self._warnings:
-            if warning not in before:
-                self._node.get_logger().warning(warning)
-
-    def _read(self, changed: list[Parameter]) -> None:
         fields = dataclasses.fields(Settings)
         values: dict[str, Any] = {s.name: _word(s, self._node.get_parameter(s.name).value) for s in fields}
         for name in ("mesh_roots", "marker_parts"):
             values[name] = list(values[name] or [])
         self.now = Settings(**values)
-        names = {parameter.name for parameter in changed}
+        names, before = {parameter.name for parameter in changed}, self._warnings
         self._warnings = parameter_warnings(self.now) + _unknown_frames(self.now, names, tuple(self._frames()))
+        for warning in self._warnings:
+            if warning not in before:
+                self._node.get_logger().warning(warning)
 
 
 def unknown_names(node: Node) -> list[str]:

@@ -18,8 +18,9 @@ from graspd_core.verify.metrics import METRICS, Metric, measure
 from graspd_core.verify.prepared_grasp import make_metrics_context
 from graspd_core.verify.trial_registry import TRIALS, Trial, TrialContext, grasp_trials
 from graspd_core.verify.world import PROTOCOLS, build_world
-from graspd_ros.outputs.messages import Pace, grasp_message
+from graspd_ros.outputs.messages import grasp_message
 from graspd_ros.outputs.responses import result_event
+from graspd_ros.parameters import Settings
 
 ROOT = Path(__file__).parents[1]
 HEIGHT = Metric("height", "mm", 1e3, lambda g: float(g.placed.translations[0, 2]), "z of the base link", 1)
@@ -48,7 +49,7 @@ def document(grasp: Grasp, target: Any, hand: Any) -> dict[str, Any]:
 
 
 def message(grasp: Grasp, hand: Any) -> Any:
-    return grasp_message(grasp, 0, "one", Header(frame_id="world"), hand, Pace())
+    return grasp_message(grasp, 0, "one", Header(frame_id="world"), hand, Settings())
 
 
 def test_a_metric_is_one_row(grasp, hand, target, monkeypatch: pytest.MonkeyPatch):

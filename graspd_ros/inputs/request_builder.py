@@ -39,7 +39,7 @@ from graspd_ros.inputs import sensor_frames as seen
 from graspd_ros.inputs.sensor_frames import Lookup, SensorFrame, Views, cloud_frame, place_of
 from graspd_ros.inputs.solids import plane_of, with_support
 from graspd_ros.parameters import BUDGETS, MOST_GRASPS, SCALES, Settings
-from graspd_ros.request import MOST_ID, KnownObject, Listener, Request, SeenViews
+from graspd_ros.request import MOST_ID, KnownObject, Request, SeenViews
 
 MOST_EXCLUDED = 256
 MOST_BOXES = 64
@@ -70,7 +70,7 @@ class RequestBuilder:
         self.newest: SensorFrame | None = None
         self.missing: Mapping[str, str] = {}
         self.views = Views()
-        self._hand = hand
+        self.hand = hand
         self.now = now
         self.lookup = lookup
         self.lookup_in_time = lookup_in_time or lookup
@@ -113,19 +113,17 @@ class RequestBuilder:
         newest = settings.cloud_policy == "newest"
         return Request(request_id, "cloud", sensor_frame.frame, sensor_frame.stamp, settings, load, only_newest=newest)
 
-    def from_message(
-        self, request_id: str, settings: Settings, message: GraspRequest, listener: Listener | None = None
-    ) -> Request:
+    def from_message(self, request_id: str, settings: Settings, message: GraspRequest) -> Request:
         """Return the request that a GraspRequest describes.
 
         Raises GraspdError: a field is invalid, the mesh or cloud is missing or unusable, or a frame is not in /tf.
         """
-        check_request(message, self._hand)
+        check_request(message, self.hand)
         if message.any_object and not settings.segment:
             raise bad_request("any_object: the parameter segment is false; set segment to true to see several objects")
         settings = settings_of(message, settings)
         source = source_of(message)
-        request = source.find(SourceInput(request_id, source.name, message, settings, listener, self))
+        request = source.find(SourceInput(request_id, source.name, message, settings, self))
         request = replace(request, steering=self._steering(message, request), closes_late=message.closes_late)
         lost = [(pose.header.frame_id, pose_matrix(pose.pose, "exclude_poses")) for pose in message.exclude_poses]
         return replace(request, exclude=tuple(message.exclude), exclude_poses=tuple(lost))
@@ -329,13 +327,11 @@ class SourceInput:
     source: str
     message: GraspRequest
     settings: Settings
-    listener: Listener | None
     builder: RequestBuilder
 
     def request(self, frame: str, stamp: Time, load: Load, **fields: Any) -> Request:
         """Return `RequestBuilder.request` of this input."""
-        about = self.request_id, self.source, frame, stamp, self.settings, load
-        return self.builder.request(*about, listener=self.listener, **fields)
+        return self.builder.request(self.request_id, self.source, frame, stamp, self.settings, load, **fields)
 
 
 @dataclass(frozen=True)

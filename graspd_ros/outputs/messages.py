@@ -32,10 +32,9 @@ from trajectory_msgs.msg import JointTrajectory, JointTrajectoryPoint
 from visualization_msgs.msg import Marker, MarkerArray
 
 from graspd_core import ArmPath, Grasp, HandModel, Outcome, Posture, Progress, Verdict
-from graspd_core.errors import ConfigError
 from graspd_core.hands.kinematics import RETREAT, link_poses
 from graspd_core.hands.model import Mount, Primitive, all_joint_names, all_joint_positions
-from graspd_core.types import Contact, Stage
+from graspd_core.types import Contact, Stage, TrialResult
 from graspd_ros.convert import (
     Matrix,
     duration_of,
@@ -49,6 +48,7 @@ from graspd_ros.convert import (
 from graspd_ros.error_codes import ErrorCode
 
 if TYPE_CHECKING:
+    from graspd_ros.parameters import Settings
     from graspd_ros.request_planner import Planned
 
 UNMEASURED = -1.0
@@ -81,21 +81,6 @@ _TEXT_ABOVE = 0.12
 
 
 @dataclass(frozen=True)
-class Pace:
-    """Speed limits for a real hand. A joint's own limit applies too."""
-
-    joint_speed: float = 1.0  # greatest speed of a revolute joint [rad/s]
-    base_speed: float = 0.05  # greatest speed of the hand's base and of prismatic joints [m/s]
-    base_turn: float = 0.5  # greatest angular speed of the base [rad/s]
-    shortest: float = 1.0  # least duration of a stage, 2.5 times its duration in the trial [s]
-
-    def __post_init__(self) -> None:
-        for name, value in vars(self).items():
-            if not (math.isfinite(value) and value > 0):
-                raise ConfigError(f"{name}: {value}; valid: a positive, finite number")
-
-
-@dataclass(frozen=True)
 class AnswerEnding:
     """Outcome of a request, for a GraspArray. `planned` is None if the request was not worked on."""
 
@@ -115,7 +100,7 @@ def ending_of(planned: Planned) -> AnswerEnding:
 
 
 def array_message(
-    ending: AnswerEnding, request_id: str, header: Header, elapsed: float, hand: HandModel, pace: Pace
+    ending: AnswerEnding, request_id: str, header: Header, elapsed: float, hand: HandModel, settings: Settings
 ) -> GraspArray:
     """Return the answer to a request that came `elapsed` seconds ago. Raises FloatingPointError: a grasp has a NaN."""
     message = GraspArray(
@@ -135,14 +120,21 @@ def array_message(
         if result.next_view is not None:
             message.next_view = PoseStamped(header=header, pose=pose_of_matrix(result.next_view))
         message.grasps = [
-            grasp_message(grasp, rank, request_id, header, hand, pace, mass=result.tried_mass)
+            grasp_message(grasp, rank, request_id, header, hand, settings, mass=result.tried_mass)
             for rank, grasp in enumerate(result.tried)
         ]
     return message
 
 
 def grasp_message(
-    grasp: Grasp, rank: int, request_id: str, header: Header, hand: HandModel, pace: Pace, *, mass: float | None = None
+    grasp: Grasp,
+    rank: int,
+    request_id: str,
+    header: Header,
+    hand: HandModel,
+    settings: Settings,
+    *,
+    mass: float | None = None,
 ) -> GraspMessage:
     """Return one grasp in the header's frame. Raises FloatingPointError if the grasp contains a NaN.
 
@@ -170,32 +162,28 @@ def grasp_message(
             for name, value in (grasp.metrics or {}).items()
             if value is not None and math.isfinite(value)
         ],
-        trials=[
-            TrialMessage(
-                name=trial.name,
-                passed=trial.passed,
-                displacement=_number(trial.displacement),
-                rotation=_number(trial.rotation),
-                reason=trial.reason,
-            )
-            for trial in grasp.trials
-        ],
+        trials=[_trial_message(trial) for trial in grasp.trials],
         contacts=[_contact_message(contact) for contact in grasp.contacts],
-        trajectory=trajectory_of(grasp, hand, pace),
+        trajectory=trajectory_of(grasp, hand, settings),
         trajectory_base_poses=base_poses(grasp, header.frame_id, header.stamp),
     )
     if grasp.arrival is not None:
         message.arrival_pose = pose_of_posture(grasp.arrival)
         message.arrival_joints = joint_message(grasp.arrival, hand, header.stamp)
     if grasp.arm is not None:
-        message.arm_trajectory = arm_trajectory(grasp, grasp.arm, pace)
+        message.arm_trajectory = arm_trajectory(grasp, grasp.arm, settings)
         message.arm_stages = list(grasp.arm.stages)
-        message.execution = execution_message(grasp, grasp.arm, hand, pace, mass)
+        message.execution = execution_message(grasp, grasp.arm, hand, settings, mass)
     if hand.mount is not None:
         message.mount_link = hand.mount.parent
         message.mount_pregrasp_pose = mount_pose(grasp.pregrasp, hand.mount)
         message.mount_grasp_pose = mount_pose(grasp.grasp, hand.mount)
     return message
+
+
+def _trial_message(trial: TrialResult) -> TrialMessage:
+    moved, turned = _number(trial.displacement), _number(trial.rotation)
+    return TrialMessage(name=trial.name, passed=trial.passed, displacement=moved, rotation=turned, reason=trial.reason)
 
 
 def _contact_message(contact: Contact) -> ContactMessage:
@@ -265,13 +253,13 @@ def _number(value: float, otherwise: float = UNMEASURED) -> float:
     return float(value) if math.isfinite(value) else otherwise
 
 
-def trajectory_of(grasp: Grasp, hand: HandModel, pace: Pace) -> JointTrajectory:
+def trajectory_of(grasp: Grasp, hand: HandModel, settings: Settings) -> JointTrajectory:
     """Return the trajectory through pregrasp, grasp and squeeze. Its stamp is zero, so it starts on receipt.
 
     The trajectory has only the driven joints, because controllers refuse others. The hand may start in any posture.
     Positions are within the joint limits. The last point is a target inside the object. The object stops the joints.
     """
-    times = posture_times(grasp, hand, pace)
+    times = posture_times(grasp, hand, settings)
     return JointTrajectory(
         header=Header(frame_id=hand.base_link),
         joint_names=list(hand.joint_names),
@@ -284,24 +272,24 @@ def base_poses(grasp: Grasp, frame: str, stamp: Time) -> list[PoseStamped]:
     return [PoseStamped(header=Header(frame_id=frame, stamp=stamp), pose=pose_of_posture(p)) for p in _postures(grasp)]
 
 
-def posture_times(grasp: Grasp, hand: HandModel, pace: Pace) -> tuple[float, float, float]:
+def posture_times(grasp: Grasp, hand: HandModel, settings: Settings) -> tuple[float, float, float]:
     """Return the times of pregrasp, grasp and squeeze from the start of the trajectory [s].
 
     The first time is enough for every joint to cross its whole range. At this time, the base must be at the pregrasp.
     """
-    speed = hand.joint_speeds(pace.joint_speed, pace.base_speed)
-    first = max(pace.shortest, _PEAK * float(np.max((hand.upper - hand.lower) / speed, initial=0.0)))
-    closing = _move_time(grasp.pregrasp, grasp.grasp, speed, pace)
-    return first, first + closing, first + closing + _move_time(grasp.grasp, grasp.squeeze, speed, pace)
+    speed = hand.joint_speeds(settings.joint_speed, settings.base_speed)
+    first = max(settings.shortest_stage, _PEAK * float(np.max((hand.upper - hand.lower) / speed, initial=0.0)))
+    closing = _move_time(grasp.pregrasp, grasp.grasp, speed, settings)
+    return first, first + closing, first + closing + _move_time(grasp.grasp, grasp.squeeze, speed, settings)
 
 
-def _move_time(start: Posture, end: Posture, speed: np.ndarray, pace: Pace) -> float:
+def _move_time(start: Posture, end: Posture, speed: np.ndarray, settings: Settings) -> float:
     joints = float(np.max(np.abs(end.joint_positions - start.joint_positions) / speed, initial=0.0))
-    travel = float(np.linalg.norm(end.position - start.position)) / pace.base_speed
+    travel = float(np.linalg.norm(end.position - start.position)) / settings.base_speed
     # q and -q are the same rotation. Take the smaller angle.
     cosine = min(abs(float(start.quaternion_wxyz @ end.quaternion_wxyz)), 1.0)
-    turn = 2 * math.acos(cosine) / pace.base_turn
-    return max(pace.shortest, _PEAK * max(joints, travel, turn))
+    turn = 2 * math.acos(cosine) / settings.base_turn
+    return max(settings.shortest_stage, _PEAK * max(joints, travel, turn))
 
 
 def _postures(grasp: Grasp) -> tuple[Posture, Posture, Posture]:
@@ -315,20 +303,20 @@ def _point(posture: Posture, hand: HandModel, at: float) -> JointTrajectoryPoint
     return JointTrajectoryPoint(positions=positions.tolist(), velocities=still, time_from_start=duration_of(at))
 
 
-def arm_trajectory(grasp: Grasp, path: ArmPath, pace: Pace) -> JointTrajectory:
+def arm_trajectory(grasp: Grasp, path: ArmPath, settings: Settings) -> JointTrajectory:
     """Return all waypoints of the arm without velocities, so that controllers pass them without stopping.
 
-    The first point is the retreat posture, at the time `pace.shortest` [s]. The arm must start in this posture. Points
-    of a stage are evenly spaced in time. No joint exceeds its own speed limit. Revolute joints stay below
-    `pace.joint_speed`. Prismatic joints and the hand's base stay below `pace.base_speed`.
+    The first point is the retreat posture, at the time `settings.shortest_stage` [s]. The arm must start in this
+    posture. Points of a stage are evenly spaced in time. No joint exceeds its own speed limit. Revolute joints stay
+    below `settings.joint_speed`. Prismatic joints and the hand's base stay below `settings.base_speed`.
     """
     from graspd_core.arms.arm_paths import LIFT
 
     approach = float(np.linalg.norm(grasp.grasp.position - grasp.pregrasp.position))
-    times, speeds = [pace.shortest], _arm_speeds(path, pace)
+    times, speeds = [settings.shortest_stage], _arm_speeds(path, settings)
     for first, last, travel in zip(path.stages, path.stages[1:], (RETREAT, approach, LIFT), strict=False):
         longest = float((np.abs(np.diff(path.positions[first : last + 1], axis=0)) / speeds).max()) * (last - first)
-        seconds = max(pace.shortest, _PEAK * longest, _PEAK * travel / pace.base_speed)
+        seconds = max(settings.shortest_stage, _PEAK * longest, _PEAK * travel / settings.base_speed)
         times += (times[-1] + seconds * np.arange(1, last - first + 1) / (last - first)).tolist()
     points = [
         JointTrajectoryPoint(positions=positions.tolist(), time_from_start=duration_of(at))
@@ -337,21 +325,21 @@ def arm_trajectory(grasp: Grasp, path: ArmPath, pace: Pace) -> JointTrajectory:
     return JointTrajectory(joint_names=list(path.joint_names), points=points)
 
 
-def _arm_speeds(path: ArmPath, pace: Pace) -> np.ndarray:
+def _arm_speeds(path: ArmPath, settings: Settings) -> np.ndarray:
     """Return the greatest speed of each arm joint [rad/s] or [m/s]."""
     own = np.inf if path.velocity is None else path.velocity
     slides = np.zeros(len(path.joint_names), dtype=bool) if path.slides is None else path.slides
-    return np.minimum(np.where(slides, pace.base_speed, pace.joint_speed), own)
+    return np.minimum(np.where(slides, settings.base_speed, settings.joint_speed), own)
 
 
 def execution_message(
-    grasp: Grasp, path: ArmPath, hand: HandModel, pace: Pace, mass: float | None = None
+    grasp: Grasp, path: ArmPath, hand: HandModel, settings: Settings, mass: float | None = None
 ) -> GraspExecution:
     """Return the motion from retreat to the end of the lift, with the index of each gate (named point of rest)."""
     from graspd_core.arms.execution import GATES, ExecutionPace, execution_of
 
-    own = ExecutionPace(pace.joint_speed, pace.base_speed, pace.base_speed, pace.shortest)
-    made = execution_of(grasp, hand, arm_speeds=_arm_speeds(path, pace), mass=mass, pace=own)
+    own = ExecutionPace(settings.joint_speed, settings.base_speed, settings.base_speed, settings.shortest_stage)
+    made = execution_of(grasp, hand, arm_speeds=_arm_speeds(path, settings), mass=mass, pace=own)
     times = [duration_of(at) for at in made.times.tolist()]
     arm = [
         JointTrajectoryPoint(positions=q, velocities=v, time_from_start=at)

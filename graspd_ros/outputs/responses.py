@@ -41,7 +41,7 @@ from graspd_core.types import Grasp, GraspResult, Progress, ProgressHook, Stage,
 from graspd_ros.convert import pose_of_posture
 from graspd_ros.error_codes import ErrorCode, code_of, sentence_of
 from graspd_ros.outputs import messages
-from graspd_ros.outputs.messages import Pace, result_markers
+from graspd_ros.outputs.messages import result_markers
 from graspd_ros.outputs.moveit import attached_kind, attached_object
 from graspd_ros.parameters import Settings
 from graspd_ros.request import MOST_ID, Listener, Request
@@ -307,7 +307,8 @@ class Responses:
             self.refused(request_id[:MOST_ID], source, code, message)
         ending = messages.AnswerEnding(GraspArray.REFUSED, code, message)
         header = Header(stamp=self._now())
-        self._publish(messages.array_message(ending, request_id[:MOST_ID], header, 0.0, self._hand, Pace()), listener)
+        answer = messages.array_message(ending, request_id[:MOST_ID], header, 0.0, self._hand, Settings())
+        self._publish(answer, listener)
 
     def cloud_not_taken(self, request_id: str, error: Exception) -> None:
         """Report an unusable cloud that came without a request, at most once a second."""
@@ -341,7 +342,7 @@ class Responses:
             nonlocal lowest, last
             if progress.found is not None and request.listener is not None:
                 rank, header = progress.verified - 1, Header(frame_id=request.frame_out, stamp=request.stamp)
-                found = messages.grasp_message(progress.found, rank, request.id, header, self._hand, _pace(request))
+                found = messages.grasp_message(progress.found, rank, request.id, header, self._hand, request.settings)
                 request.listener.found(found)
             if (now := time.monotonic()) - last < period:
                 return
@@ -431,7 +432,7 @@ class Responses:
 
     def _answer(self, request: Request, ending: messages.AnswerEnding) -> GraspArray:
         header = Header(frame_id=request.frame_out, stamp=request.stamp)
-        return messages.array_message(ending, request.id, header, request.elapsed(), self._hand, _pace(request))
+        return messages.array_message(ending, request.id, header, request.elapsed(), self._hand, request.settings)
 
     def _publish(self, message: GraspArray, listener: Listener | None) -> None:
         self.counters.answered(message)
@@ -468,11 +469,6 @@ class Responses:
 
     def _log(self):
         return self._node.get_logger()
-
-
-def _pace(request: Request) -> Pace:
-    settings = request.settings
-    return Pace(settings.joint_speed, settings.base_speed, settings.base_turn, settings.shortest_stage)
 
 
 def presentable(result: GraspResult) -> Grasp | None:

@@ -35,6 +35,7 @@ from graspd_ros.parameters import LiveSettings, Settings, check_parameters
         ("deadline", "soon", "'soon' is no number"),
         ("deadline", True, "True is no number"),
         ("deadline", 0, "0.0; valid: 0.1 to 3600"),
+        *(("base_turn", value, f"{value}; valid: 0.01 to 100") for value in (0.0, -1.0, math.inf, math.nan)),
     ],
 )
 def test_what_is_no_choice_is_refused_by_name(name, value, culprit):

@@ -87,7 +87,7 @@ def test_later_requests_keep_clear_of_the_scene_and_bad_messages_do_no_harm(clie
     things.publish(box("lost", [0.1, 0.1, 0.1], 0.0, "nowhere"))
     settle()
     lost = ask("lost")
-    assert lost.status == GraspArray.FAILED
+    assert (lost.status, lost.error_code) == (GraspArray.FAILED, "NO_TRANSFORM")
     assert lost.message.startswith("collision object 'lost': unknown frame 'nowhere'; known:")
     things.publish(CollisionObject(operation=CollisionObject.REMOVE))
     settle()

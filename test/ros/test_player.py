@@ -85,15 +85,14 @@ def test_the_pace_is_the_recorded_one_times_the_rate(client, tmp_path):
     assert time.monotonic() - begun >= 3600 / 18_000
 
 
-@pytest.mark.parametrize("rate", [1, 4])
-def test_stamps_can_be_those_of_now_at_the_rate_that_they_are_played(client, bag, heard, rate):
-    given = {"topics": ("/play/points",), "now": True, "rate": rate, "wait": TIMEOUT}
+def test_stamps_can_be_those_of_now_at_the_rate_that_they_are_played(client, bag, heard):
+    given = {"topics": ("/play/points",), "now": True, "rate": 4, "wait": TIMEOUT}
     player = threading.Thread(target=play, args=(client.node, bag), kwargs=given)
     player.start()
     client.spin_until(lambda: len(heard[PointCloud2]) == 2, "clouds")
     player.join(TIMEOUT)
     first, second = (m.header.stamp.sec * SECOND + m.header.stamp.nanosec for m in heard[PointCloud2])
-    assert second - first == SECOND // 5 // rate
+    assert second - first == SECOND // 5 // 4
     assert abs(time.time_ns() - second) < TIMEOUT * SECOND
 
 

@@ -27,8 +27,7 @@ HANDS = {"left": "allegro_left", "right": "allegro_right"}
 FEW = {"num_grasps": 1, "preset": "fast", "deadline": 600.0}  # the goals wait until the nodes are ready
 
 
-@pytest.mark.parametrize("package", ["rclpy", "sensor_msgs"])
-@pytest.mark.parametrize("program", ["graspd_ros.node", "graspd_ros.player"])
+@pytest.mark.parametrize(("program", "package"), [("graspd_ros.node", "rclpy"), ("graspd_ros.player", "sensor_msgs")])
 def test_a_ros_before_the_environments_own_is_told_in_one_line(tmp_path, program: str, package: str):
     assert foreign_ros() == ""
     # As a sourced ROS of another Python stands there: it is found, and its compiled part cannot be loaded.

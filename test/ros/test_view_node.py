@@ -11,7 +11,8 @@ from std_msgs.msg import Header
 
 from graspd_core import load_hand
 from graspd_core.types import Contact, Grasp, GraspMetrics, Posture, TrialResult
-from graspd_ros.outputs.messages import Pace, grasp_message
+from graspd_ros.outputs.messages import grasp_message
+from graspd_ros.parameters import Settings
 from graspd_ros.view_node import Follower, grasp_of, main
 
 HAND = load_hand("parallel_gripper")
@@ -48,7 +49,7 @@ def a_grasp() -> Grasp:
 def an_answer(grasp: Grasp) -> Any:
     header = Header(frame_id="camera", stamp=Time())
     answer = GraspArray(header=header, request_id="can-1", message="all is well")
-    answer.grasps = [grasp_message(grasp, 0, "can-1", header, HAND, Pace())]
+    answer.grasps = [grasp_message(grasp, 0, "can-1", header, HAND, Settings())]
     return answer
 
 

@@ -83,6 +83,7 @@ def refusal(**fields) -> RequestError:
         ({"time_budget": -1.0}, "time_budget: -1.0"),
         ({"time_budget": math.inf}, "time_budget: inf"),
         ({"time_budget": math.nan}, "time_budget: nan"),
+        ({"mass": math.nan}, "mass: nan; valid: 0.001 to 100 kg, 0 for the parameter"),
         ({"mesh_scale": -1.0}, "mesh_scale: -1.0"),
         ({"mesh_scale": math.nan}, "mesh_scale: nan"),
         ({"use_target_point": True, "target_point": Point(x=math.nan)}, "target_point: [nan"),
@@ -114,12 +115,11 @@ def test_another_hand_is_refused_and_ones_own_is_not():
 
 
 def test_what_a_request_leaves_open_is_the_parameters():
-    given = Settings(num_grasps=3, preset="fast", seed=7, deadline=5.0, mesh_scale=0.5)
-    left_open = settings_of(GraspRequest(), given)
-    assert (left_open.num_grasps, left_open.preset, left_open.seed, left_open.deadline) == (3, "fast", 7, 5.0)
-    asked = settings_of(GraspRequest(num_grasps=9, preset="accurate", seed=0, time_budget=2.5, mesh_scale=0.1), given)
-    assert (asked.num_grasps, asked.preset, asked.seed, asked.deadline) == (9, "accurate", 0, 2.5)
-    assert asked.mesh_scale == 0.1
+    given = Settings(num_grasps=3, preset="fast", seed=7, deadline=5.0, mass=0.09, mesh_scale=0.5)
+    assert settings_of(GraspRequest(), given) == replace(given, mesh_scale=1.0)  # a message's own default is 1
+    fields = {"num_grasps": 9, "preset": "accurate", "seed": 0, "mass": 0.07, "mesh_scale": 0.1}
+    asked = settings_of(GraspRequest(**fields, time_budget=2.5), given)
+    assert asked == replace(given, **fields, deadline=2.5)
 
 
 @given(

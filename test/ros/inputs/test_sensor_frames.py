@@ -2,12 +2,14 @@
 
 import array
 from contextlib import nullcontext
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
 import pytest
 from bag_writer import packed_depth
 from builtin_interfaces.msg import Time
+from expected import refused, some
 from geometry_msgs.msg import Point
 from graspd_msgs.msg import GraspRequest
 from hypothesis import given
@@ -23,17 +25,19 @@ from graspd_core.errors import CloudError, TransformError
 from graspd_core.io.messages import camera_from_message, depth_and_camera, depth_from_message, frame_fault, image_size
 from graspd_core.mesh.shapes import make_shape
 from graspd_core.perception.cloud.camera import PinholeCamera, camera_rays
+from graspd_core.transforms import SECOND
 from graspd_ros.error_codes import ErrorCode, RequestError, code_of
 from graspd_ros.inputs import sensor_frames
-from graspd_ros.inputs.request_builder import RequestBuilder
+from graspd_ros.inputs.request_builder import RequestBuilder, frame_views
 from graspd_ros.inputs.sensor_frames import ImagePairs, Views, cloud_frame, depth_sensor_frame, place_of, seen_by_camera
 from graspd_ros.parameters import Settings
+from graspd_ros.request import Request
 
-CAMERA = PinholeCamera(320, 240, 308.0, 308.0, 159.5, 119.5)
+CAMERA = PinholeCamera(160, 120, 154.0, 154.0, 79.5, 59.5)
 OPTICAL, BASE = "camera_depth_optical_frame", "base_link"
 NOW = Time(sec=1000)
 HEIGHT = float(np.ptp(make_shape("bottle").vertices[:, 2]))
-SECOND = 1_000_000_000
+ANY_AGE = Settings(cloud_max_age=0.0)
 DTYPES = {"16UC1": "u2", "mono16": "u2", "32FC1": "f4", "64FC1": "f8"}
 
 
@@ -60,17 +64,6 @@ def calibration(width: int = 64, height: int = 48, stamp: int = 0, **fields) -> 
     p = [50.0, 0.0, 30.0, 0.0, 0.0, 50.0, 20.0, 0.0, 0.0, 0.0, 1.0, 0.0]
     values = {"k": k, "p": p, "d": [0.1, -0.05, 0.001, 0.002, 0.0], "distortion_model": "plumb_bob", **fields}
     return CameraInfo(header=header(stamp), width=width, height=height, **values)
-
-
-def test_a_depth_image_and_its_camera_are_read_and_must_be_of_one_frame():
-    depth = np.random.default_rng(0).integers(0, 8000, (5, 7)) / 1000
-    message = image(depth, "16UC1")
-    found, camera = depth_and_camera(message, calibration(7, 5))
-    np.testing.assert_allclose(found, depth, atol=1e-6)
-    assert (camera.width, camera.height) == (7, 5)
-    message.header.frame_id = "elsewhere"
-    with pytest.raises(CloudError, match=r"'elsewhere'.*'camera'"):
-        depth_and_camera(message, calibration(7, 5))
 
 
 def test_a_rectified_image_has_the_camera_of_p_and_no_distortion():
@@ -200,19 +193,19 @@ def test_memory_is_bounded_and_no_image_is_given_out_twice(arrivals: list[tuple[
 
 def test_a_cloud_without_a_frame_or_with_a_stamp_of_another_clock_is_refused(scene):
     grid, _, T = scene
-    taker, cloud = builder(T), message(grid, "", True)
-    with pytest.raises(RequestError, match=r"the cloud has an empty header.frame_id") as refused:
-        taker.from_message("r", Settings(), GraspRequest(cloud=cloud))
-    assert refused.value.code is ErrorCode.BAD_CLOUD
+    cloud = message(grid, "", True)
+    with pytest.raises(RequestError, match=r"the cloud has an empty header.frame_id") as no:
+        asked(T, Settings(), cloud=cloud)
+    assert no.value.code is ErrorCode.BAD_CLOUD
     cloud.header = Header(frame_id=OPTICAL, stamp=Time(sec=NOW.sec + 60))
-    with pytest.raises(RequestError, match=r"has a stamp 60.0 s in the future, more than cloud_max_age=5 s") as refused:
-        taker.from_message("r", Settings(), GraspRequest(cloud=cloud))
-    assert refused.value.code is ErrorCode.STALE_CLOUD
+    with pytest.raises(RequestError, match=r"has a stamp 60.0 s in the future, more than cloud_max_age=5 s") as no:
+        asked(T, Settings(), cloud=cloud)
+    assert no.value.code is ErrorCode.STALE_CLOUD
     cloud.header.stamp.sec = NOW.sec + 2
-    (told, *_) = taker.from_message("r", Settings(), GraspRequest(cloud=cloud)).load().object.warnings
+    (told, *_) = asked(T, Settings(), cloud=cloud).load().object.warnings
     assert told == "the cloud came 2.0 s before its stamp: the sensor's clock is ahead of the node's"
-    cloud.header.stamp = NOW
-    assert "clock" not in str(taker.from_message("r", Settings(), GraspRequest(cloud=cloud)).load().object.warnings)
+    _, warnings = frame_views(cloud_frame(cloud, (NOW.sec + 2) * SECOND), ANY_AGE, place_of(ANY_AGE), lambda *_: T)()
+    assert warnings == ()
 
 
 def test_data_that_contradicts_the_name_of_its_frame_is_told(scene):
@@ -223,25 +216,20 @@ def test_data_that_contradicts_the_name_of_its_frame_is_told(scene):
         (grid, OPTICAL, False), (grid, "camera", False), (grid, "camera_link", True),
         (grid, "camera_depth_frame", True), (body, "camera_link", False), (body, OPTICAL, True),
     ):  # fmt: skip
-        asked = GraspRequest(cloud=message(points, frame, True))
-        warnings = builder(T).from_message("r", Settings(cloud_max_age=0.0), asked).load().object.warnings
+        seen = cloud_frame(message(points, frame, True), 0)
+        _, warnings = frame_views(seen, ANY_AGE, place_of(ANY_AGE), lambda *_: T)()
         assert (doubted in str(warnings)) is told, frame
     assert frame_fault("camera_link", body.reshape(-1, 3)) == ""
 
 
 def test_a_workspace_without_a_point_says_where_they_are_and_names_the_unit(scene):
     grid, _, T = scene
-    taker = builder(T)
-    asked = GraspRequest(cloud=message(1000 * grid, OPTICAL, False))
-    with pytest.raises(
-        RequestError, match=r"none of .* lies in the workspace.* if they are in millimetres, divide"
-    ) as no:
-        taker.from_message("r", Settings(cloud_max_age=0.0), asked).load()
-    assert "they lie from [" in str(no.value)
-    asked = GraspRequest(cloud=message(grid, OPTICAL, True), target_mask=mask_of(np.isfinite(grid[..., 0])))
-    behind = Settings(cloud_max_age=0.0, roi_max=[10.0, 10.0, 0.0])
-    with pytest.raises(RequestError, match=r"roi_max=\[10.0, 10.0, 0.0\]; they lie from"):
-        taker.from_message("r", behind, asked).load()
+    with refused(RequestError, "they lie from [", match="none of .* lies in the workspace.* in millimetres, divide"):
+        asked(T, cloud=message(1000 * grid, OPTICAL, False)).load()
+    behind = replace(ANY_AGE, roi_max=[10.0, 10.0, 0.0])
+    masked = {"cloud": message(grid, OPTICAL, True), "target_mask": mask_of(np.isfinite(grid[..., 0]))}
+    with refused(RequestError, "roi_max=[10.0, 10.0, 0.0]; they lie from"):
+        asked(T, behind, **masked).load()
 
 
 @pytest.mark.parametrize(("frame", "axis"), [(BASE, 1), (OPTICAL, 0)])
@@ -249,12 +237,11 @@ def test_an_object_that_the_workspace_cuts_is_doubted(scene, frame, axis):
     grid, _, T = scene
     points = grid if frame == OPTICAL else in_base(grid, T)
     middle = points[len(points) // 2, points.shape[1] // 2]
-    asked = GraspRequest(cloud=message(points, frame, frame == OPTICAL), sensor_frame=OPTICAL)
+    cloud = message(points, frame, frame == OPTICAL)
     for beside, cut in ((0.0, True), (0.3, False)):
         corner = np.full(3, 10.0)
         corner[axis] = middle[axis] + beside
-        settings = Settings(cloud_max_age=0.0, roi_max=corner.tolist())
-        found = builder(T).from_message("r", settings, asked).load()
+        found = asked(T, replace(ANY_AGE, roi_max=corner.tolist()), cloud=cloud, sensor_frame=OPTICAL).load()
         assert ("reaches the border of the" in str(found.evidence)) is cut
 
 
@@ -288,6 +275,10 @@ def builder(T_base_camera: np.ndarray) -> RequestBuilder:
     return RequestBuilder("allegro_right", lambda: NOW, lookup)
 
 
+def asked(T_base_camera: np.ndarray, settings: Settings = ANY_AGE, /, **fields: Any) -> Request:
+    return builder(T_base_camera).from_message("r", settings, GraspRequest(**fields))
+
+
 def in_base(grid: np.ndarray, T_base_camera: np.ndarray) -> np.ndarray:
     return grid @ T_base_camera[:3, :3].T + T_base_camera[:3, 3]
 
@@ -295,22 +286,20 @@ def in_base(grid: np.ndarray, T_base_camera: np.ndarray) -> np.ndarray:
 @pytest.mark.parametrize("organised", [True, False])
 def test_a_cloud_of_another_frame_is_refused_unless_somebody_says_where_its_camera_stood(scene, organised):
     grid, _, T = scene
-    cloud, taker, near = message(in_base(grid, T), BASE, organised), builder(T), Settings(cloud_max_age=0.0)
+    cloud = message(in_base(grid, T), BASE, organised)
     at = {"use_target_point": True, "target_point": Point(x=0.5, z=0.1), "cloud": cloud}
-    with pytest.raises(CloudError, match="its camera did not stand at the origin of its frame") as refused:
-        taker.from_message("r", near, GraspRequest(**at)).load()
-    assert code_of(refused.value) is ErrorCode.BAD_CLOUD
+    with pytest.raises(CloudError, match="its camera did not stand at the origin of its frame") as no:
+        asked(T, **at).load()
+    assert code_of(no.value) is ErrorCode.BAD_CLOUD
     x, y, z = map(float, T[:3, 3])
     for said in ({"sensor_frame": OPTICAL}, {"use_view_point": True, "view_point": Point(x=x, y=y, z=z)}):
-        loaded = taker.from_message("r", near, GraspRequest(**at, **said)).load()
-        assert loaded.support is not None
-        np.testing.assert_allclose(loaded.support.normal, [0, 0, 1], atol=0.02)
+        loaded = asked(T, **at, **said).load()
+        np.testing.assert_allclose(some(loaded.support).normal, [0, 0, 1], atol=0.02)
         assert np.ptp(loaded.object.mesh.vertices[:, 2]) == pytest.approx(HEIGHT, abs=0.012)
     with pytest.raises(TransformError, match="not connected"):
-        taker.from_message("r", near, GraspRequest(**at, sensor_frame="elbow")).load()
+        asked(T, **at, sensor_frame="elbow").load()
     # In its own frame the same cloud needs no word.
-    own = message(grid, OPTICAL, organised)
-    assert taker.from_message("r", near, GraspRequest(cloud=own)).load().support is not None
+    assert asked(T, cloud=message(grid, OPTICAL, organised)).load().support is not None
 
 
 def test_the_request_goes_before_the_parameters_and_a_point_before_a_frame():
@@ -327,69 +316,59 @@ def test_a_cloud_that_came_unasked_is_seen_from_where_the_parameters_say(scene):
     grid, _, T = scene
     frame, taker = cloud_frame(message(in_base(grid, T), BASE, False), 0), builder(T)
     with pytest.raises(CloudError, match="did not stand"):
-        taker.from_sensor_frame("r", Settings(cloud_max_age=0.0), frame).load()
-    settings = Settings(cloud_max_age=0.0, sensor_frame=OPTICAL)
+        taker.from_sensor_frame("r", ANY_AGE, frame).load()
+    settings = replace(ANY_AGE, sensor_frame=OPTICAL)
     assert taker.from_sensor_frame("r", settings, frame).load().support is not None
     seen = seen_by_camera(frame, place_of(settings), lambda *_: T)
-    assert seen.forward is not None
-    np.testing.assert_array_equal(np.r_[seen.viewpoint, seen.forward], np.r_[T[:3, 3], T[:3, 2]])
+    np.testing.assert_array_equal(np.r_[seen.viewpoint, some(seen.forward)], np.r_[T[:3, 3], T[:3, 2]])
     taker.newest = frame
     with pytest.raises(CloudError, match="did not stand"):
-        taker.add_view(Settings(cloud_max_age=0.0))
+        taker.add_view(ANY_AGE)
     taker.add_view(settings)
     assert len(taker.views.clouds) == 1
 
 
 def mask_of(shown: np.ndarray, **fields) -> Image:
     height, width = shown.shape
-    image = Image(height=height, width=width, encoding="mono8", step=width)
-    image.data = array.array("B", (255 * shown).astype(np.uint8).tobytes())
-    for name, value in fields.items():
-        setattr(image, name, value)
-    return image
+    data = array.array("B", (255 * shown).astype(np.uint8).tobytes())
+    return Image(**{"height": height, "width": width, "encoding": "mono8", "step": width, "data": data, **fields})
 
 
 def test_a_mask_says_which_object_is_meant(scene):
     grid, label, T = scene
-    cloud, taker, settings = message(grid, OPTICAL, True), builder(T), Settings(cloud_max_age=0.0, voxel_size=0.01)
+    cloud, settings = message(grid, OPTICAL, True), replace(ANY_AGE, voxel_size=0.01)
     # In the camera's frame the two are 16 cm apart.
     for number in (0, 1):
         truth = np.nanmean(grid[label == number], axis=0)
-        asked = GraspRequest(cloud=cloud, target_mask=mask_of(label == number))
-        middle = taker.from_message("r", settings, asked).load().object.mesh.vertices.mean(0)
+        loaded = asked(T, settings, cloud=cloud, target_mask=mask_of(label == number)).load()
+        middle = loaded.object.mesh.vertices.mean(0)
         assert np.linalg.norm(middle - truth) < 0.06
     for bad, culprit in (
-        (mask_of(label == 0, encoding="rgb8"), "320 x 240 'rgb8'; valid: mono8, 320 x 240"),
-        (mask_of((label == 0)[:100]), "320 x 100 'mono8'"),
-        (mask_of(label == 0, data=array.array("B", [1])), "1 bytes, step 320, are too few"),
+        (mask_of(label == 0, encoding="rgb8"), "160 x 120 'rgb8'; valid: mono8, 160 x 120"),
+        (mask_of((label == 0)[:100]), "160 x 100 'mono8'"),
+        (mask_of(label == 0, data=array.array("B", [1])), "1 bytes, step 160, are too few"),
     ):
-        with pytest.raises(RequestError, match=culprit) as refused:
-            taker.from_message("r", settings, GraspRequest(cloud=cloud, target_mask=bad)).load()
-        assert refused.value.code is ErrorCode.BAD_REQUEST
+        with pytest.raises(RequestError, match=culprit) as no:
+            asked(T, settings, cloud=cloud, target_mask=bad).load()
+        assert no.value.code is ErrorCode.BAD_REQUEST
 
 
 def test_a_mask_shows_where_contacts_may_be(scene):
     grid, label, T = scene
-    cloud, taker, settings = message(grid, OPTICAL, True), builder(T), Settings(cloud_max_age=0.0)
-    asked = taker.from_message("r", settings, GraspRequest(cloud=cloud, region_mask=mask_of(label == 1))).steering
-    assert asked is not None
-    region = asked().region
-    assert region is not None
+    cloud = message(grid, OPTICAL, True)
+    region = some(some(asked(T, cloud=cloud, region_mask=mask_of(label == 1)).steering)().region)
     seen, other = (grid[label == number].reshape(-1, 3) for number in (1, 0))
     assert (region.distance(seen[np.isfinite(seen).all(1)]) < 0).all()
     assert region.distance(np.nanmean(other, axis=0)[None])[0] > 0.05
-    bad = GraspRequest(cloud=cloud, region_mask=mask_of(label == 1, encoding="rgb8"))
-    steering = taker.from_message("r", settings, bad).steering
-    assert steering is not None
-    with pytest.raises(RequestError, match="region_mask: 320 x 240 'rgb8'; valid: mono8"):
-        steering()
+    steering = asked(T, cloud=cloud, region_mask=mask_of(label == 1, encoding="rgb8")).steering
+    with refused(RequestError, "region_mask: 160 x 120 'rgb8'; valid: mono8"):
+        some(steering)()
 
 
 def test_a_cloud_of_the_object_alone_is_taken_whole(scene):
     grid, label, T = scene
     bottle = np.where((label == 0)[..., None], grid, np.nan)
-    asked = GraspRequest(cloud=message(bottle, OPTICAL, False), alone=True)
-    loaded = builder(T).from_message("r", Settings(cloud_max_age=0.0), asked).load()
+    loaded = asked(T, cloud=message(bottle, OPTICAL, False), alone=True).load()
     assert loaded.support is None
     assert not loaded.obstacles
     assert np.linalg.norm(loaded.object.mesh.vertices.mean(0) - np.nanmean(bottle, axis=(0, 1))) < 0.06

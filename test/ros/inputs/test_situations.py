@@ -10,7 +10,7 @@ from geometry_msgs.msg import Point
 from graspd_msgs.msg import GraspArray, GraspRequest
 from rclpy.serialization import deserialize_message
 from sensor_msgs.msg import CameraInfo, Image, PointCloud2
-from situations import FILE_ONLY, MESHES, SITUATIONS, Situation, camera_place, recorded
+from situations import CLOUDS, DRIVERS, FILE_ONLY, MESHES, MESSAGES, SITUATIONS, Situation, camera_place, recorded
 
 from graspd_core.io.bags import read_raw
 
@@ -47,10 +47,21 @@ def source_of(row: Situation, path: Path, show: Callable[[dict[str, Any]], None]
     return {"source": GraspRequest.LATEST_CLOUD}
 
 
-MESSAGES = {name: row for name, row in SITUATIONS.items() if name not in FILE_ONLY}
+def rows() -> Iterator[Any]:
+    """Yield the rows. Answers of a kind (table, options, warning) after the first are slow: the library gives the same.
+
+    `test_the_library_makes_the_object_that_it_shows` and `test_replay_of_a_recording_answers_the_same` have all rows.
+    """
+    seen = set()
+    for name, row in SITUATIONS.items():
+        if name not in FILE_ONLY:
+            tables = tuple(name in table for table in (CLOUDS, MESHES, DRIVERS, MESSAGES))
+            kind = name if isinstance(row.expect, str) else (tables, *row.options, bool(row.warns))
+            yield pytest.param(row, id=name, marks=pytest.mark.slow if kind in seen else ())
+            seen.add(kind)
 
 
-@pytest.mark.parametrize("row", MESSAGES.values(), ids=MESSAGES)
+@pytest.mark.parametrize("row", list(rows()))
 def test_the_node_answers_the_same(row: Situation, client, node, tmp_path: Path):
     def show(found: dict[str, Any]) -> None:
         publishers = {name: client.node.create_publisher(KINDS[name], f"/depth/{name}", 10) for name in found}

@@ -22,19 +22,24 @@ from std_srvs.srv import Trigger
 from trimesh.transformations import translation_matrix
 from visualization_msgs.msg import Marker, MarkerArray
 
+from graspd_bench.rendering.render import render_depth
 from graspd_core import Grasp, GraspResult, Outcome, Posture, TrialResult, Verdict, hand_mesh, load_hand
 from graspd_core.hands.model import Primitive
+from graspd_core.mesh.shapes import make_shape
 from graspd_core.paths import config_dir
+from graspd_core.perception.cloud.camera import PinholeCamera
 from graspd_core.types import ROBUSTNESS, Contact, GraspMetrics, Timing
 from graspd_ros.convert import array_of, matrix_of_pose, moved_result
-from graspd_ros.outputs.messages import COLOURS, IDS_OF_A_GRASP, PARTS, Pace, array_message, ending_of, result_markers
+from graspd_ros.outputs.messages import COLOURS, IDS_OF_A_GRASP, PARTS, array_message, ending_of, result_markers
 from graspd_ros.outputs.responses import presentable
+from graspd_ros.parameters import Settings
 from graspd_ros.request_planner import Planned
 
 FEW = {"num_grasps": 2, "preset": "fast", "time_budget": 100.0}
 LONG = {"num_grasps": 64, "preset": "accurate", "time_budget": 600.0}
 SPHERE = {"source": GraspRequest.MESH, "mesh_uri": "sphere.obj"}
 BALL, RADIUS = np.array([0.0, 0.0, 0.5]), 0.035  # metres, camera frame
+CAMERA = PinholeCamera(200, 150, 400.0, 400.0, 99.5, 74.5)
 HAND_LENGTH = 0.25
 
 pytestmark = pytest.mark.timeout(300)
@@ -81,23 +86,6 @@ def test_a_request_keeps_its_id_tells_progress_and_gets_one_full_answer(client, 
     assert len(client.answers) == 1
 
 
-def test_with_an_arm_every_grasp_has_its_joints_and_what_is_out_of_reach_is_told(client, node):
-    client.set_parameters(arm="panda_like", arm_base_frame="table")
-    header, upright = Header(frame_id="table", stamp=client.now()), Quaternion(w=1.0)
-    near, far = (Pose(position=Point(x=away, z=0.3), orientation=upright) for away in (0.5, 5.0))
-    client.send_request(id="near", header=header, object_pose=near, **SPHERE, **FEW)
-    answer = client.answer("near")
-    assert answer.status == GraspArray.SUCCEEDED, answer.message
-    for grasp in answer.grasps:
-        assert list(grasp.arm_trajectory.joint_names) == [f"joint_{k}" for k in range(1, 8)]
-        assert len(grasp.arm_stages) == 4
-        assert grasp.arm_stages[-1] == len(grasp.arm_trajectory.points) - 1
-    client.send_request(id="far", header=header, object_pose=far, **SPHERE, **FEW)
-    answer = client.answer("far")
-    assert (answer.status, answer.error_code) == (GraspArray.FAILED, "NO_GRASP")
-    assert "m from the base of panda_like, whose reach with allegro_right" in answer.message
-
-
 def test_a_live_id_is_not_taken_twice_and_a_queued_request_can_be_cancelled(client, node):
     client.send_request(id="a", **SPHERE, **LONG)
     client.event(event="progress", request="a")
@@ -127,40 +115,14 @@ def test_a_deadline_that_passes_in_the_queue_is_answered_then(client, node):
     assert client.answer("long").status == GraspArray.CANCELLED
 
 
-def test_the_newest_cloud_is_grasped_on_demand(client, node, make_cloud, seen_ball):
-    client.set_parameters(cloud_policy="off")
-    cloud = make_cloud(seen_ball)
-    cloud.header.stamp = client.now()
-    cloud.header.stamp.sec -= 60
-    while int(client.health()["clouds received"]) == 0:
-        client.send_cloud(cloud)
-    client.send_request(id="old", source=GraspRequest.LATEST_CLOUD, **FEW)
-    old = client.answer("old")
-    assert (old.status, old.error_code) == (GraspArray.REFUSED, "STALE_CLOUD")
-    assert "cloud_max_age" in old.message
-    client.set_parameters(cloud_max_age=100.0)
-    cloud.header.stamp = client.now()
-    client.show(lambda: client.send_cloud(cloud), cloud.header)
-    client.send_request(id="new", source=GraspRequest.LATEST_CLOUD, **FEW)
-    answer = client.answer("new")
-    assert answer.status in (GraspArray.SUCCEEDED, GraspArray.PARTIAL)
-    assert answer.header == cloud.header
-    assert np.linalg.norm(array_of(answer.grasps[0].grasp_pose.position) - BALL) < HAND_LENGTH
-
-
 def depth_of_ball(client) -> tuple[Image, CameraInfo]:
-    """The ball and nothing else, in millimetres, seen by a camera of 200 x 150 pixels."""
-    width, height, f = 200, 150, 400.0
-    u, v = np.meshgrid(np.arange(width) - 99.5, np.arange(height) - 74.5)
-    rays = np.stack([u / f, v / f, np.ones_like(u)], -1)
-    a, b, c = (rays**2).sum(-1), rays @ BALL, BALL @ BALL - RADIUS**2
-    hit = b**2 - a * c > 0
-    depth = np.where(hit, (b - np.sqrt(np.maximum(b**2 - a * c, 0))) / a, 0)
-    header = Header(frame_id="optical", stamp=client.now())
-    image = Image(header=header, width=width, height=height, encoding="16UC1", step=2 * width)
+    """The ball and nothing else, in millimetres."""
+    depth = render_depth(make_shape("sphere"), CAMERA, translation_matrix(-BALL))
+    header, sizes = Header(frame_id="optical", stamp=client.now()), {"width": CAMERA.width, "height": CAMERA.height}
+    image = Image(header=header, encoding="16UC1", step=2 * CAMERA.width, **sizes)
     image.data = array.array("B", (depth * 1000).round().astype("<u2").tobytes())
-    k = [f, 0.0, 99.5, 0.0, f, 74.5, 0.0, 0.0, 1.0]
-    return image, CameraInfo(header=header, width=width, height=height, k=k, distortion_model="plumb_bob")
+    k = [CAMERA.fx, 0.0, CAMERA.cx, 0.0, CAMERA.fy, CAMERA.cy, 0.0, 0.0, 1.0]
+    return image, CameraInfo(header=header, k=k, distortion_model="plumb_bob", **sizes)
 
 
 def test_depth_images_become_views_and_views_a_grasp(client, node):
@@ -218,7 +180,7 @@ def test_a_grasp_that_is_less_sure_is_told_with_the_next_view_and_not_presented(
     result = GraspResult(Outcome.TOO_FEW, (grasp,), Timing(), 0, "closed_form", next_view=view)
     assert presentable(result) is None
     ending = ending_of(Planned(moved_result(result, T_table_camera)))
-    message = array_message(ending, "mine", Header(frame_id="table"), 1.0, hand, Pace())
+    message = array_message(ending, "mine", Header(frame_id="table"), 1.0, hand, Settings())
     assert message.status == GraspArray.PARTIAL
     (told,) = message.grasps
     assert (told.verdict, told.probability, told.reason) == (GraspMessage.UNVERIFIED, 0.51, "fails with 3")

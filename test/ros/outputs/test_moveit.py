@@ -23,8 +23,9 @@ from graspd_core.perception.obstacles import held_hull
 from graspd_core.types import Grasp, GraspMetrics, Posture, TrialResult, Verdict
 from graspd_ros.convert import matrix_of_pose, pose_of_matrix
 from graspd_ros.inputs.solids import updated_objects
-from graspd_ros.outputs.messages import Pace, grasp_message
+from graspd_ros.outputs.messages import grasp_message
 from graspd_ros.outputs.moveit import MoveItMissing, attached_object, moveit_grasp
+from graspd_ros.parameters import Settings
 
 HAND = load_hand("allegro_right")
 
@@ -40,7 +41,7 @@ def made(verdict: Verdict = Verdict.VERIFIED) -> Grasp:
 
 
 def message(verdict: Verdict = Verdict.VERIFIED) -> Any:
-    return grasp_message(made(verdict), 0, "mesh-1", Header(frame_id="camera", stamp=Time(sec=3)), HAND, Pace())
+    return grasp_message(made(verdict), 0, "mesh-1", Header(frame_id="camera", stamp=Time(sec=3)), HAND, Settings())
 
 
 UP = {"retreat": (0.0, 0.0, 2.0), "retreat_frame": "world"}

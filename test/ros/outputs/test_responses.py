@@ -23,8 +23,7 @@ from visualization_msgs.msg import MarkerArray
 from graspd_core import Grasp, GraspResult, Outcome, Posture, Progress, Scene, TrialResult, Verdict, load_hand
 from graspd_core.errors import MeshError
 from graspd_core.types import Contact, GraspMetrics, Stage, Timing
-from graspd_ros.convert import pose_of_posture
-from graspd_ros.outputs import messages, responses
+from graspd_ros.outputs import responses
 from graspd_ros.outputs.responses import Health, Responses, health_message, resident_memory
 from graspd_ros.parameters import Settings
 from graspd_ros.request import Request
@@ -140,25 +139,6 @@ def a_result(*grasps: Grasp) -> GraspResult:
     return GraspResult(Outcome.TOO_FEW, grasps, Timing(total=1.0), seed=0, method="closed_form")
 
 
-def test_a_pose_turns_wxyz_to_xyzw():
-    pose = pose_of_posture(a_grasp(Verdict.VERIFIED).grasp)
-    orientation = pose.orientation
-    assert (orientation.w, orientation.x, orientation.y, orientation.z) == (0.5, 0.1, -0.7, 0.5)
-    assert (pose.position.x, pose.position.y, pose.position.z) == (1.0, 2.0, 3.0)
-
-
-def test_the_joint_state_names_its_joints_and_carries_positions_only():
-    hand = load_hand("parallel_gripper", candidates=8)
-    posture = replace(a_grasp(Verdict.VERIFIED).grasp, joint_positions=np.array([0.0625]))
-    message = messages.joint_message(posture, hand, Time())
-    assert message.header.frame_id == "base_link"
-    # The jaw that follows the other has its own value.
-    assert list(message.name) == ["left_jaw", "right_jaw"]
-    assert list(message.position) == [0.0625, 0.0625]
-    assert not message.velocity
-    assert not message.effort
-
-
 def test_a_grasp_known_to_be_bad_is_not_presented():
     good, unknown, bad = (a_grasp(v) for v in (Verdict.VERIFIED, Verdict.UNVERIFIED, Verdict.FAILED))
     assert responses.presentable(a_result(good, bad)) is good
@@ -241,7 +221,7 @@ def test_figures_are_readable_and_absent_where_unknown():
     assert values(GOOD, memory=0)["memory [MB]"] == ""
 
 
-WORDS = st.text(st.characters(codec="utf-8", exclude_characters="\0"))  # DDS strings end at a zero
+WORDS = st.text(st.characters(codec="utf-8", exclude_characters="\0"), max_size=20)  # DDS strings end at a zero
 
 
 @given(st.builds(Health, name=WORDS, hand=WORDS, running=WORDS, last_error=WORDS))

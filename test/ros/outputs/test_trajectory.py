@@ -19,12 +19,12 @@ from trajectory_msgs.msg import JointTrajectory
 
 from graspd_core import ArmPath, Grasp, Posture, load_hand, load_scene, plan_grasps
 from graspd_core.arms.arm_paths import STAGE_ROWS
-from graspd_core.errors import ConfigError
 from graspd_core.hands.model import HandModel, Mount
 from graspd_core.perception.scene import object_parts
 from graspd_core.verify.world import PROTOCOLS, build_world
 from graspd_ros.convert import matrix_of, matrix_of_pose
-from graspd_ros.outputs.messages import Pace, arm_trajectory, base_poses, grasp_message, posture_times, trajectory_of
+from graspd_ros.outputs.messages import arm_trajectory, base_poses, grasp_message, posture_times, trajectory_of
+from graspd_ros.parameters import Settings
 
 HAND = load_hand("allegro_right")
 SHARES = st.lists(st.floats(0.0, 1.0), min_size=HAND.num_joints, max_size=HAND.num_joints)
@@ -55,7 +55,7 @@ def spline(trajectory: JointTrajectory) -> CubicHermiteSpline:
 
 @given(SHARES, SHARES, SHARES, st.floats(0.0, 0.3), st.floats(0.0, math.pi), st.floats(0.2, 20.0), st.floats(0.01, 5.0))
 def test_no_speed_is_exceeded_whatever_the_postures(first, second, third, travel, turn, joint_speed, shortest):
-    pace = Pace(joint_speed=joint_speed, shortest=shortest)
+    pace = Settings(joint_speed=joint_speed, shortest_stage=shortest)
     found = grasp(posture(first), posture(second, (travel, 0.0, 0.0), turn), posture(third, (travel, 0.0, 0.0), turn))
     trajectory = trajectory_of(found, HAND, pace)
     times = seconds(trajectory)
@@ -71,7 +71,7 @@ def test_no_speed_is_exceeded_whatever_the_postures(first, second, third, travel
 
 @given(SHARES, SHARES, SHARES)
 def test_joints_stay_within_their_limits_and_in_step(first, second, third):
-    trajectory = trajectory_of(grasp(posture(first), posture(second), posture(third)), HAND, Pace())
+    trajectory = trajectory_of(grasp(posture(first), posture(second), posture(third)), HAND, Settings())
     times, path = seconds(trajectory), spline(trajectory)
     for start, end, a, b in zip(times, times[1:], positions(trajectory), positions(trajectory)[1:], strict=False):
         way = path(np.linspace(start, end, 50))
@@ -84,15 +84,15 @@ def test_joints_stay_within_their_limits_and_in_step(first, second, third):
 
 def test_the_first_point_leaves_time_to_come_from_anywhere():
     still = posture([0.5] * HAND.num_joints)
-    first = posture_times(grasp(still, still, still), HAND, Pace(joint_speed=0.5))[0]
+    first = posture_times(grasp(still, still, still), HAND, Settings(joint_speed=0.5))[0]
     assert first == pytest.approx(1.5 * (HAND.upper - HAND.lower).max() / 0.5)
 
 
 def test_a_negated_quaternion_is_no_turn():
     here = posture([0.5] * HAND.num_joints)
     negated = dataclasses.replace(here, quaternion_wxyz=-here.quaternion_wxyz)
-    times = posture_times(grasp(here, negated, here), HAND, Pace())
-    np.testing.assert_allclose(np.diff(times), Pace().shortest)
+    times = posture_times(grasp(here, negated, here), HAND, Settings())
+    np.testing.assert_allclose(np.diff(times), Settings().shortest_stage)
 
 
 def test_a_sliding_joint_keeps_the_speed_of_the_base():
@@ -100,18 +100,18 @@ def test_a_sliding_joint_keeps_the_speed_of_the_base():
         HAND, joint_kind=tuple("prismatic" if kind == "revolute" else kind for kind in HAND.joint_kind)
     )
     here, there = posture([0.0] * HAND.num_joints), posture([1.0] * HAND.num_joints)
-    slow = np.diff(posture_times(grasp(here, there, there), sliding, Pace()))[0]
-    assert slow == pytest.approx(1.5 * (HAND.upper - HAND.lower).max() / Pace().base_speed)
+    slow = np.diff(posture_times(grasp(here, there, there), sliding, Settings()))[0]
+    assert slow == pytest.approx(1.5 * (HAND.upper - HAND.lower).max() / Settings().base_speed)
 
 
 def test_rounding_beyond_a_limit_is_cut_off():
     above = dataclasses.replace(posture([1.0] * HAND.num_joints), joint_positions=HAND.upper + 1e-12)
-    assert (positions(trajectory_of(grasp(above, above, above), HAND, Pace())) <= HAND.upper).all()
+    assert (positions(trajectory_of(grasp(above, above, above), HAND, Settings())) <= HAND.upper).all()
 
 
 def test_the_message_names_joints_and_starts_on_receipt():
     here = posture([0.5] * HAND.num_joints, (0.1, 0.2, 0.3), 1.0)
-    trajectory = trajectory_of(grasp(here, here, here), HAND, Pace())
+    trajectory = trajectory_of(grasp(here, here, here), HAND, Settings())
     assert tuple(trajectory.joint_names) == HAND.joint_names
     assert trajectory.header.frame_id == HAND.base_link
     assert (trajectory.header.stamp.sec, trajectory.header.stamp.nanosec) == (0, 0)
@@ -121,12 +121,6 @@ def test_the_message_names_joints_and_starts_on_receipt():
     assert {(p.header.frame_id, p.header.stamp.sec) for p in poses} == {("camera", 7)}
     assert poses[1].pose.position.z == 0.3
     assert poses[1].pose.orientation.z == pytest.approx(math.sin(0.5))
-
-
-@pytest.mark.parametrize("value", [0.0, -1.0, math.inf, math.nan])
-def test_a_pace_that_is_none_is_refused(value: float):
-    with pytest.raises(ConfigError, match="base_turn"):
-        Pace(base_turn=value)
 
 
 # The flange's z is the hand's, 3 cm before the mount; an eighth of a turn about it.
@@ -149,7 +143,7 @@ def carried(mounted: HandModel) -> Grasp:
 
 
 def test_the_arms_link_is_where_the_mount_puts_it(mounted: HandModel, carried: Grasp) -> None:
-    message = grasp_message(carried, 0, "r", Header(frame_id="camera"), mounted, Pace())
+    message = grasp_message(carried, 0, "r", Header(frame_id="camera"), mounted, Settings())
     assert message.mount_link == "tool0"
     for base, parent in (
         (message.pregrasp_pose, message.mount_pregrasp_pose),
@@ -163,14 +157,16 @@ def test_the_arms_link_is_where_the_mount_puts_it(mounted: HandModel, carried: G
     at = message.mount_grasp_pose.position
     np.testing.assert_allclose([at.x, at.y, at.z], np.array([0.1, -0.2, 0.25]) - 0.03 * z, atol=1e-12)
     floating = dataclasses.replace(mounted, mount=None)
-    assert grasp_message(carried, 0, "r", Header(frame_id="camera"), floating, Pace()).mount_link == ""
+    assert grasp_message(carried, 0, "r", Header(frame_id="camera"), floating, Settings()).mount_link == ""
 
 
 def test_all_movable_joints_are_in_every_message(mounted: HandModel, carried: Grasp) -> None:
-    message = grasp_message(carried, 0, "r", Header(frame_id="camera", stamp=Time()), mounted, Pace())
+    message = grasp_message(carried, 0, "r", Header(frame_id="camera", stamp=Time()), mounted, Settings())
     names = [f"f{finger}_{joint}" for finger in (1, 2, 3) for joint in ("spread", "proximal", "distal")]
     names.remove("f3_spread")
-    assert list(message.grasp_joints.name) == names
+    for joints in (message.pregrasp_joints, message.grasp_joints, message.squeeze_joints):
+        assert (list(joints.name), joints.header.frame_id) == (names, mounted.base_link)
+        assert (len(joints.position), list(joints.velocity), list(joints.effort)) == (len(names), [], [])
     # Controllers refuse joints that have no command of their own.
     assert list(message.trajectory.joint_names) == list(mounted.joint_names)
     assert set(mounted.joint_names) < set(names)
@@ -189,7 +185,7 @@ def test_a_follower_is_no_faster_than_its_kind_may_be(mounted: HandModel, carrie
         mimics=tuple(dataclasses.replace(m, multiplier=3.0) for m in mounted.mimics),
         velocity=np.full(4, np.inf),
     )
-    pace = Pace(joint_speed=0.1, shortest=0.01)
+    pace = Settings(joint_speed=0.1, shortest_stage=0.01)
     travel = carried.grasp.joint_positions - carried.pregrasp.joint_positions
     first, closed, _ = posture_times(carried, quick, pace)
     assert closed - first == pytest.approx(1.5 * 3 * np.abs(travel).max() / 0.1)
@@ -209,13 +205,13 @@ def grasp_with(step: float) -> Grasp:
 
 @pytest.mark.parametrize("step", [0.0, 0.02, 0.2])
 def test_no_joint_and_no_hand_is_faster_than_asked(step: float):
-    grasp, pace = grasp_with(step), Pace(joint_speed=0.5, base_speed=0.1, shortest=0.2)
+    grasp, pace = grasp_with(step), Settings(joint_speed=0.5, base_speed=0.1, shortest_stage=0.2)
     assert grasp.arm is not None
     trajectory = arm_trajectory(grasp, grasp.arm, pace)
     assert list(trajectory.joint_names) == list(NAMES)
     assert np.allclose([point.positions for point in trajectory.points], grasp.arm.positions)
     times = np.array(seconds(trajectory))
-    assert times[0] == pytest.approx(pace.shortest)
+    assert times[0] == pytest.approx(pace.shortest_stage)
     assert step / np.diff(times).min() <= 0.5
     stages = np.diff(times[list(STAGE_ROWS)])
     assert (stages >= np.maximum(0.2, np.array([0.1, 0.04, 0.1]) / 0.1) - 1e-6).all()
@@ -231,7 +227,8 @@ def test_no_joint_of_the_arm_is_faster_than_the_arm_allows_or_slides_faster_than
     found, limits, hand = grasp_with(0.2), LIMITS, load_hand("barrett_like", candidates=50)
     assert found.arm is not None
     found = dataclasses.replace(found, arm=dataclasses.replace(found.arm, **about))
-    told = grasp_message(found, 0, "id", Header(), hand, Pace(joint_speed=50.0, base_speed=base_speed, shortest=0.01))
+    pace = Settings(joint_speed=50.0, base_speed=base_speed, shortest_stage=0.01)
+    told = grasp_message(found, 0, "id", Header(), hand, pace)
     for sent in (told.arm_trajectory, told.execution.arm):
         speeds = np.diff(positions(sent), axis=0) / np.diff(seconds(sent))[:, None]
         assert (np.abs(speeds) <= limits * (1 + 1e-6)).all()
@@ -241,7 +238,7 @@ def test_no_joint_of_the_arm_is_faster_than_the_arm_allows_or_slides_faster_than
 
 def test_the_message_of_a_grasp_has_it_only_where_there_is_an_arm():
     hand, grasp = load_hand("barrett_like", candidates=50), grasp_with(0.02)
-    told = grasp_message(grasp, 0, "id", Header(frame_id="world"), hand, Pace())
+    told = grasp_message(grasp, 0, "id", Header(frame_id="world"), hand, Settings())
     assert list(told.arm_stages) == list(STAGE_ROWS)
     assert len(told.arm_trajectory.points) == STAGE_ROWS[-1] + 1
     made = told.execution
@@ -250,8 +247,8 @@ def test_the_message_of_a_grasp_has_it_only_where_there_is_an_arm():
     assert list(made.hand.joint_names) == list(hand.joint_names)
     assert seconds(made.arm) == seconds(made.hand)
     assert made.mass == -1.0
-    assert grasp_message(grasp, 0, "id", Header(), hand, Pace(), mass=0.3).execution.mass == 0.3
-    bare = grasp_message(Grasp(grasp.pregrasp, grasp.grasp, grasp.squeeze), 0, "id", Header(), hand, Pace())
+    assert grasp_message(grasp, 0, "id", Header(), hand, Settings(), mass=0.3).execution.mass == 0.3
+    bare = grasp_message(Grasp(grasp.pregrasp, grasp.grasp, grasp.squeeze), 0, "id", Header(), hand, Settings())
     assert list(bare.arm_stages) == []
     assert bare.arm_trajectory.points == []
     assert bare.execution.gates == []
@@ -262,7 +259,7 @@ def play(found: Grasp, hand: HandModel, scene) -> float:
     protocol = PROTOCOLS["standard"]
     world = build_world(hand, scene.object, object_parts(scene.object), protocol)
     data = mujoco.MjData(world.model)
-    trajectory, poses = trajectory_of(found, hand, Pace()), base_poses(found, "object", Time())
+    trajectory, poses = trajectory_of(found, hand, Settings()), base_poses(found, "object", Time())
     times, path = seconds(trajectory), spline(trajectory)
     places = np.array([[p.pose.position.x, p.pose.position.y, p.pose.position.z] for p in poses])
     turns = Rotation.from_quat([[getattr(p.pose.orientation, axis) for axis in "xyzw"] for p in poses])
