@@ -159,8 +159,10 @@ def _seed_links(arm: Arm) -> SE3:
 
 
 @lru_cache(maxsize=8)
-def _samples(arm: Arm) -> tuple[Float[Tensor, "points columns"], Float[Tensor, "points"], Int[np.ndarray, "points"]]:
-    """Return samples of all segments: points as a matrix for `place_points`, larger radii [m], and capsule indices."""
+def capsule_balls(
+    arm: Arm,
+) -> tuple[Float[np.ndarray, "balls 3"], Float[np.ndarray, "balls"], Int[np.ndarray, "balls"]]:
+    """Return balls that cover the arm's capsules: centres in the frames of their links, radii [m], capsule indices."""
     points, radii, owner = [], [], []
     for k in range(len(arm.capsules.link)):
         start, end, radius = arm.capsules.start[k], arm.capsules.end[k], arm.capsules.radius[k]
@@ -170,7 +172,12 @@ def _samples(arm: Arm) -> tuple[Float[Tensor, "points columns"], Float[Tensor, "
         # The nearest sample is at most half a spacing away along the segment, so the padded ball covers the capsule.
         radii.append(np.full(count, np.hypot(radius, spacing / 2)))
         owner.append(np.full(count, k))
-    owner = np.concatenate(owner)
+    return np.concatenate(points), np.concatenate(radii), np.concatenate(owner)
+
+
+@lru_cache(maxsize=8)
+def _samples(arm: Arm) -> tuple[Float[Tensor, "points columns"], Float[Tensor, "points"], Int[np.ndarray, "points"]]:
+    """Return `capsule_balls` with the centres as a matrix for `place_points`."""
+    points, radii, owner = capsule_balls(arm)
     links = torch.as_tensor(arm.capsules.link[owner])
-    matrix = placement(arm.chain.num_links, torch.as_tensor(np.concatenate(points)), links)
-    return matrix, torch.as_tensor(np.concatenate(radii)), owner
+    return placement(arm.chain.num_links, torch.as_tensor(points), links), torch.as_tensor(radii), owner
