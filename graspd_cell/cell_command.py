@@ -57,8 +57,8 @@ def run(options: argparse.Namespace) -> int:
     """Empty the bin. Return 0 if all objects are in the place bin, 3 if not, 130 after Ctrl-C."""
     import torch
 
-    from graspd_cell.cell_view import Film, LiveCell, ReportingSource
-    from graspd_cell.grasp_source import InProcessGrasps
+    from graspd_cell.cell_view import Film, LiveCell
+    from graspd_cell.grasp_source import InProcessGrasps, ReportingSource
     from graspd_cell.picker import Cancelled, Ending, Picker, summary
     from graspd_core.arms.arm import load_arm
     from graspd_core.hands.library import load_hand
