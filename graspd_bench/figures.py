@@ -241,7 +241,7 @@ def moves(old: Sequence[Record], new: Sequence[Record]) -> list[Move]:
         shared = [key for key in after if key in before]
         befores, afters = (by_name(side[key] for key in shared) for side in (before, after))
         for name in afters:
-            means = [{f: _mean(side[name], f) for f in FIGURES} for side in (befores, afters)]
+            means = [{f: mean_of(side[name], f) for f in FIGURES} for side in (befores, afters)]
             found += _differences(kind, name, "all", *means)
             found += [
                 move
@@ -265,7 +265,8 @@ def _moved(figure: str, old: float | None, new: float | None) -> bool:
     return abs(new - old) > max(share * abs(old), least)
 
 
-def _mean(group: Sequence[Row], figure: str) -> float | None:
+def mean_of(group: Sequence[Row], figure: str) -> float | None:
+    """Return the mean of a value over the objects, None without values. CPU time per grasp is over all objects."""
     if figure == "cpu_per_verified":
         return per_verified(group)
     over = spread(group, figure)

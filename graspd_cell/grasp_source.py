@@ -119,17 +119,14 @@ class InProcessGrasps:
         arm, hand, layout: parts of the cell.
         preset: name of graspd's preset.
         seed: seed of the optimiser.
-        tries: number of failures after which an object is given up.
     """
 
     def __init__(
-        self, arm: Arm, hand: HandModel, layout: CellLayout, *, preset: str = "balanced", seed: int = 0,
-        tries: int = 4,
-    ) -> None:  # fmt: skip
+        self, arm: Arm, hand: HandModel, layout: CellLayout, *, preset: str = "balanced", seed: int = 0
+    ) -> None:
         self._hand = hand
         self._plan = {
-            "settings": scene_config(layout.pick), "surface": TABLE, "tries": tries,
-            "enough": 1, "likely": _LIKELY,
+            "settings": scene_config(layout.pick), "surface": TABLE, "enough": 1, "likely": _LIKELY,
             "solids": {f"wall {k}": [box_mesh(wall)] for k, wall in enumerate(layout.solids[1:])},
             "restrictions": (Reach(arm, (0.0, 0.0, 0.0)),), "measure": False, "preset": preset, "seed": seed,
         }  # fmt: skip

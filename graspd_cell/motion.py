@@ -43,6 +43,8 @@ class NoMotionError(GraspdError):
 
 # Cell size of the distance grid, its margin around the points seen, and the greatest coordinate of these points [m].
 _CELL, _AROUND, _FARTHEST = 0.01, 0.12, 2.0
+# Points seen within this distance of a known solid belong to it [m].
+_SLACK = 0.012
 
 
 @dataclass(frozen=True, eq=False)
@@ -78,15 +80,15 @@ class SeenWorld:
         return away
 
 
-def seen_world(points: Points, floor: float, boxes: Sequence[Box] = (), slack: float = 0.012) -> SeenWorld:
+def seen_world(points: Points, floor: float, boxes: Sequence[Box] = ()) -> SeenWorld:
     """Build the obstacles from known solids and from a camera's points in the base frame [m].
 
-    Points within `slack` [m] of the floor or of a box, and points out of the arm's reach, are dropped.
+    Points within `_SLACK` [m] of the floor or of a box, and points out of the arm's reach, are dropped.
     """
     known = SeenWorld(floor, tuple(boxes))
     points = points[(np.abs(points) < _FARTHEST).all(1)]
-    points = points[points[:, 2] > floor + slack]
-    points = points[known.clearance(points) > slack] if boxes else points
+    points = points[points[:, 2] > floor + _SLACK]
+    points = points[known.clearance(points) > _SLACK] if boxes else points
     if not len(points):
         return known
     origin = points.min(0) - _AROUND
@@ -115,16 +117,16 @@ _COARSE = 0.02
 _SAMPLES = 4000
 
 
-def balls_about(points: Points, spacing: float = _SPACING, radius: float = _BALL) -> Balls:
-    """Return a ball of `radius` [m] at one point of every cube of side `spacing` [m] that has points."""
-    kept = np.unique(voxel_keys(points - points.min(0), spacing), return_index=True)[1]
-    return Balls(points[kept], np.full(len(kept), radius))
+def balls_about(points: Points) -> Balls:
+    """Return a ball of radius `_BALL` at one point of every cube of side `_SPACING` that has points."""
+    kept = np.unique(voxel_keys(points - points.min(0), _SPACING), return_index=True)[1]
+    return Balls(points[kept], np.full(len(kept), _BALL))
 
 
-def enclosing_balls(points: Points, spacing: float = _COARSE) -> Balls:
-    """Return balls that enclose all points: one about every cube of side `spacing` [m] that has points."""
-    cubes = np.unique(np.floor(points / spacing), axis=0)
-    return Balls((cubes + 0.5) * spacing, np.full(len(cubes), 0.5 * np.sqrt(3.0) * spacing))
+def enclosing_balls(points: Points) -> Balls:
+    """Return balls that enclose all points: one about every cube of side `_COARSE` that has points."""
+    cubes = np.unique(np.floor(points / _COARSE), axis=0)
+    return Balls((cubes + 0.5) * _COARSE, np.full(len(cubes), 0.5 * np.sqrt(3.0) * _COARSE))
 
 
 @lru_cache(maxsize=4)
@@ -270,11 +272,11 @@ class Mover:
 _STEP = 0.04
 
 
-def dense(path: Path, step: float = _STEP) -> Path:
-    """Return the path with rows inserted on straight lines, so that no joint moves more than `step` [rad] per row."""
+def dense(path: Path) -> Path:
+    """Return the path with rows inserted on straight lines, so that no joint moves more than `_STEP` per row."""
     if len(path) < 2:
         return path
-    counts = [max(1, int(np.ceil(np.abs(b - a).max() / step))) for a, b in pairwise(path)]
+    counts = [max(1, int(np.ceil(np.abs(b - a).max() / _STEP))) for a, b in pairwise(path)]
     parts = [a + np.arange(n)[:, None] / n * (b - a) for (a, b), n in zip(pairwise(path), counts, strict=True)]
     return np.concatenate([*parts, path[-1:]])
 
