@@ -33,7 +33,7 @@ from graspd_core.perception.load_scene import load_scene
 from graspd_core.perception.scene import ObjectModel, Scene, build_scene, object_parts
 from graspd_core.perception.scene_from_views import scene_from_views
 from graspd_core.planning.feasibility import kind_of
-from graspd_core.types import Grasp, TriangleMesh
+from graspd_core.types import Grasp
 from graspd_core.verify.hold_trial import hold_trial
 from graspd_core.verify.world import PROTOCOLS, Protocol, at_friction, build_world
 from graspd_dataset.run_records import markdown_table
@@ -140,15 +140,11 @@ def run_size(case: MapCase) -> list[Record]:
     """Plan and try on a shape of 0.1 kg, scaled to a least width of `case.across` times the hand's span."""
     config = settings(case.preset)
     width = float(case.across) * _span(case.hand, config.problem.fine_candidates)
-    scale = width / least_width(make_shape(case.thing))
+    # The least width is along x, y or z. The hand must open at least this wide.
+    scale = width / float(np.ptp(make_shape(case.thing).vertices, axis=0).min())
     scene = load_scene(f"shape:{case.thing}", mass=PROTOCOL_MASS, scale=scale, resolution=config.resolution)
     hand, grasps = plan(case, scene)
     return [try_grasps(case, up, hand, scene.object, grasps, PROTOCOLS["standard"]) for up in case.up]
-
-
-def least_width(mesh: TriangleMesh) -> float:
-    """Return the least extent of a mesh along its x, y and z axes [m]. The hand must open at least this wide."""
-    return float(np.ptp(mesh.vertices, axis=0).min())
 
 
 def hand_span(hand: HandModel) -> float:

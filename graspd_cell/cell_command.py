@@ -7,7 +7,6 @@ import atexit
 import gc
 import os
 from collections import Counter
-from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -80,7 +79,9 @@ def run(options: argparse.Namespace) -> int:
     )
     attempts: list[Attempt] = []
     with Interrupt() as interrupt:
-        _greet(live, interrupt.is_interrupted)
+        if live is not None:
+            print_note(f"{live.page.url} - the arm starts when this page is open")
+            live.page.wait_for_visitor(_PATIENCE, interrupt.is_interrupted)
         picker = Picker(robot, source, arm, hand, world.layout, cancelled=interrupt.is_interrupted)
         try:
             for attempt in waiting(picker.empty_the_bin(options.attempts or 2 * options.count + 3), "pick"):
@@ -172,12 +173,6 @@ def _refuse(options: argparse.Namespace) -> None:
         raise ConfigError(f"--speed: {options.speed}; valid: a positive number")
     if options.film is not None:
         check_writable(options.film)
-
-
-def _greet(live: LiveCell | None, stop: Callable[[], bool]) -> None:
-    if live is not None:
-        print_note(f"{live.page.url} - the arm starts when this page is open")
-        live.page.wait_for_visitor(_PATIENCE, stop)
 
 
 def _tell(live: LiveCell | None, attempt: Attempt, report: Report) -> None:

@@ -95,11 +95,6 @@ def cell_cases(request: Request) -> tuple[CellCase, ...]:
     )
 
 
-def cell_seconds(case: CellCase) -> float:
-    """Estimate the CPU seconds of a case."""
-    return 8.0 + 12.0 * case.size
-
-
 def run_cell(case: CellCase) -> Record:
     """Empty one bin and return its record."""
     arm_name, hand_name = case.pair.split("+")
@@ -299,6 +294,6 @@ def cell_summary(record: Record) -> str:
 STUDY = Study(
     "bins emptied in simulated cells by three arms and hands, from depth images to the other bin",
     cell_cases, run_cell, cell_sections,
-    ("../graspd_cell/*.py", "rendering/*.py"), ("presets", "objects", "cases", "seeds", "quick"), cell_seconds,
-    summary=cell_summary, usual=False,
+    ("../graspd_cell/*.py", "rendering/*.py"), ("presets", "objects", "cases", "seeds", "quick"),
+    lambda case: 8.0 + 12.0 * case.size, summary=cell_summary, usual=False,
 )  # fmt: skip

@@ -13,7 +13,7 @@ from graspd_core.hands.model import HandModel
 from graspd_core.mesh.topology import is_closed
 from graspd_core.se3 import perpendicular, quaternion_from_rotation
 from graspd_core.types import Posture, TriangleMesh
-from graspd_viewer.drawing import SEEN, Colour, Part, hand_parts, placed_links, scene_parts, sdf_slice, slice_axes
+from graspd_viewer.drawing import SEEN, Part, hand_parts, placed_links, scene_parts, sdf_slice, slice_axes
 from graspd_viewer.session import Session
 
 _MOST_POINTS = 20_000
@@ -153,7 +153,8 @@ class SceneNodes:
         if hand:
             mesh = TriangleMesh(mesh.vertices[mesh.faces].reshape(-1, 3), np.arange(mesh.faces.size).reshape(-1, 3))
         return self._server.scene.add_mesh_simple(
-            name, PER_METRE * mesh.vertices, mesh.faces, color=_bytes(part.colour), flat_shading=True,
+            name, PER_METRE * mesh.vertices, mesh.faces,
+            color=tuple(round(255 * channel) for channel in part.colour), flat_shading=True,
             material="toon5" if hand else "standard", side="front" if closed else "double",
             opacity=None if part.opacity == 1.0 else part.opacity, cast_shadow=False, receive_shadow=False,
         )  # fmt: skip
@@ -175,11 +176,6 @@ class SceneNodes:
         self._server.scene.set_up_direction(up)
         for camera in (self._server.initial_camera, *(c.camera for c in self._server.get_clients().values())):
             camera.position, camera.look_at = PER_METRE * eye, PER_METRE * middle
-
-
-def _bytes(colour: Colour) -> tuple[int, int, int]:
-    r, g, b = (round(255 * channel) for channel in colour)
-    return r, g, b
 
 
 def _quaternion(rotation: Float[np.ndarray, "3 3"]) -> Float[np.ndarray, "4"]:

@@ -16,7 +16,6 @@ from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 
 import numpy as np
-from jaxtyping import Float
 
 from graspd_bench.bullet.bullet_world import build_bullet_world, bullet_available, bullet_displacement
 from graspd_bench.study import PROTOCOL_MASS, ObjectCase, Record, Request, Sections, object_cases, raw_grasps
@@ -75,16 +74,13 @@ def _shared_volume(query: DistanceQuery, skin: TriangleMesh) -> float:
     high = np.minimum(query.tree.high, skin.vertices.max(0))
     if (high <= low).any():
         return 0.0
-    axes = [_middles(a, b) for a, b in zip(low, high, strict=True)]
+    ends = zip(np.floor(low / VOXEL), np.ceil(high / VOXEL), strict=True)
+    axes = [(np.arange(first, last) + 0.5) * VOXEL for first, last in ends]
     cells = np.stack(np.meshgrid(*axes, indexing="ij"), -1).reshape(-1, 3)
     cells = cells[is_inside(query.tree, cells)]
     if len(cells) == 0:
         return 0.0
     return float(is_inside(make_distance_query(skin).tree, cells).sum()) * VOXEL**3
-
-
-def _middles(low: float, high: float) -> Float[np.ndarray, "n"]:
-    return (np.arange(np.floor(low / VOXEL), np.ceil(high / VOXEL)) + 0.5) * VOXEL
 
 
 SHAPES = ("shape:sphere", "shape:cylinder", "shape:box")
