@@ -24,6 +24,7 @@ from graspd_core.hands.mano.mano_hand import load_mano
 from graspd_core.mesh.mesh_files import surface_samples
 from graspd_core.mesh.shapes import object_hash
 from graspd_core.mesh.surface_queries import DistanceQuery, is_inside, make_distance_query, signed_distance
+from graspd_core.mesh.topology import scaled_normals
 from graspd_core.optimize.plan_config import PlanConfig, load_preset, override, to_mapping
 from graspd_core.perception.load_scene import load_scene
 from graspd_core.perception.scene import object_parts
@@ -58,9 +59,7 @@ def measure_skin(query: DistanceQuery, skin: TriangleMesh) -> SkinMetrics:
     """Measure how a closed skin mesh touches an object, object frame [m]. `query` gives distances to the object."""
     points, _ = surface_samples(skin, _SAMPLES, _SEED)
     distance = signed_distance(query, points, reach=2 * CONTACT_DISTANCES[-1])
-    corners = skin.vertices[skin.faces]
-    cross = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-    each = 0.5 * float(np.linalg.norm(cross, axis=1).sum()) / len(points)
+    each = 0.5 * float(np.linalg.norm(scaled_normals(skin.vertices, skin.faces), axis=1).sum()) / len(points)
     return SkinMetrics(
         contact_area=tuple(float((np.abs(distance) <= within).sum()) * each for within in CONTACT_DISTANCES),
         intersection_volume=_shared_volume(query, skin),
