@@ -24,9 +24,8 @@ _STEPS = 12
 
 def tip_pose(mover: Mover, q: Joints) -> Pose:
     """Return `T_base_tip` [m] at the arm's joint values `q`."""
-    rotation, place = mover.shape.links(q[None])
-    pose = np.eye(4)
-    pose[:3, :3], pose[:3, 3] = rotation[0, mover.shape.arm.tip], place[0, mover.shape.arm.tip]
+    tip, pose = mover.shape.links(q[None])[0, mover.shape.arm.tip], np.eye(4)
+    pose[:3, :3], pose[:3, 3] = tip.rotation.numpy(), tip.translation.numpy()
     return pose
 
 

@@ -27,10 +27,11 @@ from graspd_cell.robot import JointMotion
 from graspd_core.arms.arm import Arm, tip_hand
 from graspd_core.arms.arm_collision import capsule_balls
 from graspd_core.errors import Extra, GraspdError
-from graspd_core.hands.kinematics import forward, in_base, link_poses, make_kinematics
+from graspd_core.hands.kinematics import forward, in_base, link_poses, make_kinematics, place_points
 from graspd_core.hands.model import HandModel
 from graspd_core.hands.surface_points import dense_samples
 from graspd_core.mesh.topology import voxel_keys
+from graspd_core.se3 import SE3
 
 Joints = Float[np.ndarray, "joints"]
 Path = Float[np.ndarray, "rows joints"]
@@ -152,20 +153,19 @@ class ArmShape:
 
     Attributes:
         arm: the arm.
-        local: centre of each ball in the frame of its link [m].
+        balls: centres of the balls as a matrix for `place_points`.
         radius: radius of each ball [m]. The balls of a capsule cover the whole capsule.
         link: link index of each ball.
     """
 
     arm: Arm
-    local: Points
+    balls: Float[torch.Tensor, "_ columns"]
     radius: Float[np.ndarray, "_"]
     link: Int[np.ndarray, "_"]
 
-    def links(self, q: Path) -> tuple[Float[np.ndarray, "rows links 3 3"], Float[np.ndarray, "rows links 3"]]:
-        """Return rotation and translation [m] of every link at joint values, base frame."""
-        links = forward(make_kinematics(self.arm.chain, dtype=torch.float64), torch.as_tensor(q))
-        return links.rotation.numpy(), links.translation.numpy()
+    def links(self, q: Path) -> SE3:
+        """Return `T_base_link` [m] of every link at joint values."""
+        return forward(make_kinematics(self.arm.chain, dtype=torch.float64), torch.as_tensor(q))
 
     @cached_property
     def beyond_shoulder(self) -> Bool[np.ndarray, "_"]:
@@ -177,8 +177,8 @@ class ArmShape:
 @lru_cache(maxsize=4)
 def arm_shape(arm: Arm) -> ArmShape:
     """Return the arm with balls along its capsules. They exceed a capsule by less than an eighth of its radius."""
-    local, radius, capsule = capsule_balls(arm)
-    return ArmShape(arm, local, radius, arm.capsules.link[capsule])
+    balls, radius, capsule = capsule_balls(arm)
+    return ArmShape(arm, balls, radius.numpy(), arm.capsules.link[capsule])
 
 
 # Pairs of balls that are nearer than this in the seed posture are not checked against each other [m].
@@ -219,10 +219,10 @@ class Mover:
         return coarse, pairs, np.argwhere(gap > _TOUCHING)
 
     def _placed(self, q: Path, *carried: Balls) -> list[np.ndarray]:
-        rotation, place = self.shape.links(q)
-        link, tip = self.shape.link, self.shape.arm.tip
-        balls = np.einsum("bnij,nj->bni", rotation[:, link], self.shape.local) + place[:, link]
-        return [balls, *(some.at @ rotation[:, tip].swapaxes(1, 2) + place[:, None, tip] for some in carried)]
+        links = self.shape.links(q)
+        tip = links[:, self.shape.arm.tip]
+        balls = place_points(self.shape.balls, links).numpy()
+        return [balls, *(tip.apply(torch.as_tensor(some.at)).numpy() for some in carried)]
 
     def placed(self, q: Joints) -> tuple[Points, Points]:
         """Return the collision balls' centres: of the arm, and of hand and held object, base frame [m]."""

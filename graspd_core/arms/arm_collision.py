@@ -50,7 +50,7 @@ def hits_of_scene(arm: Arm, scene: Scene, base: SE3, links: SE3) -> Hits:
     """
     solids = [("the object", scene.sdf), *(("an obstacle", obstacle.sdf) for obstacle in scene.obstacles)]
     moved = np.flatnonzero(arm.chain.link_group[arm.capsules.link] != 0)
-    points, padded, owner = _samples(arm)
+    points, padded, owner = capsule_balls(arm)
     at = (base.rotation @ place_points(points, links)[..., None]).squeeze(-1) + base.translation
     found = [hits_of_support(arm, scene, base, placed(arm.capsules, links)[:2])]
     for what, sdf in solids:
@@ -159,10 +159,8 @@ def _seed_links(arm: Arm) -> SE3:
 
 
 @lru_cache(maxsize=8)
-def capsule_balls(
-    arm: Arm,
-) -> tuple[Float[np.ndarray, "balls 3"], Float[np.ndarray, "balls"], Int[np.ndarray, "balls"]]:
-    """Return balls that cover the arm's capsules: centres in the frames of their links, radii [m], capsule indices."""
+def capsule_balls(arm: Arm) -> tuple[Float[Tensor, "n columns"], Float[Tensor, "n"], Int[np.ndarray, "n"]]:
+    """Return samples of all segments: points as a matrix for `place_points`, larger radii [m], and capsule indices."""
     points, radii, owner = [], [], []
     for k in range(len(arm.capsules.link)):
         start, end, radius = arm.capsules.start[k], arm.capsules.end[k], arm.capsules.radius[k]
@@ -172,12 +170,7 @@ def capsule_balls(
         # The nearest sample is at most half a spacing away along the segment, so the padded ball covers the capsule.
         radii.append(np.full(count, np.hypot(radius, spacing / 2)))
         owner.append(np.full(count, k))
-    return np.concatenate(points), np.concatenate(radii), np.concatenate(owner)
-
-
-@lru_cache(maxsize=8)
-def _samples(arm: Arm) -> tuple[Float[Tensor, "points columns"], Float[Tensor, "points"], Int[np.ndarray, "points"]]:
-    """Return `capsule_balls` with the centres as a matrix for `place_points`."""
-    points, radii, owner = capsule_balls(arm)
+    owner = np.concatenate(owner)
     links = torch.as_tensor(arm.capsules.link[owner])
-    return placement(arm.chain.num_links, torch.as_tensor(points), links), torch.as_tensor(radii), owner
+    matrix = placement(arm.chain.num_links, torch.as_tensor(np.concatenate(points)), links)
+    return matrix, torch.as_tensor(np.concatenate(radii)), owner

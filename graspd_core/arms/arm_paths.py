@@ -184,9 +184,7 @@ def _postures(task: ArmTask, target: SE3) -> tuple[Float[Tensor, "postures joint
     return q[kept], owner[kept]
 
 
-def nearest_turn(
-    arm: Arm, q: Float[Tensor, "batch joints"], near: Float[np.ndarray, "joints"]
-) -> Float[Tensor, "batch joints"]:
+def nearest_turn(arm: Arm, q: Float[Tensor, "batch joints"], near: np.ndarray) -> Float[Tensor, "batch joints"]:
     """Add full turns to revolute joints, so that each joint is as near to the posture `near` as its limits allow."""
     turns = ((torch.as_tensor(near) - q) / (2 * np.pi)).round() * (2 * np.pi)
     turned = torch.where(torch.as_tensor(arm.chain.slides), q, q + turns)
