@@ -31,16 +31,9 @@ _CHECK_EVERY = 100
 
 @dataclass(frozen=True, eq=False)
 class _Run:
-    """One running simulation.
+    """One running simulation: the ids of the client, of the object's body, of the hand's body, and of its joints.
 
-    Attributes:
-        client: id of the PyBullet client.
-        world: hand and object of the simulation.
-        protocol: physics settings.
-        body: body id of the object.
-        hand: body id of the hand.
-        joints: joint ids of the hand's actuated joints.
-        worst: greatest displacement [m] and rotation [rad] of the object so far. The array is updated in place.
+    `worst` has the greatest displacement [m] and rotation [rad] of the object so far. It is updated in place.
     """
 
     client: int
