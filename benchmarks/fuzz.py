@@ -19,20 +19,10 @@ import subprocess
 import sys
 import time
 import traceback
-from dataclasses import dataclass
 from pathlib import Path
 
 ROOT = Path(__file__).parents[1]
 SECONDS_PER_INPUT, MEGABYTES = 5, 2048
-
-
-@dataclass(frozen=True)
-class Figures:
-    """Result of fuzzing a target: number of inputs, number of reached edges in the code, and duration [s]."""
-
-    inputs: int
-    edges: int
-    seconds: float
 
 
 def fuzz_here(name: str, seconds: int, out: Path, seed: int) -> None:
@@ -91,8 +81,11 @@ def _keep(findings: Path, name: str, data: bytes, error: Exception) -> None:
     file.with_suffix(".txt").write_text(f"{told}\n{traceback.format_exc()}")
 
 
-def fuzz(name: str, seconds: float, out: Path, seed: int) -> Figures:
-    """Fuzz one target in a child process until the time is over. If an input kills the process, start another one."""
+def fuzz(name: str, seconds: float, out: Path, seed: int) -> tuple[int, int, float]:
+    """Fuzz one target in a child process until the time is over. If an input kills the process, start another one.
+
+    Return the number of inputs, the number of reached edges in the code, and the duration [s].
+    """
     inputs, edges, begun = 0, 0, time.monotonic()
     while (left := seconds - (time.monotonic() - begun)) >= 1:
         arguments = ["--child", name, "--seconds", str(int(left)), "--out", str(out), "--seed", str(seed)]
@@ -107,7 +100,7 @@ def fuzz(name: str, seconds: float, out: Path, seed: int) -> Figures:
         if not inputs:
             sys.exit(f"{name}: does not start:\n{ended.stderr[-2000:]}")
         seed += 1
-    return Figures(inputs, edges, time.monotonic() - begun)
+    return inputs, edges, time.monotonic() - begun
 
 
 def main() -> int:
@@ -134,10 +127,10 @@ def main() -> int:
     names = given.targets or list(TARGETS)
     print("| target | inputs | edges | seconds | findings |\n|---|---:|---:|---:|---:|", flush=True)
     for name in names:
-        figures = fuzz(name, given.minutes * 60 / len(names), out, given.seed)
+        inputs, edges, seconds = fuzz(name, given.minutes * 60 / len(names), out, given.seed)
         # The count includes libFuzzer's own files: inputs that hung or killed the process.
         found = [file for file in (out / "findings").glob(f"{name}-*") if file.suffix != ".txt"]
-        print(f"| {name} | {figures.inputs} | {figures.edges} | {figures.seconds:.0f} | {len(found)} |", flush=True)
+        print(f"| {name} | {inputs} | {edges} | {seconds:.0f} | {len(found)} |", flush=True)
     left = sorted(file for file in (out / "findings").glob("*") if file.suffix != ".txt")
     for file in left:
         note = file.with_suffix(".txt")

@@ -103,8 +103,8 @@ class Client:
         self._requests.publish(GraspRequest(id=name, **fields))
         return name
 
-    def answered(self, name: str, what: str = "an answer") -> float:
-        return self.wait(lambda: self.answers[name], what)
+    def answered(self, name: str) -> float:
+        return self.wait(lambda: self.answers[name], "an answer")
 
     def settle(self) -> None:
         """Wait for an answer to every request. Then wait 1 s longer for duplicate answers."""

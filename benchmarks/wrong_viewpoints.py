@@ -3,8 +3,8 @@
     python benchmarks/wrong_viewpoints.py [--count 500] [--frames FOLDER]
 
 Clouds come from ten rendered scenes (objects of `graspd bench cameras` on which no threshold was chosen, seeds from
-100), and from the depth frames in a folder (`NAME/camera.json` with K, `NAME/depth_mm.png`). Points are unordered, so
-that no pixel shows where the camera stood. Each cloud has three forms: all points, points thinned to 8 mm, and only the
+100), and from the depth frames in a folder (`NAME/camera.json`, `NAME/depth_mm.png`). Points are unordered, so that no
+pixel shows where the camera stood. Each cloud has three forms: all points, points thinned to 8 mm, and only the
 object's points. A wrong position is a robot's base, the true position mirrored, 5 m away, or anywhere at the true
 distance. The line of sight turns by more than 20°. Verified grasps are tried on the true object, if known.
 """
@@ -12,7 +12,6 @@ distance. The line of sight turns by more than 20°. Verified grasps are tried o
 from __future__ import annotations
 
 import argparse
-import json
 from collections import Counter
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -25,7 +24,7 @@ from graspd_bench.studies.cameras import ASSUMED, FIRST_SEED, SHAPES, CameraView
 from graspd_bench.study import PROTOCOL_MASS
 from graspd_core.errors import GraspdError
 from graspd_core.hands.library import load_hand
-from graspd_core.perception.cloud.camera import PinholeCamera, cloud_from_depth
+from graspd_core.perception.cloud.depth_files import load_depth_view
 from graspd_core.perception.cloud.point_cloud import PointCloud, Points, Vector
 from graspd_core.perception.scene import build_scene, object_parts
 from graspd_core.perception.scene_from_views import scene_from_views
@@ -63,13 +62,8 @@ def rendered() -> Iterator[Seen]:
 
 
 def frames(folder: Path) -> Iterator[Seen]:
-    from PIL import Image
-
     for path in sorted(folder.glob("*/camera.json")):
-        K = np.array(json.loads(path.read_text())["K"])
-        depth = np.asarray(Image.open(path.with_name("depth_mm.png")), dtype=float) / 1000
-        camera = PinholeCamera(depth.shape[1], depth.shape[0], K[0, 0], K[1, 1], K[0, 2], K[1, 2])
-        cloud = cloud_from_depth(depth, camera)
+        cloud = load_depth_view(path.with_name("depth_mm.png"), path)
         seen = segment([cloud])
         if seen.support is None:
             continue

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import dataclass, replace
 from functools import lru_cache
 from pathlib import Path
 from typing import Any
@@ -33,7 +33,7 @@ from graspd_core.perception.load_scene import load_scene
 from graspd_core.perception.scene import ObjectModel, Scene, build_scene, object_parts
 from graspd_core.perception.scene_from_views import scene_from_views
 from graspd_core.planning.feasibility import kind_of
-from graspd_core.types import Grasp, TriangleMesh
+from graspd_core.types import Grasp
 from graspd_core.verify.hold_trial import hold_trial
 from graspd_core.verify.world import PROTOCOLS, Protocol, at_friction, build_world
 from graspd_dataset.run_records import markdown_table
@@ -75,32 +75,19 @@ class MapCase(Case):
         return " ".join(str(word) for word in (self.map, self.preset, *place, f"seed {self.seed}"))
 
 
-@dataclass(frozen=True)
-class MapCell:
-    """Results of one case's grasps in one cell.
-
-    Attributes:
-        up: value of the cell on the vertical axis.
-        held: number of grasps that passed the hold trial.
-        reasons: number of failed grasps by reason. Grasps that were not found count as failed.
-    """
-
-    up: Place
-    held: int
-    reasons: Mapping[str, int]
+# Runs a case of a map. It raises GraspdError if no scene can be built. Returns a record for each cell of the case: its
+# vertical value `up`, the number of grasps that passed the hold trial as `held`, and the number of failed grasps by
+# reason as `reasons`. Grasps that were not found count as failed.
+Run = Callable[[MapCase], list[Record]]
 
 
-# Runs a case of a map. It raises GraspdError if no scene can be built.
-Run = Callable[[MapCase], tuple[MapCell, ...]]
-
-
-def run_on(run: Run, case: MapCase) -> tuple[MapCell, ...]:
+def run_on(run: Run, case: MapCase) -> list[Record]:
     """Run a case. If the scene cannot be built, all grasps of the case fail for that reason."""
     try:
         return run(case)
     except GraspdError as error:
         reason = f"{NO_SCENE}: {kind_of(str(error))}"
-        return tuple(MapCell(up, 0, {reason: case.count}) for up in case.up)
+        return [{"up": up, "held": 0, "reasons": {reason: case.count}} for up in case.up]
 
 
 @lru_cache(maxsize=4)
@@ -122,23 +109,23 @@ def plan(case: MapCase, scene: Scene) -> tuple[HandModel, tuple[Grasp, ...]]:
 
 def try_grasps(
     case: MapCase, up: Place, hand: HandModel, target: ObjectModel, grasps: Sequence[Grasp], protocol: Protocol
-) -> MapCell:
+) -> Record:
     """Run the hold trial of every grasp on `target`. Return the results as the map cell with vertical value `up`."""
     if not grasps:
-        return MapCell(up, 0, {NOT_FOUND: case.count})
+        return {"up": up, "held": 0, "reasons": {NOT_FOUND: case.count}}
     world = build_world(hand, target, object_parts(target), protocol)
     holds = [hold_trial(world, grasp, protocol) for grasp in grasps]
     reasons = Counter(kind_of(hold.reason) for hold in holds if not hold.passed)
     if len(grasps) < case.count:
         reasons[NOT_FOUND] = case.count - len(grasps)
-    return MapCell(up, sum(hold.passed for hold in holds), dict(reasons))
+    return {"up": up, "held": sum(hold.passed for hold in holds), "reasons": dict(reasons)}
 
 
 _POSTURES = 4096
 _YAW, _AZIMUTH = 0.3, np.deg2rad(20.0)
 
 
-def run_friction_mass(case: MapCase) -> tuple[MapCell, ...]:
+def run_friction_mass(case: MapCase) -> list[Record]:
     """Plan with friction `case.across` and a mass of 0.1 kg. Try the grasps at every mass of `case.up` [kg]."""
     config = settings(case.preset)
     scene = load_scene(
@@ -146,22 +133,18 @@ def run_friction_mass(case: MapCase) -> tuple[MapCell, ...]:
     )
     hand, grasps = plan(case, scene)
     protocol = at_friction(PROTOCOLS["standard"], float(case.across))
-    return tuple(try_grasps(case, mass, hand, scene.object.at_mass(float(mass)), grasps, protocol) for mass in case.up)
+    return [try_grasps(case, mass, hand, scene.object.at_mass(float(mass)), grasps, protocol) for mass in case.up]
 
 
-def run_size(case: MapCase) -> tuple[MapCell, ...]:
+def run_size(case: MapCase) -> list[Record]:
     """Plan and try on a shape of 0.1 kg, scaled to a least width of `case.across` times the hand's span."""
     config = settings(case.preset)
     width = float(case.across) * _span(case.hand, config.problem.fine_candidates)
-    scale = width / least_width(make_shape(case.thing))
+    # The least width is along x, y or z. The hand must open at least this wide.
+    scale = width / float(np.ptp(make_shape(case.thing).vertices, axis=0).min())
     scene = load_scene(f"shape:{case.thing}", mass=PROTOCOL_MASS, scale=scale, resolution=config.resolution)
     hand, grasps = plan(case, scene)
-    return tuple(try_grasps(case, up, hand, scene.object, grasps, PROTOCOLS["standard"]) for up in case.up)
-
-
-def least_width(mesh: TriangleMesh) -> float:
-    """Return the least extent of a mesh along its x, y and z axes [m]. The hand must open at least this wide."""
-    return float(np.ptp(mesh.vertices, axis=0).min())
+    return [try_grasps(case, up, hand, scene.object, grasps, PROTOCOLS["standard"]) for up in case.up]
 
 
 def hand_span(hand: HandModel) -> float:
@@ -186,12 +169,12 @@ def _span(hand: str, candidates: int) -> float:
     return hand_span(hand_for(hand, candidates))
 
 
-def run_view(case: MapCase) -> tuple[MapCell, ...]:
+def run_view(case: MapCase) -> list[Record]:
     """Plan on the reconstruction of one view, at elevation `case.across` [deg]. Try the grasps on the true object."""
     (noise,) = case.up
     truth, scene = _seen(case.thing, float(case.across), float(noise), case.seed, settings(case.preset).resolution)
     hand, grasps = plan(case, scene)
-    return (try_grasps(case, noise, hand, truth, grasps, PROTOCOLS["standard"]),)
+    return [try_grasps(case, noise, hand, truth, grasps, PROTOCOLS["standard"])]
 
 
 def noise_at(times: float) -> DepthNoise:
@@ -216,12 +199,12 @@ def _seen(thing: str, elevation: float, noise: float, seed: int, resolution: int
     return build_scene(stage.truth, source=thing, mass=PROTOCOL_MASS, resolution=resolution).object, scene
 
 
-def run_wall(case: MapCase) -> tuple[MapCell, ...]:
+def run_wall(case: MapCase) -> list[Record]:
     """Plan and try on a cup. `case.up` is the wall thickness [mm]. `case.across` is the resolution of the SDF grid."""
     (wall,) = case.up
     scene = on_grid(cup(float(wall)), int(case.across))
     hand, grasps = plan(case, scene)
-    return (try_grasps(case, wall, hand, scene.object, grasps, PROTOCOLS["standard"]),)
+    return [try_grasps(case, wall, hand, scene.object, grasps, PROTOCOLS["standard"])]
 
 
 @lru_cache(maxsize=1)
@@ -321,7 +304,7 @@ def cases_of(name: str, method: str) -> tuple[MapCase, ...]:
 
 
 def run_map(case: MapCase) -> Record:
-    cells = [asdict(cell) for cell in run_on(MAPS[case.map].run, case)]
+    cells = run_on(MAPS[case.map].run, case)
     return {"cells": cells, "held": max(cell["held"] for cell in cells)}
 
 

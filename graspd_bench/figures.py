@@ -236,26 +236,16 @@ def moves(old: Sequence[Record], new: Sequence[Record]) -> list[Move]:
     """Return the changes between two runs. For each name: means over shared objects ("all"), then every object."""
     found: list[Move] = []
     for kind in ("raw", "verified"):
-        before = {(row.name, row.object): row for row in rows(old, kind)}
-        after = {(row.name, row.object): row for row in rows(new, kind)}
+        before, after = ({(row.name, row.object): row for row in rows(run, kind)} for run in (old, new))
         shared = [key for key in after if key in before]
         befores, afters = (by_name(side[key] for key in shared) for side in (before, after))
         for name in afters:
-            means = [{f: _mean(side[name], f) for f in FIGURES} for side in (befores, afters)]
-            found += _differences(kind, name, "all", *means)
-            found += [
-                move
-                for row in afters[name]
-                for move in _differences(kind, name, row.object, before[name, row.object].values, row.values)
-            ]
+            means = ({f: mean_of(side[name], f) for f in FIGURES} for side in (befores, afters))
+            pairs = [("all", *means)]
+            pairs += [(row.object, before[name, row.object].values, row.values) for row in afters[name]]
+            every = ((thing, f, a.get(f), b.get(f)) for thing, a, b in pairs for f in FIGURES)
+            found += [Move(kind, name, thing, f, a, b) for thing, f, a, b in every if _moved(f, a, b)]
     return found
-
-
-def _differences(
-    kind: str, name: str, object_name: str, old: dict[str, float | None], new: dict[str, float | None]
-) -> list[Move]:
-    pairs = ((figure, old.get(figure), new.get(figure)) for figure in FIGURES)
-    return [Move(kind, name, object_name, figure, a, b) for figure, a, b in pairs if _moved(figure, a, b)]
 
 
 def _moved(figure: str, old: float | None, new: float | None) -> bool:
@@ -265,7 +255,8 @@ def _moved(figure: str, old: float | None, new: float | None) -> bool:
     return abs(new - old) > max(share * abs(old), least)
 
 
-def _mean(group: Sequence[Row], figure: str) -> float | None:
+def mean_of(group: Sequence[Row], figure: str) -> float | None:
+    """Return the mean of a value over the objects, None without values. CPU time per grasp is over all objects."""
     if figure == "cpu_per_verified":
         return per_verified(group)
     over = spread(group, figure)

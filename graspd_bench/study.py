@@ -107,11 +107,11 @@ class Request:
             if not 0 <= seed < 2**31:
                 raise ConfigError(f"seed: {seed}; valid: 0 to 2^31 - 1")
 
-    def preset(self, usual: str = "balanced") -> str:
-        """Return the requested preset, or `usual`. Raises ConfigError: several presets, or an unknown preset."""
+    def preset(self) -> str:
+        """Return the requested preset, or balanced. Raises ConfigError: several presets, or an unknown preset."""
         if len(self.presets) > 1:
             raise ConfigError(f"presets: {', '.join(self.presets)}; this study takes one at a time")
-        name = (self.presets or (usual,))[0]
+        name = (self.presets or ("balanced",))[0]
         load_preset(name)
         return name
 

@@ -98,7 +98,9 @@ def sweep_suite(request: Request) -> tuple[Cell, ...]:
         for thing in find_objects(request.objects or (_SWEEP_OBJECTS[:2] if request.quick else _SWEEP_OBJECTS))
         for sweep, values in SWEEPS.items()
         for changes in values
-        for cell in _cells(request, "raw", sweep_name(sweep, changes), override(base, changes), thing, count, trials)
+        # The value in a name such as `steps=90` is the sum of the changed settings.
+        for name in (f"{sweep}={sum(changes.values()):g}",)
+        for cell in _cells(request, "raw", name, override(base, changes), thing, count, trials)
     )
 
 
@@ -125,11 +127,6 @@ def hands_suite(request: Request) -> tuple[Cell, ...]:
         for hand in hand_names()
         for cell in _cells(request, "raw", hand_row(hand), base, thing, count, trials, hand=hand)
     )
-
-
-def sweep_name(sweep: str, changes: Mapping[str, int]) -> str:
-    """Return the name of a sweep value's cells, such as `steps=90`. The value is the sum of the changed settings."""
-    return f"{sweep}={sum(changes.values()):g}"
 
 
 def cell_seconds(cell: Cell) -> float:

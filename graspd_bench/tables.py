@@ -7,7 +7,7 @@ import re
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
-from graspd_bench.figures import Row, by_name, is_few, is_hand, is_preset, per_verified, rows, spread
+from graspd_bench.figures import Row, by_name, is_few, is_hand, is_preset, mean_of, rows, spread
 from graspd_bench.study import Picture, Record, Sections
 from graspd_bench.suites import DECADES
 from graspd_core.errors import ConfigError
@@ -240,9 +240,7 @@ def _known(groups: Mapping[str, Sequence[Row]], figure: str) -> bool:
 
 
 def _mean(group: Sequence[Row], figure: str, form: str) -> str:
-    over = spread(group, figure)
-    value = per_verified(group) if figure == "cpu_per_verified" else over and over.mean
-    return _form(value, form)
+    return _form(mean_of(group, figure), form)
 
 
 def _form(value: float | None, form: str) -> str:

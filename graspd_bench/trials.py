@@ -200,9 +200,7 @@ class FreeBody:
     pose: Float[np.ndarray, "4 4"]
 
 
-def settle(
-    bodies: Sequence[FreeBody], *, wall: float | None = None, seconds: float = 4.0, protocol: Protocol | None = None
-) -> tuple[Pose, ...]:
+def settle(bodies: Sequence[FreeBody], *, wall: float | None = None, seconds: float = 4.0) -> tuple[Pose, ...]:
     """Let objects come to rest on the table z = 0.
 
     Args:
@@ -210,7 +208,6 @@ def settle(
         wall: half the side of a square fence around the origin [m]. Inside it, strong damping slows the objects' fall.
             If None, there is no fence, and the objects already lie on the table.
         seconds: limit of the simulated time [s].
-        protocol: physics settings. None: the settings of the standard trial.
 
     Returns:
         The final poses `T_world_body`. Equal bodies give equal poses.
@@ -219,8 +216,7 @@ def settle(
 
     if not bodies:
         return ()
-    protocol = protocol or PROTOCOLS["standard"]
-    spec = mujoco.MjSpec()
+    spec, protocol = mujoco.MjSpec(), PROTOCOLS["standard"]
     spec.compiler.degree = False
     set_physics(spec.option, protocol)
     spec.option.gravity = [0.0, 0.0, -_GRAVITY]

@@ -11,6 +11,7 @@ from jaxtyping import Float
 from graspd_cell.layout import Bin, Box
 from graspd_cell.motion import DEEPEST, Balls, Mover, Points, balls_about
 from graspd_core.arms.arm import Arm
+from graspd_core.arms.arm_paths import nearest_turn
 from graspd_core.arms.inverse_kinematics import nearest_postures, solve, start_table
 from graspd_core.se3 import SE3
 
@@ -23,9 +24,8 @@ _STEPS = 12
 
 def tip_pose(mover: Mover, q: Joints) -> Pose:
     """Return `T_base_tip` [m] at the arm's joint values `q`."""
-    rotation, place = mover.shape.links(q[None])
-    pose = np.eye(4)
-    pose[:3, :3], pose[:3, 3] = rotation[0, mover.shape.arm.tip], place[0, mover.shape.arm.tip]
+    tip, pose = mover.shape.links(q[None])[0, mover.shape.arm.tip], np.eye(4)
+    pose[:3, :3], pose[:3, 3] = tip.rotation.numpy(), tip.translation.numpy()
     return pose
 
 
@@ -117,11 +117,7 @@ def _clear_postures(mover: Mover, arm: Arm, q: Joints, targets: Sequence[Pose]) 
     count = starts.shape[1]
     rows = torch.arange(len(targets)).repeat_interleave(count)
     found, there = solve(arm, goal[rows], starts.flatten(0, 1), _STEPS)
-    reached = found[there].double().numpy()
-    # Choose the equivalent angle (modulo 2π) that is nearest to the current joint value.
-    turned = reached + 2 * np.pi * np.round((q - reached) / (2 * np.pi))
-    inside = (turned >= arm.lower) & (turned <= arm.upper)
-    reached = np.where(inside, turned, reached)
+    reached = nearest_turn(arm, found[there].double(), q).numpy()
     return reached[mover.clearances(reached).min(1) >= mover.margin] if len(reached) else reached
 
 

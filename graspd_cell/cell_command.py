@@ -7,7 +7,6 @@ import atexit
 import gc
 import os
 from collections import Counter
-from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -57,8 +56,8 @@ def run(options: argparse.Namespace) -> int:
     """Empty the bin. Return 0 if all objects are in the place bin, 3 if not, 130 after Ctrl-C."""
     import torch
 
-    from graspd_cell.cell_view import Film, LiveCell, ReportingSource
-    from graspd_cell.grasp_source import InProcessGrasps
+    from graspd_cell.cell_view import Film, LiveCell
+    from graspd_cell.grasp_source import InProcessGrasps, ReportingSource
     from graspd_cell.picker import Cancelled, Ending, Picker, summary
     from graspd_core.arms.arm import load_arm
     from graspd_core.hands.library import load_hand
@@ -80,7 +79,9 @@ def run(options: argparse.Namespace) -> int:
     )
     attempts: list[Attempt] = []
     with Interrupt() as interrupt:
-        _greet(live, interrupt.is_interrupted)
+        if live is not None:
+            print_note(f"{live.page.url} - the arm starts when this page is open")
+            live.page.wait_for_visitor(_PATIENCE, interrupt.is_interrupted)
         picker = Picker(robot, source, arm, hand, world.layout, cancelled=interrupt.is_interrupted)
         try:
             for attempt in waiting(picker.empty_the_bin(options.attempts or 2 * options.count + 3), "pick"):
@@ -172,12 +173,6 @@ def _refuse(options: argparse.Namespace) -> None:
         raise ConfigError(f"--speed: {options.speed}; valid: a positive number")
     if options.film is not None:
         check_writable(options.film)
-
-
-def _greet(live: LiveCell | None, stop: Callable[[], bool]) -> None:
-    if live is not None:
-        print_note(f"{live.page.url} - the arm starts when this page is open")
-        live.page.wait_for_visitor(_PATIENCE, stop)
 
 
 def _tell(live: LiveCell | None, attempt: Attempt, report: Report) -> None:

@@ -7,17 +7,15 @@ grasp of its true mesh at its true mass in free space. Seeds up to `DEVELOPED_ON
 
 from __future__ import annotations
 
-import time
 from collections import Counter
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
 from graspd_bench.study import Case, Record, Request, Sections, Study
-from graspd_cell.grasp_source import InProcessGrasps, Offer
+from graspd_cell.grasp_source import InProcessGrasps, ReportingSource
 from graspd_cell.picker import Attempt, Ending, Picker
 from graspd_cell.referee import Report
 from graspd_cell.simulated_robot import SETTLING, SimulatedRobot
@@ -97,11 +95,6 @@ def cell_cases(request: Request) -> tuple[CellCase, ...]:
     )
 
 
-def cell_seconds(case: CellCase) -> float:
-    """Estimate the CPU seconds of a case."""
-    return 8.0 + 12.0 * case.size
-
-
 def run_cell(case: CellCase) -> Record:
     """Empty one bin and return its record."""
     arm_name, hand_name = case.pair.split("+")
@@ -112,12 +105,14 @@ def run_cell(case: CellCase) -> Record:
     robot.wait(SETTLING)
     began = robot.referee()
     watch = AttemptWatch(robot)
-    source = _TimedSource(InProcessGrasps(arm, hand, world.layout, preset=case.preset, seed=case.seed))
-    picker = Picker(robot, source, arm, hand, world.layout)
+    cpu: list[float] = []
+    source = InProcessGrasps(arm, hand, world.layout, preset=case.preset, seed=case.seed)
+    timed = ReportingSource(source, lambda view, offer: cpu.append(offer.cpu_seconds))
+    picker = Picker(robot, timed, arm, hand, world.layout)
     most, error = _TRIES_A_THING * case.size + _MORE_TRIES, ""
     try:
         for attempt in picker.empty_the_bin(most):
-            watch.note(attempt, source.cpu)
+            watch.note(attempt, cpu[-1])
             watch.about_to_look()
     except GraspdError as failure:
         error = str(failure)
@@ -128,8 +123,8 @@ def run_cell(case: CellCase) -> Record:
         "masses": {thing.name: round(thing.model.mass, 4) for thing in world.things},
         "fits": fits,
         "attempts": watch.records,
-        "looks": source.looks,
-        "graspd_cpu": source.all_cpu,
+        "looks": len(cpu),
+        "graspd_cpu": sum(cpu),
         "why_ended": error or picker.why_ended,
         "gave_up": bool(error),
         "simulated_s": round(robot.time, 2),
@@ -142,22 +137,6 @@ def can_be_held(hand: HandModel, thing: Thing, preset: str) -> bool:
     scene = build_scene(thing.model.mesh, source=thing.name, mass=thing.model.mass)
     result = plan_grasps(scene, hand, count=1, seed=0, preset=preset, measure=False)
     return any(grasp.verdict is Verdict.VERIFIED for grasp in result.grasps)
-
-
-class _TimedSource:
-    """Grasp source that measures the CPU seconds of every call."""
-
-    def __init__(self, source: InProcessGrasps) -> None:
-        self._source, self.cpu, self.all_cpu, self.looks = source, 0.0, 0.0, 0
-
-    def next(self, view: Any, failures: Any) -> Offer:
-        """Return the offer of the wrapped source. Store the CPU seconds of this call and of all calls."""
-        began = time.process_time()
-        offer = self._source.next(view, failures)
-        self.cpu = time.process_time() - began
-        self.all_cpu += self.cpu
-        self.looks += 1
-        return offer
 
 
 class AttemptWatch:
@@ -315,6 +294,6 @@ def cell_summary(record: Record) -> str:
 STUDY = Study(
     "bins emptied in simulated cells by three arms and hands, from depth images to the other bin",
     cell_cases, run_cell, cell_sections,
-    ("../graspd_cell/*.py", "rendering/*.py"), ("presets", "objects", "cases", "seeds", "quick"), cell_seconds,
-    summary=cell_summary, usual=False,
+    ("../graspd_cell/*.py", "rendering/*.py"), ("presets", "objects", "cases", "seeds", "quick"),
+    lambda case: 8.0 + 12.0 * case.size, summary=cell_summary, usual=False,
 )  # fmt: skip

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time
 from collections import deque
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -12,11 +12,10 @@ import numpy as np
 from jaxtyping import UInt8
 
 from graspd_bench.rendering.render import look_at, render_shaded, save_png
-from graspd_cell.grasp_source import GraspSource, Offer, cloud_of
+from graspd_cell.grasp_source import Offer, cloud_of
 from graspd_cell.robot import DepthView
 from graspd_cell.simulated_robot import SimulatedRobot
 from graspd_core.hands.model import HandModel
-from graspd_core.planning.any_thing import Failure
 from graspd_core.types import TriangleMesh
 
 if TYPE_CHECKING:
@@ -138,16 +137,3 @@ class LiveCell:
             mesh = placed_hand(hand, offer.grasp.grasp)
             parts = [Part("chosen/hand", mesh, VERDICTS[offer.grasp.verdict], 0.4)]
         self.page.draw("chosen", parts)
-
-
-class ReportingSource:
-    """Grasp source that passes every view, and every answer of another source, to a callback."""
-
-    def __init__(self, source: GraspSource, tell: Callable[[DepthView, Offer], None]) -> None:
-        self._source, self._tell = source, tell
-
-    def next(self, view: DepthView, failures: Sequence[Failure]) -> Offer:
-        """Return the offer of the wrapped source. See `GraspSource`."""
-        offer = self._source.next(view, failures)
-        self._tell(view, offer)
-        return offer

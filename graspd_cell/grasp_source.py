@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from itertools import chain
 from typing import Protocol
@@ -41,7 +41,7 @@ class Offer:
         failures: the given failures, where their objects are now, and objects for which planning found no grasp.
         earlier: those of `failures` that are of the grasp's object.
         exhausted: True if no further try is worthwhile: every object seen failed too often, or the cloud is unusable.
-        seconds: graspd's wall-clock time [s].
+        seconds, cpu_seconds: graspd's wall-clock time and CPU time [s].
     """
 
     grasp: Grasp | None
@@ -55,6 +55,7 @@ class Offer:
     earlier: Sequence[Failure] = ()
     exhausted: bool = False
     seconds: float = 0.0
+    cpu_seconds: float = 0.0
 
     @property
     def place(self) -> Float[np.ndarray, "3"]:
@@ -68,6 +69,19 @@ class GraspSource(Protocol):
     def next(self, view: DepthView, failures: Sequence[Failure]) -> Offer:
         """Return the most reliable grasp of an object in the view. Grasps similar to `failures` are excluded."""
         ...
+
+
+class ReportingSource:
+    """Grasp source that passes every view, and every answer of another source, to a callback."""
+
+    def __init__(self, source: GraspSource, tell: Callable[[DepthView, Offer], object]) -> None:
+        self._source, self._tell = source, tell
+
+    def next(self, view: DepthView, failures: Sequence[Failure]) -> Offer:
+        """Return the offer of the wrapped source. See `GraspSource`."""
+        offer = self._source.next(view, failures)
+        self._tell(view, offer)
+        return offer
 
 
 def cloud_of(view: DepthView) -> PointCloud:
@@ -105,17 +119,14 @@ class InProcessGrasps:
         arm, hand, layout: parts of the cell.
         preset: name of graspd's preset.
         seed: seed of the optimiser.
-        tries: number of failures after which an object is given up.
     """
 
     def __init__(
-        self, arm: Arm, hand: HandModel, layout: CellLayout, *, preset: str = "balanced", seed: int = 0,
-        tries: int = 4,
-    ) -> None:  # fmt: skip
+        self, arm: Arm, hand: HandModel, layout: CellLayout, *, preset: str = "balanced", seed: int = 0
+    ) -> None:
         self._hand = hand
         self._plan = {
-            "settings": scene_config(layout.pick), "surface": TABLE, "tries": tries,
-            "enough": 1, "likely": _LIKELY,
+            "settings": scene_config(layout.pick), "surface": TABLE, "enough": 1, "likely": _LIKELY,
             "solids": {f"wall {k}": [box_mesh(wall)] for k, wall in enumerate(layout.solids[1:])},
             "restrictions": (Reach(arm, (0.0, 0.0, 0.0)),), "measure": False, "preset": preset, "seed": seed,
         }  # fmt: skip
@@ -124,19 +135,17 @@ class InProcessGrasps:
 
     def next(self, view: DepthView, failures: Sequence[Failure]) -> Offer:
         """Return the most reliable grasp of an object in the pick bin. See `GraspSource`."""
-        began, told = time.perf_counter(), EMPTY
+        wall, cpu, told = time.perf_counter(), time.process_time(), EMPTY
         try:
             found = plan_any_thing([cloud_of(view)], self._hand, failures=failures, before=self._before, **self._plan)
         except CloudError as error:
             found, told = (), str(error)
-        seconds = time.perf_counter() - began
-        if not found:
-            return Offer(None, reason=told, failures=tuple(failures), exhausted=True, seconds=seconds)
-        self._before = found
-        return _offer(found, seconds)
+        self._before = found or self._before
+        offer = _offer(found) if found else Offer(None, reason=told, failures=tuple(failures), exhausted=True)
+        return replace(offer, seconds=time.perf_counter() - wall, cpu_seconds=time.process_time() - cpu)
 
 
-def _offer(found: Sequence[ThingPlan], seconds: float) -> Offer:
+def _offer(found: Sequence[ThingPlan]) -> Offer:
     seen = np.array([thing.place for thing in found])
     # Each failure follows its object from view to view. Failures of no object seen are dropped.
     known = [tuple(replace(failure, place=thing.place, seen=seen) for failure in thing.failures) for thing in found]
@@ -145,7 +154,7 @@ def _offer(found: Sequence[ThingPlan], seconds: float) -> Offer:
     reasons = "; ".join(dict.fromkeys(thing.reason for thing in found if thing.reason))
     if found[0].grasp is None:
         over = all(thing.reason == OUT_OF_TRIES for thing in found)
-        return Offer(None, seen=seen, reason=reasons, failures=failures, exhausted=over, seconds=seconds)
+        return Offer(None, seen=seen, reason=reasons, failures=failures, exhausted=over)
     best = found[0]
     assert best.grasp is not None
     assert best.scene is not None
@@ -153,5 +162,5 @@ def _offer(found: Sequence[ThingPlan], seconds: float) -> Offer:
     target, verified = best.scene.object, best.grasp.verdict is Verdict.VERIFIED
     return Offer(
         best.grasp, best.points, target.mesh, best.result.mass or target.mass, verified, seen, best.reason, failures,
-        known[0], seconds=seconds,
+        known[0],
     )  # fmt: skip

@@ -18,17 +18,20 @@ from itertools import pairwise
 from typing import Any
 
 import numpy as np
+import torch
 from jaxtyping import Bool, Float, Int
 from scipy.ndimage import distance_transform_edt
 
 from graspd_cell.layout import Box
 from graspd_cell.robot import JointMotion
 from graspd_core.arms.arm import Arm, tip_hand
+from graspd_core.arms.arm_collision import capsule_balls
 from graspd_core.errors import Extra, GraspdError
-from graspd_core.hands.kinematics import link_poses
+from graspd_core.hands.kinematics import forward, in_base, link_poses, make_kinematics, place_points
 from graspd_core.hands.model import HandModel
 from graspd_core.hands.surface_points import dense_samples
 from graspd_core.mesh.topology import voxel_keys
+from graspd_core.se3 import SE3
 
 Joints = Float[np.ndarray, "joints"]
 Path = Float[np.ndarray, "rows joints"]
@@ -41,6 +44,8 @@ class NoMotionError(GraspdError):
 
 # Cell size of the distance grid, its margin around the points seen, and the greatest coordinate of these points [m].
 _CELL, _AROUND, _FARTHEST = 0.01, 0.12, 2.0
+# Points seen within this distance of a known solid belong to it [m].
+_SLACK = 0.012
 
 
 @dataclass(frozen=True, eq=False)
@@ -76,15 +81,15 @@ class SeenWorld:
         return away
 
 
-def seen_world(points: Points, floor: float, boxes: Sequence[Box] = (), slack: float = 0.012) -> SeenWorld:
+def seen_world(points: Points, floor: float, boxes: Sequence[Box] = ()) -> SeenWorld:
     """Build the obstacles from known solids and from a camera's points in the base frame [m].
 
-    Points within `slack` [m] of the floor or of a box, and points out of the arm's reach, are dropped.
+    Points within `_SLACK` [m] of the floor or of a box, and points out of the arm's reach, are dropped.
     """
     known = SeenWorld(floor, tuple(boxes))
     points = points[(np.abs(points) < _FARTHEST).all(1)]
-    points = points[points[:, 2] > floor + slack]
-    points = points[known.clearance(points) > slack] if boxes else points
+    points = points[points[:, 2] > floor + _SLACK]
+    points = points[known.clearance(points) > _SLACK] if boxes else points
     if not len(points):
         return known
     origin = points.min(0) - _AROUND
@@ -113,16 +118,16 @@ _COARSE = 0.02
 _SAMPLES = 4000
 
 
-def balls_about(points: Points, spacing: float = _SPACING, radius: float = _BALL) -> Balls:
-    """Return a ball of `radius` [m] at one point of every cube of side `spacing` [m] that has points."""
-    kept = np.unique(voxel_keys(points - points.min(0), spacing), return_index=True)[1]
-    return Balls(points[kept], np.full(len(kept), radius))
+def balls_about(points: Points) -> Balls:
+    """Return a ball of radius `_BALL` at one point of every cube of side `_SPACING` that has points."""
+    kept = np.unique(voxel_keys(points - points.min(0), _SPACING), return_index=True)[1]
+    return Balls(points[kept], np.full(len(kept), _BALL))
 
 
-def enclosing_balls(points: Points, spacing: float = _COARSE) -> Balls:
-    """Return balls that enclose all points: one about every cube of side `spacing` [m] that has points."""
-    cubes = np.unique(np.floor(points / spacing), axis=0)
-    return Balls((cubes + 0.5) * spacing, np.full(len(cubes), 0.5 * np.sqrt(3.0) * spacing))
+def enclosing_balls(points: Points) -> Balls:
+    """Return balls that enclose all points: one about every cube of side `_COARSE` that has points."""
+    cubes = np.unique(np.floor(points / _COARSE), axis=0)
+    return Balls((cubes + 0.5) * _COARSE, np.full(len(cubes), 0.5 * np.sqrt(3.0) * _COARSE))
 
 
 @lru_cache(maxsize=4)
@@ -133,8 +138,7 @@ def _hand_surface(hand: HandModel) -> tuple[Points, Int[np.ndarray, "_"]]:
 def hand_points(hand: HandModel, joints: Joints) -> tuple[Points, Int[np.ndarray, "_"]]:
     """Return surface points of the hand at joint values, in the hand's base frame [m], and each point's link index."""
     points, links = _hand_surface(hand)
-    rotations, translations = link_poses(hand, joints)
-    return np.einsum("nij,nj->ni", np.asarray(rotations)[links], points) + np.asarray(translations)[links], links
+    return in_base(link_poses(hand, joints), points, links), links
 
 
 def hand_balls(arm: Arm, hand: HandModel, joints: Joints) -> Balls:
@@ -145,50 +149,23 @@ def hand_balls(arm: Arm, hand: HandModel, joints: Joints) -> Balls:
 
 @dataclass(frozen=True, eq=False)
 class ArmShape:
-    """Collision model of an arm as balls, with fast forward kinematics.
+    """Collision model of an arm as balls.
 
     Attributes:
         arm: the arm.
-        local: centre of each ball in the frame of its link [m].
+        balls: centres of the balls as a matrix for `place_points`.
         radius: radius of each ball [m]. The balls of a capsule cover the whole capsule.
         link: link index of each ball.
     """
 
     arm: Arm
-    local: Points
+    balls: Float[torch.Tensor, "_ columns"]
     radius: Float[np.ndarray, "_"]
     link: Int[np.ndarray, "_"]
 
-    @cached_property
-    def _constants(self) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-        """Return A, B, C, d per link. Joint value q rotates by `R = A + sin(q) B + cos(q) C` or slides by `q d` [m]."""
-        chain = self.arm.chain
-        x, y, z = chain.joint_axis.T
-        zero = np.zeros_like(x)
-        skew = np.stack([zero, -z, y, z, zero, -x, -y, x, zero], -1).reshape(-1, 3, 3)
-        slides = np.array([kind == "prismatic" for kind in chain.joint_kind])[:, None, None]
-        skew = np.where(slides, 0.0, skew)
-        offset = chain.link_offset_rotation
-        square = offset @ skew @ skew
-        slide = np.where(slides, offset @ chain.joint_axis[..., None], 0.0)[..., 0]
-        return offset + square, offset @ skew, -square, slide
-
-    def links(self, q: Path) -> tuple[Float[np.ndarray, "rows links 3 3"], Float[np.ndarray, "rows links 3"]]:
-        """Return rotation and translation [m] of every link at joint values, base frame."""
-        chain, (constant, sine, cosine, slide) = self.arm.chain, self._constants
-        rotation = np.empty((len(q), len(chain.link_names), 3, 3))
-        place = np.empty((len(q), len(chain.link_names), 3))
-        for link, (parent, joint) in enumerate(zip(chain.link_parent, chain.link_joint, strict=True)):
-            value = q[:, joint] if joint >= 0 else np.zeros(len(q))
-            turn = constant[link] + np.sin(value)[:, None, None] * sine[link]
-            turn = turn + np.cos(value)[:, None, None] * cosine[link]
-            shift = chain.link_offset_translation[link] + value[:, None] * slide[link]
-            if parent < 0:
-                rotation[:, link], place[:, link] = turn, shift
-                continue
-            rotation[:, link] = rotation[:, parent] @ turn
-            place[:, link] = place[:, parent] + np.einsum("bij,bj->bi", rotation[:, parent], shift)
-        return rotation, place
+    def links(self, q: Path) -> SE3:
+        """Return `T_base_link` [m] of every link at joint values."""
+        return forward(make_kinematics(self.arm.chain, dtype=torch.float64), torch.as_tensor(q))
 
     @cached_property
     def beyond_shoulder(self) -> Bool[np.ndarray, "_"]:
@@ -200,15 +177,8 @@ class ArmShape:
 @lru_cache(maxsize=4)
 def arm_shape(arm: Arm) -> ArmShape:
     """Return the arm with balls along its capsules. They exceed a capsule by less than an eighth of its radius."""
-    at, radius, link = [], [], []
-    for k, owner in enumerate(arm.capsules.link):
-        start, end, thick = arm.capsules.start[k], arm.capsules.end[k], arm.capsules.radius[k]
-        count = 1 + int(np.ceil(np.linalg.norm(end - start) / thick))
-        gap = np.linalg.norm(end - start) / max(count - 1, 1)
-        at.append(start + np.linspace(0.0, 1.0, count)[:, None] * (end - start))
-        radius.append(np.full(count, np.hypot(thick, gap / 2)))
-        link.append(np.full(count, owner))
-    return ArmShape(arm, np.concatenate(at), np.concatenate(radius), np.concatenate(link))
+    balls, radius, capsule = capsule_balls(arm)
+    return ArmShape(arm, balls, radius.numpy(), arm.capsules.link[capsule])
 
 
 # Pairs of balls that are nearer than this in the seed posture are not checked against each other [m].
@@ -248,11 +218,11 @@ class Mover:
         gap = np.linalg.norm(balls[0, :, None] - carried[0], axis=-1) - shape.radius[:, None] - coarse.radius
         return coarse, pairs, np.argwhere(gap > _TOUCHING)
 
-    def _placed(self, q: Path, carried: Balls) -> tuple[np.ndarray, np.ndarray]:
-        rotation, place = self.shape.links(q)
-        link, tip = self.shape.link, self.shape.arm.tip
-        balls = np.einsum("bnij,nj->bni", rotation[:, link], self.shape.local) + place[:, link]
-        return balls, carried.at @ rotation[:, tip].swapaxes(1, 2) + place[:, None, tip]
+    def _placed(self, q: Path, *carried: Balls) -> list[np.ndarray]:
+        links = self.shape.links(q)
+        tip = links[:, self.shape.arm.tip]
+        balls = place_points(self.shape.balls, links).numpy()
+        return [balls, *(tip.apply(torch.as_tensor(some.at)).numpy() for some in carried)]
 
     def placed(self, q: Joints) -> tuple[Points, Points]:
         """Return the collision balls' centres: of the arm, and of hand and held object, base frame [m]."""
@@ -266,7 +236,7 @@ class Mover:
         """
         shape = self.shape
         coarse, pairs, with_carried = self._own
-        balls, carried = self._placed(q, self.carried)
+        balls, carried, rough = self._placed(q, self.carried, coarse)
         held = shape.beyond_shoulder
         at = np.concatenate([balls[:, held], carried], 1)
         radius = np.concatenate([shape.radius[held], self.carried.radius])
@@ -274,9 +244,8 @@ class Mover:
         between = np.linalg.norm(balls[:, pairs[:, 0]] - balls[:, pairs[:, 1]], axis=-1) - shape.radius[pairs].sum(1)
         parts = [away, between + self.margin]
         if len(with_carried):
-            carried = self._placed(q, coarse)[1]
             a, b = with_carried.T
-            gap = np.linalg.norm(balls[:, a] - carried[:, b], axis=-1) - shape.radius[a] - coarse.radius[b]
+            gap = np.linalg.norm(balls[:, a] - rough[:, b], axis=-1) - shape.radius[a] - coarse.radius[b]
             parts.append(gap + self.margin)
         return np.concatenate(parts, 1)
 
@@ -303,11 +272,11 @@ class Mover:
 _STEP = 0.04
 
 
-def dense(path: Path, step: float = _STEP) -> Path:
-    """Return the path with rows inserted on straight lines, so that no joint moves more than `step` [rad] per row."""
+def dense(path: Path) -> Path:
+    """Return the path with rows inserted on straight lines, so that no joint moves more than `_STEP` per row."""
     if len(path) < 2:
         return path
-    counts = [max(1, int(np.ceil(np.abs(b - a).max() / step))) for a, b in pairwise(path)]
+    counts = [max(1, int(np.ceil(np.abs(b - a).max() / _STEP))) for a, b in pairwise(path)]
     parts = [a + np.arange(n)[:, None] / n * (b - a) for (a, b), n in zip(pairwise(path), counts, strict=True)]
     return np.concatenate([*parts, path[-1:]])
 

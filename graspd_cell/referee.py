@@ -52,10 +52,10 @@ class Referee:
         self._peaks: Forces = {}
 
     def watch(self, data: Any) -> None:
-        """Update the peak forces with the current ones."""
-        for pair, force in robot_forces(self._world, data).items():
-            if force > self._peaks.get(pair, 0.0):
-                self._peaks[pair] = force
+        """Update the peak forces of arm and hand on table, bins and objects with the current ones."""
+        for (a, b), force in _pair_forces(self._world, data).items():
+            if a in (ARM, HAND) and b >= TABLE and force > self._peaks.get((a, b), 0.0):
+                self._peaks[a, b] = force
 
     def clear(self) -> None:
         """Reset the peak forces."""
@@ -73,12 +73,8 @@ class Referee:
         return self._world.things[part - THING].name if part >= THING else PARTS[part]
 
 
-def robot_forces(world: CellWorld, data: Any) -> Forces:
-    """Return the normal forces of arm and hand on table, bins and objects, summed for each pair [N]."""
-    return {(a, b): force for (a, b), force in _pair_forces(world, data).items() if a in (ARM, HAND) and b >= TABLE}
-
-
 def _pair_forces(world: CellWorld, data: Any) -> Forces:
+    """Return the normal forces between parts and objects, summed for each touching pair [N]."""
     contact = data.contact
     address = contact.efc_address
     acting = address >= 0

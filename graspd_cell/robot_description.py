@@ -5,14 +5,13 @@ Frames of the arm keep their names. Frame names of the hand begin with `hand_`, 
 
 from __future__ import annotations
 
-import warnings
 import xml.etree.ElementTree as ET
 from collections.abc import Mapping
 from pathlib import Path
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 
+from graspd_bench.bullet.bullet_world import roll_pitch_yaw
 from graspd_cell.world import CellWorld, Pose
 from graspd_core.arms.arm import Arm, tip_hand
 from graspd_core.hands.model import HandModel
@@ -44,11 +43,7 @@ def robot_description(arm: Arm, hand: HandModel) -> str:
         if element.tag in ("link", "joint", "material"):
             root.append(element)
     mount, turn = ET.SubElement(root, "joint", name=f"{HAND_PREFIX}mount", type="fixed"), tip_hand(arm, hand)
-    with warnings.catch_warnings():
-        # SciPy warns if the angles are not unique (gimbal lock). Any of the solutions is correct.
-        warnings.simplefilter("ignore")
-        roll, pitch, yaw = Rotation.from_matrix(turn.rotation.numpy()).as_euler("xyz")
-    x, y, z = turn.translation.tolist()
+    (x, y, z), (roll, pitch, yaw) = turn.translation.tolist(), roll_pitch_yaw(turn.rotation.numpy())
     ET.SubElement(mount, "parent", link=arm.chain.link_names[arm.tip])
     ET.SubElement(mount, "child", link=HAND_PREFIX + hand.base_link)
     ET.SubElement(mount, "origin", xyz=f"{x:.9g} {y:.9g} {z:.9g}", rpy=f"{roll:.9g} {pitch:.9g} {yaw:.9g}")

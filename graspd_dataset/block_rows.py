@@ -25,7 +25,7 @@ from graspd_core.verify.metrics import measure
 from graspd_core.verify.prepared_grasp import make_metrics_context
 from graspd_dataset.blocks import Block, DatasetObject
 from graspd_dataset.dataset_store import parquet_bytes
-from graspd_dataset.guarded_calls import Limits, MadeBlock, ReadyObject, call_guarded, close_child
+from graspd_dataset.guarded_calls import Limits, MadeBlock, ReadyObject, Report, call_guarded, close_child
 from graspd_dataset.ray_engine import pickled_hand
 from graspd_dataset.record_schema import arrow_schema, object_schema
 from graspd_dataset.run_records import code_version, forget_peak, peak_mb
@@ -72,15 +72,16 @@ def make_block(block: Block, hand: bytes, shared: bytes) -> MadeBlock:
     # If no grasp holds the assumed mass, the trials use a smaller mass. The rows hold the smaller mass.
     target = scene.object if result.mass is None else scene.object.at_mass(result.mass)
     row = {"block": block.key, "asked": block.inputs, "outcome": result.outcome.name, "message": result.message}
-    return MadeBlock(
-        object_sha256=scene.object.sha256,
-        file=parquet_bytes(_table(block, target, model, grasps), row),
+    file = parquet_bytes(_table(block, target, model, grasps), row)
+    report = Report(
+        block.key,
         rows=len(grasps),
         verified=sum(grasp.verdict is Verdict.VERIFIED for grasp in grasps),
         failures=dict(Counter(failure_kind(grasp) for grasp in grasps if grasp.verdict is Verdict.FAILED)),
         cpu=time.process_time() - began,
         peak_mb=peak_mb(),
     )
+    return MadeBlock(file, scene.object.sha256, report)
 
 
 def all_measured(scene: Scene, hand: HandModel, grasps: Sequence[Grasp]) -> tuple[Grasp, ...]:
@@ -179,7 +180,7 @@ def dry_run(blocks: Sequence[Block], limits: Limits, workers: int | None) -> str
     if not blocks:
         return "nothing is missing"
     workers = workers or os.cpu_count() or 1
-    measured: dict[str, tuple[Block, MadeBlock]] = {}
+    measured: dict[str, tuple[Block, bytes, Report]] = {}
     for block in blocks:
         if block.hand_content not in measured:
             try:
@@ -187,16 +188,16 @@ def dry_run(blocks: Sequence[Block], limits: Limits, workers: int | None) -> str
                 made = call_guarded(limits, make_block, block, pickled_hand(block), ready.shared)
             except (MemoryError, TimeoutError, ChildProcessError) as error:
                 raise ConfigError(f"{block.object.source}: {error}; change --memory or --patience") from None
-            measured[block.hand_content] = block, made
+            measured[block.hand_content] = block, made.file, made.report
     close_child()
     lines, wanted = [], Counter[str]()
     for block in blocks:
         wanted[block.hand_content] += block.count
     cpu = size = tried = 0.0
-    for hand, (block, made) in measured.items():
+    for hand, (block, file, made) in measured.items():
         share = wanted[hand] / block.count
-        cpu, size, tried = cpu + share * made.cpu, size + share * len(made.file), tried + share * made.rows
-        counts = f"{made.verified} of {made.rows} verified, {made.cpu:.1f} CPU s, {len(made.file) / 1024:.0f} kB"
+        cpu, size, tried = cpu + share * made.cpu, size + share * len(file), tried + share * made.rows
+        counts = f"{made.verified} of {made.rows} verified, {made.cpu:.1f} CPU s, {len(file) / 1024:.0f} kB"
         lines.append(f"{block.hand}: one block of {block.object.source}: {counts}, {made.peak_mb:.0f} MB at the peak")
     hours = f"{cpu / 3600:.3g} CPU hours, {cpu / 3600 / workers:.3g} hours on {workers} cores"
     lines.append(f"{len(blocks)} blocks, {sum(wanted.values())} grasps wanted, about {tried:.0f} tried: {hours}")

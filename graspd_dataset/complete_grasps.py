@@ -18,7 +18,7 @@ from graspd_core.optimize.plan_config import PlanConfig
 from graspd_core.optimize.problem import Problem, build_problem
 from graspd_core.perception.scene import Scene
 from graspd_core.se3 import rotation_from_quaternion
-from graspd_core.types import Grasp, Posture
+from graspd_core.types import Grasp, Posture, stacked
 from graspd_dataset.finger_closing import CLOSE_STEPS, make_closing
 from graspd_dataset.foreign_grasps import ImportedGrasp
 
@@ -107,8 +107,7 @@ def beyond_limits(grasp: ImportedGrasp, hand: HandModel) -> str:
 
 
 def _poses(problem: Problem, postures: Sequence[Posture]) -> Poses:
-    rows = [(posture.position, posture.quaternion_wxyz, posture.joint_positions) for posture in postures]
-    return Poses(*(torch.as_tensor(np.stack(part)).to(problem.hand.lower) for part in zip(*rows, strict=True)))
+    return Poses(*(torch.as_tensor(part).to(problem.hand.lower) for part in stacked(postures)))
 
 
 def _merged(theirs: ImportedGrasp, ours: Grasp) -> Grasp:

@@ -9,7 +9,7 @@ from __future__ import annotations
 import json
 import pickle
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any, TypeVar
 
 from graspd_core.errors import ConfigError
@@ -83,24 +83,11 @@ class ReadyObject:
 
 @dataclass(frozen=True)
 class MadeBlock:
-    """The file of a block, and the cost of making it.
+    """Content of a block's Parquet file, the hash of the object's cleaned mesh, and the report without `files`."""
 
-    Attributes:
-        object_sha256: hash of the object's cleaned mesh.
-        file: content of the Parquet file.
-        rows, verified: number of all candidates, and of verified candidates.
-        failures: number of failed candidates for each kind of failure (`failure_kind`).
-        cpu: CPU time of this process [s].
-        peak_mb: peak memory of this process [MB].
-    """
-
-    object_sha256: str
     file: bytes
-    rows: int
-    verified: int
-    failures: dict[str, int]
-    cpu: float
-    peak_mb: float
+    object_sha256: str
+    report: Report
 
 
 @dataclass(frozen=True)
@@ -139,15 +126,7 @@ def run_block(job: Job, hand: bytes, shared: bytes, store: DatasetStore, limits:
         return failed_report(store, job, error)
     path = block_path(job.hand, made.object_sha256, job.key)
     store.write(path, made.file)
-    return Report(
-        job.key,
-        rows=made.rows,
-        verified=made.verified,
-        failures=made.failures,
-        cpu=made.cpu,
-        peak_mb=made.peak_mb,
-        files={path: file_hash(made.file)},
-    )
+    return replace(made.report, files={path: file_hash(made.file)})
 
 
 def ready_of(pickled: bytes, content: bytes | None) -> ReadyObject:

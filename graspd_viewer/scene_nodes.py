@@ -13,7 +13,7 @@ from graspd_core.hands.model import HandModel
 from graspd_core.mesh.topology import is_closed
 from graspd_core.se3 import perpendicular, quaternion_from_rotation
 from graspd_core.types import Posture, TriangleMesh
-from graspd_viewer.drawing import SEEN, Colour, Part, hand_parts, placed_links, scene_parts, sdf_slice, slice_axes
+from graspd_viewer.drawing import SEEN, Part, hand_parts, placed_links, scene_parts, sdf_slice, slice_axes
 from graspd_viewer.session import Session
 
 _MOST_POINTS = 20_000
@@ -58,17 +58,18 @@ class SceneNodes:
 
     def draw(self, group: str, parts: Sequence[Part]) -> None:
         """Replace the drawn parts of a group."""
+        self._clear(group)
+        self._groups[group] = [self._mesh(f"/{part.name}", part) for part in parts]
+        for node in self._groups[group]:
+            node.visible = group not in self._hidden
+
+    def _clear(self, group: str) -> None:
         for node in self._groups.pop(group, ()):
             node.remove()
-        nodes = [self._mesh(f"/{part.name}", part) for part in parts]
-        for node in nodes:
-            node.visible = group not in self._hidden
-        self._groups[group] = nodes
 
     def draw_lines(self, lines: Float[np.ndarray, "n 2 3"], colours: Float[np.ndarray, "n 3"]) -> None:
         """Replace the drawn line segments [m]. `colours` are RGB, 0 to 1."""
-        for node in self._groups.pop("lines", ()):
-            node.remove()
+        self._clear("lines")
         if len(lines):
             tints = np.repeat((255 * colours).astype(np.uint8)[:, None], 2, axis=1)
             node = self._server.scene.add_line_segments(
@@ -78,8 +79,7 @@ class SceneNodes:
 
     def draw_slice(self, session: Session, axis: int | None, share: float) -> None:
         """Replace the drawn SDF slice. See `sdf_slice` for `axis` and `share`. If `axis` is None, remove the slice."""
-        for node in self._groups.pop("slice", ()):
-            node.remove()
+        self._clear("slice")
         if axis is None or session.scene is None:
             return
         image, middle = sdf_slice(session.scene, axis, share)
@@ -137,14 +137,12 @@ class SceneNodes:
 
     def draw_points(self, points: Float[np.ndarray, "n 3"]) -> None:
         """Replace the drawn points [m]."""
-        for node in self._groups.pop("cloud", ()):
-            node.remove()
-        nodes = []
+        self._clear("cloud")
         if len(points):
             every = -(-len(points) // _MOST_POINTS)
             shown = (PER_METRE * points[::every]).astype(np.float32)
-            nodes = [self._server.scene.add_point_cloud("/cloud", shown, SEEN, point_size=PER_METRE * 0.0012)]
-        self._groups["cloud"] = nodes
+            node = self._server.scene.add_point_cloud("/cloud", shown, SEEN, point_size=PER_METRE * 0.0012)
+            self._groups["cloud"] = [node]
 
     def _mesh(self, name: str, part: Part) -> Any:
         # The inside of a closed body is invisible. Drawing the inside costs a software renderer a fifth of a frame.
@@ -155,7 +153,8 @@ class SceneNodes:
         if hand:
             mesh = TriangleMesh(mesh.vertices[mesh.faces].reshape(-1, 3), np.arange(mesh.faces.size).reshape(-1, 3))
         return self._server.scene.add_mesh_simple(
-            name, PER_METRE * mesh.vertices, mesh.faces, color=_bytes(part.colour), flat_shading=True,
+            name, PER_METRE * mesh.vertices, mesh.faces,
+            color=tuple(round(255 * channel) for channel in part.colour), flat_shading=True,
             material="toon5" if hand else "standard", side="front" if closed else "double",
             opacity=None if part.opacity == 1.0 else part.opacity, cast_shadow=False, receive_shadow=False,
         )  # fmt: skip
@@ -177,11 +176,6 @@ class SceneNodes:
         self._server.scene.set_up_direction(up)
         for camera in (self._server.initial_camera, *(c.camera for c in self._server.get_clients().values())):
             camera.position, camera.look_at = PER_METRE * eye, PER_METRE * middle
-
-
-def _bytes(colour: Colour) -> tuple[int, int, int]:
-    r, g, b = (round(255 * channel) for channel in colour)
-    return r, g, b
 
 
 def _quaternion(rotation: Float[np.ndarray, "3 3"]) -> Float[np.ndarray, "4"]:

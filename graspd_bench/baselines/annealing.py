@@ -26,7 +26,7 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from graspd_core.hands.kinematics import link_poses, place_points, placement
+from graspd_core.hands.kinematics import in_base, link_poses, place_points, placement
 from graspd_core.hands.model import HandModel
 from graspd_core.hands.self_collision import collision_spheres
 from graspd_core.mesh.sdf import sample_sdf
@@ -128,9 +128,7 @@ def inner_contacts(hand: HandModel, per_link: int) -> Int[np.ndarray, "contacts"
     chosen: list[int] = []
     facing = _facing(hand)
     group = hand.link_group[hand.candidate_link]
-    rotation, translation = link_poses(hand, hand.open_posture)
-    position = np.einsum("pij,pj->pi", rotation[hand.candidate_link], hand.candidate_points)
-    position += translation[hand.candidate_link]
+    position = in_base(link_poses(hand, hand.open_posture), hand.candidate_points, hand.candidate_link)
     for number in np.unique(group):
         most = float(facing[group == number].max())
         if most < _LEAST_FACING:
@@ -153,11 +151,8 @@ def _facing(hand: HandModel) -> Float[np.ndarray, "candidates"]:
     early, late = (
         link_poses(hand, hand.open_posture + share * (hand.closed_posture - hand.open_posture)) for share in (0.4, 0.6)
     )
-
-    def points(frames) -> Float[np.ndarray, "candidates 3"]:
-        return np.einsum("pij,pj->pi", frames[0][links], hand.candidate_points) + frames[1][links]
-
-    motion = points(late) - points(early)
+    before, after = (in_base(frames, hand.candidate_points, links) for frames in (early, late))
+    motion = after - before
     length = np.linalg.norm(motion, axis=1)
     still = length < 1e-6
     motion = np.where(still[:, None], hand.palm_normal, motion / np.maximum(length, 1e-6)[:, None])

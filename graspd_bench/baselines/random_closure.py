@@ -16,7 +16,7 @@ from torch import Tensor
 from graspd_core.hands.kinematics import forward
 from graspd_core.hands.model import HandModel
 from graspd_core.optimize.candidates import PlannerInput, PlannerOutput
-from graspd_core.optimize.loop import Poses, minimise
+from graspd_core.optimize.loop import Poses, minimise, pack, unpack
 from graspd_core.optimize.obstacle_distance import hand_reach, obstacle_gaps
 from graspd_core.optimize.plan_config import Method
 from graspd_core.optimize.problem import Problem
@@ -59,13 +59,8 @@ def plan(task: PlannerInput) -> PlannerOutput:
         if not interrupted:
             groups = touching_groups(problem, closing, hand, solution.poses, task.config.grasp_stages.touch_reach)
             good = (groups >= least) & clear_of_obstacles(problem, solution.poses)
-            kept = join(kept, solution.poses[good])
+            kept = unpack(torch.cat([pack(kept), pack(solution.poses[good])]))
     return PlannerOutput(kept[torch.arange(min(count, len(kept.joints)), device=task.device)], interrupted)
-
-
-def join(a: Poses, b: Poses) -> Poses:
-    pairs = ((getattr(a, name), getattr(b, name)) for name in ("translation", "quaternion", "joints"))
-    return Poses(*(torch.cat(pair) for pair in pairs))
 
 
 def draw_approaches(problem: Problem, hand: HandModel, count: int, seed: int) -> Poses:

@@ -14,7 +14,7 @@ from jaxtyping import Float
 from graspd_bench.bullet.bullet_world import BulletWorld, add_object, load_hand_urdf, simulation
 from graspd_core.se3 import rotation_from_quaternion
 from graspd_core.types import Grasp, Posture, TrialResult
-from graspd_core.verify.hold_trial import DIRECTIONS, axis_name, broken_limit
+from graspd_core.verify.hold_trial import DIRECTIONS, axis_name, broken_limit, straight_path
 from graspd_core.verify.world import Protocol
 
 # pybullet is a compiled module without stubs.
@@ -31,16 +31,9 @@ _CHECK_EVERY = 100
 
 @dataclass(frozen=True, eq=False)
 class _Run:
-    """One running simulation.
+    """One running simulation: the ids of the client, of the object's body, of the hand's body, and of its joints.
 
-    Attributes:
-        client: id of the PyBullet client.
-        world: hand and object of the simulation.
-        protocol: physics settings.
-        body: body id of the object.
-        hand: body id of the hand.
-        joints: joint ids of the hand's actuated joints.
-        worst: greatest displacement [m] and rotation [rad] of the object so far. The array is updated in place.
+    `worst` has the greatest displacement [m] and rotation [rad] of the object so far. It is updated in place.
     """
 
     client: int
@@ -105,16 +98,15 @@ def _start(client: int, world: BulletWorld, posture: Posture, protocol: Protocol
     for joint, value in zip(joints, posture.joint_positions.tolist(), strict=True):
         pybullet.resetJointState(hand, joint, value, physicsClientId=client)
     run = _Run(client, world, protocol, body, hand, joints, np.zeros(2))
-    _put_base(run, posture.position, posture.quaternion_wxyz)
+    _put_base(run, posture)
     return run
 
 
-def _put_base(run: _Run, position: Float[np.ndarray, "3"], quaternion_wxyz: Float[np.ndarray, "4"]) -> None:
+def _put_base(run: _Run, posture: Posture) -> None:
     import pybullet
 
-    pybullet.resetBasePositionAndOrientation(
-        run.hand, position.tolist(), np.roll(quaternion_wxyz, -1).tolist(), physicsClientId=run.client
-    )
+    xyzw = np.roll(posture.quaternion_wxyz, -1).tolist()
+    pybullet.resetBasePositionAndOrientation(run.hand, posture.position.tolist(), xyzw, physicsClientId=run.client)
 
 
 def _start_penetration(run: _Run) -> float:
@@ -128,13 +120,9 @@ def _start_penetration(run: _Run) -> float:
 def _move(run: _Run, start: Posture, end: Posture) -> str:
     """Move base and joint targets linearly from `start` to `end`. Return why the trial failed, otherwise ""."""
     steps = round(run.protocol.stage_time / TIMESTEP)
-    # A quaternion and its negative are the same rotation. The sign makes the base turn the shorter way.
-    sign = 1.0 if start.quaternion_wxyz @ end.quaternion_wxyz >= 0 else -1.0
-    for step in range(1, steps + 1):
-        a = step / steps
-        quaternion = (1 - a) * start.quaternion_wxyz + a * sign * end.quaternion_wxyz
-        _put_base(run, (1 - a) * start.position + a * end.position, quaternion / np.linalg.norm(quaternion))
-        _drive(run, (1 - a) * start.joint_positions + a * end.joint_positions)
+    for step, posture in enumerate(straight_path(start, end, np.arange(1, steps + 1) / steps), 1):
+        _put_base(run, posture)
+        _drive(run, posture.joint_positions)
         if reason := _step(run, step):
             return reason
     return ""

@@ -13,7 +13,7 @@ import numpy as np
 from jaxtyping import Float, Int, UInt8
 from PIL import Image
 
-from graspd_core.hands.kinematics import hand_mesh, link_poses
+from graspd_core.hands.kinematics import hand_mesh, in_base, link_poses
 from graspd_core.hands.model import HandModel
 from graspd_core.mesh.surface_queries import first_hits
 from graspd_core.mesh.topology import scaled_normals
@@ -208,9 +208,7 @@ def _scene(
 ) -> list[tuple[TriangleMesh, tuple[float, float, float]]]:
     import trimesh
 
-    rotations, translations = link_poses(hand, posture)
-    links = hand.candidate_link
-    placed = np.einsum("pij,pj->pi", rotations[links], hand.candidate_points) + translations[links]
+    placed = in_base(link_poses(hand, posture), hand.candidate_points, hand.candidate_link)
     dot = trimesh.creation.icosphere(subdivisions=0, radius=_DOT * size)
     count = len(dot.vertices)
     dots = TriangleMesh(

@@ -57,7 +57,8 @@ def _whole() -> Iterator[Case]:
         ("mixed-winding", "half of the faces wound inwards at random", lambda: _flipped("mug", 0.5)),
         ("soup", "a box of loose triangles that share no corner", lambda: _soup("box", 0.0)),
         ("jittered-soup", "loose triangles with gaps of half a millimetre", lambda: _soup("cylinder", 5e-4)),
-        ("overlapping-bodies", "a cross of three boxes that run through each other", _cross),
+        ("overlapping-bodies", "a cross of three boxes that run through each other",
+         lambda: joined(*(box(np.roll((0.03, 0.03, 0.1), turn)) for turn in range(3)))),
         ("self-intersecting", "a bottle with noise that folds its surface through itself", _folded),
         ("inner-void", "a ball with a smaller ball inside, wound alike",
          lambda: joined(make_shape("sphere"), _scaled("sphere", 0.6))),
@@ -145,10 +146,6 @@ def _soup(shape: str, jitter: float) -> TriangleMesh:
     corners = mesh.vertices[mesh.faces]
     corners = corners + np.random.default_rng(_SEED).normal(0.0, jitter, (len(corners), 1, 3))
     return TriangleMesh(corners.reshape(-1, 3), np.arange(3 * len(corners)).reshape(-1, 3))
-
-
-def _cross() -> TriangleMesh:
-    return joined(*(box(np.roll((0.03, 0.03, 0.1), turn)) for turn in range(3)))
 
 
 def _folded() -> TriangleMesh:

@@ -93,24 +93,19 @@ class StressEnding:
 
 def faults(case: Case, ending: StressEnding) -> tuple[str, ...]:
     """Return how an ending breaks the expectations and limits of its case, one line per fault. Empty without faults."""
-    wrong = []
-    if ending.ending not in case.expect:
-        wrong.append(f"ended in {ending.ending}, not in {' or '.join(case.expect)}: {ending.message}")
-    if ending.planning > case.deadline + GRACE:
-        wrong.append(f"planned {ending.planning:.1f} s at a deadline of {case.deadline} s")
-    if ending.loading > case.loading:
-        wrong.append(f"loaded for {ending.loading:.1f} s, longer than {case.loading} s")
-    if ending.memory > case.memory:
-        wrong.append(f"used {ending.memory:.0f} MB, more than {case.memory:.0f} MB")
-    if ending.again < ending.verified:
-        wrong.append(f"{ending.verified - ending.again} of {ending.verified} verified grasps fail a second trial")
-    if not ending.finite:
-        wrong.append("a number of the result is not finite")
-    if ending.ending != GRASP and not ending.message:
-        wrong.append("the user gets no message")
-    if case.message not in ending.message:
-        wrong.append(f"the message lacks {case.message!r}")
-    return tuple(wrong)
+    unexpected = f"ended in {ending.ending}, not in {' or '.join(case.expect)}: {ending.message}"
+    lost, late = ending.verified - ending.again, ending.planning > case.deadline + GRACE
+    wrong = {
+        unexpected: ending.ending not in case.expect,
+        f"planned {ending.planning:.1f} s at a deadline of {case.deadline} s": late,
+        f"loaded for {ending.loading:.1f} s, longer than {case.loading} s": ending.loading > case.loading,
+        f"used {ending.memory:.0f} MB, more than {case.memory:.0f} MB": ending.memory > case.memory,
+        f"{lost} of {ending.verified} verified grasps fail a second trial": lost > 0,
+        "a number of the result is not finite": not ending.finite,
+        "the user gets no message": ending.ending != GRASP and not ending.message,
+        f"the message lacks {case.message!r}": case.message not in ending.message,
+    }
+    return tuple(fault for fault, found in wrong.items() if found)
 
 
 def run_case(case: Case, preset: str = "balanced") -> StressEnding:

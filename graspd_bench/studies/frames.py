@@ -21,7 +21,6 @@ from graspd_core.errors import ConfigError, GraspdError
 from graspd_core.hands.library import load_hand
 from graspd_core.mesh.topology import is_closed
 from graspd_core.perception.cloud.depth_files import load_depth_view
-from graspd_core.perception.cloud.point_cloud import PointCloud
 from graspd_core.perception.scene_from_views import scene_from_views
 from graspd_core.perception.segment.segment import Target, segment
 from graspd_core.planning.plan_grasps import plan_grasps
@@ -62,7 +61,9 @@ def frame_cases(request: Request) -> tuple[Frame, ...]:
 
 def run_frame(case: Frame) -> Record:
     """Plan for the object on the view axis, or at the reference cloud's median if the first IoU is at most 0.5."""
-    cloud, reference = read_frame(Path(case.folder))
+    folder = Path(case.folder)
+    cloud = load_depth_view(folder / "depth_mm.png", folder / "camera.json")
+    reference = np.loadtxt(folder / "object_cloud.xyz")
     hand = load_hand(case.hand)
     target, found = None, {}
     try:
@@ -73,7 +74,7 @@ def run_frame(case: Frame) -> Record:
             if found["iou"] > 0.5:
                 break
         began = time.perf_counter()
-        scene = scene_from_views([cloud], target=target, source=Path(case.folder).name)
+        scene = scene_from_views([cloud], target=target, source=folder.name)
         scene_s = time.perf_counter() - began
         result = plan_grasps(scene, hand, count=case.count, preset=case.preset)
     except GraspdError as error:
@@ -89,12 +90,6 @@ def run_frame(case: Frame) -> Record:
         "outcome": result.outcome.name,
         "warnings": list(result.warnings),
     }
-
-
-def read_frame(folder: Path) -> tuple[PointCloud, np.ndarray]:
-    """Return the cloud of a frame's depth image, and the reference cloud of its object [m], both in camera frame."""
-    view = load_depth_view(folder / "depth_mm.png", folder / "camera.json")
-    return view, np.loadtxt(folder / "object_cloud.xyz")
 
 
 def overlap(found: np.ndarray, reference: np.ndarray) -> float:

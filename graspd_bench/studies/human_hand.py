@@ -16,7 +16,6 @@ from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 
 import numpy as np
-from jaxtyping import Float
 
 from graspd_bench.bullet.bullet_world import build_bullet_world, bullet_available, bullet_displacement
 from graspd_bench.study import PROTOCOL_MASS, ObjectCase, Record, Request, Sections, object_cases, raw_grasps
@@ -25,6 +24,7 @@ from graspd_core.hands.mano.mano_hand import load_mano
 from graspd_core.mesh.mesh_files import surface_samples
 from graspd_core.mesh.shapes import object_hash
 from graspd_core.mesh.surface_queries import DistanceQuery, is_inside, make_distance_query, signed_distance
+from graspd_core.mesh.topology import scaled_normals
 from graspd_core.optimize.plan_config import PlanConfig, load_preset, override, to_mapping
 from graspd_core.perception.load_scene import load_scene
 from graspd_core.perception.scene import object_parts
@@ -59,9 +59,7 @@ def measure_skin(query: DistanceQuery, skin: TriangleMesh) -> SkinMetrics:
     """Measure how a closed skin mesh touches an object, object frame [m]. `query` gives distances to the object."""
     points, _ = surface_samples(skin, _SAMPLES, _SEED)
     distance = signed_distance(query, points, reach=2 * CONTACT_DISTANCES[-1])
-    corners = skin.vertices[skin.faces]
-    cross = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-    each = 0.5 * float(np.linalg.norm(cross, axis=1).sum()) / len(points)
+    each = 0.5 * float(np.linalg.norm(scaled_normals(skin.vertices, skin.faces), axis=1).sum()) / len(points)
     return SkinMetrics(
         contact_area=tuple(float((np.abs(distance) <= within).sum()) * each for within in CONTACT_DISTANCES),
         intersection_volume=_shared_volume(query, skin),
@@ -75,16 +73,13 @@ def _shared_volume(query: DistanceQuery, skin: TriangleMesh) -> float:
     high = np.minimum(query.tree.high, skin.vertices.max(0))
     if (high <= low).any():
         return 0.0
-    axes = [_middles(a, b) for a, b in zip(low, high, strict=True)]
+    ends = zip(np.floor(low / VOXEL), np.ceil(high / VOXEL), strict=True)
+    axes = [(np.arange(first, last) + 0.5) * VOXEL for first, last in ends]
     cells = np.stack(np.meshgrid(*axes, indexing="ij"), -1).reshape(-1, 3)
     cells = cells[is_inside(query.tree, cells)]
     if len(cells) == 0:
         return 0.0
     return float(is_inside(make_distance_query(skin).tree, cells).sum()) * VOXEL**3
-
-
-def _middles(low: float, high: float) -> Float[np.ndarray, "n"]:
-    return (np.arange(np.floor(low / VOXEL), np.ceil(high / VOXEL)) + 0.5) * VOXEL
 
 
 SHAPES = ("shape:sphere", "shape:cylinder", "shape:box")

@@ -151,12 +151,9 @@ def imported_sections(records: Sequence[Record], chart: Path | None) -> Sections
     whys = sum((Counter(record["refused"]) for record in records), Counter[str]())
     refused = "; ".join(f"{count} refused: {why}" for why, count in whys.items())
     note = "Shares are of all grasps of an object, also refused grasps and those not found. Other numbers are medians."
-    warnings = [f"{_name(record['object'])}: {record['frame_doubt']}." for record in records if _doubted(record)]
+    doubted = [record for record in records if record.get("frame_doubt")]
+    warnings = [f"{_name(record['object'])}: {record['frame_doubt']}." for record in doubted]
     return {"imported": [markdown_table(headings, body), " ".join(filter(None, (note, refused, *warnings)))]}
-
-
-def _doubted(record: Record) -> bool:
-    return bool(record.get("frame_doubt"))
 
 
 def _name(source: str) -> str:
@@ -172,7 +169,7 @@ def _row(name: str, records: Sequence[Record], source: str, trials: Sequence[str
         there = [value for value in values if value is not None]
         return f"{np.median(there):.{digits}f}" if there else "–"
 
-    if source == "imported" and any(map(_doubted, records)):
+    if source == "imported" and any(record.get("frame_doubt") for record in records):
         # Figures of poses in a wrong frame say nothing about the grasps.
         return [name, "imported, frame in doubt", f"{len(grasps)} of {count}", *["–"] * (width - 3)]
     cells = [name, SOURCES[source], f"{len(grasps)} of {count}"]

@@ -79,11 +79,6 @@ def seen_cases(request: Request) -> tuple[Seen, ...]:
     return tuple(Seen(**vars(case), views=views, sight=sight) for case in cases for views, sight in seen)
 
 
-def seen_seconds(case: Seen) -> float:
-    """Return the estimated CPU time of a case [s]."""
-    return 4.0 + 0.4 * case.count + 0.6 * case.views
-
-
 def run_seen(case: Seen) -> Record:
     """Reconstruct, plan and try grasps. If no scene can be built, the record holds the error message as `refused`."""
     hand = load_hand(case.hand, candidates=case.config.problem.fine_candidates)

@@ -108,7 +108,7 @@ def run_steered(case: SteeredCase) -> Record:
         # Greatest violation of each constraint. It is negative if all grasps obey.
         "beyond_cone_rad": max((beyond_cone(hand, grasp, steering) for grasp in good), default=None),
         "beyond_region_m": max((beyond_region(grasp, steering) for grasp in good), default=None),
-        "in_boxes": sum(_in_boxes(hand, grasp, steering) for grasp in good),
+        "in_boxes": sum(bool(entered(hand, [g.pregrasp, g.grasp, g.squeeze], steering.avoid).any()) for g in good),
     }
 
 
@@ -137,10 +137,6 @@ def beyond_region(grasp: Grasp, goal: Steering) -> float:
         np.abs(np.array([c.position for c in grasp.contacts]) - goal.region.center) - np.array(goal.region.size) / 2
     )
     return float(beyond.max())
-
-
-def _in_boxes(hand: HandModel, grasp: Grasp, goal: Steering) -> bool:
-    return bool(entered(hand, [grasp.pregrasp, grasp.grasp, grasp.squeeze], goal.avoid).any())
 
 
 def steered_sections(records: Sequence[Record], chart: Path | None) -> Sections:

@@ -50,7 +50,7 @@ def hits_of_scene(arm: Arm, scene: Scene, base: SE3, links: SE3) -> Hits:
     """
     solids = [("the object", scene.sdf), *(("an obstacle", obstacle.sdf) for obstacle in scene.obstacles)]
     moved = np.flatnonzero(arm.chain.link_group[arm.capsules.link] != 0)
-    points, padded, owner = _samples(arm)
+    points, padded, owner = capsule_balls(arm)
     at = (base.rotation @ place_points(points, links)[..., None]).squeeze(-1) + base.translation
     found = [hits_of_support(arm, scene, base, placed(arm.capsules, links)[:2])]
     for what, sdf in solids:
@@ -159,7 +159,7 @@ def _seed_links(arm: Arm) -> SE3:
 
 
 @lru_cache(maxsize=8)
-def _samples(arm: Arm) -> tuple[Float[Tensor, "points columns"], Float[Tensor, "points"], Int[np.ndarray, "points"]]:
+def capsule_balls(arm: Arm) -> tuple[Float[Tensor, "n columns"], Float[Tensor, "n"], Int[np.ndarray, "n"]]:
     """Return samples of all segments: points as a matrix for `place_points`, larger radii [m], and capsule indices."""
     points, radii, owner = [], [], []
     for k in range(len(arm.capsules.link)):

@@ -159,7 +159,7 @@ def _postures(task: ArmTask, target: SE3) -> tuple[Float[Tensor, "postures joint
     count = starts.shape[1]
     owner = torch.arange(len(starts)).repeat_interleave(count)
     q, reached = solve(arm, target[owner], starts.flatten(0, 1), _STEPS)
-    q, owner = _nearest_turn(arm, q[reached]), owner[reached]
+    q, owner = nearest_turn(arm, q[reached], arm.seed), owner[reached]
     if not len(q):
         return q, owner
     hits = hits_of_support(arm, task.scene, task.base, placed(arm.capsules, arm_links(arm, q))[:2])
@@ -174,9 +174,9 @@ def _postures(task: ArmTask, target: SE3) -> tuple[Float[Tensor, "postures joint
     return q[kept], owner[kept]
 
 
-def _nearest_turn(arm: Arm, q: Float[Tensor, "batch joints"]) -> Float[Tensor, "batch joints"]:
-    """Add full turns to revolute joints, so that each joint is as near to the seed as its limits allow."""
-    turns = ((torch.as_tensor(arm.seed) - q) / (2 * np.pi)).round() * (2 * np.pi)
+def nearest_turn(arm: Arm, q: Float[Tensor, "batch joints"], near: np.ndarray) -> Float[Tensor, "batch joints"]:
+    """Add full turns to revolute joints, so that each joint is as near to the posture `near` as its limits allow."""
+    turns = ((torch.as_tensor(near) - q) / (2 * np.pi)).round() * (2 * np.pi)
     turned = torch.where(torch.as_tensor(arm.chain.slides), q, q + turns)
     inside = (turned >= torch.as_tensor(arm.lower)) & (turned <= torch.as_tensor(arm.upper))
     return torch.where(inside, turned, q)

@@ -64,9 +64,9 @@ def test_a_real_case_leaves_a_record():
 
 def test_a_refused_scene_loses_all_grasps_and_says_why():
     done = failure_maps.run_on(failure_maps.run_size, replace(TINY, thing="teapot", up=("a", "b")))
-    assert [(cell.up, cell.held) for cell in done] == [("a", 0), ("b", 0)]
+    assert [(cell["up"], cell["held"]) for cell in done] == [("a", 0), ("b", 0)]
     for cell in done:
-        ((reason, count),) = cell.reasons.items()
+        ((reason, count),) = cell["reasons"].items()
         assert reason.startswith("no scene: unknown shape 'teapot'")
         assert count == TINY.count
 

@@ -38,10 +38,9 @@ def mover_of(arm_name: str, points: np.ndarray | None = None, boxes: tuple[Box, 
 def test_links_are_where_the_arms_own_kinematics_have_them(name: str):
     arm = load_arm(name)
     q = arm.seed + np.random.default_rng(0).uniform(-0.5, 0.5, (20, len(arm.seed)))
-    rotation, place = arm_shape(arm).links(q)
-    true = arm_links(arm, torch.as_tensor(q))
-    np.testing.assert_allclose(rotation, true.rotation.numpy(), atol=1e-12)
-    np.testing.assert_allclose(place, true.translation.numpy(), atol=1e-12)
+    links, true = arm_shape(arm).links(q), arm_links(arm, torch.as_tensor(q))
+    np.testing.assert_allclose(links.rotation.numpy(), true.rotation.numpy(), atol=1e-12)
+    np.testing.assert_allclose(links.translation.numpy(), true.translation.numpy(), atol=1e-12)
 
 
 @pytest.mark.parametrize("name", ARMS)
