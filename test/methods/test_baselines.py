@@ -258,22 +258,6 @@ def test_it_stops_when_told_and_at_the_deadline(scenes, hand):
     assert (late.interrupted, len(late.poses.joints)) == ("deadline", 0)
 
 
-<<<<<<< HEAD
-=======
-def test_what_asks_for_more_links_than_touch_gives_nothing(scenes, hand):
-    strict = replace(CLOSURE, settings=replace(CLOSURE.settings, touching=12, rounds=1))
-    found = close_at_random(scenes["sphere"], hand, count=2, config=strict)
-    assert (found.interrupted, len(found.poses.joints)) == ("", 0)
-
-
-def test_its_poses_become_ranked_grasps(scenes, hand):
-    candidates = find_candidates(PlannerInput(scenes["cylinder"], hand, count=3, seed=0, config=CLOSURE, hooks=Hooks()))
-    assert 1 <= len(candidates) <= 3
-    scores = [grasp.score for grasp in candidates]
-    assert scores == sorted(scores, reverse=True)
-
-
->>>>>>> e8e4a9cca5202a8aadf4c9ddf13e236ae2124dcb
 @pytest.mark.slow
 @pytest.mark.parametrize("name", hand_names())
 def test_it_works_with_every_hand(scenes, name):
