@@ -141,11 +141,12 @@ def _has_thin_walls(seen: Surfels, least: float) -> bool:
 def _closed(evidence: Evidence, guess: Surfels, cells: int) -> TriangleMesh:
     """Close the surface by the grid solver. Use Open3D's solver if the settings ask for it or no surface fits."""
     settings = evidence.settings
+    adaptive = partial(poisson.poisson_field, finest=settings.poisson_cell)
     small = float(np.ptp(evidence.seen.points, axis=0).max()) < _LEAST_CELLS * settings.min_cell
     if settings.poisson == "grid" and not small:
         with suppress(CloudError):
             return closed_mesh(evidence, guess, poisson.grid_poisson_field, cells)
-    return closed_mesh(evidence, guess, partial(poisson.poisson_field, finest=settings.poisson_cell), cells)
+    return closed_mesh(evidence, guess, adaptive, cells)
 
 
 def closed_mesh(evidence: Evidence, guess: Surfels, field: poisson.Field, cells: int) -> TriangleMesh:
