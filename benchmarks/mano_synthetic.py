@@ -14,7 +14,6 @@ import sys
 from pathlib import Path
 from types import ModuleType
 from typing import Any
-from unittest.mock import patch
 
 import numpy as np
 
@@ -90,8 +89,16 @@ def mano_pickle(model: dict[str, Any]) -> bytes:
     vars(source).update(x=np.concatenate([shapes, np.zeros_like(shapes)], axis=-1), _dirty_vars={"x"})
     numbers = np.arange(shapes.size * 2).reshape(*shapes.shape[:2], -1)[..., : shapes.shape[-1]]
     vars(chosen).update(a=source, idxs=numbers.ravel(), preferred_shape=shapes.shape, _status="new")
-    with patch.dict(sys.modules, modules):
+    saved = {name: sys.modules.get(name) for name in modules}
+    sys.modules.update(modules)
+    try:
         return pickle.dumps({**model, "shapedirs": chosen}, protocol=2)
+    finally:
+        for name, module in saved.items():
+            if module is None:
+                del sys.modules[name]
+            else:
+                sys.modules[name] = module
 
 
 def _bones() -> tuple[list[tuple[int, np.ndarray, np.ndarray, float]], np.ndarray]:

@@ -234,21 +234,22 @@ class Picker:
         return seen_world(points[away > radius[nearest] + 0.03], 0.0, self._known)
 
     def go_home(self) -> None:
-        """Move the arm to `start`, out of the camera's view, and open the hand. Raise the arm after a failure."""
+        """Move the arm to `start`, out of the camera's view, and open the hand. Raise the arm after an abort."""
         world = SeenWorld(0.0, self._known)
         for left in reversed(range(_TRIES_HOME)):
             try:
-                self._move_arm_home(self._mover(world))
+                self._move_arm_home(world)
                 break
-            except (MotionAborted, NoMotionError):
+            except MotionAborted:
                 if not left:
                     raise
                 self.back_off(world)
         self._move_hand(self._hand.open_posture)
 
-    def _move_arm_home(self, mover: Mover) -> None:
+    def _move_arm_home(self, world: SeenWorld) -> None:
         now = self._arm_now()
         if np.abs(now - self._layout.start).max() > 0.02:
+            mover = self._mover(world)
             up = straight(mover, now, np.array([0.0, 0.0, 0.12]))
             self._follow_arm(up, self._pace.free)
             self._follow_arm(find_path(mover, up[-1], self._layout.start, _WAY_HOME), self._pace.free)

@@ -83,7 +83,13 @@ class ReadyObject:
 
 @dataclass(frozen=True)
 class MadeBlock:
-    """Content of a block's Parquet file, the hash of the object's cleaned mesh, and the report without `files`."""
+    """A block that was made.
+
+    Attributes:
+        file: content of the Parquet file.
+        object_sha256: hash of the object's cleaned mesh.
+        report: report without `files`.
+    """
 
     file: bytes
     object_sha256: str

@@ -31,7 +31,7 @@ _CHECK_EVERY = 100
 
 @dataclass(frozen=True, eq=False)
 class _Run:
-    """One running simulation: the ids of the client, of the object's body, of the hand's body, and of its joints.
+    """One running simulation. `client`, `body` (the object), `hand` and `joints` are ids of PyBullet.
 
     `worst` has the greatest displacement [m] and rotation [rad] of the object so far. It is updated in place.
     """

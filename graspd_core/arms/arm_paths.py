@@ -121,7 +121,7 @@ def _some_paths(task: ArmTask, grasps: Sequence[Grasp]) -> list[ArmPath | str]:
     joints = torch.as_tensor(stacked([grasp.pregrasp for grasp in grasps])[2])[owner]
     followed = _followed(task, paths[owner], q, joints)
     rows_of_each = [torch.nonzero(owner == grasp).flatten().tolist() for grasp in range(len(grasps))]
-    # The row of each grasp's first valid path. Else the grasp's first row, or -1 if there is no row.
+    # For each grasp: the row of its first valid path, else its first row, else -1.
     best = [next(filter(followed.good, rows), rows[0] if rows else -1) for rows in rows_of_each]
     reasons, names, chain = _why_lost(task, paths, followed, best), task.arm.joint_names, task.arm.chain
     made = partial(ArmPath, names, stages=STAGE_ROWS, velocity=chain.velocity, slides=chain.slides)

@@ -81,7 +81,7 @@ class _Commands(argparse._SubParsersAction):
         return super().add_parser(name, help=_summary(name), **settings)
 
 
-# Commands in the order of `graspd --help`: module in graspd_core, or other package. Summary, which needs no import.
+# Module within graspd_core, or name of the other package, and a summary, so that `graspd --help` imports no command.
 _COMMANDS = {
     "synthesize": ("cli.synthesize_command", "plan grasps on a mesh, a cloud or a built-in shape"),
     "replay": ("cli.replay_command", "plan grasps on the clouds or depth images of a rosbag2 recording"),
@@ -146,7 +146,7 @@ def _parser() -> _Parser:
 
 
 def _modules(command: str = "") -> dict[str, str]:
-    """Return the module of each command, but only those of graspd_core if `command` is one. Entry points are slow."""
+    """Return the module of each command. For a command of graspd_core, leave out the slow search for other packages."""
     own = {name: f"graspd_core.{module}" for name, (module, _) in _COMMANDS.items() if not module.startswith("graspd_")}
     return own if command in own else own | {point.name: point.value for point in entry_points(group="graspd.commands")}
 

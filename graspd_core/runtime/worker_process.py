@@ -12,7 +12,6 @@ import atexit
 import contextlib
 import ctypes
 import importlib
-import math
 import os
 import pickle
 import signal
@@ -32,18 +31,20 @@ _M_ARENA_MAX, _ARENAS = -8, 2
 
 def trim_heap() -> None:
     """Return freed memory to the system. Only glibc needs this call."""
-    _call_libc("malloc_trim", ctypes.c_size_t(0))
+    try:
+        trim = ctypes.CDLL(None).malloc_trim
+    except (OSError, AttributeError, TypeError):  # no glibc
+        return
+    trim(ctypes.c_size_t(0))
 
 
 def limit_malloc_arenas() -> None:
     """Let all threads share two memory arenas (glibc only). One arena per thread would keep much freed memory."""
-    _call_libc("mallopt", _M_ARENA_MAX, _ARENAS)
-
-
-def _call_libc(name: str, *arguments: Any) -> None:
-    # Not every C library has these functions.
-    with contextlib.suppress(OSError, AttributeError, TypeError):
-        getattr(ctypes.CDLL(None), name)(*arguments)
+    try:
+        mallopt = ctypes.CDLL(None).mallopt
+    except (OSError, AttributeError, TypeError):
+        return
+    mallopt(_M_ARENA_MAX, _ARENAS)
 
 
 T = TypeVar("T")
@@ -75,11 +76,28 @@ class WorkerProcess:
         """Run `work` in the child. Return its result or raise its error. Raises MemoryError: the child died twice."""
         # pickle copies tensors. multiprocessing would share the memory of tensors, which is lost if a process dies.
         call = pickle.dumps((work, arguments, named), pickle.HIGHEST_PROTOCOL)
-        reply = self._reply(call) or self._reply(call)
-        if reply is None:
-            # Do not run the function in this process, because it could kill this process too.
-            raise MemoryError(f"{work.__name__}: the worker process died twice, perhaps for lack of memory")
-        return _result(reply)
+        with self._lock:
+            for _ in range(2):
+                if self._process.poll() is not None:
+                    self._start()
+                try:
+                    self._pipe.send_bytes(call)
+                    reply = self._pipe.recv_bytes()
+                    break
+                except (EOFError, OSError):
+                    self._process.wait()
+                except BaseException:
+                    # After Ctrl-C, the answer to this call would stay in the pipe, and the next call would read it.
+                    self._process.kill()
+                    self._process.wait()
+                    raise
+            else:
+                # Do not run the function in this process, because it could kill this process too.
+                raise MemoryError(f"{work.__name__}: the worker process died twice, perhaps for lack of memory")
+        failed, answer = pickle.loads(reply)
+        if failed:
+            raise answer
+        return answer
 
     def bounded(self, seconds: float, most_mb: float, work: Callable[..., T], *arguments: Any) -> T:
         """Run `work` in the child, but kill the child if the call takes too long or too much memory.
@@ -90,12 +108,6 @@ class WorkerProcess:
             ChildProcessError: the child died.
         """
         call = pickle.dumps((work, arguments, {}), pickle.HIGHEST_PROTOCOL)
-        if (reply := self._reply(call, seconds, most_mb)) is None:
-            raise ChildProcessError(f"its process died with exit code {self._process.returncode}")
-        return _result(reply)
-
-    def _reply(self, call: bytes, seconds: float = math.inf, most_mb: float = math.inf) -> bytes | None:
-        """Return the child's reply to a pickled call, or None if the child died. Raises the errors of the limits."""
         with self._lock:
             if self._process.poll() is not None:
                 self._start()
@@ -107,16 +119,17 @@ class WorkerProcess:
                         raise TimeoutError(f"the call did not end within {seconds:g} s")
                     if (held := resident_mb(self._process.pid)) > most_mb:
                         raise MemoryError(f"its process used {held:.0f} MB, more than {most_mb:g} MB")
-                return self._pipe.recv_bytes()
-            except BaseException as error:
-                died = isinstance(error, (EOFError, OSError)) and not isinstance(error, TimeoutError)
-                if not died:
-                    # After Ctrl-C, the answer to this call would stay in the pipe, and the next call would read it.
-                    self._process.kill()
+                reply = self._pipe.recv_bytes()
+            except (EOFError, ConnectionError):
+                raise ChildProcessError(f"its process died with exit code {self._process.wait()}") from None
+            except BaseException:
+                self._process.kill()
                 self._process.wait()
-                if died:
-                    return None
                 raise
+        failed, answer = pickle.loads(reply)
+        if failed:
+            raise answer
+        return answer
 
     def close(self) -> None:
         """End the child."""
@@ -200,15 +213,9 @@ def serve(number: int, modules: Iterable[str] = (), parent: int = 0) -> None:
         trim_heap()
 
 
-def _result(reply: bytes) -> Any:
-    failed, answer = pickle.loads(reply)
-    if failed:
-        raise answer
-    return answer
-
-
 def _end_with(parent: int) -> None:
-    _call_libc("prctl", _PR_SET_PDEATHSIG, signal.SIGKILL)
+    with contextlib.suppress(OSError, AttributeError):
+        ctypes.CDLL(None).prctl(_PR_SET_PDEATHSIG, signal.SIGKILL)
     if os.getppid() != parent:
         os._exit(1)
 

@@ -26,6 +26,7 @@ from graspd_core import (
 from graspd_core.config import SceneConfig, SegmentationConfig, from_mapping, load_scene_config
 from graspd_core.errors import ConfigError
 from graspd_core.perception.obstacles import make_obstacles
+from graspd_core.perception.reconstruct.reconstruct import reconstruct
 from graspd_core.perception.segment.segment import segment
 
 
@@ -213,3 +214,13 @@ def test_every_field_is_used_on_the_way_from_views_to_a_scene():
     ring = np.array([[0.12 * np.cos(t), 0.12 * np.sin(t), 0.01 * t] for t in np.linspace(0, 12.6, 200)])
     make_obstacles([ring], None, on_table.truth, 1.0, settings.obstacles)
     assert set(FIELDS) - read == set()
+
+
+def test_the_settings_change_the_mesh_and_its_confidence():
+    rng = np.random.default_rng(0)
+    ball = rng.normal(size=(4000, 3))
+    views = [PointCloud(0.04 * ball / np.linalg.norm(ball, axis=1, keepdims=True), np.array([0.5, 0.0, 0.3]))]
+    usual = SceneConfig().reconstruction
+    here = reconstruct(views, settings=dataclasses.replace(usual, max_faces=500, seen_distance=1e-6))
+    assert len(here.mesh.faces) <= 500
+    assert here.confidence.max() < 1.0

@@ -8,6 +8,7 @@ from functools import partial
 import numpy as np
 import pytest
 import torch
+from expected import some
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
@@ -152,6 +153,28 @@ def test_distance_changes_no_faster_than_one_moves(name, seed):
     a, b = (torch.rand(16, 3, generator=generator, dtype=torch.float64) - 0.5 for _ in range(2))
     change = (KERNELS[name](a) - KERNELS[name](b)).abs()
     assert (change <= (a - b).norm(dim=-1) + 1e-12).all()
+
+
+@pytest.mark.parametrize("name", KERNELS)
+def test_gradient_has_no_nan_on_centre_and_axis(name):
+    points = torch.tensor([[0.0, 0.0, 0.0], [0.0, 0.0, 0.1], [0.0, 0.0, 0.2], [0.0, 0.0, 0.9]], requires_grad=True)
+    KERNELS[name](points).sum().backward()
+    assert torch.isfinite(some(points.grad)).all()
+
+
+@pytest.mark.parametrize("name", KERNELS)
+@given(seed=st.integers(0, 10_000))
+def test_gradient_is_the_finite_difference(name, seed):
+    generator = torch.Generator().manual_seed(seed)
+    # Irregular offsets keep clear of the creases, where no derivative exists.
+    points = torch.rand(4, 3, generator=generator, dtype=torch.float64) - 0.5
+    points.requires_grad_()
+    (gradient,) = torch.autograd.grad(KERNELS[name](points).sum(), points)
+    step = 1e-6
+    shifts = step * torch.eye(3, dtype=torch.float64)
+    ahead, behind = (torch.stack([KERNELS[name](points.detach() + s * d) for d in shifts], -1) for s in (1, -1))
+    smooth = (ahead + behind - 2 * KERNELS[name](points.detach())[:, None]).abs() < 1e-9
+    assert torch.allclose(gradient[smooth], ((ahead - behind) / (2 * step))[smooth], atol=1e-5)
 
 
 SLIDER = """<robot name="slider">

@@ -203,8 +203,8 @@ CLOSURE = PlanConfig(
 )
 
 
-def closure_task(scene, hand, *, count: int = 4, seed: int = 0, **hooks) -> PlannerInput:
-    return PlannerInput(scene, hand, count, seed, CLOSURE, Hooks(**hooks), dtype=DOUBLE)
+def closure_task(scene, hand, *, count: int = 4, seed: int = 0, config=CLOSURE, **hooks) -> PlannerInput:
+    return PlannerInput(scene, hand, count, seed, config, Hooks(**hooks), dtype=DOUBLE)
 
 
 def close_at_random(scene, hand, **asked) -> PlannerOutput:
@@ -256,6 +256,12 @@ def test_it_stops_when_told_and_at_the_deadline(scenes, hand):
     late = close_at_random(scenes["box"], hand, deadline=time.perf_counter())
     assert (cancelled.interrupted, len(cancelled.poses.joints)) == ("cancelled", 0)
     assert (late.interrupted, len(late.poses.joints)) == ("deadline", 0)
+
+
+def test_what_asks_for_more_links_than_touch_gives_nothing(scenes, hand):
+    strict = replace(CLOSURE, settings=replace(CLOSURE.settings, touching=12, rounds=1))
+    found = close_at_random(scenes["sphere"], hand, count=2, config=strict)
+    assert (found.interrupted, len(found.poses.joints)) == ("", 0)
 
 
 @pytest.mark.slow

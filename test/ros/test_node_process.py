@@ -37,15 +37,15 @@ for arguments in json.loads(sys.argv[1]):
 pytestmark = pytest.mark.timeout(300)
 
 
-def test_a_signal_ends_a_busy_node_cleanly(client, shared_node):
-    """By SIGTERM. By SIGINT, tests end all nodes, which are idle."""
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_a_signal_ends_a_busy_node_cleanly(client, shared_node, number):
     process = shared_node.process()
     client.forget()
     actions = client.actions(SynthesizeGrasps, "synthesize")
     goal = SynthesizeGrasps.Goal(request=GraspRequest(id="goal", **SPHERE, **LONG))
     asked = client.send_goal(actions, goal).get_result_async()
     client.event(event="progress", stage="optimise")
-    status, log = process.stop(signal.SIGTERM)
+    status, log = process.stop(number)
     assert status == 0
     assert "Traceback" not in log
     ended = client.done(asked, "result of the goal")

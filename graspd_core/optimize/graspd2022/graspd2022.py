@@ -133,7 +133,10 @@ def euler_step(
     torque: Float[Tensor, "*#batch 3"],
     time_step: float,
 ) -> tuple[Float[Tensor, "*batch 3"], Float[Tensor, "*batch 3"]]:
-    """Return linear [m/s] and angular [rad/s] velocity after `time_step` [s]. The body does not turn before."""
+    """Return linear [m/s] and angular [rad/s] velocity after `time_step` [s] of a force [N] and a torque [N·m].
+
+    The angular velocity before the step is zero.
+    """
     return linear + (time_step / body.mass) * force, time_step * (torque @ body.inverse_inertia)
 
 
@@ -259,8 +262,8 @@ def published_starts(problem: Problem, scene: Scene, hand: HandModel, count: int
 class Evaluation(NamedTuple):
     """Values per start, and the outward normals at the hand's points.
 
-    `cost` is L_phys + L_range + L_inter, weighted. Without relaxation, a loss on the motion replaces L_phys. `task` and
-    `limit` are L_task and L_limit.
+    `cost` is L_phys + L_range + L_inter, weighted. Without relaxation, an unweighted loss on the motion replaces
+    L_phys. `task` and `limit` are L_task and L_limit.
     """
 
     cost: Values

@@ -57,7 +57,10 @@ def extrude(seen: Surfels, free_space: FreeSpace, step: float) -> Surfels:
 def _lowered(
     top: Points, outward: Points, bottom: float, free_space: FreeSpace, step: float
 ) -> tuple[Surfels, Bool[np.ndarray, "n"]]:
-    """Return vertical walls from points down to the height `bottom` [m], and beneath which points cameras allow one."""
+    """Return vertical walls from points down to height `bottom` [m], and a mask of the points that have such a wall.
+
+    A point has no wall where the cameras contradict the wall.
+    """
     levels = np.arange(bottom + 0.5 * step, top[:, 2].max(initial=bottom + step), step)
     row, level = np.nonzero(levels < top[:, 2:] - 0.5 * step)
     points = np.column_stack([top[row, :2], levels[level]])

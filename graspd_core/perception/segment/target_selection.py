@@ -75,7 +75,9 @@ def select_target(
     views: Sequence[PointCloud],
     settings: SegmentationConfig,
 ) -> Mask:
-    """Return the voxels of the selected object: the one most covered by a box or mask, and others half masked.
+    """Return the voxels of the selected object. For a box or mask, this is the object with most points in it.
+
+    A mask also selects every object of which it covers at least half.
 
     Args:
         label: object number of each voxel, -1 for none.
@@ -194,7 +196,7 @@ def _hiding(point: Vector, scene: VoxelScene, views: Sequence[PointCloud]) -> Ma
 
 
 def _covered(label: Labels, meant: Mask, things: list[int], share: Float[np.ndarray, "things"], least: float) -> Mask:
-    """Take objects whole if the target covers at least the fraction `least` of them, else only their voxels in it."""
+    """Return all voxels of objects covered at least to the fraction `least`, and the covered voxels of the others."""
     whole = [k for k in things if share[k] >= least]
     return np.isin(label, whole) | (np.isin(label, things) & meant)
 

@@ -147,7 +147,7 @@ def spin_until(node: Node, condition: Callable[[], bool]) -> None:
 
 
 def test_a_transform_that_is_wrong_is_left_out_of_its_message(node: Node, capfd):
-    """Transforms of another process, moving and static: test_scenarios.py and test_planning_scene.py."""
+    """Transforms of another process: test_scenarios.py (played from a bag) and test_planning_scene.py (static)."""
     buffer, wrong, right = TransformBuffer(), TransformStamped(child_frame_id="broken"), TransformStamped()
     listener, publisher = tf_listener.TransformListener(node, buffer), node.create_publisher(TFMessage, "/tf", 10)
     wrong.transform.rotation.w, right.child_frame_id = 3.0, "right"
