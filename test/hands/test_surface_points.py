@@ -27,7 +27,7 @@ from graspd_core.runtime import disk_cache as cache
 CORNERS = np.array([[0.0, 0, 0], [0.03, 0, 0], [0, 0.02, 0], [0, 0, 0.04]])
 FACES = np.array([[0, 2, 1], [0, 1, 3], [0, 3, 2], [1, 2, 3]])
 BARREL = 2 * np.pi * 0.01 * 0.04
-# Solids with their areas [m²] and volumes [m³]; the slanted face of the hull by de Gua's theorem.
+# Solids with their areas [m²] and volumes [m³]. The slanted face of the hull is by de Gua's theorem.
 SHAPES = [
     (Primitive(0, "box", np.eye(3), np.zeros(3), (0.01, 0.02, 0.03)), 8 * (0.0002 + 0.0006 + 0.0003), 8 * 6e-6),
     (Primitive(0, "sphere", np.eye(3), np.array([0.1, 0, 0]), (0.02,)), 4 * np.pi * 0.0004, 4 / 3 * np.pi * 8e-6),

@@ -257,7 +257,7 @@ def mano(path: Path) -> ManoHand:
 
 
 def by_the_paper(data: ManoData, betas: np.ndarray, pose: np.ndarray, shift: np.ndarray) -> np.ndarray:
-    """Vertices [m] in numpy after the paper's equations; `pose` is 16 axis-angle vectors."""
+    """Return the vertices [m] by the paper's equations, in numpy. `pose` has 16 axis-angle vectors."""
     shaped = data.template + data.shape_directions @ betas
     joints = data.joint_regressor @ shaped
     turns = Rotation.from_rotvec(pose).as_matrix()

@@ -191,7 +191,7 @@ def test_what_a_hand_can_hardly_have_is_warned_of(tmp_path: Path, text: str, tol
 
 
 def test_what_is_as_it_should_be_is_not_warned_of(tmp_path: Path) -> None:
-    """A linkage whose joints follow, and an effort that the description names; shipped hands: test_boxed_hands.py."""
+    """Coupled joints follow, and the description sets an effort. test_boxed_hands.py has the shipped hands."""
     (tmp_path / "a.urdf").write_text(
         f'<robot name="closed"><link name="palm">{BOX}</link>{KNUCKLES.format("", MIMIC, MIMIC)}</robot>'
     )
