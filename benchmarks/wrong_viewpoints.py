@@ -4,9 +4,9 @@
 
 Clouds come from ten rendered scenes (objects of `graspd bench cameras` on which no threshold was chosen, seeds from
 100), and from the depth frames in a folder (`NAME/camera.json` as in docs/clouds.md, `NAME/depth_mm.png`). Points are
-unordered, so that no pixel shows where the camera stood. Each cloud has three forms: all points, points thinned to
-8 mm, and only the object's points. A wrong position is a robot's base, the true position mirrored, 5 m away, or anywhere at the true
-distance. The line of sight turns by more than 20°. Verified grasps are tried on the true object, if known.
+unordered, so that no pixel shows where the camera stood. Each cloud has three forms: all points, points thinned to 8
+mm, and only the object's points. A wrong position is a robot's base, the true position mirrored, 5 m away, or anywhere
+at the true distance. The line of sight turns by more than 20°. Verified grasps are tried on the true object, if known.
 """
 
 from __future__ import annotations
