@@ -152,25 +152,26 @@ class RecentRuns:
         return run, found[rank]
 
     def next_best(self, request: Request, excluded: Sequence[Matrix]) -> Planned | None:
-        """Return earlier grasps of the same object that are not similar to `excluded`. None if no grasp is left.
+        """Return earlier grasps of the same object that are not similar to `excluded`. None if too few are left.
 
-        Only runs with equal trials, preset and `closes_late` count, and only grasps that passed every requested trial.
+        Only runs with equal trials, preset and `closes_late` count, and of these the runs that tried the greatest mass.
+        Only grasps that passed every requested trial count.
         """
         same = [run for run in self._runs.values() if run.object_key == request.object_key and request.object_key]
-        runs = [run for run in same if run.terms == _terms(request)]
+        same = [run for run in same if run.terms == _terms(request) and run.grasps]
+        # A run may have tried its grasps at less than the assumed mass, e.g. because its constraints left weak grasps.
+        most = max((run.planned.mass for run in same), default=0.0)
+        runs = [run for run in same if run.planned.mass == most]
         known = {id(grasp): grasp for run in runs for grasp in run.grasps}
         wanted = Verdict.UNVERIFIED if request.settings.verify == "none" else Verdict.VERIFIED
-        left = [grasp for grasp in unlike(known.values(), excluded) if grasp.verdict is wanted]
         count = request.settings.num_grasps
-        if not left:
+        left = [grasp for grasp in unlike(known.values(), excluded) if grasp.verdict is wanted][:count]
+        if len(left) < count:
             return None
-        outcome = Outcome.SUCCEEDED if len(left) >= count else Outcome.TOO_FEW
-        message = f"{min(count, len(left))} grasps of an earlier run, none similar to the {len(excluded)} excluded"
+        message = f"{count} grasps of an earlier run, none similar to the {len(excluded)} excluded"
         warnings = runs[-1].planned.result.warnings
-        result = GraspResult(outcome, tuple(left[:count]), Timing(), request.settings.seed, "", message, warnings)
-        # A run may have tried its grasps at less than the assumed mass. Every grasp holds the least of these masses.
-        mass = min(run.planned.mass for run in runs if run.grasps)
-        return replace(runs[-1].planned, result=result, file="", mass=mass)
+        result = GraspResult(Outcome.SUCCEEDED, tuple(left), Timing(), request.settings.seed, "", message, warnings)
+        return replace(runs[-1].planned, result=result, file="")
 
 
 def _terms(request: Request) -> tuple[str, str, bool]:

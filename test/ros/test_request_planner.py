@@ -177,11 +177,22 @@ def test_the_next_best_grasp_comes_at_once_from_the_candidates_of_the_same_run(h
             ask("sixth", unknown)
 
 
-def test_grasps_of_earlier_runs_have_the_least_mass_of_their_trials(planned):
+def test_only_the_earlier_runs_that_tried_the_greatest_mass_answer(planned):
     runs = RecentRuns()
-    for name, mass in (("first", 0.3), ("second", 0.5)):
-        runs.keep(sphere(id=name), replace(planned, mass=mass), np.eye(4))
-    assert some(runs.next_best(sphere(), [])).mass == 0.3
+    light, heavy = (replace(planned.result, warnings=(f"tried at {mass}",)) for mass in (0.3, 0.5))
+    runs.keep(sphere(id="heavy"), replace(planned, result=heavy, mass=0.5), np.eye(4))
+    runs.keep(sphere(id="light"), replace(planned, result=light, mass=0.3), np.eye(4))
+    found = some(runs.next_best(sphere(), []))
+    assert found.mass == 0.5
+    assert found.result.warnings == ("tried at 0.5",)
+    assert found.result.tried == heavy.tried[: SETTINGS.num_grasps]
+
+
+def test_too_few_earlier_grasps_are_no_answer_so_that_the_node_plans(planned):
+    runs, left = RecentRuns(), len(planned.result.tried)
+    runs.keep(sphere(), planned, np.eye(4))
+    assert runs.next_best(sphere(settings=replace(SETTINGS, num_grasps=left)), []) is not None
+    assert runs.next_best(sphere(settings=replace(SETTINGS, num_grasps=left + 1)), []) is None
 
 
 def test_grasps_of_an_earlier_run_have_no_path_of_an_arm_that_is_switched_off(planned):
