@@ -151,7 +151,7 @@ def __dir__() -> list[str]:
 
 
 class _MovedModules:
-    """Import finder for old paths of moved modules, after all other finders. Its ImportError names the new path."""
+    """Import finder that runs last. For the old path of a moved module, its ImportError names the new path."""
 
     def find_spec(self, fullname: str, path: Any = None, target: Any = None) -> ModuleSpec | None:
         if not fullname.startswith(f"{__name__}."):

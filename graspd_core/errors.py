@@ -83,7 +83,7 @@ class SimulatorError(GraspdError):
 
 
 class Extra:
-    """Context for importing a library that a pip extra installs, e.g. `with Extra("clouds"): import open3d`.
+    """Context manager for importing a library that a pip extra installs, e.g. `with Extra("clouds"): import open3d`.
 
     Raises ConfigError: a library is not installed. The message has the pip command that installs the extra.
     """
@@ -92,7 +92,7 @@ class Extra:
         self.name = name
 
     def __enter__(self) -> None:
-        """Do nothing. Python requires this method of a context."""
+        """Do nothing. Python requires this method of a context manager."""
 
     def __exit__(self, kind: object, error: object, trace: object) -> None:
         if isinstance(error, ModuleNotFoundError):

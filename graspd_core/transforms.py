@@ -113,7 +113,7 @@ class TransformBuffer:
 
     @property
     def refused(self) -> str:
-        """The end of an error message about a missing frame: the last refused transform, or nothing."""
+        """Text to append to an error about a missing frame: the last refused transform. Empty if none was refused."""
         return self._refused[1]
 
     def frames(self) -> tuple[str, ...]:
@@ -151,7 +151,7 @@ class TransformBuffer:
 
 
 def refuse_motion(frame: str, poses: Sequence[Float[np.ndarray, "4 4"]]) -> None:
-    """Raise TransformError if a camera frame moved between views, whose `poses` are in a fixed frame [m]."""
+    """Raise TransformError if a camera frame moved between views. `poses` are its poses in a fixed frame [m]."""
     far = max((float(np.linalg.norm(pose[:3, 3] - poses[0][:3, 3])) for pose in poses), default=0.0)
     apart = max((float(np.linalg.norm(pose[:3, :3] - poses[0][:3, :3])) for pose in poses), default=0.0)
     # Two rotation matrices with the angle a in between differ by a matrix of the norm 2 √2 sin(a / 2).

@@ -78,7 +78,7 @@ class Plane:
         margin: least height of the hand above the plane [m], equal to the noise of the camera that saw the plane.
 
     Raises:
-        ConfigError: the normal is no unit vector, or a number is not finite, or the margin is below 0.
+        ConfigError: the normal is not a unit vector, a number is not finite, or the margin is below 0.
     """
 
     normal: Float[np.ndarray, "3"]
@@ -280,7 +280,7 @@ class Progress:
 
 @dataclass(frozen=True)
 class Snapshot:
-    """Hand poses that a run is working on, object frame: while optimising the starts, during trials the candidates.
+    """Current hand poses of a run, object frame: the starting poses while optimising, the candidates during trials.
 
     Attributes:
         positions: positions of the base links [m].

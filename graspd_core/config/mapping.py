@@ -116,13 +116,13 @@ _MOST_MERGED = 10_000
 
 
 class _Loader(yaml.SafeLoader):
-    """The safe YAML loader. It refuses a key that stands twice, and limits the entries that `<<` merges add."""
+    """The safe YAML loader. It refuses a key that occurs twice, and limits the entries that `<<` merges add."""
 
     def compose_mapping_node(self, anchor: Any) -> yaml.MappingNode:
         node, known = super().compose_mapping_node(anchor), set[tuple[str, str]]()
         for key, _ in node.value:
             if isinstance(key, yaml.ScalarNode) and ((key.tag, key.value) in known or known.add((key.tag, key.value))):
-                raise yaml.constructor.ConstructorError(None, None, f"{key.value!r} stands twice", key.start_mark)
+                raise yaml.constructor.ConstructorError(None, None, f"{key.value!r} occurs twice", key.start_mark)
         return node
 
     def flatten_mapping(self, node: yaml.MappingNode) -> None:

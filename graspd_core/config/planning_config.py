@@ -20,7 +20,7 @@ class ProblemConfig:
             so that the whole hand touches. With zero, it pulls only the nearest candidate of each rigid group of links.
         softness: depth to which the hand's surface yields, as flesh does [m]. Planning makes object and hand thinner by
             this depth, for contact candidates and for sharp points. Trials do not model softness.
-        features: number of sharp object points that polishing uses. Objects with large thin walls get more points.
+        features: number of sharp object points in the last optimiser steps. Objects with large thin walls get more.
         directions: number of disturbance wrenches that a grasp should resist.
         friction: friction coefficient for planning, below the object's friction, so that contacts keep a margin.
         confidence_floor: weight of a contact on guessed surface, relative to a contact on seen surface.
@@ -103,14 +103,14 @@ class RobustConfig:
 
 @dataclass(frozen=True)
 class HeldShares:
-    """Fractions of grasps that hold on the true object with its true mass, measured on single views (docs/clouds.md).
+    """For groups of grasps, the fraction that holds on the true object with its true mass (docs/clouds.md).
 
     Attributes:
-        likeliest: fraction among the grasps that hold on the likeliest shape, the best guess from the view.
-        places: fraction among the grasps that also hold with the hand misplaced.
-        shapes: fraction among the grasps that hold with the hand misplaced and on other shapes.
-        fails_places: fraction among the grasps that hold on the likeliest shape but not with the hand misplaced.
-        fails_shapes: fraction among the grasps that hold with the hand misplaced but not on other shapes.
+        likeliest: grasps that hold on the likeliest shape, the best guess from the view.
+        places: grasps that also hold with the hand misplaced.
+        shapes: grasps that hold with the hand misplaced and on other shapes.
+        fails_places: grasps that hold on the likeliest shape but not with the hand misplaced.
+        fails_shapes: grasps that hold with the hand misplaced but not on other shapes.
     """
 
     likeliest: float

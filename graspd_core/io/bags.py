@@ -89,7 +89,7 @@ def is_bag(path: str | Path) -> bool:
 
 
 def bag_topics(path: str | Path) -> tuple[BagTopic, ...]:
-    """Return the topics of a recording, sorted by name. Raises BagError: the path is no bag, or the bag is broken."""
+    """Return the topics of a recording, sorted by name. Raises BagError: the path is not a bag or the bag is broken."""
     with _opened(path) as reader:
         return _topics(reader)
 
@@ -97,7 +97,7 @@ def bag_topics(path: str | Path) -> tuple[BagTopic, ...]:
 def read_transforms(path: str | Path) -> TransformBuffer:
     """Read all transforms of a recording (/tf and /tf_static).
 
-    Raises BagError: the path is no bag, or the bag is broken or has no transforms.
+    Raises BagError: the path is not a bag, or the bag is broken or has no transforms.
     """
     buffer = TransformBuffer(history=None)
     with _opened(path) as reader:
@@ -123,12 +123,12 @@ def read_frames(
     Args:
         path: a rosbag2 directory, or one of its storage files (.mcap, .db3).
         topic: topic of clouds or depth images. None takes the only cloud topic, else the only depth topic.
-        info_topic: CameraInfo topic. None takes `camera_info` beside the depth images, else the only CameraInfo topic.
+        info_topic: CameraInfo topic. None takes `camera_info` next to the depth topic, else the only CameraInfo topic.
         every: yield every n-th message only.
         limit: greatest number of messages to yield. None means no limit.
 
     Raises:
-        BagError: the path is no bag, the bag is broken, or the topic is missing, ambiguous, empty or unsuitable.
+        BagError: the path is not a bag, the bag is broken, or the topic is missing, ambiguous, empty or unsuitable.
     """
     with _opened(path) as reader:
         chosen = _choose(path, reader, topic)
@@ -158,7 +158,7 @@ def read_frames(
 def read_raw(path: str | Path, topics: tuple[str, ...] = ()) -> Iterator[tuple[BagTopic, int, bytes]]:
     """Yield raw messages (CDR), each with its topic and receive time [ns]. Without `topics`, all topics are read.
 
-    Raises BagError: the path is no bag, or the bag is broken or lacks a topic.
+    Raises BagError: the path is not a bag, or the bag is broken or lacks a topic.
     """
     with _opened(path) as reader:
         known = {topic.name: topic for topic in _topics(reader)}

@@ -130,7 +130,7 @@ def _check_order(is_bigendian: bool, dtype: np.dtype, points: Float[np.ndarray, 
 
 
 def _odd_share(numbers: Float[np.ndarray, "n"]) -> float:
-    """Return the fraction of the finite, non-zero numbers that are no plausible lengths in any unit."""
+    """Return the fraction of the finite, non-zero numbers that are not plausible lengths in any unit."""
     size = np.abs(numbers[np.isfinite(numbers) & (numbers != 0)])
     return float(((size < 1e-6) | (size > 1e9)).mean()) if len(size) else 0.0
 
@@ -295,7 +295,7 @@ def _png_begins(data: memoryview, told: str) -> int:
     for at in (_QUANTISED.size, 0):
         if bytes(data[at : at + len(_PNG)]) == _PNG:
             return at
-    raise CloudError(f"depth image: format {told[:64]!r}, and the data is no PNG; valid: '16UC1; compressedDepth png'")
+    raise CloudError(f"depth image: format {told[:64]!r}, but data is not a PNG; valid: '16UC1; compressedDepth png'")
 
 
 def depth_and_camera(image: Any, info: Any, *, rectified: bool = False) -> tuple[DepthImage, PinholeCamera]:
@@ -307,7 +307,7 @@ def depth_and_camera(image: Any, info: Any, *, rectified: bool = False) -> tuple
         rectified: whether the image is rectified. A rectified image has no distortion.
 
     Raises:
-        CloudError: the image is no depth image, is broken, or has another frame than the calibration.
+        CloudError: the image is not a depth image, is broken, or has another frame than the calibration.
     """
     theirs, own = info.header.frame_id, image.header.frame_id
     if theirs and theirs.removeprefix("/") != own.removeprefix("/"):

@@ -1,4 +1,4 @@
-"""Reader of the surfaces in COLLADA (.dae) files, without a COLLADA library.
+"""Read the surfaces of COLLADA (.dae) files, without a COLLADA library.
 
 The reader takes the triangles, strips, fans, polylists and polygons of the visual scene that `<scene>` names, or of the
 only visual scene, or of all geometries if there is no scene. It applies the node transforms, and converts lengths to

@@ -1,4 +1,4 @@
-"""Connected pieces of a mesh: dropping tiny floating pieces, and counting separate bodies.
+"""Find connected pieces of a mesh: drop tiny floating pieces, and count separate bodies.
 
 Scanners and careless exports leave floating pieces. Planning would treat separate bodies as one rigid body.
 """
@@ -136,7 +136,7 @@ def _grown(
     among: Bool[np.ndarray, "points"],
     reach: float,
 ) -> Bool[np.ndarray, "points"]:
-    """Return which points lie on the longest piece of `among`, or on pieces connected by gaps below `reach` [m]."""
+    """Return which points of `among` lie on its longest piece, or on pieces joined to it by gaps below `reach` [m]."""
     low, high = np.full((2, int(owner.max()) + 1, 3), np.inf)
     np.minimum.at(low, owner[among], points[among])
     np.minimum.at(high, owner[among], -points[among])

@@ -1,4 +1,4 @@
-"""Mesh files: reading, checking, cleaning, writing and mass properties. Lengths are in metres.
+"""Read, check, clean and write mesh files, and compute mass properties. Lengths are in metres.
 
 If a file holds no mesh or only a part of one, the error says what the file holds. Messages guess the unit of a file.
 The guess is never applied.
@@ -170,7 +170,7 @@ def read_mesh(path: str | Path, *, scale: float = 1.0) -> tuple[TriangleMesh, tu
     text = b"\n" + path.read_bytes() if path.suffix.lower() == ".obj" else b""
     named = text.count(b"\nv ")
     if named and not len(faces):
-        raise MeshError(f"{path}: {named} vertices and no face: cut off before its faces, or no mesh")
+        raise MeshError(f"{path}: {named} vertices and no face: cut off before its faces, or not a mesh")
     mesh, warnings = _without_strays(TriangleMesh(vertices, faces), str(path))
     # The OBJ reader drops unused vertices silently, so they are counted in the text.
     warnings += _stray_warnings(str(path), named - len(vertices))

@@ -186,7 +186,7 @@ def pressed_points(
 def first_hits(
     mesh: TriangleMesh, directions: Float[np.ndarray, "*batch 3"]
 ) -> tuple[Float[np.ndarray, "*batch"], Integer[np.ndarray, "*batch"], Float[np.ndarray, "*batch 3"]]:
-    """Cast rays from the origin. Return distances per length of `directions` (inf: no hit), hit faces and normals."""
+    """Cast rays from the origin. Return distances in lengths of `directions` (inf: no hit), hit faces and normals."""
     with Extra("clouds"):
         import open3d as o3d
 

@@ -144,7 +144,7 @@ _FAR = 100.0
 
 
 def far_centre(vertices: Float[np.ndarray, "vertices 3"]) -> Float[np.ndarray, "3"]:
-    """Return a mesh's centre [m]. Return zero if the centre is within a hundred times the mesh's size of the origin."""
+    """Return a mesh's centre [m], or zero if it is closer to the origin than a hundred times the mesh's size."""
     low, high = vertices.min(0), vertices.max(0)
     centre = (low + high) / 2
     return centre if np.linalg.norm(centre) > _FAR * (high - low).max() else np.zeros(3)

@@ -1,1 +1,1 @@
-"""Building scenes from camera data and files."""
+"""Build scenes from camera data and files."""

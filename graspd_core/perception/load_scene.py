@@ -1,4 +1,4 @@
-"""Building a scene from a mesh file, a point cloud file, a depth image, a built-in shape, or a mesh."""
+"""Build a scene from a mesh file, a point cloud file, a depth image, a built-in shape, or a mesh."""
 
 from __future__ import annotations
 
@@ -61,7 +61,7 @@ def load_scene(
             in metres per unit of depth, and 1 means the unit that the camera's file gives.
 
     Raises:
-        MeshError: the mesh cannot be read or used, comes with an argument of clouds, or a number is out of range.
+        MeshError: the mesh cannot be read or used, an argument for clouds is given, or a number is out of range.
         CloudError: the cloud cannot be read or shows no object.
     """
     started = time.perf_counter()

@@ -1,8 +1,8 @@
-"""Obstacles around the object: convex hulls that the hand avoids, made from seen points or from known shapes.
+"""Build obstacles around the object: convex hulls that the hand avoids, made from seen points or from known shapes.
 
 The obstacle of a neighbouring object is the convex hull of its seen points and their projection onto the support plane.
 So space beneath overhangs counts as full. Nothing is guessed behind the seen side, because a thick guess would block
-free space. A neighbour that surrounds the target is halved until its parts leave that space free.
+free space. A neighbour that surrounds the target is halved until its parts leave the target free.
 """
 
 from __future__ import annotations
@@ -85,8 +85,8 @@ def _hulls(
     """Yield hulls of parts of the points, and each part's distance from the target's points [m].
 
     A neighbour whose hull fills the target's place is halved across the longest of `axes`, down to `side` [m]. Parts
-    must also leave free the space between their points and the target. A whole neighbour need not, because its unseen
-    back may be there.
+    must also leave the space between their points and the target free. A whole neighbour may fill this space, because
+    its unseen back may be there.
     """
     gap, hull = float(target.query(seen)[0].min()), padded_hull(seen, support, padding)
     planes = ConvexHull(hull.vertices).equations
@@ -116,9 +116,9 @@ def padded_hull(points: Points, support: Plane | None, padding: float) -> Triang
 
 
 def held_hull(mesh: TriangleMesh, base: Posture) -> TriangleMesh:
-    """Return the convex hull of an object in the frame of the hand's base link at the posture `base` [m].
+    """Return the convex hull [m] of a held object in the frame of the hand's base link.
 
-    The hull has at most 128 corners, so that motion planners stay fast.
+    `base` is the link's pose in the object frame. At most 128 corners keep motion planners fast.
     """
     rotation = rotation_from_quaternion(torch.as_tensor(base.quaternion_wxyz, dtype=torch.float64)).numpy()
     return limited_hull((mesh.vertices - base.position) @ rotation, _HELD_CORNERS)
@@ -130,8 +130,8 @@ def with_neighbours(
     """Return the scene with collision objects, e.g. of a MoveIt planning scene, added as obstacles.
 
     A collision object that largely overlaps the target is taken for the target, and left out with a warning. Collision
-    objects that do not rise above the support, or that are too far away, are left out without a warning. A collision
-    object that reaches deep into an object which cameras saw is a doubt.
+    objects that do not rise above the support, or that are too far away, are left out without a warning. If a
+    collision object reaches deep into an object that cameras saw, no grasp counts as verified.
 
     Args:
         scene: the scene of the object to grasp.

@@ -3,7 +3,7 @@
 A scene keeps the coordinates of its file. Float32 would round an object far from the origin, for example in map
 coordinates. `near_scene` moves such a scene near the origin, and `moved_grasp` moves grasps back.
 
-The confidence grid has the nodes of the signed distance grid. Confidence falls from 1 at seen to 0 at guessed surface.
+The confidence grid has the nodes of the signed distance grid. Confidence falls from 1 at seen to 0 at guessed surfaces.
 """
 
 from __future__ import annotations
@@ -111,7 +111,7 @@ class ObjectModel:
         radius: distance from the centre of mass to the farthest vertex [m].
         warnings: problems found in the input, one sentence each.
         reconstructed: whether the mesh was reconstructed from camera data.
-        file_state: `file_state` of the source when loading began. Empty if the source is no file.
+        file_state: `file_state` of the source when loading began. Empty if the source is not a file.
     """
 
     source: str
@@ -277,7 +277,7 @@ def object_sdf(model: ObjectModel, resolution: int = 48) -> GridSDF:
 
 
 def object_sharp_points(model: ObjectModel, count: int) -> tuple[Float[np.ndarray, "points 3"], float]:
-    """Return the object's sharp points [m] and the thin fraction of its surface (`sharp_points`), cached by content."""
+    """Return the sharp points [m] and the thin fraction of the object's surface (`sharp_points`), cached by content."""
     coarse = {"pool": _COARSE_POOL} if model.reconstructed else {}
 
     def build() -> cache.Arrays:
@@ -292,7 +292,7 @@ def object_sharp_points(model: ObjectModel, count: int) -> tuple[Float[np.ndarra
 
 
 def object_parts(model: ObjectModel) -> tuple[TriangleMesh, ...]:
-    """Return a convex decomposition of the object that keeps its hollows, cached by content.
+    """Return a convex decomposition of the object, cached by content. Hollows of the object stay hollow.
 
     The parts of a reconstructed object are coarser, because camera data are coarse.
     """
@@ -341,7 +341,7 @@ def moved_object(model: ObjectModel, offset: Float[np.ndarray, "3"]) -> ObjectMo
 
 
 def make_obstacle(mesh: TriangleMesh) -> Obstacle:
-    """Return the obstacle with this surface. A distant grid keeps its place in float64 (`moved_sdf`)."""
+    """Return an obstacle with the surface `mesh`. The origin of its grid is in float64 (`moved_sdf`)."""
     far = far_centre(mesh.vertices)
     sides = np.ptp(mesh.vertices, axis=0) + 2 * _OBSTACLE_PADDING
     resolution = min(int(np.ceil(np.cbrt(sides.prod()) / _OBSTACLE_CELL)), _OBSTACLE_RESOLUTION)

@@ -1,4 +1,4 @@
-"""Scenes from depth camera views: segment the object, reconstruct its surface, and build the obstacles around it."""
+"""Build scenes from depth camera views: segment an object, reconstruct its surface, and make obstacles around it."""
 
 from __future__ import annotations
 
@@ -163,7 +163,7 @@ def _camera_doubts(seen: Segmentation, views: Sequence[PointCloud]) -> tuple[str
 
 
 def _is_whole_object(views: Sequence[PointCloud]) -> bool:
-    """Return True if `check_scene` refuses a single all-round cloud, False if it accepts the views. Else, raise."""
+    """Return False if `check_scene` accepts the views, True if it refuses a single all-round cloud. Else, raise."""
     try:
         check_scene(views)
     except CloudError:

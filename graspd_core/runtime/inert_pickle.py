@@ -169,7 +169,7 @@ def read_bounded(path: Path, what: str) -> bytes:
 def load_inert(content: bytes, admitted: Mapping[tuple[str, str], Maker], what: str) -> Any:
     """Return the content of a pickle: Python's numbers, text, lists and dictionaries, and `Inert` objects.
 
-    Raises ValueError: `content` is no pickle, or names a class or function that is not in `admitted`.
+    Raises ValueError: `content` is not a pickle, or names a class or function that is not in `admitted`.
     """
     try:
         return _Reader(content, admitted).load()

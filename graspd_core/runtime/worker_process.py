@@ -1,4 +1,4 @@
-"""Run functions in a child process, because many libraries hold Python's lock during long calls and some crash.
+"""Run functions in a child process, because many libraries hold Python's GIL during long calls and some crash.
 
 A server process calls `start_worker_process` once. After that `run_isolated` runs functions in the child. In other
 processes `run_isolated` calls the functions directly. The child is a bare interpreter, because a child of

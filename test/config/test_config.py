@@ -82,7 +82,7 @@ def test_a_preset_file_changes_only_what_it_names(tmp_path: Path):
         ("[1, 2]", ["mapping", "[1, 2]"]),
         ("method: magic", ["method", "'magic'", "closed_form"]),
         ("a: [1", ["not valid YAML"]),
-        ("robust: {}\nresolution: 32\nrobust: {}", ["bad.yaml", "line 3: 'robust' stands twice"]),
+        ("robust: {}\nresolution: 32\nrobust: {}", ["bad.yaml", "line 3: 'robust' occurs twice"]),
     ],
 )
 def test_a_bad_preset_file_is_named(tmp_path: Path, text: str, culprits: list[str]):

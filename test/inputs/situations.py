@@ -446,7 +446,7 @@ MESSAGES = {
 DRIVERS = {
     "points with colours, n by 6": Situation(
         array(np.hstack([ROWS, np.full((76800, 3), 128.0)])),
-        r"colours or normals beside x, y, z\? .*points\[:, :3\]",
+        r"colours or normals after x, y, z\? .*points\[:, :3\]",
         "YanjieZe/Improved-3D-Diffusion-Policy#24",
     ),
     "text of points with colours": Situation(

@@ -374,7 +374,7 @@ def test_faces_with_many_corners_are_named(tmp_path: Path):
         ("v 0 0 -", "cut off: it ends in the middle of a line, 'v 0 0 -'"),
         ("f 1 2", "cut off: it ends in the middle of a line, 'f 1 2'"),
         ("f 1 2 9\n", "a face names a vertex that the file does not hold"),
-        ("", "3 vertices and no face: cut off before its faces, or no mesh"),
+        ("", "3 vertices and no face: cut off before its faces, or not a mesh"),
     ],
 )
 def test_an_obj_that_was_cut_off(tmp_path: Path, last: str, told: str):

@@ -105,10 +105,10 @@ def test_calibrations_are_read():
         ({"model": "", "distortion": [0.1]}, "unknown distortion model ''; valid: plumb_bob"),
         ({"distortion": [0.1] * 6}, "6 distortion coefficients; plumb_bob has at most 5"),
         ({"matrix": [0.0] * 9}, "fx=0.0, fy=0.0"),
-        ({"matrix": [float("nan")] * 9}, "is no calibration"),
+        ({"matrix": [float("nan")] * 9}, "is not a calibration"),
         ({"matrix": [1.0] * 4}, "its matrix K has 4 numbers; 9 are needed"),
         ({"width": 0}, "an image of 0 x 480 pixels"),
-        ({"distortion": [float("inf")]}, "is no calibration"),
+        ({"distortion": [float("inf")]}, "is not a calibration"),
     ],
 )
 def test_what_is_no_calibration_is_refused(changes, culprit):

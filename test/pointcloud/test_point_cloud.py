@@ -83,9 +83,9 @@ def test_a_cloud_moves_with_its_camera():
 @pytest.mark.parametrize("scales", [(-1.0, 1.0, 1.0), (1e-3, 1e-3, 1e-3), (1.0, np.nan, 1.0)])
 def test_a_cloud_is_neither_mirrored_nor_scaled(scales):
     pose = look_at((0.3, 0.2, 0.1), (0, 0, 0)) * np.array([*scales, 1.0])
-    with pytest.raises(CloudError, match="is no rigid transform; valid: a rotation, a finite position"):
+    with pytest.raises(CloudError, match="is not a rigid transform; valid: a rotation, a finite position"):
         transform_cloud(PointCloud(np.ones((2, 3)), ORIGIN), pose)
-    with pytest.raises(CloudError, match="is no rigid transform; valid: a rotation, a finite position"):
+    with pytest.raises(CloudError, match="is not a rigid transform; valid: a rotation, a finite position"):
         cloud_from_depth(np.ones((6, 8)), PinholeCamera(8, 6, 10.0, 10.0, 3.5, 2.5), pose)
 
 

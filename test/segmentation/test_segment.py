@@ -275,7 +275,7 @@ def test_a_mask_of_background_finds_nothing():
         (Target(point=np.zeros(3), mask=np.ones(3, dtype=bool)), "point and mask given; valid: only one of point"),
         (Target(point=np.array([0.0, np.nan, 0.0])), "valid: finite numbers"),
         (Target(box=(np.zeros(3), np.array([1.0, 1.0, 0.0]))), "valid: finite, with a volume above 0"),
-        (Target(mask=np.ones(3, dtype=bool)), r"mask of length 3; valid: \d+, the points of the first view"),
+        (Target(mask=np.ones(3, dtype=bool)), r"mask of length 3; valid: \d+, the number of points in the first view"),
         (Target(mask=np.zeros(len(seen(THREE.meshes)[0].points), dtype=bool)), "mask selects no point"),
     ],
 )

@@ -45,7 +45,7 @@ def test_what_a_driver_fills_gaps_with_is_no_point():
     points = np.array([[0.0, 0, 0], eye, [np.nan, 0, 0], [0.0, 0, 0.1]])
     assert measured(points, eye).tolist() == [False, False, False, True]
     for value in (np.zeros(3), eye):
-        with pytest.raises(CloudError, match="zero or at the camera, as a driver fills in"):
+        with pytest.raises(CloudError, match="zero or at the camera, as drivers mark missing depth"):
             segment([PointCloud(np.tile(value, (500, 1)), eye)])
 
 

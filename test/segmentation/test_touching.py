@@ -30,7 +30,7 @@ CYLINDER_BESIDE = tabletop("box", obstacles=[("cylinder", 0.064, 0.0)])
 def test_two_that_touch_are_told_where_the_seam_is_seen(azimuth):
     view = view_of(CYLINDER_BESIDE, azimuth)
     (doubt,) = segment([view]).warnings
-    assert doubt.startswith("cloud: the object may be 2 objects that touch, about (")
+    assert doubt.startswith("cloud: the object may be 2 objects that touch, with centres at (")
     said = np.array(re.findall(r"-?\d+\.\d+", doubt), dtype=float).reshape(2, 3)
     for mesh in (CYLINDER_BESIDE.truth, CYLINDER_BESIDE.obstacles[0]):
         assert np.linalg.norm(said - 0.5 * (mesh.vertices.min(0) + mesh.vertices.max(0)), axis=1).min() < 0.04

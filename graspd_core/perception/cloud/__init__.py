@@ -1,1 +1,1 @@
-"""Cameras, depth images and point clouds, and reading of files with such data."""
+"""Cameras, depth images and point clouds, and readers of their files."""

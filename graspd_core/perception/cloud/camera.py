@@ -1,4 +1,4 @@
-"""Pinhole cameras with lens distortion, conversion of depth images to points, and objects at the image border.
+"""Model pinhole cameras with lens distortion, convert depth images to points, and find objects at the image border.
 
 Camera frames follow the optical convention: z forward, x right, y down. The distortion follows OpenCV's model (Brown
 and Conrady). ROS calls the model plumb_bob with k1, k2, p1, p2, k3, and rational_polynomial if k4, k5, k6 follow.
@@ -82,7 +82,7 @@ class PinholeCamera:
         finite = all(abs(number) <= _MAX_CALIBRATION_PX for number in numbers)
         if not (finite and min(self.fx, self.fy) >= _MIN_FOCAL_PX):
             raise CloudError(
-                f"camera: fx={self.fx}, fy={self.fy}, cx={self.cx}, cy={self.cy} is no calibration; "
+                f"camera: fx={self.fx}, fy={self.fy}, cx={self.cx}, cy={self.cy} is not a calibration; "
                 "valid: finite numbers, fx and fy above 0"
             )
         if len(self.distortion) > 8:
@@ -172,8 +172,8 @@ def reaches_image_border(
 ) -> bool:
     """Return True if an object reaches an image border of the camera at `eye`. `mine` marks the object's points.
 
-    A long side of the hull of all points in the image is a border. Points of the object, and other points, must lie
-    within `width` [rad] of the side.
+    In the image, each long side of the convex hull of all points counts as a border. The object reaches a border if
+    its points and other points lie along the border, within `width` [rad].
     """
     if not mine.any():
         return False
@@ -251,7 +251,7 @@ def cloud_from_depth(
 
 
 def _check_image(depth: Float[np.ndarray, "pixels"], camera: PinholeCamera) -> None:
-    """Raise CloudError if depth was cut to 8 bits (255 mm), or if the camera matrix is for another image size."""
+    """Raise CloudError if depths were cut to 8 bits (0 to 255 mm), or the camera matrix is for another image size."""
     known = depth[np.isfinite(depth) & (depth > 0)]
     share = float((known > _MOST_OF_8_BITS - 1e-6).mean()) if known.size else 0.0
     if share > _CUT_SHARE and abs(float(known.max()) - _MOST_OF_8_BITS) < 1e-6:
@@ -269,7 +269,7 @@ def _check_image(depth: Float[np.ndarray, "pixels"], camera: PinholeCamera) -> N
 
 
 def depth_encoding(name: str) -> tuple[str, float]:
-    """Return the NumPy type of a pixel and the metres per unit. Raises CloudError for other encodings."""
+    """Return a depth encoding's NumPy type and metres per unit. Raises CloudError for an unknown encoding."""
     if name not in ENCODINGS:
         remedy = next((f"; {said}" for begins, said in _REMEDIES.items() if name.startswith(begins)), "")
         raise CloudError(f"depth image: encoding {name[:64]!r}; valid for depth: {', '.join(ENCODINGS)}{remedy}")

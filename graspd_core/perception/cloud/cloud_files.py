@@ -1,4 +1,4 @@
-"""Reading of point clouds from files: point formats, arrays, and depth images with their camera.
+"""Read point clouds from files: point formats, arrays, and depth images with their camera.
 
 Open3D reads only xyz and compressed pcd files in graspd. For a ply or pcd file that is cut short, Open3D would return
 uninitialised memory. Formats: "The PLY Polygon File Format" (Turk, 1994) and "The PCD file format", version 0.7 (Point
@@ -52,7 +52,7 @@ class _Element:
 def read_ply_points(data: bytes) -> Points:
     """Read the vertices of a ply file, text or binary in either byte order. NaN is kept.
 
-    Raises ValueError: no ply file, no x, y or z, a file cut short, or list properties in or before the vertices.
+    Raises ValueError: not a ply file, no x, y or z, a file cut short, or list properties in or before the vertices.
     """
     # The header ends where end_header starts a line. A comment may contain the same word.
     head, *more = re.split(rb"[\r\n]end_header", data, maxsplit=1)
@@ -62,7 +62,7 @@ def read_ply_points(data: bytes) -> Points:
     start = 0
     for element in elements:
         if "" in element.codes:
-            raise ValueError(f"element {element.name!r} has a list; valid: lists only after the vertices")
+            raise ValueError(f"element {element.name!r} has a list property; valid: only after element 'vertex'")
         if element.name == "vertex":
             break
         start += element.count * sum(np.dtype(code).itemsize if order else 1 for code in element.codes)
@@ -127,8 +127,8 @@ def _pcd_points(data: bytes, header: dict[str, list[str]], at: int) -> Points | 
 def _refuse_false_sizes(packed: bytes, needed: int) -> None:
     size, unpacked = np.frombuffer(packed[:8].ljust(8, b"\0"), "<u4").tolist()
     if unpacked != needed or size > len(packed) - 8 or unpacked > _DENSEST * size:
-        there = f"{size} packed and {unpacked} unpacked bytes, and the file has {max(len(packed) - 8, 0)} packed ones"
-        raise ValueError(f"its header promises {needed} bytes of points, its data promises {there}")
+        there = f"{unpacked} bytes, packed as {size}, and the file has {max(len(packed) - 8, 0)} packed bytes"
+        raise ValueError(f"its header declares {needed} bytes of points, but its data declares {there}")
 
 
 def _ply_header(lines: list[str]) -> tuple[str, list[_Element]]:
@@ -191,7 +191,8 @@ def load_views(path: str | Path, viewpoint: Vector | None = None, scale: float =
     """Read the views of one or several cameras from a file, in one frame.
 
     For a file of points, `viewpoint` [m] replaces the camera's position in the file. With depth, `viewpoint` is an
-    error. `scale` is in metres per unit of points and viewpoint, or of depth, not of poses. 1 means the units below.
+    error. `scale` is the metres per unit of the points and the viewpoint in the file, or of depths. Poses are always in
+    metres. With a scale of 1, the file has the units below.
 
     * ply, xyz, npy (n×3 or h×w×3): points [m], seen from the origin.
     * pcd: points [m], seen from its `VIEWPOINT`. The format does not give the camera's direction.
@@ -200,8 +201,7 @@ def load_views(path: str | Path, viewpoint: Vector | None = None, scale: float =
       `distortion` (up to k1 k2 p1 p2 k3 k4 k5 k6) and the camera's pose `T_world_camera` (4×4).
     * npz with `depths` (views×h×w), `K`, `poses` (views×4×4, each `T_world_camera`), and optionally `distortion`.
 
-    Raises:
-        CloudError: the file is missing, has an unknown ending, is unreadable, or holds none of the listed content.
+    Raises CloudError: the file is missing, has an unknown ending, is unreadable, or holds none of the listed content.
     """
     path = Path(path)
     ending = path.suffix.lower().lstrip(".")
@@ -243,7 +243,7 @@ def _points_view(arrays: Mapping[str, np.ndarray], said: Vector | None) -> Point
     pixels = points if points.ndim == 3 else points[None]
     if points.ndim == 2 and points.shape[1] in (4, 6, 7):
         told = "colours or normals" if points.shape[1] > 4 else "an intensity"
-        raise CloudError(f"shape {points.shape}: {told} beside x, y, z? save only the coordinates, points[:, :3]")
+        raise CloudError(f"shape {points.shape}: {told} after x, y, z? save only the coordinates, points[:, :3]")
     if pixels.ndim != 3 or pixels.shape[2] != 3 or viewpoint.shape != (3,):
         raise CloudError(f"points of shape {points.shape}, viewpoint {viewpoint.shape}; (n, 3) and (3,) are needed")
     if not np.isfinite(viewpoint).all():
@@ -251,7 +251,7 @@ def _points_view(arrays: Mapping[str, np.ndarray], said: Vector | None) -> Point
     if forward is not None:
         largest = np.abs(forward).max(initial=0.0)
         if forward.shape != (3,) or not 0 < largest < np.inf:
-            raise CloudError("'forward' is no direction; 3 finite numbers are needed, not all zero")
+            raise CloudError("'forward' is not a direction; 3 finite numbers are needed, not all zero")
         forward = forward / largest
         forward = forward / np.linalg.norm(forward)
     return seen_from(pixels, viewpoint, forward)
@@ -302,7 +302,7 @@ def rigid(pose: np.ndarray, name: str) -> Float[np.ndarray, "4 4"]:
     pose = _numbers({name: pose}, name)
     if not is_rigid(pose, _ROTATION_TOLERANCE):
         raise CloudError(
-            f"{name!r} is no rigid transform: its upper left 3 × 3 must be a rotation, its last row 0 0 0 1"
+            f"{name!r} is not a rigid transform: its upper left 3 × 3 must be a rotation, its last row 0 0 0 1"
         )
     return pose
 

@@ -1,4 +1,4 @@
-"""Reading of a depth image from one file, and of its camera from another, the `--camera` file.
+"""Read a depth image from one file, and its camera from another file, the camera file (`--camera`).
 
 The camera file is JSON with `width`, `height`, and one of `K` (row by row), Open3D's `intrinsic_matrix` (column by
 column), or `fx fy cx cy`. Optional keys are `distortion` and `distortion_model` as in CameraInfo, `T_world_camera`
@@ -164,7 +164,7 @@ def _metres(pixels: np.ndarray, unit: float | None, name: str) -> DepthImage:
     """Return depth [m], 0 for missing depth. Raises CloudError if pixels hold no depth or the unit seems wrong."""
     if pixels.ndim != 2 or pixels.dtype.kind not in "iuf" or pixels.dtype.itemsize < 2:
         size = f"{' × '.join(map(str, pixels.shape))} of {pixels.dtype}"
-        raise CloudError(f"{name}: {size} is no depth image; valid: one channel of 16 bits or more")
+        raise CloudError(f"{name}: {size} is not a depth image; valid: one channel of 16 bits or more")
     unit = unit or (1.0 if pixels.dtype.kind == "f" else _WHOLE)
     # Values too large for float32 become infinite, which means missing depth.
     with np.errstate(over="ignore", invalid="ignore"):

@@ -1,7 +1,7 @@
-"""Free space: the space that the cameras saw to be empty, in front of surfaces and beside the object's outline.
+"""Find free space: the space that cameras saw to be empty, in front of surfaces and outside the object's outline.
 
 Each view's points of the object become a small depth image. A guessed point in front of the surface in this image, or
-beside the outline, contradicts the camera. A point behind the surface is hidden, so it is possible.
+outside the outline, contradicts the camera. A point behind the surface is hidden, so it is possible.
 """
 
 from __future__ import annotations
@@ -44,7 +44,7 @@ class ViewDepth:
         eye: position of the camera [m].
         frame: axes of the camera, as columns right, down and forward.
         low, cell: corner of the first cell, and width of a cell, in image coordinates (x/z and y/z).
-        depth: depth of the object's surface in each cell [m]. Cells beside the outline copy the nearest seen cell, or
+        depth: depth of the object's surface in each cell [m]. Cells outside the outline copy the nearest seen cell, or
             are infinite if an occluder covers the cell.
         nearest: depth up to which the camera saw empty space [m]: least depth of 3×3 cells, or depth of the occluder.
         beside: distance from the outline in cells, 0 inside the outline and where an occluder hides the object.
@@ -68,8 +68,8 @@ class FreeSpace:
         standing: whether the object stands on a support that fills z < 0.
         lowest: height of the lowest seen points [m]. Segmentation removes lower points together with the
             support, so seen outlines may be too high by up to `lowest`.
-        slack: depth in empty space up to which a point does not contradict the cameras [m].
-        tolerance: distance from seen surface up to which the cameras confirm a guessed point [m].
+        slack: a point at most this deep in empty space does not contradict the cameras [m].
+        tolerance: the cameras confirm a guessed point that is at most this far from seen surface [m].
     """
 
     view_depths: tuple[ViewDepth, ...]
@@ -160,7 +160,7 @@ def empty_depth(free_space: FreeSpace, points: Places) -> Depths:
 
 
 def weigh(free_space: FreeSpace, points: Places, normals: Places) -> tuple[Bool[np.ndarray, "*batch"], Depths]:
-    """Return which points a camera confirms (on seen surface, facing it), and each point's contradiction, 0 to 1."""
+    """Return which points are confirmed (on seen surface, facing a camera), and each point's contradiction, 0 to 1."""
     confirmed, deep = _classify(free_space, points, normals)
     return confirmed, np.clip((deep - free_space.slack) / CONTRADICTION_DEPTH_M, 0.0, 1.0)
 
@@ -201,7 +201,7 @@ def _classify(
 
 
 def _look(view_depth: ViewDepth, points: Places) -> tuple[Depths, Depths]:
-    """Return how deep points lie in empty space, and how far behind seen surface (infinite beside the outline) [m]."""
+    """Return how deep points lie in empty space, and how far behind seen surface (infinite outside the outline) [m]."""
     local = (points - view_depth.eye) @ view_depth.frame
     forward = np.maximum(local[..., 2], 1e-6)
     place = (local[..., :2] / forward[..., None] - view_depth.low) / view_depth.cell

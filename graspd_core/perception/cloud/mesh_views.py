@@ -1,4 +1,4 @@
-"""Detection of view meshes: one camera's points with faces between neighbouring pixels, as camera viewers export them.
+"""Detect view meshes: one camera's points with faces between neighbouring pixels, as camera viewers export them.
 
 A view mesh is open, and all faces turn to the camera. In the image, each face has half the area of a pixel. A view
 mesh must not be used as a solid, because a table and the objects on the table would be one body.

@@ -54,7 +54,7 @@ class PointCloud:
 
 
 def is_rigid(pose: np.ndarray, tolerance: float = RIGID) -> bool:
-    """Return True if a matrix is a rotation, to within `tolerance`, with a finite position above a row 0 0 0 1."""
+    """Return True if a matrix is 4×4 and holds a rotation (within `tolerance`), a finite position and a row 0 0 0 1."""
     if pose.shape != (4, 4):
         return False
     turn = np.nan_to_num(pose[:3, :3]).clip(-2, 2)
@@ -69,7 +69,7 @@ def transform_cloud(cloud: PointCloud, T_a_b: Float[np.ndarray, "4 4"]) -> Point
     """
     if not is_rigid(T_a_b):
         told = np.asarray(T_a_b).tolist()
-        raise CloudError(f"cloud: {told} is no rigid transform; valid: a rotation, a finite position, and 0 0 0 1")
+        raise CloudError(f"cloud: {told} is not a rigid transform; valid: a rotation, a finite position, and 0 0 0 1")
     rotation, position = T_a_b[:3, :3], T_a_b[:3, 3]
     points = cloud.points @ rotation.T
     points += position
@@ -79,7 +79,7 @@ def transform_cloud(cloud: PointCloud, T_a_b: Float[np.ndarray, "4 4"]) -> Point
 
 
 def crop(cloud: PointCloud, low: Sequence[float], high: Sequence[float]) -> tuple[PointCloud, Bool[np.ndarray, "n"]]:
-    """Return the points between two corners of a box [m], and which points these are. NaN is outside."""
+    """Return the cloud inside a box from `low` to `high` [m], and a mask of the points inside. NaN is outside."""
     inside = near = np.ones(len(cloud.points), dtype=bool)
     for column, least, most in zip(cloud.points.T, low, high, strict=True):
         near = near & (column > least - _BEYOND[1]) & (column < most + _BEYOND[1])
@@ -95,7 +95,7 @@ def crop(cloud: PointCloud, low: Sequence[float], high: Sequence[float]) -> tupl
 def _continued(
     at_side: Points, left: Float[np.ndarray, "left 3"], beyond: Float[np.ndarray, "left"], axis: int
 ) -> Float[np.ndarray, "ends 2 3"]:
-    """Follow surfaces from points at a side through the points `left` outside. Return the points found with origin."""
+    """Follow surfaces from points `at_side` of a box out through `left`. Return pairs of points (inside, outside)."""
     origin = front = at_side
     found = [np.empty((0, 2, 3))]
     for begin in np.arange(0.0, _BEYOND[1], _STEP):

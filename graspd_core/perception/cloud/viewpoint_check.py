@@ -83,8 +83,7 @@ def seen_from(pixels: Pixels, viewpoint: Vector, forward: Vector | None = None) 
 
     NaN points are kept. An image of one row or column is not checked.
 
-    Raises:
-        CloudError: the viewpoint is no position, or the pixels show another one, which the error names.
+    Raises CloudError: the viewpoint is not a position, or the pixels show another position, which the error names.
     """
     viewpoint = np.asarray(viewpoint, dtype=float)
     refuse_no_place(viewpoint)
@@ -274,7 +273,7 @@ def hidden_share(points: Points, viewpoint: Vector, nearer: Float[np.ndarray, "p
 
 
 def _away_share(points: Points, surfaces: Surfaces, viewpoint: Vector) -> float:
-    """Return the fraction of points that face away from the viewpoint, if most of each surface faces the viewpoint."""
+    """Turn the normals of each surface mostly to the viewpoint. Return the fraction of points that still face away."""
     normal, surface, clear = surfaces
     ray = viewpoint - points
     cosine = (normal * ray).sum(1) / np.maximum(np.linalg.norm(ray, axis=1), 1e-12)

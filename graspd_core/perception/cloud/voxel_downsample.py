@@ -1,4 +1,4 @@
-"""Cropping of point clouds to the workspace, and downsampling to one mean point per voxel.
+"""Crop point clouds to the workspace, and downsample them to one mean point per voxel.
 
 Segmentation labels the mean points only. Every original point then gets the label of its voxel.
 """
@@ -22,7 +22,7 @@ Labels = Int[np.ndarray, "voxels"]
 
 
 def rows_of(label: Int[np.ndarray, "n"]) -> list[Int[np.ndarray, "_"]]:
-    """Return the rows of each object, in the order of the objects' numbers. The number -1 marks no object."""
+    """Return the row indices of each object, in the order of the objects' numbers. Rows with number -1 are left out."""
     order = np.argsort(label, kind="stable")
     return np.split(order, np.searchsorted(label[order], np.arange(label.max(initial=-1) + 1)))[1:]
 
@@ -82,7 +82,7 @@ def voxel_downsample(views: Sequence[PointCloud], settings: SegmentationConfig) 
     kept = [_inside(view, stride, settings) for view in views]
     finite = sum(number for *_, number in kept)
     if finite == 0 and any(np.isfinite(view.points).all(1).any() for view in views):
-        raise CloudError(f"cloud: all {given} points are zero or at the camera, as a driver fills in for missing depth")
+        raise CloudError(f"cloud: all {given} points are zero or at the camera, as drivers mark missing depth")
     if finite == 0:
         raise CloudError(f"cloud: all {given} points are NaN or infinite")
     rows = tuple(row for row, *_ in kept)
@@ -109,8 +109,8 @@ def _inside(
 ) -> tuple[
     Int[np.ndarray, "kept"], Float[np.ndarray, "kept 3"], Float[np.ndarray, "kept"], Float[np.ndarray, "ends 2 3"], int
 ]:
-    """Take every `stride`-th point. Return rows, points and distances in the workspace, where it cuts surfaces, and
-    how many points were measured.
+    """Take every `stride`-th point. Return row indices, points and distances of the points in the workspace, the `ends`
+    of surfaces at its border (see `PointCloud`), and the number of measured points.
     """
     rows = stride * np.flatnonzero(measured(view.points[::stride], view.viewpoint))
     points = view.points[rows].astype(float)

@@ -1,1 +1,1 @@
-"""Reconstruction of a closed mesh from the points of an object."""
+"""Reconstruct a closed mesh from the points of an object."""

@@ -1,4 +1,4 @@
-"""Guessed surfaces between an object and its support: walls beneath the outline seen from above, and the bottom."""
+"""Guess surfaces between an object and its support: walls beneath the outline seen from above, and the bottom."""
 
 from __future__ import annotations
 

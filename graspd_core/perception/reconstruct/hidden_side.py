@@ -1,4 +1,4 @@
-"""The hidden side of an object: the camera view that would show most of it, and other shapes that it may have.
+"""Find the camera view that would show most of an object's hidden side, and other shapes that this side may have.
 
 The other shapes come from the completion rules, such as mirror symmetry, that the reconstruction did not choose.
 """

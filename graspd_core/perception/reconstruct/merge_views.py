@@ -1,4 +1,4 @@
-"""Merging of views, or of one cloud that shows an object from all round, into one set of points with normals.
+"""Merge views, or one cloud that shows an object from all sides, into one set of points with normals.
 
 Depth noise runs along the line of sight. So each point is moved along its line of sight to the plane of its neighbours,
 and the point's normal is turned to the camera. The two sides of a thin wall therefore stay apart.
@@ -128,7 +128,7 @@ def orient_view(view: PointCloud, step: float, settings: ReconstructionConfig) -
 
 
 def thin(surfels: Surfels, step: float) -> Surfels:
-    """Return the mean surfel of each group. A group shares a cube of side `step` [m] and one of six directions."""
+    """Group surfels by cubes of side `step` [m] and by the axis direction nearest to the normal. Return the means."""
     facing = np.abs(surfels.normals).argmax(1)
     side = 2 * facing + (np.take_along_axis(surfels.normals, facing[:, None], 1)[:, 0] > 0)
     cells = np.column_stack([np.floor(surfels.points / step).astype(int), side])

@@ -1,11 +1,11 @@
-"""Closed surfaces from oriented points: screened Poisson (Kazhdan and Hoppe 2013), cut by the cameras' free space.
+"""Fit closed surfaces to oriented points: screened Poisson (Kazhdan and Hoppe 2013), cut by the cameras' free space.
 
 Where points are missing, a Poisson surface bulges outwards or stays open. So the surface's distance field is sampled on
 a grid, cut by the space seen to be empty and by the support, and meshed again. The new mesh is closed.
 
 The field is computed on a regular grid by Fourier transforms (Kazhdan 2005), or by Open3D on an adaptive grid. On small
-grids, Fourier transforms take a sixth of the time. The field is then drawn to zero at the points, as in screened
-Poisson. The drawing would also fit noise, so the points are first checked to lie on one surface.
+grids, Fourier transforms take a sixth of the time. The field is then pulled to zero at the points, as in screened
+Poisson. This would also fit noise, so the points are first checked to lie on one surface.
 """
 
 from __future__ import annotations
@@ -126,7 +126,7 @@ def close_surface(surfels: Surfels, field: Field, free_space: FreeSpace, cell: f
 
 
 def _beneath_floors(surfels: Surfels, lowest: float) -> Points:
-    """Return the points of low floors, such as a cup's floor, moved to the support, so that the hull reaches it."""
+    """Return points of low floors, e.g. of a cup, moved down to the support, so that the hull reaches the support."""
     floor = (surfels.normals[:, 2] > MIN_FLOOR_COSINE) & (surfels.points[:, 2] < lowest + MAX_FLOOR_RISE_M)
     return surfels.points[floor] * np.array([1.0, 1.0, 0.0])
 

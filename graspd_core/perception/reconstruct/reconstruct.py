@@ -1,4 +1,4 @@
-"""Reconstruction of a closed mesh from one or more views of an object, with the confidence of each part.
+"""Reconstruct a closed mesh from one or more views of an object, with the confidence of each part.
 
 The hidden part is guessed first, by the symmetry, revolution or extrusion that fits the views best. Then screened
 Poisson reconstruction fits a surface to seen and guessed points. The surface is computed on a grid, and again by Open3D

@@ -1,4 +1,4 @@
-"""Fitting of bodies of revolution: find the axis, revolve the seen profile about it, and close its ends.
+"""Fit bodies of revolution: find the axis, revolve the seen profile about it, and close its ends.
 
 All normals meet the axis, so they give a first axis. For a point p with normal n, the axis through c along a obeys
 n·(c × a) + (p × n)·a = 0, which is linear in (a, c × a) (Pottmann and Wallner, Computational Line Geometry, 2001).

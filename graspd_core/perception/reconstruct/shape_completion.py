@@ -1,4 +1,4 @@
-"""Completion of the unseen side of an object, by the rule that fits the views best.
+"""Complete the unseen side of an object by the rule that fits the views best.
 
 The rules are a body of revolution, one or two mirror planes, a centre of symmetry, and extrusion. Extrusion extends the
 outline seen from above down to the support, alone or together with a symmetry. Guessed points in empty space, in the

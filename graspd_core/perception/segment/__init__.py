@@ -1,1 +1,1 @@
-"""Segmentation of one object from camera data."""
+"""Segment one object from camera data."""

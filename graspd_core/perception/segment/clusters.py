@@ -1,4 +1,4 @@
-"""Objects in a scene: cluster points, join clusters of one object, and find clusters that may be several objects.
+"""Find objects in a scene: cluster points, join clusters of one object, and find clusters that may be several objects.
 
 Occlusion splits one object into several clusters, for example into the near wall and the far wall of a cup. Two
 clusters are joined only if they touch in some camera's image, because the edge between them is then an occlusion. They
@@ -276,7 +276,7 @@ def _near(
     settings: SegmentationConfig,
     support: FlatPart | None,
 ) -> bool:
-    """Return True if clusters `apart` [m] are near enough for one object. A cluster that hangs may be farther away."""
+    """Return True if clusters `apart` [m] from each other may be one object. Hanging clusters may be farther apart."""
     if support is None:  # One object behind another looks like a second side of the first object.
         return apart <= settings.unsupported_reach
     if apart <= max(link, settings.gap) or share_within(b @ support.axes, a @ support.axes) >= OUTLINE_SHARE:

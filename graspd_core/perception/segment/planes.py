@@ -1,4 +1,4 @@
-"""Large flat parts of a scene, found by RANSAC and refined by weighted least squares.
+"""Find large flat parts of a scene by RANSAC, and refine them by weighted least squares.
 
 The noise of a depth camera grows with the square of the distance, because stereo and structured light measure
 disparity. A plane's tolerance grows with the square of the distance too, by a factor estimated from the residuals.
@@ -69,15 +69,15 @@ class FlatPart:
         return points @ self.plane.normal - self.plane.offset
 
     def tolerance(self, distance: Float[np.ndarray, "n"]) -> Float[np.ndarray, "n"]:
-        """Return the height up to which a point belongs to the plane [m], for its distance from the camera [m]."""
+        """Return the height up to which points belong to the plane [m]. It grows with `distance` to the camera [m]."""
         return np.clip(INLIER_DEVIATIONS * self.noise * distance**2, self.least, self.most)
 
     def clearance(self, points: Points, distance: Float[np.ndarray, "n"]) -> Float[np.ndarray, "n"]:
-        """Return the height of points above the tolerance [m], for their distances from the camera [m]."""
+        """Return how far points are above the tolerance band [m], which widens with `distance` from the camera [m]."""
         return self.height(points) - self.tolerance(distance)
 
     def as_support(self, distance: Float[np.ndarray, "n"]) -> Plane:
-        """Return the plane as a support. Its `margin` is the noise [m] at an object's distances from the camera [m]."""
+        """Return the plane as a support. Its `margin` is the camera noise [m] at `distance` from the camera [m]."""
         return replace(self.plane, margin=float(np.median(self.tolerance(distance))) / INLIER_DEVIATIONS)
 
     def beneath(self, points: Points, margin: float) -> Bool[np.ndarray, "n"]:

@@ -1,4 +1,4 @@
-"""Segmentation of an object from depth camera views: crop, downsample, find the support, cluster, select."""
+"""Segment an object from depth camera views: crop, downsample, find the support, cluster, select."""
 
 from __future__ import annotations
 
@@ -46,7 +46,7 @@ class Segmentation:
 
     Attributes:
         views: the object's points in each view, at full density. Views that do not show the object are left out.
-        numbers: index of each of `views` among the segmented clouds.
+        numbers: index of each of `views` among the clouds given to `segment`.
         support: support plane of the object. None if none was seen.
         obstacles: downsampled points of each other object or surface nearby [m].
         warnings: warnings for the user.
@@ -119,8 +119,7 @@ def find_things(
 
     To select an object, give any of its points as target. The result is empty if no object is found.
 
-    Raises:
-        CloudError: a cloud is empty, all NaN, or has too few points.
+    Raises CloudError: a cloud is empty, all NaN, or has too few points.
     """
     parted = _parted(views, settings or SegmentationConfig())
     scene, label, most = parted.scene, parted.label, parted.settings.largest_object
@@ -285,9 +284,9 @@ def _touching(scene: VoxelScene, chosen: Mask, part: Labels) -> tuple[str, ...]:
         return ()
     places = " and ".join("({:.3f}, {:.3f}, {:.3f})".format(*scene.mean[rows].mean(0)) for rows in apart or parts)
     if apart:
-        return (f"cloud: the target touches another object, about {places} m; the target ends at the seam",)
+        return (f"cloud: the target touches another object with its centre at {places} m; the target ends at the seam",)
     return (
-        f"cloud: the object may be {len(parts)} objects that touch, about {places} m; "
+        f"cloud: the object may be {len(parts)} objects that touch, with centres at {places} m; "
         "give a point, a box or a mask as target",
     )
 

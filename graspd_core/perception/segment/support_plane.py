@@ -1,4 +1,4 @@
-"""Classification of a scene's flat parts: support, background, or face of an object.
+"""Classify a scene's flat parts: support, background, or face of an object.
 
 A support faces the cameras, is larger than the objects on it, and has at least one object on it. The object reaches
 down to the support, lies over the visible part of the support, and has a graspable size. Other flat parts fail this:
@@ -44,8 +44,8 @@ def find_ground(
 ) -> tuple[FlatPart | None, tuple[FlatPart, ...], Mask]:
     """Find the support and the background among the flat parts of a scene. `viewpoints` are camera positions [m].
 
-    Return the support, None if no object stands on a visible plane, and the large flat parts that are not the support,
-    such as walls, floors and empty tables. Return also which voxels may belong to objects.
+    Return the support (None if no object stands on a visible plane), the large flat parts that are not the support
+    (such as walls, floors and empty tables), and which voxels may belong to objects.
     """
     margin = settings.support_margin
     parts = [part for part in parts if part.filled > MIN_SEEN_SHARE and not _falls_off(scene, part, margin)]
@@ -76,7 +76,7 @@ def find_ground(
 
 
 def _covered(scene: VoxelScene, part: FlatPart, margin: float) -> Mask:
-    """Return which voxels are on a flat part, or in the part's plane at most `margin` [m] beside the part."""
+    """Return which voxels are on a flat part, or in the part's plane at most `margin` [m] outside its hull."""
     height, tolerance = np.abs(part.height(scene.mean)), part.tolerance(scene.mean_distance)
     band = np.flatnonzero(height <= (1 + NEIGHBOURHOOD_TOLERANCES) * tolerance.max())
     band = band[part.beneath(scene.mean[band], 2 * margin)]
@@ -106,7 +106,7 @@ def _falls_off(scene: VoxelScene, part: FlatPart, margin: float) -> bool:
 def _standing(
     scene: VoxelScene, part: FlatPart, left: Mask, viewpoints: Eyes, settings: SegmentationConfig
 ) -> tuple[int, int]:
-    """Count voxels of objects that may stand on a flat part. Return the counts for touching objects and for all."""
+    """Return the voxel counts of the objects that touch a flat part, and of all objects that may stand on the part."""
     points, distance = scene.mean[left], scene.mean_distance[left]
     label = link_points(points, scene.weight[left], link_length(points, settings), settings.neighbour_share)
     touching, standing = 0, 0

@@ -1,4 +1,4 @@
-"""Selection of the object by a point, a box or a mask. Without them, the object nearest the view axis is selected."""
+"""Select the object by a point, a box or a mask. Without them, select the object nearest the view axis."""
 
 from __future__ import annotations
 
@@ -39,9 +39,8 @@ class Target:
 def check_target(target: Target, views: Sequence[PointCloud]) -> None:
     """Check a target.
 
-    Raises:
-        CloudError: several kinds are given, a value is not finite, the box is empty, or the mask has no point,
-            another length than the first view, or another type than bool.
+    Raises CloudError: several kinds are given, a value is not finite, the box is empty, or the mask selects no point,
+    has another length than the first view, or another type than bool.
     """
     given = [name for name in ("point", "box", "mask") if getattr(target, name) is not None]
     if len(given) > 1:
@@ -58,7 +57,9 @@ def check_target(target: Target, views: Sequence[PointCloud]) -> None:
     if target.mask is not None:
         if len(target.mask) != len(views[0].points):
             many = len(views[0].points)
-            raise CloudError(f"target: mask of length {len(target.mask)}; valid: {many}, the points of the first view")
+            raise CloudError(
+                f"target: mask of length {len(target.mask)}; valid: {many}, the number of points in the first view"
+            )
         # Pictures have masks of 0 and 255. NumPy would take these numbers for indices.
         kind = np.asarray(target.mask).dtype
         if kind != np.dtype(bool):
@@ -83,7 +84,8 @@ def select_target(
         label: object number of each voxel, -1 for none.
         free: indices of the objects to choose from if the target is empty.
         target: a valid target (`check_target`).
-        settings: `target_reach` for a point. `target_share`: fraction in a box or mask that selects the whole object.
+        settings: `target_reach` is used for a point. A box or mask that covers less than `target_share` of an object
+            selects only the covered voxels, otherwise the whole object.
 
     Raises:
         NoObjectError: no object is at the target. The message lists the objects.

@@ -110,7 +110,7 @@ def test_depth_comes_packed_too(message, off: float):
 @pytest.mark.parametrize(
     ("message", "culprit"),
     [
-        (CompressedImage(format="16UC1; compressedDepth rvl", data=bytes(40)), "the data is no PNG; valid: "),
+        (CompressedImage(format="16UC1; compressedDepth rvl", data=bytes(40)), "data is not a PNG; valid: "),
         (CompressedImage(format="16UC1; compressedDepth png", data=packed(DEPTH).data[:60]), "its PNG is broken"),
         (CompressedImage(format="16UC1; compressedDepth png", data=packed(DEPTH).data[:30]), "its PNG is cut off"),
         (
