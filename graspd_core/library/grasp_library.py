@@ -72,7 +72,7 @@ class LibraryEntry:
     @property
     def is_heavy_enough(self) -> bool:
         """Whether its grasps may count as verified for an object of the same mesh whose mass nobody knows."""
-        # Below the assumed mass, only grasps that lift the light end were verified.
+        # If trials used less than an assumed mass, only grasps that lift `light_end` were verified.
         return self.mass_assumed or self.mass >= light_end(heavy_mass(self.volume))
 
     @property
