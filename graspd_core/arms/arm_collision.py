@@ -1,7 +1,7 @@
 """Check collisions of an arm's capsules with the support, the object, obstacles, the hand, and each other.
 
 The support is a plane. Object and obstacles are signed distance fields, sampled along the segment of each capsule. The
-samples are balls that cover the capsule. Their radii exceed the capsule's radius by less than an eighth. The base is
+samples are spheres that cover the capsule. Their radii exceed the capsule's radius by less than an eighth. The base is
 checked only against the arm. The first moving link is not checked against the support, above which it only turns.
 """
 
@@ -104,7 +104,7 @@ def hits_of_hand(arm: Arm, hand: HandModel, links: SE3, joints: Float[Tensor, "b
     """Return collision depths of arm and hand at the hand's `joints`, without links that touch in posture `seed`."""
     own_start, own_end, own_radius = placed(arm.capsules, links)
     start, end, radius = _hand_capsules(arm, hand, links, joints)
-    # Arm links outside a bounding ball of the hand cannot collide with the hand.
+    # Arm links outside a bounding sphere of the hand cannot collide with the hand.
     center = 0.5 * (start + end).mean(1, keepdim=True)
     ball = torch.maximum((start - center).norm(dim=-1), (end - center).norm(dim=-1)).add(radius).amax(1, keepdim=True)
     near = segment_distance(own_start, own_end, center, center) < own_radius + ball
@@ -167,7 +167,7 @@ def capsule_balls(arm: Arm) -> tuple[Float[Tensor, "n columns"], Float[Tensor, "
         count = 1 + int(np.ceil(np.linalg.norm(end - start) / radius))
         spacing = np.linalg.norm(end - start) / max(count - 1, 1)
         points.append(start + np.linspace(0.0, 1.0, count)[:, None] * (end - start))
-        # The nearest sample is at most half a spacing away along the segment, so the padded ball covers the capsule.
+        # The nearest sample is at most half a spacing away along the segment, so the larger sphere covers the capsule.
         radii.append(np.full(count, np.hypot(radius, spacing / 2)))
         owner.append(np.full(count, k))
     owner = np.concatenate(owner)

@@ -198,7 +198,7 @@ def tip_features(tip: SE3) -> Float[Tensor, "batch 12"]:
 def nearest_postures(
     table: StartTable, tip: SE3, count: int, usable: Bool[Tensor, "entries"] | None = None
 ) -> Float[Tensor, "batch count joints"]:
-    """Return the `count` postures nearest to each pose `tip`, nearest first. If any are `usable`, skip the others."""
+    """Return the `count` postures nearest to each pose `tip`, nearest first. Skip unusable ones if any is `usable`."""
     q, features = table.q, table.features
     if usable is not None and usable.any():
         q, features = q[usable], features[usable]

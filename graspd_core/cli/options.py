@@ -58,7 +58,7 @@ def add_planning_options(parser: argparse.ArgumentParser) -> None:
     about = "mass of the object (default: the greatest mass that its volume allows)"
     parser.add_argument("--mass", type=float, metavar="KG", help=about)
     parser.add_argument("--friction", type=float, default=0.6, metavar="MU", help="friction coefficient (default 0.6)")
-    parser.add_argument("--deadline", type=float, metavar="SEC", help="time limit with loading; found grasps are kept")
+    parser.add_argument("--deadline", type=float, metavar="SEC", help="time limit incl. loading; found grasps are kept")
     parser.add_argument("--verify", choices=VERIFICATIONS, default="standard")
     parser.add_argument("--robust", action="store_true", help="rank grasps by trials with a misplaced hand")
     parser.add_argument("--least-friction", action="store_true", help="measure the least friction for each grasp")

@@ -131,7 +131,7 @@ def process_began() -> float:
 
 @dataclass(frozen=True)
 class Watched:
-    """Hooks that show a run in a browser, and `show`, which shows the result until Ctrl-C. Unset hooks do nothing."""
+    """Hooks that show a run in a browser, and `show`, which shows the result until Ctrl-C. The defaults do nothing."""
 
     watch: WatchHook | None = None
     progress: ProgressHook = lambda progress: None

@@ -3,7 +3,7 @@
 A finger is a chain of links that ends in a link without children. All fingers branch from the palm. In a human-like
 hand most fingers bend the same way. Then the palm normal is the direction in which the fingertips move from straight to
 mid-range joints. In a gripper the fingers move against each other. Then the palm normal is along the fingers. A search
-finds the postures: fingertips around a small ball in front of the palm (closed), or a large ball (open).
+finds the postures: fingertips around a small sphere in front of the palm (closed), or a large sphere (open).
 """
 
 from __future__ import annotations
@@ -30,22 +30,22 @@ from graspd_core.hands.self_collision import link_overlaps
 from graspd_core.hands.surface_points import dense_samples, units
 
 _STARTS, _TIP_SPREAD, _STEPS, _RATE = 24, 0.4, 100, 0.08
-# Weights of the costs in the search: fingertips all on one side of the ball, joints away from their rest posture, ball
-# away from its wanted place, and overlap of links [1/m].
+# Weights of the costs in the search: fingertips all on one side of the sphere, joints away from their rest posture,
+# sphere away from its wanted place, and overlap of links [1/m].
 _BALANCE, _REST, _PLACE, _OVERLAP = 0.3, 0.08, 0.3, 60.0
 
 
 @dataclass(frozen=True, eq=False)
 class FingertipGoal:
-    """The goal of the search for a posture: fingertips on a ball.
+    """The goal of the search for a posture: fingertips on an imagined sphere.
 
     Attributes:
-        ball: centre of the ball, base frame [m].
-        radius: radius of the ball [m].
+        ball: centre of the sphere, base frame [m].
+        radius: radius of the sphere [m].
         rest: joint values near which the search stays [rad] or [m].
-        directions: wanted unit vectors from the ball to each fingertip. None to surround the ball evenly.
+        directions: wanted unit vectors from `ball` to each fingertip. None to surround the sphere evenly.
         weights: weight of each fingertip's error, used only with `directions`. They sum to one. None for equal weights.
-        ball_fixed: True if the search must not move the ball.
+        ball_fixed: True if the search must not move the sphere.
     """
 
     ball: Float[np.ndarray, "3"]
@@ -62,7 +62,7 @@ def around_ball(
     goal: FingertipGoal,
     surface: tuple[Float[np.ndarray, "samples 3"], Int[np.ndarray, "samples"]],
 ) -> tuple[Float[np.ndarray, "joints"], Float[np.ndarray, "3"]]:
-    """Return a posture with the fingertips around a ball and little overlap of links, and the ball's final centre [m].
+    """Return a posture with fingertips around a sphere and little overlap of links, and the sphere's final centre [m].
 
     Wrist joints stay straight. `surface` has surface points in link frames [m] and their links, to measure overlap.
     """
@@ -108,7 +108,7 @@ def around_ball(
 def _missed(
     fingers: Fingers, goal: FingertipGoal, away: Float[Tensor, "starts tips 3"]
 ) -> tuple[Float[Tensor, "starts"], Float[Tensor, "starts"]]:
-    """Return the tips' squared error [finger lengths²] and one-sidedness (0 to 1). `away`: vectors, ball to tips."""
+    """Return squared error [finger lengths²] and one-sidedness (0 to 1) of tips at `away` from the sphere's centre."""
     if goal.directions is not None:
         missed = ((away - goal.radius * torch.as_tensor(goal.directions)) / fingers.length).square().sum(-1)
         mean = missed.mean(-1) if goal.weights is None else missed @ torch.as_tensor(goal.weights)
@@ -122,7 +122,7 @@ def _missed(
 
 
 def side_by_side(fingers: Fingers) -> Float[np.ndarray, "tips 3"]:
-    """Return a shift of the ball along the knuckles for each fingertip [m], so that fingers close side by side."""
+    """Return for each fingertip a shift of its sphere along the knuckles [m], so that fingers close side by side."""
     aside = np.zeros_like(fingers.roots)
     if fingers.mates.sum() > 1:
         knuckles, row = fingers.roots[fingers.mates], knuckle_row(fingers)
@@ -136,7 +136,7 @@ def _joined_links(hand: HandModel) -> Bool[np.ndarray, "links links"]:
     return (groups[:, None] == groups) | (above[:, None] == groups) | (groups[:, None] == above)
 
 
-# In finger lengths: radii of the balls of the closed and the open posture, and distance of the ball from the palm.
+# In finger lengths: sphere radius of the closed and of the open posture, and distance of the sphere from the palm.
 _CLOSED, _OPEN, _AHEAD = 0.16, 0.55, 0.4
 # The palm's surface within this distance of the palm axis gives the height of the palm centre [m].
 _SPOT = 0.02
@@ -186,7 +186,7 @@ def default_postures(hand: HandModel, which: tuple[str, ...] = ("open", "closed"
 
 
 def _along(hand: HandModel, fingers: Fingers) -> Float[np.ndarray, "3"]:
-    """Return a gripper's mean finger direction at mid-range, if possible turned normal to the row of finger joints."""
+    """Return a gripper's mean finger direction at mid-range. Make it normal to the row of finger joints if possible."""
     middle = middle_joints(hand, fingers)
     half_way = placed_tips(hand, fingers, middle) - fingers.roots
     along = units(half_way.mean(0), 1e-6)
@@ -204,7 +204,7 @@ def _along(hand: HandModel, fingers: Fingers) -> Float[np.ndarray, "3"]:
 def _first_bends(
     hand: HandModel, fingers: Fingers, q: Float[np.ndarray, "joints"], along: Float[np.ndarray, "3"]
 ) -> Float[np.ndarray, "tips 3"]:
-    """Return the position of each finger's first joint that bends: its axis is not `along`. Base frame [m]."""
+    """Return the position of each finger's first joint whose axis is not parallel to `along`, base frame [m]."""
     rotations, translations = link_poses(hand, q)
     places = fingers.roots.copy()
     for finger, tip in enumerate(fingers.links):
@@ -242,23 +242,24 @@ def _balance(directions: Float[np.ndarray, "tips 3"]) -> Float[np.ndarray, "tips
 
 
 def _own_sides(hand: HandModel, fingers: Fingers, normal: Float[np.ndarray, "3"]) -> Float[np.ndarray, "tips 3"]:
-    """Return the palm's side at which each gripper finger is: a unit vector in the palm plane, or zero.
-
-    A single finger has no side. The sides come from the finger roots, because the tips may cross each other.
-    """
+    """Return the unit direction in the palm plane from the gripper's middle to each finger. Zero for one finger."""
     middle = middle_joints(hand, fingers)
     plane = np.eye(3) - np.outer(normal, normal)
     by_root, by_tip = (
         (points - points.mean(0)) @ plane for points in (fingers.roots, placed_tips(hand, fingers, middle))
     )
+    # The roots are preferred, because the tips may cross each other.
     aside = np.where(np.linalg.norm(by_root, axis=1, keepdims=True) > 1e-3, by_root, by_tip)
-    # The joints limit the direction. So two fingers beside each other move straight away from a third finger.
+    # The joints limit the direction. So two fingers side by side move straight away from a third finger.
     travel = plane @ (point_jacobian(hand, middle, fingers.points, fingers.links) * (middle - hand.lower))
     return units((travel @ (travel.transpose(0, 2, 1) @ aside[:, :, None])).squeeze(-1), 1e-12)
 
 
 def _apart(hand: HandModel, fingers: Fingers) -> Float[np.ndarray, "tips 3"]:
-    """Return each finger's opening direction in the palm plane of a human-like hand. The thumb opens oppositely."""
+    """Return the unit direction in the palm plane in which each finger of a human-like hand opens.
+
+    Fingers open along their mean root-to-tip direction. The thumb opens in the opposite direction.
+    """
     plane = np.eye(3) - np.outer(hand.palm_normal, hand.palm_normal)
     straight = (fingers.tips - fingers.roots)[fingers.mates].mean(0) @ plane
     if fingers.mates.sum() > 1:

@@ -6,8 +6,8 @@ greatest depth in a single primitive, which may be too small. For a hull, the re
 face planes. It is exact inside the hull, and may be too small outside near edges and corners.
 
 `CollisionTensors` holds the primitives of a hand, to compute the distance of object points to every link. Each hull is
-replaced by a box with round edges that fills the hull as well as possible. Between this box and the hull's surface,
-only the hand's contact candidates are tested. A thin wall passes between candidates, but not through the box.
+replaced by a box with round edges that fills the hull as well as possible. The distance does not see object points
+between this box and the hull's surface. There, only contact candidates detect the object, and may miss a thin wall.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ from graspd_core.se3 import SE3, safe_norm
 _Places, _Distances = Float[Tensor, "*batch 3"], Float[Tensor, "*batch"]
 # Planes and bounds of this many primitives are cached. No hand may have more primitives.
 _MOST = 2048
-# Linear programs that fit a box into a hull.
+# Number of linear programs that fit a box into a hull.
 _FILLS = 4
 
 
@@ -111,9 +111,9 @@ def hull_planes(primitive: Primitive) -> tuple[Float[np.ndarray, "planes 3"], Fl
 def box_inside(hull: Primitive) -> Float[np.ndarray, "16"]:
     """Return a large box with round edges inside a hull, in the link frame.
 
-    The box is along the principal axes of the corners. Linear programs first find the largest ball (radius only). Then
-    they increase the product of the three widths. The numbers are the rotation (9) and translation (3) of `T_link_box`,
-    the half extents of the core (3), and the radius (1) [m].
+    The box is along the principal axes of the corners. Linear programs first find the largest sphere (radius only).
+    Then they increase the product of the three widths. The result holds the rotation (9) and translation (3) of
+    `T_link_box`, the half extents of the core (3), and the radius (1) [m].
     """
     from scipy.optimize import linprog
 

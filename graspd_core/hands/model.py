@@ -230,7 +230,7 @@ class HandModel:
     def joint_speeds(self, turning: float, sliding: float) -> Float[np.ndarray, "joints"]:
         """Return the greatest speed of each actuated joint [rad/s] or [m/s], within the joints' own limits.
 
-        No revolute joint is faster than `turning` [rad/s], no prismatic joint than `sliding` [m/s], coupled joints too.
+        Revolute joints keep below `turning` [rad/s], prismatic joints below `sliding` [m/s], coupled joints included.
         """
         speeds, moved = self.velocity.copy(), self.link_joint >= 0
         own = np.where(np.array(self.joint_kind) == "prismatic", sliding, turning)

@@ -153,8 +153,8 @@ def deepest_overlap(hand: HandModel, q: Float[np.ndarray, "postures joints"]) ->
 def adjacent_links(hand: HandModel) -> Bool[np.ndarray, "links links"]:
     """Return the pairs of links that are never checked for collision. The result is cached on disk by hand content.
 
-    Adjacent are links of one rigid group, links one joint apart, and links two joints apart that never overlap by much,
-    or overlap in most postures. Pairs that overlap in the open posture or in every sampled posture are adjacent too.
+    Links are adjacent if they are in one rigid group or one joint apart, or overlap in the open posture or in every
+    sampled posture. Links two joints apart are also adjacent if they never overlap by much or overlap in most postures.
     """
     shapes = {"adjacent": (hand.num_links,)}
     return kept(hand, "adjacent", hand.num_links, shapes, lambda: (_adjacent_links(hand),))["adjacent"]

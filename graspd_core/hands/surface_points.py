@@ -55,7 +55,7 @@ def surface_points(primitive: Primitive, count: int, rng: np.random.Generator) -
 
 
 def feature_points(primitive: Primitive, spacing: float) -> tuple[Points, Points, Bool[np.ndarray, "points"]]:
-    """Return points at most `spacing` [m] apart on edges and rims (of hulls: corners), normals, a mask of corners."""
+    """Return points on edges and rims (hulls: corners), at most `spacing` [m] apart, with normals and a corner mask."""
     if primitive.kind == "box":
         points, normals, corner = _box_edges(np.asarray(primitive.size), spacing)
     elif primitive.kind == "cylinder":
@@ -187,7 +187,7 @@ class _Pool:
 
 @lru_cache(maxsize=8)
 def with_candidates(hand: HandModel, count: int) -> HandModel:
-    """Return the hand with `count` contact candidates. If the hand has them, return it. Raises HandError: count < 1."""
+    """Return the hand with `count` contact candidates, unchanged if it has them. Raises HandError: `count` below 1."""
     if count < 1:
         raise HandError(f"candidates: {count}; valid: 1 or more")
     if count == len(hand.candidate_link):
@@ -201,7 +201,7 @@ def candidates(hand: HandModel, count: int, seed: int) -> tuple[Points, Points, 
 
     Corners that face a grasped object are chosen first. Then farthest-point sampling (Gonzalez 1985) runs within each
     rigid group. Candidates are denser on fingertips and sparser on the hand's back (`_weights`). The first n candidates
-    cover the hand evenly too. If a link has a skin, its candidates lie on the skin. Links before a palm get none.
+    cover the hand evenly too. If a link has a skin, its candidates lie on the skin. Forearm and wrist get none.
     """
     rng = np.random.default_rng(seed)
     features = _exposed(hand, _feature_pool(hand))
@@ -243,7 +243,7 @@ def dense_samples(hand: HandModel, *, count: int = 4000, seed: int = 1) -> Sampl
 
 
 def samples_with_edges(hand: HandModel, *, count: int, seed: int) -> Samples:
-    """Return `dense_samples`, then points without area on edges, of hulls on corners. Cached by the hand's content."""
+    """Return `dense_samples`, then points of zero area on edges and on hull corners. Cached by the hand's content."""
 
     def build() -> Samples:
         edges = _exposed(hand, _feature_pool(hand, 0.002))

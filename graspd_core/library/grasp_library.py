@@ -71,8 +71,8 @@ class LibraryEntry:
 
     @property
     def is_heavy_enough(self) -> bool:
-        """Whether its grasps may count as verified for an object of the same mesh whose mass nobody knows."""
-        # Below the assumed mass, only grasps that lift the light end were verified.
+        """True if the grasps may count as verified for an object of the same mesh and of unknown mass."""
+        # If trials used less than an assumed mass, only grasps that lift `light_end` were verified.
         return self.mass_assumed or self.mass >= light_end(heavy_mass(self.volume))
 
     @property
@@ -176,7 +176,7 @@ class GraspLibrary:
             return [name for (name,) in base.execute("SELECT DISTINCT name FROM records ORDER BY name")]
 
     def of_mesh(self, wanted: LibraryEntry) -> list[LibraryEntry]:
-        """Return the entries with mesh, hand, friction and mass of `wanted`. An assumed mass admits other masses.
+        """Return the entries with mesh, hand, friction and mass of `wanted`. For an assumed mass, see `with_mass`.
 
         Only entries with trials at least as strict as those of `wanted` count. Order: strictest first, then heaviest.
         """
@@ -284,7 +284,7 @@ def _entry_of_row(row: Sequence[Any]) -> LibraryEntry:
 
 
 def with_mass(entries: Iterable[LibraryEntry], mass: float | None) -> list[LibraryEntry]:
-    """Return the entries with this mass [kg], heaviest first. For an unknown mass (None), those heavy enough."""
+    """Return the entries with this mass [kg], heaviest first. If None (unknown), return all that are heavy enough."""
     same = (entry for entry in entries if (entry.is_heavy_enough if mass is None else entry.mass == mass))
     return sorted(same, key=lambda entry: -entry.mass)
 

@@ -72,8 +72,8 @@ class Physics:
 def entry_by_name(library: GraspLibrary, hand: HandModel | None, name: str, physics: Physics) -> LibraryEntry:
     """Return the entry of the object with this name, for this hand (None for any hand).
 
-    The object's mass and friction are the library's. If entries differ in them, `physics` selects the entry. An entry
-    whose mass is below a given mass is refused.
+    The object gets mass and friction of the entry. If entries differ in mass or friction, `physics` selects the entry.
+    An entry with less than the mass in `physics` is refused.
 
     Raises:
         ConfigError: the name is unknown, has no entry for this hand or physics, or several objects have this name.
@@ -168,7 +168,7 @@ def _changed(library: GraspLibrary, entry: LibraryEntry) -> MeshError:
 NEAR = 0.03
 # A stored grasp is refused if the hand is deeper than this in an obstacle [m]. The search allows equal depth.
 _DEEP = 0.005
-# Fractions of the lift at which hand and object are checked, less than 2 · `NEAR` apart, and points of the object.
+# Fractions of the lift at which hand and object are checked, less than 2 · `NEAR` apart. Number of object points.
 _LIFT_SHARES, _LIFTED_POINTS = (0.0, 0.25, 0.5, 0.75, 1.0), 1000
 
 Wanted = Callable[[Sequence[Grasp]], Sequence[Grasp]]
@@ -374,7 +374,7 @@ def lift_clearance(scene: Scene, hand: HandModel, grasps: Sequence[Grasp]) -> Fl
     if not scene.obstacles or not grasps:
         return least.numpy()
     balls = (np.concatenate(pair) for pair in zip(extreme_points(hand), collision_spheres(hand), strict=True))
-    # Order of both: centres, radii, links.
+    # Each has centres, radii and links.
     centers, radii, links = map(torch.as_tensor, balls)
     positions, quaternions, joints = map(torch.as_tensor, stacked([grasp.squeeze for grasp in grasps]))
     rotation = rotation_from_quaternion(quaternions)

@@ -39,7 +39,7 @@ _AT_ONCE = 128
 _KNOCK_COST = 100.0
 # Every usable candidate scores above this. A dropped candidate has a score of −inf.
 _WORST = -1e3
-# The search is repeated if the ranking expects less than this share of the requested grasps to hold.
+# The search is repeated if the scores predict that less than this share of the requested grasps holds.
 # The seed step between searches differs from that between rounds, so that no seed is used twice.
 _LEAST_EXPECTED, _SEED_STEP = 0.9, 15_485_863
 
@@ -60,7 +60,7 @@ class PlannerInput:
 
     @cached_property
     def problem(self) -> Problem:
-        """Scene and hand as tensors. The postures and the ranking of every method are computed with this problem."""
+        """Scene and hand as tensors. Every method uses them to compute its postures and to rank its grasps."""
         scene = self.restrictions.searched(self.scene)
         return build_problem(
             scene, self.hand, self.config.problem, seed=self.seed, device=self.device, dtype=self.dtype

@@ -39,7 +39,7 @@ _POOL_AMONG_OBSTACLES, _DEPTH_SCALE, _HIGHEST_LIFT = 18, 0.005, 0.03
 _ROWS_AT_ONCE = 6
 # With restrictions: the greatest number of pools, and the seed step between two pools.
 _MOST_POOLS, _POOL_SEED_STEP = 20, 7_919
-# A hand closes around a slab of the object: the slab's half breadth, and depth from the grip [m].
+# A hand closes around a slab of the object: the slab's half breadth, and its depth from `StartPool.grip` [m].
 _SLAB_HALF_BREADTH, _SLAB_DEPTH = 0.05, 0.09
 # Joint noise as a share of the range, and radius around the palm's axis in which the palm avoids the surface [m].
 _JOINT_NOISE, _PALM_RADIUS = 0.1, 0.04
@@ -52,13 +52,13 @@ class StartPool:
     """Hand poses in the object frame, from which the starts are chosen.
 
     Attributes:
-        grip: point that faces the object: middle of the palm, or middle between the fingertips, base frame [m].
+        grip: middle of the palm, or middle between the fingertips, base frame [m]. This point faces the object.
         standoff: distance of the grip from the object [m].
         middle: position of the grip, object frame [m].
         rotation: orientation of the base.
         translation: origin of the base, object frame [m].
         joints: joint values [rad] or [m].
-        depth: distance of the faced place behind the first surface in front of the palm [m]. 0 without `Aim.places`.
+        depth: how far the faced place lies behind the first surface in front of the palm [m]. 0 without `Aim.places`.
     """
 
     grip: Float[Tensor, "batch 3"]
@@ -229,7 +229,7 @@ def _depth(obstacles: ObstacleTensors, base: SE3, links: SE3) -> Values:
 def _lowered(preference: Values, count: int, penalty: Callable[[Tensor], Values]) -> Values:
     """Return `preference` minus `penalty`. Rows that cannot be among the `count` greatest may get −inf.
 
-    A penalty is never negative, but slow to compute. So rows follow in descending order of `preference`, while needed.
+    A penalty is never negative, but slow to compute. So the loop ends once no other row can be among the greatest.
     """
     lowered = torch.full_like(preference, -torch.inf)
     for rows in preference.argsort(descending=True).split(_ROWS_AT_ONCE * count):

@@ -79,7 +79,7 @@ class KernelProblem:
         Args:
             function: name of the function.
             arguments: tensors are passed as addresses of their values and must be contiguous.
-            watch: called in this thread every few milliseconds with the steps done in all rows. True ends the call.
+            watch: called in this thread every few milliseconds with the steps done, summed over all rows. True ends it.
 
         Raises:
             MemoryError: the threads need more memory than is available.

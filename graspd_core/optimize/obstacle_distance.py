@@ -53,11 +53,11 @@ class ObstacleTensors:
         offset: n·x on the support, raised by the margin of the support [m]. 0 without a support.
         sdfs: signed distance fields of the obstacles within the hand's reach.
         approach: unit direction in which the hand moves to its pregrasp, base frame.
-        points, radii, links: centre in the link frame [m], radius [m] and link of each ball: first the balls about the
-            extreme points of the hand's primitives, then the collision spheres.
-        corners: number of balls about extreme points.
-        matrix: matrix from which `place_points` computes the centres of the balls.
-        around: for each link, a ball that encloses all balls of the link: centre in the link frame and radius [m].
+        points, radii, links: centre in the link frame [m], radius [m] and link of each sphere: first the spheres about
+            the extreme points of the hand's primitives (radius 0 about a corner), then the collision spheres.
+        corners: number of spheres about extreme points.
+        matrix: matrix from which `place_points` computes the centres of the spheres.
+        around: for each link, a sphere that encloses all spheres of the link: centre in the link frame and radius [m].
     """
 
     normal: Float[Tensor, "3"] | None
@@ -106,7 +106,7 @@ def make_obstacle_tensors(
 
 
 def _balls_about(count: int, points: np.ndarray, radii: np.ndarray, links: np.ndarray) -> Float[np.ndarray, "links 4"]:
-    """Return for each link a ball that encloses the link's balls: centre and radius. Without balls, radius −inf."""
+    """Return centre and radius of a sphere around all spheres of each link [m]. The radius is −inf without spheres."""
     around = np.zeros((count, 4))
     around[:, 3] = -np.inf
     for link in np.unique(links):
@@ -124,14 +124,14 @@ def hand_reach(hand: HandModel) -> float:
 
 
 def extreme_points(hand: HandModel) -> tuple[Float[np.ndarray, "corners 3"], Float[np.ndarray, "corners"], np.ndarray]:
-    """Join the balls of `extreme_points_of_solids` into arrays: centres in link frames [m], radii [m] and links."""
+    """Join the spheres of `extreme_points_of_solids` into arrays: centres in link frames [m], radii [m] and links."""
     solids = extreme_points_of_solids(hand)
     points, radii, links = zip(*((p, np.full(len(p), r), np.full(len(p), link)) for p, r, link in solids), strict=True)
     return np.concatenate(points), np.concatenate(radii), np.concatenate(links)
 
 
 def extreme_points_of_solids(hand: HandModel) -> list[tuple[Float[np.ndarray, "n 3"], float, int]]:
-    """Return balls whose convex hull is the primitive, by primitive: centres in link frame [m], radius [m], link."""
+    """Return for each primitive spheres with the primitive as convex hull: centres in link frame, radius [m], link."""
     found = ((*_extremes(primitive), primitive) for primitive in hand.primitives)
     return [(at @ solid.rotation.T + solid.translation, radius, solid.link) for at, radius, solid in found]
 
@@ -153,7 +153,7 @@ def _extremes(primitive: Primitive) -> tuple[Float[np.ndarray, "n 3"], float]:
 
 
 def obstacle_gaps(obstacles: ObstacleTensors, base: SE3, links: SE3) -> Float[Tensor, "batch gaps"]:
-    """Return signed distances [m] of the hand's balls to support and obstacles. `links` are poses in the base frame.
+    """Return signed distances [m] of the hand's spheres to support and obstacles. `links` are poses in the base frame.
 
     Distances are negative inside. A distance of at least `WIDE` may be returned as `WIDE`.
     """
@@ -196,7 +196,7 @@ def least_gap(obstacles: ObstacleTensors, base: SE3, links: SE3, wide: float = W
 def _gaps_to(
     sdf: GridSDF, points: Float[Tensor, "*batch 3"], radii: Float[Tensor, "points"], wide: float
 ) -> Float[Tensor, "*batch"]:
-    """Return the gaps of balls to one obstacle [m]. Only balls near the grid are sampled. Other balls get `wide`."""
+    """Return the gaps of spheres to one obstacle [m]. Only spheres near the grid are sampled. Others get `wide`."""
     off_grid = (points.detach() - (sdf.origin + sdf.half)).abs() - sdf.half
     near = (off_grid < (radii + wide)[:, None]).all(-1)
     gaps = points.new_full(near.shape, wide)

@@ -133,7 +133,7 @@ class BoundRestrictions:
 
     Attributes:
         each: the restrictions, applied in order. The first restriction that refuses a candidate gives the reason.
-        origin: origin of the frame of this class's poses, in the frame of the restrictions [m].
+        origin: origin of the frame that this class's methods use, in the frame that `each` restriction uses [m].
     """
 
     each: tuple[BoundRestriction, ...] = ()

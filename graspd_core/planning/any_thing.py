@@ -2,9 +2,9 @@
 
 Objects with fewer earlier failures come first. At equal numbers of failures, objects with more probable grasps in the
 previous view come first, then higher objects, because nothing lies on them. An object gets one round of the planner,
-but all rounds if an earlier grasp of this or an unknown object failed. It gets twice the effort if an earlier search
-found no grasp. The first verified grasp ends the search. After `enough` objects, a grasp with a probability of at least
-`likely` also ends the search, to limit the time. `result_of_things` returns the result of one request.
+but all rounds if an earlier grasp of this or an unknown object failed. It gets at least twice the effort if an earlier
+search found no grasp. The first verified grasp ends the search. After `enough` objects, a grasp with a probability of
+at least `likely` also ends the search, to limit the time. `result_of_things` returns the result of one request.
 """
 
 from __future__ import annotations
@@ -41,8 +41,8 @@ OUT_OF_TRIES, NOT_LOOKED_AT = "no tries left", "not tried before the search ende
 _SAME_PLACE, _SLIPPED = 0.04, 0.2
 # Doubt about the scene of an object if a robot executed a grasp of the object and the grasp failed.
 _FAILED = "an earlier grasp of this object failed"
-# Efforts of a search for one grasp, after one search in vain and after several. With an effort of 2, it would not have
-# more starts, because no search has fewer than 16. A search for many grasps has an effort of 2.
+# Effort of a search for one grasp, after one failed search and after several. An effort of 2 would not add starts,
+# because every search has at least 16 starts. After a failed search, a search for many grasps has an effort of 2.
 _HARDER, _TWICE = (4.0, 8.0), 2.0
 # Probability of an object's best grasp before any search: the mean of 93 objects in eight full bins, for two hands.
 _UNKNOWN = 0.2
@@ -70,8 +70,8 @@ class Failure:
     def object_among(self, places: Float[np.ndarray, "_ 3"], *, unsure: bool = False) -> int | None:
         """Return the index of the failed object among objects at `places` [m]: the nearest within 4 cm, or None.
 
-        If none is there, and `seen` is known, the object has moved by up to 20 cm. Then it is the nearest of those that
-        lie where none was seen before, or with `unsure` the nearest of all.
+        If no object is within 4 cm and `seen` is known, the object may have moved by up to 20 cm. Then return the
+        nearest object at a place where none was seen before. With `unsure`, all places count.
         """
         away = np.zeros(0) if self.place is None else np.linalg.norm(places - self.place, axis=1)
         if away.min(initial=np.inf) >= _SAME_PLACE:
@@ -212,7 +212,7 @@ def _is_solid(points: Float[np.ndarray, "_ 3"], solids: Mapping[str, Sequence[Tr
 
 
 def _up(views: Sequence[PointCloud], surface: Plane | None) -> Float[np.ndarray, "3"]:
-    """Return the direction of height: the support's normal, towards the camera in a camera's own frame, else z."""
+    """Return the upward direction: the support's normal, or towards a camera at the origin, else z."""
     if surface is not None:
         return surface.normal
     if any(view.viewpoint.any() for view in views):
@@ -235,8 +235,8 @@ def _in_order(
             rows[index][1].append(failure)
         elif failure.grasp is not None and failure.executed:
             lost[failure.object_among(places, unsure=True)] = failure
-    # Images of a heap do not always show the same objects. So lost failures add one doubt about the nearest object, but
-    # no more, because another object must not run out of tries.
+    # Images of a heap do not always show the same objects. So a failure of an object not found counts for the nearest
+    # object, but only once, because another object must not run out of tries.
     for index, failure in lost.items():
         if index is not None and not rows[index][1]:
             rows[index][1].append(failure)

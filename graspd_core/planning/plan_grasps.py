@@ -99,7 +99,7 @@ def plan_grasps(
         measure: whether to measure the metrics of grasps that did not fail. Measuring takes longer than a trial.
         progress: hook that gets `Progress` values. The calling thread runs it.
         watch: hook that gets `Snapshot` values, with the hands that the run is working on. The calling thread runs it.
-        stop: polled hook. If it returns true, the run ends within one optimiser step or 0.1 s of simulated time.
+        stop: polled function. If it returns true, the run ends within one optimiser step or 0.1 s of simulated time.
 
     Raises:
         ConfigError: count, seed, verify, deadline, device, preset or a restriction is not valid.

@@ -49,7 +49,7 @@ SLIPPERY = StopRule(first=10, windows=(5, 10, 20, 40), safety=16.0)
 CREEPING = StopRule(first=100, windows=(50,), safety=16.0, speed=0.0005, spin=math.radians(0.5))
 # Between one or two fingertips, an object may begin to turn after 1.9 s. Hands with fewer fingers use CREEPING.
 _FEWEST_FINGERS = 3
-# Rows: stop rule, and least impedance ratio and sliding friction for it, measured at 0.6 and 0.3. Else CREEPING.
+# Rows: stop rule, and least impedance ratio and friction at which it is used. If no row fits, CREEPING is used.
 _RULES = ((FIRM, 10.0, 0.6), (SLIPPERY, 10.0, 0.3))
 
 

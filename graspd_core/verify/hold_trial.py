@@ -38,7 +38,7 @@ _BEYOND = 1e-3
 def hold_trial(
     world: World, grasp: Grasp, protocol: Protocol, *, stop: Callable[[], bool] = lambda: False
 ) -> TrialResult:
-    """Run one hold trial. The trial ends as soon as the object exceeds a limit.
+    """Run one hold trial. It ends when the object exceeds a limit, or when the stop hook `stop()` returns true.
 
     Returns:
         The result, with the greatest displacement [m] of the object's centre of mass and the greatest rotation [rad]

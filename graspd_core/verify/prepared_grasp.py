@@ -315,7 +315,7 @@ Hull = tuple[float, Float[np.ndarray, "6"], float]
 
 
 def compiled_hull(wrenches: Float[np.ndarray, "n 6"]) -> Hull | None:
-    """Build the convex hull of wrenches by compiled code. Return None if that fails or is missing, or above 256."""
+    """Build the convex hull of wrenches with the kernel. None without a kernel, above 256 wrenches, or on failure."""
     library = kernel().library
     if library is None or len(wrenches) > _MOST_WRENCHES:
         return None

@@ -62,17 +62,17 @@ def results_in_order(
     *,
     known_over: StopHook = lambda: False,
 ) -> Generator[Result]:
-    """Yield the result of each item in order, until `over` returns true.
+    """Yield the result of each item in order, until `over` returns true or the caller closes the iterator.
 
-    If the caller closes the iterator, the stop hooks of all running work return true.
+    Then running work is told to stop: the stop hook that `work` received returns true.
 
     Args:
-        over: stop hook that ends the iteration. Only the calling thread calls it.
+        over: function that returns true to end the iteration. Only the calling thread calls it.
         work: function of an item and a stop hook. With one thread, the calling thread runs it. Otherwise a pool does.
         items: the items to work on.
         threads: number of threads, at least 1.
         needed: returns the least number of results that the caller still needs. At least this many items are queued.
-        known_over: stop hook that ends running work. All threads call it.
+        known_over: function that returns true to stop running work. All threads call it. Not called with one thread.
     """
     if min(threads, len(items)) <= 1:
         for item in items:

@@ -1,4 +1,4 @@
-"""Keep the clock and the hooks of one run, and tell its outcome."""
+"""Keep the clock and the hooks of one run, and decide its outcome."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ class Run:
         began: start of the run, a `time.perf_counter()` value.
         deadline: time after `began` at which the run ends [s]. None for no limit.
         progress: hook that gets progress reports, or None.
-        stop: hook that ends the run by returning true, or None.
+        stop: stop hook, a function that ends the run by returning true, or None.
         watch: hook that gets snapshots of the hands, or None if nobody watches.
         origin: origin of the planning frame, in the frame of the request [m].
         cancelled: whether the stop hook has returned true.
@@ -66,7 +66,7 @@ class Run:
 
 
 def outcome_of(grasps: Sequence[Grasp], count: int, ended_early: Outcome | None = None) -> Outcome:
-    """Return success if at least `count` grasps are usable. Else return `ended_early` if given, or the shortage."""
+    """Return `SUCCEEDED` if `count` grasps are usable, else `ended_early`, else the kind of shortage."""
     if sum(grasp.usable for grasp in grasps) >= count:
         return Outcome.SUCCEEDED
     return ended_early or (Outcome.TOO_FEW if grasps else Outcome.NO_CANDIDATES)

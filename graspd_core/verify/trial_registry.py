@@ -36,7 +36,7 @@ class Trial:
     Attributes:
         name: name in the trial results.
         applies: function that returns whether the trial runs in a context.
-        run: function that tries one grasp. It polls the stop hook. If the hook returns true, the trial fails.
+        run: function that tries one grasp. It polls a stop hook. If the stop hook returns true, the trial fails.
     """
 
     name: str

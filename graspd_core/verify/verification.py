@@ -53,7 +53,7 @@ _CUTTING = threading.Lock()
 # Sorting uses this robustness for verified grasps whose robustness was not measured.
 _UNKNOWN = 0.5
 
-# First part of the seed of the pose errors for ranking, so that no other pose errors have this seed.
+# First part of the seed of the pose errors in `rank_by_robustness`. No other pose errors have this seed.
 _NOISE = 0x6E6F697365
 
 
@@ -141,7 +141,7 @@ def lighter(
     around = trials.around and altered(trials.around, mass=mass)
     trials = replace(trials, alone=altered(trials.alone, mass=mass), around=around)
     known = replace(scene, object=replace(scene.object, mass_assumed=False))
-    # Without other checks, the shape is as sure as it was seen.
+    # Without checks, the probability is the measured fraction for the likeliest shape.
     bare = RobustnessChecks((), 1.0 if scene.evidence is None else MASS_KNOWN.likeliest)
     checks = robustness_checks_of(known, others, trials, certainty.probability) or bare
     heavy = scene.object.mass
@@ -149,7 +149,7 @@ def lighter(
 
 
 def payloads(context: VerificationContext, grasps: Sequence[Grasp], stop: StopHook) -> list[float]:
-    """Return each grasp's payload [kg], or 0 if it is less than 10 % above those of all preceding grasps."""
+    """Return each grasp's payload [kg], or 0 if it is not at least 10 % above the payloads of all preceding grasps."""
     trials, found = context.trials, list[float]()
     for grasp in grasps:
         least = FINENESS * max(found, default=LEAST_PAYLOAD)

@@ -145,7 +145,7 @@ def full_inertia(inertia: Float[np.ndarray, "3 3"], floor: float) -> list[float]
     moments, axes = np.linalg.eigh(0.5 * (inertia + inertia.T))
     moments = np.maximum(moments, floor)
     moments[2] = min(moments[2], 0.999 * (moments[0] + moments[1]))
-    # For a thin rod, the line above makes the second moment the greatest. MuJoCo would refuse it without this.
+    # For a thin rod, the second moment may now exceed the sum of the others. MuJoCo would refuse such moments.
     moments[0] = max(moments[0], 1.001 * (moments[1] - moments[2]))
     m = axes @ np.diag(moments) @ axes.T
     return [m[0, 0], m[1, 1], m[2, 2], m[0, 1], m[0, 2], m[1, 2]]

@@ -1,1 +1,1 @@
-"""The MANO model of the human hand."""
+"""Read the MANO model of the human hand, and convert it to a hand model."""

@@ -35,7 +35,7 @@ _MAX_DENSE, _MAX_DEPTH = 2**22, 8
 def read_pickle(path: Path) -> Any:
     """Return the content of a MANO file: numbers, text, lists, dictionaries, and class instances as `Inert` data.
 
-    Raises HandError: the file does not exist, is too large, is no pickle, or has a class or function not in `ADMITTED`.
+    Raises HandError: the file is missing, is too large, is not a pickle, or has a class or function not in `ADMITTED`.
     """
     try:
         return load_inert(read_bounded(path, "MANO file"), ADMITTED, "MANO file")

@@ -44,8 +44,8 @@ _OPPOSITION = 0.05
 # Limits of flexion, abduction and twist of three joints [deg] from the flat hand. A finger's joints flex by 90, 110 and
 # 90, and a knuckle abducts by ±15 (Lin, Wu and Huang 2000). A knuckle also bends 20 backwards (Norkin and White: 45
 # passively). The thumb's knuckle and tip flex by 50 and 80 (American Academy of Orthopaedic Surgeons 1965). Its saddle
-# joint has total ranges of 53, 42 and 17 (Cooney et al. 1981), near the middle of which MANO's rest pose lies. Axes
-# that are no degree of freedom in the literature get a small range, because human joints have some play.
+# joint has total ranges of 53, 42 and 17 (Cooney et al. 1981), and MANO's rest pose lies near their middle. Axes that
+# the literature does not count as degrees of freedom get a small range, because human joints have some play.
 _FINGER_LIMITS = (
     ((-20.0, 90.0), (-15.0, 15.0), (-5.0, 5.0)),
     ((-5.0, 110.0), (-3.0, 3.0), (-3.0, 3.0)),
@@ -65,7 +65,7 @@ _LEAST_LEVER = 0.02
 
 
 def _all_fingers(finger: tuple, thumb: tuple) -> Float[np.ndarray, "15 *values"]:
-    """Return the values of a finger's and of the thumb's joints [deg] for all bodies except the wrist [rad]."""
+    """Return values for all bodies except the wrist [rad], from those of one finger and of the thumb [deg]."""
     return np.deg2rad([*finger * (len(FINGERS) - 1), *thumb])
 
 

@@ -47,7 +47,7 @@ def skin_vertices(
 
 
 def wrist_loop(data: ManoData) -> Int[np.ndarray, "loop"]:
-    """Return the indices of the vertices around the wrist opening, in the direction of face edges. Empty if no opening.
+    """Return the indices of the vertices around the wrist opening, in the direction of face edges. Empty if closed.
 
     Raises HandError: the boundary is not a single loop, faces have opposite winding, or three faces share an edge.
     """

@@ -138,7 +138,7 @@ def assemble(
 
 
 def _tree(order: Sequence[str], chain: Sequence[JointSpec], couplings: Mapping[str, Coupling]) -> dict[str, Any]:
-    """Return the fields of links and joints. `chain` has the joint above each link except link 0."""
+    """Return the `HandModel` fields of links and joints. `chain` has the joint above each link except link 0."""
     actuated = [joint for joint in chain if joint.kind != "fixed" and joint.name not in couplings]
     keys = ("lower", "upper", "effort", "velocity")
     limits = {key: np.array([getattr(joint, key) for joint in actuated], dtype=float) for key in keys}
@@ -314,7 +314,7 @@ def read_couplings(path: Path, joints: Sequence[ET.Element]) -> dict[str, Coupli
         leader = mimic.get("joint")
         if leader not in moving:
             raise HandError(
-                f"{path}: joint {name!r} mimics {leader!r}, which is no movable joint; choose from {', '.join(moving)}"
+                f"{path}: joint {name!r} mimics {leader!r}, which is not a movable joint; valid: {', '.join(moving)}"
             )
         multiplier, offset = (read_numbers(path, mimic, key, 1, text)[0] for key, text in _DEFAULTS)
         direct[name] = Coupling(leader, float(multiplier), float(offset))

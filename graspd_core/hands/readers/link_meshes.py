@@ -20,7 +20,7 @@ from graspd_core.mesh.mesh_files import load_mesh
 from graspd_core.mesh.shapes import file_state
 from graspd_core.types import TriangleMesh
 
-# Greatest number of corners of a hull. For a ball of 12 mm, the hull then lies up to 0.3 mm below the surface.
+# Greatest number of corners of a hull. For a sphere of radius 12 mm, the hull is up to 0.3 mm below the surface.
 _CORNERS = 200
 # Greatest number of corners of all hulls of a hand together, and least number that every hull may have.
 _ALL_CORNERS, _FEWEST_CORNERS = 12_800, 48
@@ -80,7 +80,7 @@ def mesh_hull(
 ) -> TriangleMesh:
     """Return the convex hull [m] of a mesh file scaled along each axis, with at most `corners` corners.
 
-    A negative factor mirrors the mesh. Raises HandError: the file does not exist, is no mesh, or has a wrong size.
+    A negative factor mirrors the mesh. Raises HandError: the file does not exist, is not a mesh, or has a wrong size.
     """
     path = resolve_mesh(urdf, shape, filename)
     try:
@@ -99,7 +99,7 @@ def mesh_hull(
 
 
 def whole_mesh(urdf: Path, shape: ET.Element, filename: str, scale: Float[np.ndarray, "3"]) -> TriangleMesh:
-    """Read a mesh file and scale it along each axis [m]. Raises HandError: the file does not exist or is no mesh."""
+    """Read a mesh file and scale it along each axis [m]. Raises HandError: the file is missing or not a mesh."""
     try:
         mesh = load_mesh(resolve_mesh(urdf, shape, filename))
     except (MeshError, OSError) as error:

@@ -138,7 +138,7 @@ _SECTIONS = ("compiler", "default", "asset", "worldbody", "tendon", "equality", 
 # Attributes whose values are names. They are not searched for nan and inf, because a name may contain these letters.
 _NAMES = {"name", "class", "childclass", "model", "mesh", "file"}
 _HEAVIEST, _MOST_CLASSES = 1e3, 300
-# MuJoCo's number for `inertiafromgeom="true"`. The geoms then give all masses, and <inertial> counts for nothing.
+# MuJoCo's number for `inertiafromgeom="true"`. The geoms then give all masses, and <inertial> is ignored.
 _FROM_GEOMS = 1
 # Greatest number of files, the main file included.
 _MOST_FILES = 30
@@ -198,10 +198,7 @@ def read_mjcf(path: Path, root: ET.Element) -> HandModel:
 
 
 def included_files(path: Path) -> tuple[Path, ...]:
-    """Return the files that a hand's file includes, sorted by path. Only an MJCF file includes others.
-
-    Raises HandError: see `read_mjcf`.
-    """
+    """Return the files that an MJCF file includes, sorted by path. Raises HandError: see `read_mjcf`."""
     root, seen = read_xml(path), {path.resolve()}
     if root.tag == "mujoco":
         _include(path, path, root, seen)
@@ -211,7 +208,7 @@ def included_files(path: Path) -> tuple[Path, ...]:
 def _include(path: Path, holder: Path, parent: ET.Element, seen: set[Path], depth: int = 0) -> None:
     """Replace each `<include>` below `parent` by the included elements, as in MuJoCo. `holder`: the file of `parent`.
 
-    Raises HandError: an included file does not exist, is no MJCF file, or is included twice.
+    Raises HandError: an included file does not exist, is not an MJCF file, or is included twice.
     """
     children: list[ET.Element] = []
     for child in parent:

@@ -45,7 +45,7 @@ def _shapes(
 
 
 def _with_capsules(shapes: Sequence[Primitive]) -> tuple[Primitive, ...]:
-    """Replace each cylinder that has a sphere at each end by a capsule. URDF files often write a capsule so."""
+    """Replace each cylinder that has a sphere at each end by a capsule. URDF files often build a capsule this way."""
     found, taken = list(shapes), set[int]()
     for i, shape in enumerate(shapes):
         if shape.kind != "cylinder":
@@ -205,7 +205,7 @@ def below_link(path: Path, root: ET.Element, link: str) -> None:
     """Keep only `link` and the links and joints below it. Raises HandError: the file has no such link."""
     links = [str(element.get("name")) for element in root.findall("link")]
     if link not in links:
-        raise HandError(f"{path}: root: no link {link!r}; links: {', '.join(links) or 'none, the file is no URDF'}")
+        raise HandError(f"{path}: root: no link {link!r}; links: {', '.join(links) or 'none, the file is not a URDF'}")
     ends = [(joint_end(joint, "parent"), joint_end(joint, "child")) for joint in root.findall("joint")]
     kept, waiting = {link}, [link]
     while waiting:

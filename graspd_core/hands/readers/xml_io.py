@@ -1,6 +1,6 @@
 """Read XML files of hands. Harmless mistakes are accepted, dangerous content is refused.
 
-Namespaces are not resolved, so undeclared prefixes are no error. Comments may come before the XML header. A document
+Namespaces are not resolved, so undeclared prefixes are accepted. Comments may come before the XML header. A document
 type declaration is refused, because its entities can use unlimited memory or read other files.
 """
 
@@ -72,7 +72,7 @@ def parse_xml(path: Path, text: str) -> Element:
         if tag in _OWNERS and "name" in attributes:
             element.owner = f"{tag} {attributes['name']!r}"
         if tag in _OWNERS and not attributes.get("name", "").isprintable():
-            raise wrong(path, element, "has a name with a line end or an unprintable character; use another name")
+            raise wrong(path, element, "has a name with a line break or an unprintable character; use another name")
         if len(stack) > DEEPEST:
             raise wrong(path, element, f"<{tag}> is nested more than {DEEPEST} deep")
         if count > _MOST_ELEMENTS or len(attributes) > _MOST_ATTRIBUTES:
@@ -88,7 +88,7 @@ def parse_xml(path: Path, text: str) -> Element:
     parser.EndElementHandler = lambda _: stack.pop()
     try:
         body = text.lstrip()
-        # The leading line ends are kept, so that line numbers stay correct.
+        # The leading line breaks are kept, so that line numbers stay correct.
         before = text.count("\n", 0, len(text) - len(body))
         parser.Parse(("\n" * before + body).encode("utf-8", errors="replace"), True)
     except expat.ExpatError as error:
@@ -142,7 +142,7 @@ def _decoded(data: bytes) -> str:
 
 
 def _blanked(text: str, start: str, end: str) -> str:
-    """Replace all text between `start` and `end` by its line ends, in linear time. Line numbers do not change."""
+    """Replace all text between `start` and `end` by its line breaks, in linear time. Line numbers do not change."""
     pieces, at = [], 0
     while (first := text.find(start, at)) >= 0 and (last := text.find(end, first + len(start))) >= 0:
         pieces += [text[at:first], "\n" * text.count("\n", first, last)]

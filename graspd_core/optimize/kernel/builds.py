@@ -50,7 +50,7 @@ class Kernel:
 
 
 def kernel() -> Kernel:
-    """Return the build that this process uses. Raises ConfigError: GRASPD_KERNEL names no build and no file."""
+    """Return the build that this process uses. Raises ConfigError: GRASPD_KERNEL is not a build or a file."""
     return _kernel(os.environ.get("GRASPD_KERNEL", ""))
 
 

@@ -44,7 +44,7 @@ struct Solids {
     const float* pose;  // count x 12: T_link_solid
     const float *core, *radius;
     const int32_t *round, *link, *group;  // group: -1 without contact candidates
-    // count x stride: squared distance at which bounding balls of two solids meet. Zero for solids of adjacent links.
+    // count x stride: squared distance at which bounding spheres of two solids meet. Zero for solids of adjacent links.
     const float* near;
     int32_t stride;
 };
@@ -63,8 +63,8 @@ struct Object {
     int32_t feature_count, feature_stride, coarse_features;
 };
 
-// The support as a half-space, the obstacles as grids, and the balls of the hand that keep clear of both: first balls
-// at the corners of the hand's solids, then its collision spheres.
+// The support as a half-space, the obstacles as grids, and the spheres of the hand that keep clear of both: first
+// spheres at the corners of the hand's solids, then its collision spheres.
 struct Obstacles {
     int32_t grids, has_support;
     const Grid* grid;
@@ -116,7 +116,7 @@ struct Surface {
 // The solids of a hand in doubles, sorted by link: boxes and round solids as in `Solids`, and the planes of hulls.
 struct Bodies {
     int32_t count, links;
-    const double *pose, *ball;  // count x 12: T_link_solid. count x 4: bounding ball, solid frame
+    const double *pose, *ball;  // count x 12: T_link_solid. count x 4: bounding sphere, solid frame
     const double *core, *radius;
     const int32_t *round, *link, *plane_start;  // plane_start: count + 1
     const double* planes;                       // outward unit normals and offsets, solid frame

@@ -4,7 +4,7 @@
 
 namespace graspd {
 
-// Returns the loss of the balls at the corners of the hand's solids in the support, and adds forces to the links.
+// Returns the loss of the spheres at the corners of the hand's solids in the support, and adds forces to the links.
 static float support_depth(const Problem& p, float weight, Scratch& s) {
     const Obstacles& o = p.obstacles;
     Samples& at = s.obstacle;
@@ -21,7 +21,7 @@ static float support_depth(const Problem& p, float weight, Scratch& s) {
     return total;
 }
 
-// Returns whether any ball is nearer than `margin` to the grid. In a bin, most obstacles are away from the hand.
+// Returns whether any sphere is nearer than `margin` to the grid. In a bin, most obstacles are away from the hand.
 static bool near_grid(const Grid& grid, int count, const float* radius, float margin, const Samples& at) {
     const int nodes[3] = {grid.nx, grid.ny, grid.nz};
     float half[3], middle[3];
@@ -38,7 +38,7 @@ static bool near_grid(const Grid& grid, int count, const float* radius, float ma
     return away < count;
 }
 
-// Returns the loss of the balls at placed points in one obstacle, and adds forces to the links.
+// Returns the loss of the spheres at placed points in one obstacle, and adds forces to the links.
 static float neighbour_depth(
     const Grid& grid, const Points& points, const float* radius, float margin, float weight, Scratch& s) {
     Samples& at = s.obstacle;

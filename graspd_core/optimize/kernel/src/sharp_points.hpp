@@ -4,7 +4,7 @@
 
 namespace graspd {
 
-// Margin beyond the distance of the last farthest pair, within which the nearest pairs are searched [m].
+// Pairs are searched up to the farthest distance of the previous result plus this margin [m].
 constexpr float CUT_MARGIN = 0.005f;
 
 // Returns the signed distance of a point `at` to a solid, and writes the gradient. Both are in the solid's frame.
@@ -60,7 +60,7 @@ struct Bound {
     float origin[3], half[3];
 };
 
-// Computes bounds of all pairs in solids and blocks that may be nearer than `most`. Returns the number of these pairs.
+// Computes distance bounds of pairs of solid and point, in all blocks that may be nearer than `most`. Returns how many.
 static int bound_distances(const Problem& p, int features, float most, Scratch& s) {
     const float *fx = p.object.features, *fy = fx + p.object.feature_stride, *fz = fy + p.object.feature_stride;
     const int whole = padded(features), blocks = whole / LANES;
@@ -157,7 +157,7 @@ static int deepest_feature(const Problem& p, int k, float* depth, float* gradien
     return found;
 }
 
-// Adds the loss of the nearest pairs, and sets their adjoints. A pair nearer than a group's candidates gives its gap.
+// Adds the loss of the nearest pairs, and sets their adjoints. A pair also sets the gap of its group if it is nearer.
 static int sharp_points(const Problem& p, int features, float weight, float* penetration, Scratch& s) {
     const Solids& solids = p.solids;
     if (features == 0 || solids.count == 0) return 0;

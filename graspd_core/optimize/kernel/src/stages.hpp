@@ -125,8 +125,8 @@ static float find_pregrasp(const Problem& p, const Pregrasp& settings, const flo
     return 1.f - worst / settings.clearance;
 }
 
-// Adds the gradient of squared depths [mm²] of candidates in the object, of the deepest object point in each solid, of
-// solids in each other, and of obstacles. Also adds the gradient that keeps contacts.
+// Adds the gradient of squared depths [mm²]: of candidates in the object, of the deepest object point in each solid, of
+// solids in each other, and of the hand in obstacles. Also adds the gradient that keeps contacts.
 static void add_sunk_slope(const Problem& p, float weight, float keep, Opening& o, Scratch& s) {
     Samples& at = s.candidates;
     for (int i = 0; i < 6 * p.hand.links; i++) s.wrench[i] = 0;
@@ -159,7 +159,7 @@ static void add_sunk_slope(const Problem& p, float weight, float keep, Opening& 
     for (int i = 0; i < o.variables; i++) o.gradient[i] += o.slope[i];
 }
 
-// Finds near a grasp x (base position, quaternion, joints) a grasp `out` (base position, joints) that penetrates less.
+// Finds a grasp `out` (base position, joints) that penetrates less, near a grasp x (base position, quaternion, joints).
 template <class Go>
 static void settle(const Problem& p, const Pregrasp& settings, const float* x, float* out, Scratch& s, Go go) {
     Opening o(p);

@@ -30,8 +30,8 @@ struct Triangle {
     Vec3 a, b, c;
 };
 
-// A node: its box, and centroid, sum of area vectors and radius about the centroid of all its triangles. A leaf has
-// `count` triangles. Other nodes have the first child directly after them, and the second at index `second`.
+// A node: its box, and for its triangles the centroid, the sum of area vectors, the radius about the centroid. A leaf
+// has `count` triangles. Other nodes have the first child directly after them, and the second at index `second`.
 struct SurfaceNode {
     Vec3 low, high, middle, area;
     double radius;
@@ -187,7 +187,7 @@ inline double winding_number(const Surface& s, const Vec3& p, double accuracy) {
     return std::fabs(angle) / (4 * M_PI);
 }
 
-// A number within DOUBT of one half at accuracy COARSE is computed again at accuracy FINE.
+// A winding number within DOUBT of one half at accuracy COARSE is computed again at accuracy FINE.
 constexpr double COARSE = 1.5, FINE = 6, DOUBT = 0.3;
 
 inline double winding_number(const Surface& s, const Vec3& p) {
@@ -196,7 +196,7 @@ inline double winding_number(const Surface& s, const Vec3& p) {
     return std::fabs(coarse - 0.5) < DOUBT ? winding_number(s, p, FINE) : coarse;
 }
 
-// Measures distances of successive points. The previous point bounds the distance, and may give the side if near.
+// Measures distances of successive points. The previous point bounds the distance, and gives the side if it is near.
 class SurfaceProbe {
    public:
     explicit SurfaceProbe(const Surface& surface) : surface_(surface) {}
@@ -240,7 +240,7 @@ class SurfaceProbe {
     const Surface& surface_;
     Vec3 place_ = {0, 0, 0};
     double nearest_ = 0, farthest_ = INFINITY, number_ = 0.5;
-    // True if the last distance was computed, if the number of `place_` holds for the last point, and if it is clear.
+    // True if the last distance was computed, if `number_` holds for the last point, if `number_` is far from one half.
     bool here_ = false, same_ = false, known_ = false;
 };
 

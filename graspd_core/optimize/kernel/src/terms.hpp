@@ -16,9 +16,9 @@ INLINE float tempered(float depth, float* slope) {
     return 0.1f * d * d * shrink;
 }
 
-// Finds the indices of the `wanted` least keys, without NaN, and returns their number. Bisects for a cut with exactly
-// as many keys below. If the bounds meet, the first of equal keys fill up. The first trial is `cut`, the last result,
-// because keys change little from step to step.
+// Finds the indices of the `wanted` least keys, without NaN, and returns their number. Bisection finds a cut with just
+// `wanted` keys below. If equal keys prevent this, the first of the equal keys are taken. `cut` is the first trial, and
+// gets the result. Pass the last result, because keys change little from step to step.
 static int least(const float* key, int count, int wanted, float* cut, int32_t* out) {
     const int whole = padded(count);
     Floats low = all(INFINITY), high = all(-INFINITY);

@@ -1,4 +1,4 @@
-// The convex hull of wrenches, which adds point by point (Barber, Dobkin and Huhdanpaa, The Quickhull Algorithm, 1996).
+// Builds the convex hull of wrenches point by point (Barber, Dobkin and Huhdanpaa, The Quickhull Algorithm, 1996).
 #pragma once
 #include <algorithm>
 #include <cmath>

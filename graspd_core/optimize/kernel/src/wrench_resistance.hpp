@@ -124,7 +124,7 @@ static void support_adjoint(const Problem& p, int whole, Task& t) {
 }
 #undef GRASPD_VELOCITY
 
-// Returns the unweighted loss. Adds adjoints of distance and normal to the candidates, of points to t.ga*.
+// Returns the unweighted loss. Adds adjoints of distance and normal to the candidates, and of points to t.ga*.
 static float wrench_resistance(
     const Problem& p, const Points& points, float radius, float delta, bool soft, float weight, Scratch& s) {
     Task& t = s.task;
