@@ -54,7 +54,7 @@ def cases(seeds: range, scans: Path | None) -> Iterator[CameraView]:
 
 
 def grasps_of_view(case: CameraView) -> list[dict[str, Any]]:
-    """Return a row for each grasp that holds on the likeliest shape: checks passed, and if it holds the true object."""
+    """Return a row per grasp that holds on the likeliest shape: passed checks, and if it holds on the true object."""
     stage, cloud, mass, target = view_of(case)
     hand, config = load_hand(case.hand), replace(load_preset(case.preset), certainty=CertaintyConfig(0.0))
     disk_cache.forget()

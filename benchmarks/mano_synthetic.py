@@ -168,7 +168,7 @@ def _surface(segments: list[tuple[int, np.ndarray, np.ndarray, float]]) -> tuple
 
 
 def _weights(segments: list[tuple[int, np.ndarray, np.ndarray, float]], vertices: np.ndarray) -> np.ndarray:
-    """Return skinning weights. A vertex follows the nearest body, and near joints that body's parent and children."""
+    """Return skinning weights. A vertex follows the nearest body, near joints also its parent and children."""
     depths = _depths(segments, vertices)
     nearest = np.full((len(vertices), BODIES), np.inf)
     for column, (body, *_) in enumerate(segments):
@@ -182,7 +182,7 @@ def _weights(segments: list[tuple[int, np.ndarray, np.ndarray, float]], vertices
 
 
 def _regressor(vertices: np.ndarray, joints: np.ndarray) -> np.ndarray:
-    """Return the joint regressor. A row has weights of the 40 vertices nearest to a joint: sum one, least norm."""
+    """Return the joint regressor. A row weights the 40 vertices nearest to a joint, with sum one and least norm."""
     rows = np.zeros((BODIES, len(vertices)))
     for row, joint in zip(rows, joints, strict=True):
         near = np.argsort(np.linalg.norm(vertices - joint, axis=1))[:40]

@@ -267,7 +267,7 @@ def clearest(scene: Scene, shown: Sequence[Part], before: Sequence[Part]) -> flo
 def stood(
     scene: Scene, parts: Sequence[Part], near: float, turn: float
 ) -> tuple[list[TriangleMesh], Float[np.ndarray, "4 4"]]:
-    """Return the meshes, turned until up is z and by `turn` [rad] about z, and the camera pose. Light comes from z."""
+    """Return meshes, turned so that up is z and then by `turn` [rad] about z, and the camera pose. Light is from z."""
     corners = scene.object.mesh.vertices
     middle = 0.5 * (corners.min(0) + corners.max(0))
     up = np.array([0.0, 0.0, 1.0]) if scene.support is None else scene.support.normal

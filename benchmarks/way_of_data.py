@@ -20,7 +20,7 @@ PREFIX = str(ROOT / "graspd_")
 
 
 def caller_of(frame: FrameType) -> FrameType | None:
-    """Return the nearest frame of graspd that called `frame`, if there is one."""
+    """Return the nearest stack frame in graspd's code that called `frame`, if there is one."""
     caller = frame.f_back
     while caller is not None and not caller.f_code.co_filename.startswith(PREFIX):
         caller = caller.f_back

@@ -17,7 +17,7 @@ COUNT = 4
 
 
 def gentle(config: PlanConfig) -> PlanConfig:
-    """Return settings that reduce penetration during polishing, at the cost of wrench resistance."""
+    """Return settings that reduce penetration in the last steps (polishing), at the cost of wrench resistance."""
     return override(
         config,
         {

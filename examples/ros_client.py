@@ -1,6 +1,6 @@
-"""A client of the node: python examples/ros_client.py mug.obj, beside `graspd_node`.
+"""Request grasps from a running `graspd_node`: python examples/ros_client.py mug.obj.
 
-It requests grasps by the action /graspd/synthesize, shows progress, and prints what a robot must execute. A path is
+The program uses the action /graspd/synthesize, shows progress, and prints what a robot must execute. A path is
 relative to the node's folder. To grasp what a camera sees, set `source=GraspRequest.LATEST_CLOUD` instead.
 """
 

@@ -1,8 +1,8 @@
 """Train a small network on a data set of `graspd dataset`: python examples/train_on_dataset.py DIR [HAND [EPOCHS]].
 
 The network predicts whether a candidate holds, from the object's surface in the hand's frame and from the joints. A
-quarter of the objects is held out. Of their candidates, the program prints the share that holds, and the same share of
-the half rated best.
+quarter of the objects is held out. The program prints the fraction of their candidates that holds, and the same
+fraction of the half that the network rates best.
 """
 
 from __future__ import annotations

@@ -1,7 +1,7 @@
 """Use your own hand from its URDF: python examples/your_own_hand.py [my_hand.urdf].
 
 If a URDF has no description, palm and postures are guessed. A YAML description beside the URDF corrects the guesses.
-`graspd hands inspect my_hand.urdf --picture hand.png` shows the hand. Without a file, the program makes up a claw.
+`graspd hands inspect my_hand.urdf --picture hand.png` shows the hand. Without a file, the program uses an example claw.
 """
 
 from __future__ import annotations

@@ -83,7 +83,7 @@ def save(made: Any, path: Path) -> Path:
 def place_labels(
     axes: Any, points: Sequence[tuple[float, float]], texts: Sequence[str], colours: Sequence[str]
 ) -> None:
-    """Write a label beside each point so that it overlaps no point, label or frame, if possible.
+    """Write a label beside each point, inside the axes, so that it overlaps no point and no other label, if possible.
 
     Call this function after all drawing, because it needs the final layout.
     """
@@ -120,7 +120,7 @@ def _place(point: np.ndarray, half: np.ndarray, distance: float, angle: float) -
 
 
 def _trouble(place: np.ndarray, half: np.ndarray, taken: Sequence[tuple[float, ...]], frame: Any) -> float:
-    """Return a label position's cost: area shared with `taken` boxes, plus 50 times the length outside the frame."""
+    """Return a label position's cost: area shared with `taken` boxes, plus 50 times the length outside the axes."""
     low, high = place - half, place + half
     shared = 0.0
     for x0, y0, x1, y1 in taken:

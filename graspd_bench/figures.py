@@ -233,7 +233,7 @@ class Move:
 
 
 def moves(old: Sequence[Record], new: Sequence[Record]) -> list[Move]:
-    """Return the changes between two runs. For each name: means over shared objects ("all"), then every object."""
+    """Return the changes between two runs. For each name: means over common objects ("all"), then every object."""
     found: list[Move] = []
     for kind in ("raw", "verified"):
         before, after = ({(row.name, row.object): row for row in rows(run, kind)} for run in (old, new))
@@ -256,7 +256,7 @@ def _moved(figure: str, old: float | None, new: float | None) -> bool:
 
 
 def mean_of(group: Sequence[Row], figure: str) -> float | None:
-    """Return the mean of a value over the objects, None without values. CPU time per grasp is over all objects."""
+    """Return the mean of a value over the objects, None without values. For `cpu_per_verified`, see `per_verified`."""
     if figure == "cpu_per_verified":
         return per_verified(group)
     over = spread(group, figure)

@@ -258,7 +258,7 @@ def run_pace(cell: Cell) -> dict[str, Any]:
 
 
 def grasp_steps(cell: Cell) -> int | None:
-    """Return the optimiser steps of a batch, summed over all starts. None if the method is not `closed_form`."""
+    """Return the number of optimiser steps of a batch, summed over starts. None if the method is not `closed_form`."""
     s = cell.settings.settings
     if not isinstance(s, ClosedFormConfig):
         return None

@@ -53,7 +53,7 @@ def write_record(folder: Path, study: str, case: Case, record: Record) -> None:
 
 
 def read_record(folder: Path, study: str, case: Case, code: str | None, *, failed: bool = False) -> Record | None:
-    """Return a case's record by code version `code` (None: any), or None. `failed` allows records of failed cases."""
+    """Return a case's record made by code version `code` (None: any), or None. `failed` also allows a failed case."""
     try:
         record = json.loads((folder / case_file(study, case)).read_text(encoding="utf-8"))
     except (OSError, ValueError):

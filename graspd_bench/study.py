@@ -40,7 +40,7 @@ Sections = Mapping[str, Sequence[str | Picture | None]]
 
 @dataclass(frozen=True)
 class Case:
-    """Base class of one run of a study. Of files in `object`, `hand` and `preset`, the content counts, not the path."""
+    """Base class of one run of a study. Files in `object`, `hand` and `preset` count by content, not by path."""
 
     @property
     def label(self) -> str:
@@ -167,7 +167,7 @@ def all_shapes() -> tuple[str, ...]:
 
 
 def find_objects(sources: Sequence[str]) -> tuple[str, ...]:
-    """List `sources` with folders replaced by their meshes. Raises MeshError: unknown object, or two with one name."""
+    """List `sources` with folders replaced by their meshes. Raises MeshError: unknown object, or a name twice."""
     found = object_sources(sources)
     names = [object_name(source) for source in found]
     if twice := sorted({name for name in names if names.count(name) > 1}):

@@ -56,7 +56,7 @@ def straight(
 
 
 def held_balls(mover: Mover, q: Joints, surface: Points) -> Balls:
-    """Return the mover's collision balls that move with the tip, plus balls of a held object, in the tip frame [m].
+    """Return the mover's spheres that move with the tip, plus spheres of a held object, in the tip frame [m].
 
     `surface` has the object's surface points [m] in the base frame. The arm is at joint values `q`.
     """

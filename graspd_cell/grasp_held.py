@@ -60,7 +60,7 @@ def after_squeeze(hand: HandModel, grasp: Grasp, reading: JointReading) -> Hold:
 
 
 def why_not_gripped(hold: Hold, hand: HandModel) -> str:
-    """Return why the hand closed on no object, by the reading after the squeeze, or "" if it closed on one."""
+    """Return why the hand closed on no object, judged by the reading after the squeeze, or "" if it closed on one."""
     covered = _covered(hold, hold.positions)
     if covered > _ARRIVED:
         return f"the fingers closed on nothing: they covered {100 * covered:.0f} % of the squeeze"
@@ -70,7 +70,7 @@ def why_not_gripped(hold: Hold, hand: HandModel) -> str:
 
 
 def why_lost(hold: Hold, hand: HandModel, reading: JointReading) -> str:
-    """Return why the object is no longer in the hand, by a later reading, or "" if the hand still holds it."""
+    """Return why the object is no longer in the hand, judged by a later reading, or "" if the hand still holds it."""
     own, toward = reading.of(hand.joint_names), np.sign(hold.target - hold.touch)
     before, now = (np.maximum((toward * efforts)[hold.presses], 0.0).sum() for efforts in (hold.efforts, own.efforts))
     covered = _covered(hold, own.positions)

@@ -38,8 +38,8 @@ class Offer:
         verified: True if the grasp's verdict is `VERIFIED`.
         seen: places of all objects seen [m].
         reason: why there is no verified grasp.
-        failures: the given failures, where their objects are now, and objects for which planning found no grasp.
-        earlier: those of `failures` that are of the grasp's object.
+        failures: the given failures, moved to their objects' present places, and one for each object without a grasp.
+        earlier: those of the given failures that happened at the grasp's object.
         exhausted: True if no further try is worthwhile: every object seen failed too often, or the cloud is unusable.
         seconds, cpu_seconds: graspd's wall-clock time and CPU time [s].
     """

@@ -1,9 +1,9 @@
 """Collision-free motions of the arm between postures. Obstacles are the camera's points and the known solids.
 
-Arm, hand and the held object are modelled as balls. The arm's balls come from its capsules (docs/arms.md). Hand and
-object have balls at surface points, which are fixed to the tip during a motion. Obstacles are a distance grid of the
-points seen, a floor, and boxes. OMPL's RRTConnect finds paths and checks whole edges at once. toppra times the paths
-within limits.
+Arm, hand and the held object are modelled as spheres. The arm's spheres come from its capsules (docs/arms.md). Hand
+and object have spheres at surface points, which are fixed to the tip during a motion. Obstacles are a distance grid of
+the points seen, a floor, and boxes. OMPL's RRTConnect finds paths and checks whole edges at once. toppra times the
+paths within limits.
 
 OMPL is used because its wheel has no dependencies. The alternative roboplan needs 25 other packages and its own model
 of arm and scene. The alternative to toppra, Ruckig, connects only two states, and sends further waypoints to a server.
@@ -104,28 +104,28 @@ def seen_world(points: Points, floor: float, boxes: Sequence[Box] = ()) -> SeenW
 
 @dataclass(frozen=True, eq=False)
 class Balls:
-    """Balls fixed to a link: centres in the link's frame and radii [m]."""
+    """Spheres fixed to a link: centres in the link's frame and radii [m]."""
 
     at: Points
     radius: Float[np.ndarray, "_"]
 
 
-# Spacing of the surface points that are kept of hands and objects, and radius of the ball at each point [m].
+# Spacing of the surface points that are kept of hands and objects, and radius of the sphere at each point [m].
 _SPACING, _BALL = 0.012, 0.004
-# Side of the cubes whose enclosing balls stand for hand and held object in the check against the arm [m].
+# Side of the cubes whose enclosing spheres stand for hand and held object in the check against the arm [m].
 _COARSE = 0.02
 # Points sampled on a hand's surface.
 _SAMPLES = 4000
 
 
 def balls_about(points: Points) -> Balls:
-    """Return a ball of radius `_BALL` at one point of every cube of side `_SPACING` that has points."""
+    """Return spheres of radius `_BALL`: for every cube of side `_SPACING` that has points, one at such a point."""
     kept = np.unique(voxel_keys(points - points.min(0), _SPACING), return_index=True)[1]
     return Balls(points[kept], np.full(len(kept), _BALL))
 
 
 def enclosing_balls(points: Points) -> Balls:
-    """Return balls that enclose all points: one about every cube of side `_COARSE` that has points."""
+    """Return spheres that enclose all points: one about every cube of side `_COARSE` that has points."""
     cubes = np.unique(np.floor(points / _COARSE), axis=0)
     return Balls((cubes + 0.5) * _COARSE, np.full(len(cubes), 0.5 * np.sqrt(3.0) * _COARSE))
 
@@ -142,20 +142,20 @@ def hand_points(hand: HandModel, joints: Joints) -> tuple[Points, Int[np.ndarray
 
 
 def hand_balls(arm: Arm, hand: HandModel, joints: Joints) -> Balls:
-    """Return the balls of the hand at joint values, in the frame of the arm's tip."""
+    """Return the spheres of the hand at joint values, in the frame of the arm's tip."""
     local, mount = hand_points(hand, joints)[0], tip_hand(arm, hand)
     return balls_about(local @ mount.rotation.numpy().T + mount.translation.numpy())
 
 
 @dataclass(frozen=True, eq=False)
 class ArmShape:
-    """Collision model of an arm as balls.
+    """Collision model of an arm as spheres.
 
     Attributes:
         arm: the arm.
-        balls: centres of the balls as a matrix for `place_points`.
-        radius: radius of each ball [m]. The balls of a capsule cover the whole capsule.
-        link: link index of each ball.
+        balls: centres of the spheres as a matrix for `place_points`.
+        radius: radius of each sphere [m]. The spheres of a capsule cover the whole capsule.
+        link: link index of each sphere.
     """
 
     arm: Arm
@@ -169,19 +169,19 @@ class ArmShape:
 
     @cached_property
     def beyond_shoulder(self) -> Bool[np.ndarray, "_"]:
-        """Mask of the balls to check against obstacles: all except those of the base and the first moving link."""
+        """Mask of the spheres to check against obstacles: all except those of the base and the first moving link."""
         group = self.arm.chain.link_group
         return (group[self.link] != 0) & (group[self.link] != group[self.arm.moved_link[0]])
 
 
 @lru_cache(maxsize=4)
 def arm_shape(arm: Arm) -> ArmShape:
-    """Return the arm with balls along its capsules. They exceed a capsule by less than an eighth of its radius."""
+    """Return the arm with spheres along its capsules. They exceed a capsule by less than an eighth of its radius."""
     balls, radius, capsule = capsule_balls(arm)
     return ArmShape(arm, balls, radius.numpy(), arm.capsules.link[capsule])
 
 
-# Pairs of balls that are nearer than this in the seed posture are not checked against each other [m].
+# Pairs of spheres that are nearer than this in the seed posture are not checked against each other [m].
 _TOUCHING = 0.01
 
 
@@ -192,7 +192,7 @@ class Mover:
     Attributes:
         shape: the arm.
         world: the obstacles.
-        carried: collision balls of the hand and the held object, tip frame.
+        carried: collision spheres of the hand and the held object, tip frame.
         margin: distance that a motion keeps from obstacles [m]. A start or goal nearer than this lowers the distance.
     """
 
@@ -203,7 +203,7 @@ class Mover:
 
     @cached_property
     def _own(self) -> tuple[Balls, np.ndarray, np.ndarray]:
-        """Return coarse balls of hand and object, and index pairs to check: arm with arm, and arm with coarse balls."""
+        """Return coarse spheres of hand and object, and index pairs to check: arm with arm, arm with coarse spheres."""
         shape, arm = self.shape, self.shape.arm
         coarse = enclosing_balls(self.carried.at)
         group = arm.chain.link_group
@@ -225,14 +225,14 @@ class Mover:
         return [balls, *(tip.apply(torch.as_tensor(some.at)).numpy() for some in carried)]
 
     def placed(self, q: Joints) -> tuple[Points, Points]:
-        """Return the collision balls' centres: of the arm, and of hand and held object, base frame [m]."""
+        """Return the centres of the arm's collision spheres, and of those of hand and object, in the base frame [m]."""
         balls, carried = self._placed(q[None], self.carried)
         return balls[0], carried[0]
 
     def clearances(self, q: Path) -> Float[np.ndarray, "rows balls"]:
-        """Return distances of the robot's balls to obstacles, then distances of the pairs of balls from `_own` [m].
+        """Return distances of the robot's spheres to obstacles, then distances of the sphere pairs from `_own` [m].
 
-        `margin` is added to the distances of pairs, because two balls of the robot may come close, but not overlap.
+        `margin` is added to the distances of pairs, because two spheres of the robot may come close, but not overlap.
         """
         shape = self.shape
         coarse, pairs, with_carried = self._own
@@ -251,16 +251,16 @@ class Mover:
 
     @property
     def carried_columns(self) -> slice:
-        """Columns of `clearances` for the balls of hand and object."""
+        """Columns of `clearances` for the spheres of hand and object."""
         arm = int(self.shape.beyond_shoulder.sum())
         return slice(arm, arm + len(self.carried.radius))
 
     def arm_clearances(self, q: Path) -> Float[np.ndarray, "rows balls"]:
-        """Return the distances of the arm's balls (not of hand and object) to floor, boxes and points seen [m]."""
+        """Return the distances of the arm's spheres (not of hand and object) to floor, boxes and points seen [m]."""
         return self.clearances(q)[:, : self.carried_columns.start]
 
     def allowed(self, ends: Path) -> Float[np.ndarray, "balls"]:
-        """Return the distance that each ball must keep [m]: the margin, or less if it is nearer at one of `ends`."""
+        """Return the distance that each sphere must keep [m]: the margin, or less if nearer at one of `ends`."""
         return np.minimum(self.margin, self.clearances(ends).min(0) - 1e-3)
 
     def clear(self, path: Path, allowed: Float[np.ndarray, "balls"]) -> bool:

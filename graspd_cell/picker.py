@@ -334,9 +334,9 @@ class Picker:
             self._stop_if_cancelled()
 
     def _learn(self, attempt: Attempt, offer: Offer) -> None:
-        """Store the grasp as failed. After success, the next image decides whether its object is gone.
+        """Store the grasp as failed, even after success, in case the next image still shows the object.
 
-        After a try in the bin, forget which objects had no grasp. They may have one now.
+        After an executed try, forget which objects had no grasp. They may have one now.
         """
         assert offer.grasp is not None
         picked, executed = attempt.ending is Ending.PICKED, attempt.ending is not Ending.NO_WAY

@@ -52,7 +52,7 @@ def _parse(arguments: list[str]) -> argparse.Namespace:
     parser.add_argument("--things", **things, help="objects in the bin (default: %(default)s)")
     parser.add_argument("--seed", type=int, default=0, help="seed of the fall and the camera noise (default 0)")
     parser.add_argument("--clock", action="store_true", help="publish /clock, and stamp with simulated time")
-    parser.add_argument("--speed", type=float, default=1.0, metavar="X", help="speed, in times real time (default 1)")
+    parser.add_argument("--speed", type=float, default=1.0, metavar="X", help="multiple of real time (default 1)")
     options = parser.parse_args(arguments)
     if not 0 < options.speed < float("inf"):
         raise ConfigError(f"speed: {options.speed}; valid: a positive number")

@@ -108,7 +108,7 @@ def _one_thread() -> None:
 
 
 def _kept(key: str, pickled: bytes) -> Any:
-    """Return the unpickled value of a key. Keep recent values, as MuJoCo models are cached for one instance each."""
+    """Return the unpickled value of a key. Keep recent values, because MuJoCo models are cached per instance."""
     if key not in _loaded:
         _loaded[key] = pickle.loads(pickled)
     _loaded.move_to_end(key)

@@ -105,7 +105,7 @@ def joints_by_name(values: Any, hand: HandModel, where: str) -> Float[np.ndarray
         raise FormatError(f"{where}: {short_repr(values)}; expected joint values by name")
     names = all_joint_names(hand)
     if strange := [name for name in values if name not in names]:
-        raise FormatError(f"{where}: {short_repr(strange[0])} is no joint of {hand.name}; valid: {', '.join(names)}")
+        raise FormatError(f"{where}: {short_repr(strange[0])} is not a joint of {hand.name}; valid: {', '.join(names)}")
     if missing := [name for name in hand.joint_names if name not in values]:
         raise FormatError(f"{where}: joint {missing[0]!r} of {hand.name} is missing")
     joints = np.array([float(numbers_of(values[name], (), f"{where}: {name}")) for name in hand.joint_names])
@@ -121,7 +121,7 @@ def checked_order(order: Sequence[str], hand: HandModel) -> tuple[str, ...]:
     names = all_joint_names(hand)
     for name in order:
         if name not in names or list(order).count(name) > 1:
-            fault = "occurs twice" if name in names else f"is no joint of {hand.name}"
+            fault = "occurs twice" if name in names else f"is not a joint of {hand.name}"
             raise ConfigError(f"joint order: {name!r} {fault}; valid: {', '.join(names)}")
     if missing := [name for name in hand.joint_names if name not in order]:
         raise ConfigError(f"joint order: {missing[0]!r} of {hand.name} is missing")
@@ -163,7 +163,7 @@ def read_dexgraspbench(
 
     Raises:
         ConfigError: the joint order is not known or does not fit the hand.
-        FormatError: the file is no npy file with one dictionary, its pickle calls code, or an entry is not valid.
+        FormatError: the file is not an npy file that holds one dictionary, the pickle calls code, or an entry is bad.
     """
     order = order_of(hand, order)
     values = npy_dictionary(path, content)
@@ -324,7 +324,7 @@ def read_graspgen(path: Path, text: bytes, hand: HandModel, mesh: str | None) ->
 
 
 def _open_at(pose: object, hand: HandModel, where: str) -> Posture:
-    """Return the open hand at a 4 x 4 pose `T_object_hand`. Raises FormatError: the pose is no rigid transform."""
+    """Return the open hand at a 4 x 4 pose `T_object_hand`. Raises FormatError: the pose is not a rigid transform."""
     from scipy.spatial.transform import Rotation
 
     matrix = numbers_of(pose, (4, 4), f"{where}: transform")

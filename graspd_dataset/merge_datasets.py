@@ -60,9 +60,7 @@ def sample(store: DatasetStore, count: int, seed: int, verdict: str | None = Non
 
     If `verdict` is given, draw only from rows with this verdict. The same rows and seed give the same sample.
 
-    Raises:
-        ConfigError: `count` is less than 1.
-        FormatError: there is no data set, or a file is damaged.
+    Raises ConfigError if `count` is less than 1, FormatError if there is no data set or a file is damaged.
     """
     import pyarrow as pa
 

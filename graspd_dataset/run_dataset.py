@@ -85,7 +85,8 @@ def begin_run(store: DatasetStore, request: DatasetRequest, blocks: int, *, any_
     records = run_records(store)
     others = sorted({record.code for record in records} - {code})
     if others and not any_code:
-        raise ConfigError(f"{store.label}: made by code {others[0]}, not by this code ({code}); give --any-code to add")
+        told = f"made by code version {others[0]}, but this is version {code}"
+        raise ConfigError(f"{store.label}: {told}; give --any-code to add anyway")
     machine = f"{os.cpu_count()} cores, {platform.machine()}, Python {platform.python_version()}"
     new = RunRecord(command_of(request, store.label), code, commit(), date.today().isoformat(), machine, blocks)
     return next((replace(record, blocks=blocks) for record in records if record.path == new.path), new)
@@ -139,7 +140,7 @@ def data_card(store: DatasetStore, stats: DatasetStats) -> str:
         "## How it was made",
         "",
         *(f"    {record.command}\n" for record in records),
-        *(f"- {r.made}, code {r.code}, commit {r.commit or 'unknown'}; {r.machine}" for r in records),
+        *(f"- {r.made}, code version {r.code}, commit {r.commit or 'unknown'}; {r.machine}" for r in records),
         f"- {done} blocks in {cpu / 3600:.2f} CPU hours; at most {max((r.peak_mb for r in records), default=0):.0f} MB "
         "a process",
         "",
@@ -181,7 +182,7 @@ def missing_blocks(blocks: Sequence[Block], store: DatasetStore, *, retry_failed
 
 
 def remove_failure(store: DatasetStore, report: Report, failed: Collection[str]) -> None:
-    """Remove the record of an earlier failure if the object or block has succeeded. `failed`: recorded keys."""
+    """Remove the record of an earlier failure if the object or block has succeeded. `failed`: all keys on record."""
     if report.key in failed and not report.failed:
         store.remove(f"failed/{report.key}.json")
 

@@ -92,7 +92,7 @@ def matrix_of_pose(pose: Pose) -> Matrix:
 
 
 def near(point: Point, name: str, what: str = "") -> Float[np.ndarray, "3"]:
-    """Return a point [m]. Raises RequestError about field `name`, part `what`: not finite, or farther than 1 km."""
+    """Check a point of field `name`, and return it as an array [m]. Raises RequestError: not finite, or beyond 1 km."""
     place = array_of(point)
     if not (np.abs(place) <= _FARTHEST).all():
         raise bad_request(f"{name}: {what}{place.tolist()}; valid: finite, within {_FARTHEST:g} m")
@@ -100,7 +100,7 @@ def near(point: Point, name: str, what: str = "") -> Float[np.ndarray, "3"]:
 
 
 def pose_matrix(pose: Pose, name: str = "object_pose") -> Matrix:
-    """Return the pose in field `name` as a matrix. A zero quaternion is no rotation. Raises RequestError: invalid."""
+    """Return field `name`'s pose as a matrix. A zero quaternion means no rotation. Raises RequestError if invalid."""
     near(pose.position, name, "position ")
     length = float(np.linalg.norm(wxyz_of(pose.orientation)))
     if length == 0:
@@ -111,7 +111,7 @@ def pose_matrix(pose: Pose, name: str = "object_pose") -> Matrix:
 
 
 def matrix_of_transform(transform: Transform) -> Matrix:
-    """Return a transform as a matrix. Raises the error of `matrix_of`."""
+    """Return a transform as a matrix. Raises TransformError if the transform is invalid (see `matrix_of`)."""
     place, turn = transform.translation, transform.rotation
     return matrix_of((place.x, place.y, place.z), (turn.w, turn.x, turn.y, turn.z))
 

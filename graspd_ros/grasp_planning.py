@@ -37,7 +37,7 @@ class PlanningMessages:
         self._up: tuple[str, tuple[float, float, float]] | None = None
 
     def watching(self, request: Request, goal: Any) -> Request:
-        """Store the object's name. Return a request with `closes_late` whose `load` also stores the up direction."""
+        """Store the object's name. Return the request with `closes_late`. Its `load` also stores the up direction."""
         self._touch = (goal.object.name,) if goal.object.name else ()
 
         def loaded() -> Scene:

@@ -59,7 +59,7 @@ def answer_known(
     restrictions: Sequence[Steering | Reach],
     **plan: Any,
 ) -> tuple[GraspResult, Scene | None, bool]:
-    """Return grasps that are not similar to the `excluded` base-link poses, the scene, and whether its mass is assumed.
+    """Return grasps, the scene, and whether its mass is assumed. No grasp is similar to an `excluded` base-link pose.
 
     The scene is None if it was not loaded. If the library has too few grasps, plan more with arguments `plan`. Raises
     the errors of `find_entry` and planning.

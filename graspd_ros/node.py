@@ -222,7 +222,7 @@ def _make_node(args: list[str] | None, on_failure: Callable[[], None]) -> GraspN
 
 
 def log_directory() -> str:
-    """If the default log directory is read-only, set ROS_LOG_DIR to a temporary one, and return a message. Else ""."""
+    """Set ROS_LOG_DIR to a temporary directory if the default one is read-only. Return a message about this, or ""."""
     if os.environ.get("ROS_LOG_DIR"):
         return ""
     usual = Path(os.environ.get("ROS_HOME") or Path.home() / ".ros") / "log"

@@ -76,12 +76,12 @@ def _check_topic(name: str) -> None:
     try:
         validate_topic_name(name)
     except InvalidTopicNameException:
-        raise ConfigError(f"{name!r} is no topic; valid: a name such as /collision_object") from None
+        raise ConfigError(f"{name!r} is not a topic name; valid: a name such as /collision_object") from None
 
 
 def _check_corner(corner: Any) -> None:
     if not _numbers(corner) or len(corner) != 3 or not np.isfinite(corner).all():
-        raise ConfigError(f"{corner} is no position; valid: three finite numbers x, y, z [m]")
+        raise ConfigError(f"{corner} is not a position; valid: three finite numbers x, y, z [m]")
 
 
 def _check_parts(parts: Any) -> None:
@@ -131,7 +131,7 @@ class Settings:
         [WORKSPACE] * 3, "upper corner of the workspace, in the frame of the cloud [m]", check=_check_corner
     )
     sensor_frame: str = _setting(
-        "", "frame in /tf at whose origin the camera of the clouds is; empty: the frame of the cloud"
+        "", "frame in /tf whose origin is the position of the camera, for clouds; empty: the frame of the cloud"
     )
     view_point: list[float] = _setting(
         [0.0] * 3,
@@ -251,7 +251,7 @@ def parameter_warnings(settings: Settings) -> list[str]:
         found.append(f"roi_min={settings.roi_min} is above roi_max={settings.roi_max}: no point lies in the workspace")
     for root in settings.mesh_roots:
         if not root.startswith("package://") and not Path(root).is_dir():
-            found.append(f"mesh_roots: {root!r} is no directory")
+            found.append(f"mesh_roots: {root!r} is not a directory")
     return found
 
 
@@ -305,7 +305,7 @@ def _check_value(name: str, value: Any) -> None:
     if _is_number(setting):
         low, high = setting.metadata["limits"]
         if not _is_number_like(value):
-            raise ConfigError(f"parameter {name}: {value!r} is no number; valid: a number such as 1.0")
+            raise ConfigError(f"parameter {name}: {value!r} is not a number; valid: a number such as 1.0")
         if not low <= value <= high:
             raise ConfigError(f"parameter {name}: {value!r}; valid: {low:g} to {high:g}")
     if choices and value not in choices:

@@ -104,7 +104,7 @@ class RecentRuns:
     def keep(self, request: Request, planned: Planned, T_out_object: Matrix) -> None:
         """Store a result under the id of its request, so that later requests can exclude its grasps.
 
-        `T_out_object` [m] places the grasps in the answer's frame, because a camera's frame may move later.
+        `T_out_object` [m] is the object's pose in the answer's frame. A camera's frame may move later.
         """
         about = request.object_key, request.frame_out, T_out_object, _terms(request)
         # Only requests without an arm reuse a run. The arm may be elsewhere or switched off by then.
@@ -285,7 +285,7 @@ class Planner:
         return lambda target, source: self._lookup(target, source, stamp, stop)
 
     def _placing(self, request: Request, stop: StopHook) -> FrameLookup:
-        """Return the lookup for excluded poses: at a single cloud's time, as its camera may move, else the newest."""
+        """Return the lookup for excluded poses. For a single cloud, it uses the cloud's time: the camera may move."""
         one_cloud = request.region_points is not None and not request.timeless
         return self._lookup_at(request.stamp if one_cloud else Time(), stop)
 

@@ -165,7 +165,7 @@ class Worker(Generic[R, V]):
         return dropped
 
     def state(self) -> tuple[str | None, int]:
-        """Return the running request's id (or None), and the number of waiting requests without `only_newest` ones."""
+        """Return the running request's id (or None), and the number of waiting requests that are not `only_newest`."""
         with self._condition:
             running = self._running.id if self._running else None
             return running, len(self._waiting)

@@ -151,8 +151,7 @@ def serve_page(page: str, host: str, port: int, open_run: Callable[[str], int | 
         host, port: the address to listen on.
         open_run: shows the grasps of the run with a given key. Returns the viewer's port, None if the key is unknown.
 
-    Raises:
-        ConfigError: the address cannot be listened on.
+    Raises ConfigError: the address cannot be listened on.
     """
     handler = partial(_OnePage, page.encode(), host, open_run)
     try:

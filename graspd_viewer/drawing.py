@@ -102,7 +102,7 @@ def force_parts(positions: Float[np.ndarray, "n 3"], forces: Float[np.ndarray, "
 
 
 def weakest_parts(push: Float[np.ndarray, "6"], target: ObjectModel) -> list[Part]:
-    """Return arrows for force and torque of the unit disturbance `push`. A part with a norm up to 0.05 has no arrow."""
+    """Return arrows for force and torque of the unit disturbance `push`. No arrow if its norm is at most 0.05."""
     center, parts = target.center_of_mass, []
     for name, part, colour in (("weakest/force", push[:3], WEAKEST), ("weakest/turn", push[3:], TURN)):
         share = float(np.linalg.norm(part))

@@ -106,7 +106,8 @@ def best_view(
 ) -> tuple[Float[np.ndarray, "3"], Float[np.ndarray, "3"], Float[np.ndarray, "3"]]:
     """Return the camera's position, the point that it looks at [m], and the up direction of the best view.
 
-    For object and hand, visible pixels are divided by the most in any view. The best view has the greatest minimum.
+    Each view has two fractions: visible pixels of the object, and of the hand, divided by the most in any view. The
+    smaller fraction rates the view.
     """
     meshes = [object_mesh] if hand is None else [object_mesh, hand]
     corners = np.concatenate([mesh.vertices for mesh in meshes])

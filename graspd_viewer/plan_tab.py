@@ -173,7 +173,8 @@ class PlanTab:
         self._hand = gui.add_dropdown("Hand", hand_names(), initial_value="allegro_right")
         self._preset = gui.add_dropdown("Preset", preset_names(), initial_value="fast")
         self._friction = gui.add_slider("Friction", 0.1, 1.5, 0.05, 0.6, hint="between object and hand")
-        self._approach = gui.add_dropdown("The hand comes from", tuple(APPROACHES), hint="side in the object's frame")
+        sides = tuple(APPROACHES)
+        self._approach = gui.add_dropdown("The hand comes from", sides, hint="approach side, in the object's frame")
         self._angle = gui.add_slider("Within [°]", 5, 180, 5, 30, hint="greatest angle to this direction")
         self._count = gui.add_slider("Grasps", 1, MOST_GRASPS, 1, 8, hint="number of verified grasps")
         self._plan = gui.add_button("Plan")
@@ -200,7 +201,7 @@ class PlanTab:
             self._start(lambda _: self._plan_and_show(self._request()))
 
     def replace(self, work: Callable[[StopHook], None]) -> None:
-        """Stop the run in progress. When it has ended, start a thread that calls `work`. Only the newest waits."""
+        """Stop the run in progress. After its end, call the newest waiting `work` in a thread."""
         with self._waiting:
             self._next = work
         self._stop.set()

@@ -1,8 +1,8 @@
 """A viser server with limits, and the drawing thread.
 
 By default viser listens on every network interface, lets any web page connect and accepts files of any size. It also
-opens a public tunnel if a visitor asks. graspd's server does not. The drawing thread runs only the newest job of each
-kind. So a moved slider does not leave a queue of drawings.
+opens a public tunnel if a visitor asks. graspd's server does none of this. The drawing thread runs only the newest job
+of each kind. So a moved slider does not leave a queue of drawings.
 """
 
 from __future__ import annotations
@@ -126,8 +126,7 @@ LOCAL = ("localhost", "127.0.0.1", "::1")
 def start_server(host: str, port: int) -> Any:
     """Start a `viser.ViserServer` on `host`, at `port` or the next free port.
 
-    Raises:
-        ConfigError: viser is not installed, the port is invalid, or this machine does not have the address.
+    Raises ConfigError: viser is not installed, the port is invalid, or this machine does not have the address.
     """
     with Extra("view"):
         import viser
@@ -175,7 +174,7 @@ def may_connect(origin: str | None, named: str | None, host: str) -> bool:
     """Return True if a client may connect. `origin` and `named` are its Origin and Host headers.
 
     Refuse pages of another site. If `host` is local, refuse clients that address the server by another name. Clients
-    that are no web pages send no Origin, and may connect.
+    that are not web pages send no Origin, and may connect.
     """
     name = urlsplit(f"//{named or ''}")
     if host in LOCAL and name.hostname not in LOCAL:

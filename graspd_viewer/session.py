@@ -115,7 +115,7 @@ def _hand_of(document: dict[str, Any], path: Path, wanted: str | None) -> HandMo
     # The file names a hand's URDF, not its description, which may begin the hand at a later link (`root`).
     if (base := named.get("base_link", hand.base_link)) != hand.base_link:
         told = f"{path}: its poses are those of link {short_repr(base)}"
-        raise FormatError(f"{told}, but {source} begins at {hand.base_link!r}; name the hand with --hand")
+        raise FormatError(f"{told}, but the base link of {source} is {hand.base_link!r}; name the hand with --hand")
     return hand
 
 

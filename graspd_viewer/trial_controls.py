@@ -37,7 +37,7 @@ FRAME_STEPS = 5
 
 @dataclass(frozen=True)
 class Frame:
-    """State of a trial at one time, in the frame of the object before the trial. In a lift, hand and object rise.
+    """State of a trial at one time, in the object's coordinate frame before the trial. In a lift, hand and object rise.
 
     Attributes:
         stage: name of the current stage.

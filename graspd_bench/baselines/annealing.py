@@ -1,8 +1,8 @@
 """Planner like GraspIt!'s eigengrasp planner (Ciocarlie and Allen, IJRR 2009): annealing, then closing of the fingers.
 
 Eigengrasps are the principal components of human hand postures. No recordings of postures exist for an arbitrary hand.
-Here seeded random postures between open and closed replace the recordings. In each posture, the fingers are closed by
-similar shares. The first component closes the hand. The next components are differences between fingers.
+Here seeded random postures between open and closed replace the recordings. In each posture, the fingers are closed to
+similar degrees. The first component closes the hand. The next components are differences between fingers.
 
 A chain steps from one hand state to the next. A state is the base pose and the amplitudes of a few eigengrasps.
 GraspIt!'s energy of a state is a mean over contact locations i on the inside of the hand:
@@ -146,7 +146,7 @@ def inner_contacts(hand: HandModel, per_link: int) -> Int[np.ndarray, "contacts"
 
 
 def _facing(hand: HandModel) -> Float[np.ndarray, "candidates"]:
-    """Return the cosine between each contact candidate's normal and its motion. On the palm, use the palm's normal."""
+    """Return the cosine between each candidate's normal and its closing motion, or on the palm, the palm's normal."""
     links = hand.candidate_link
     early, late = (
         link_poses(hand, hand.open_posture + share * (hand.closed_posture - hand.open_posture)) for share in (0.4, 0.6)
@@ -286,7 +286,7 @@ class Annealing:
 
     @torch.no_grad()
     def pierced(self, problem: Problem, x: Float[Tensor, "batch variables"]) -> Bool[Tensor, "batch"]:
-        """Return for each state whether the hand overlaps the object. Test candidates and the object's sharp points."""
+        """Return whether each state's hand overlaps the object, by contact candidates and the object's sharp points."""
         if len(x) == 0:
             return torch.zeros(0, dtype=torch.bool, device=x.device)
         return link_gaps(problem, self.poses(x), self.sphere_links)[:, 0].amin(-1) < 0.0

@@ -38,7 +38,7 @@ class DepthNoise:
         flying: share of edge pixels with a depth between foreground and background.
         edge_loss: share of edge pixels without depth.
         loss: share of all pixels that lose depth. These pixels form patches.
-        grazing: angle between surface and line of sight below which pixels may lose depth [rad]. At 0, all do so.
+        grazing: angle between surface and line of sight below which pixels may lose depth [rad]. At angle 0, all do.
         baseline: distance between the two lenses of a stereo camera [m]. A point that one lens cannot see has no depth.
         step: depth is rounded to multiples of this unit [m].
         disparity_step: disparity (focal length x baseline / depth) is rounded to multiples of this unit [pixels].

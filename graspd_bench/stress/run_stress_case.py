@@ -38,7 +38,7 @@ class Case:
         about: the fault, in one line.
         scene: makes the input in a given folder and loads it as a user would. It may raise a GraspdError.
         expect: valid endings: "grasp", names of `Outcome` ("TOO_FEW"), or classes of errors ("MeshError").
-        whole: whether the input has a graspable object. Summaries give the share with a verified grasp.
+        whole: whether the input has a graspable object. Summaries give the fraction of such cases with a grasp.
         deadline: time limit of planning [s].
         loading: time limit of loading [s].
         memory: limit of the process's peak memory, including libraries [MB].

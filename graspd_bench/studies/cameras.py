@@ -92,12 +92,12 @@ class CameraView(Case):
 
 
 def camera_cases(request: Request) -> tuple[CameraView, ...]:
-    """Return cases for every object, seed and way. Cameras take turns, and half of the views have a crowd.
+    """Return cases for every object, seed and way to plan. The four cameras alternate. Half of the views have a crowd.
 
-    Raises GraspdError: an object of the request is no mesh file.
+    Raises GraspdError: an object of the request is not a mesh file.
     """
     if shapes := [name for name in request.objects if name.startswith("shape:")]:
-        raise ConfigError(f"objects: {shapes[0]}; valid: mesh files beside a csv of masses")
+        raise ConfigError(f"objects: {shapes[0]}; valid: mesh files in a folder with a csv of masses")
     things = (*(name for name in FAMILIES if name not in CHOSEN_ON), *SHAPES)
     things += tuple(find_objects(request.objects)) if request.objects else ()
     seeds = request.seeds or range(FIRST_SEED, FIRST_SEED + SEEDS)
@@ -198,7 +198,7 @@ def run_view(case: CameraView) -> Record:
 
 
 def camera_sections(records: Sequence[Record], chart: Path | None) -> Sections:
-    """Return a table with rows for ways, cameras, crowds and kinds of objects, and the probability's calibration."""
+    """Return a table with rows by way to plan, camera, crowd and kind of object, and the probability's calibration."""
     usual = [r for r in records if r["way"] == ASSUMED]
     rows = [(way, [r for r in records if r["way"] == way]) for way in (ASSUMED, GIVEN, OPEN3D)]
     for name, told in (("camera", str), ("crowd", lambda some: "crowded" if some else "alone"), ("kind", str)):

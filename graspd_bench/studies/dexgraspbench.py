@@ -264,7 +264,7 @@ def _pairs(records: Sequence[Record], variant: str) -> list[tuple[bool, Record]]
 
 
 def bench_sections(records: Sequence[Record], chart: Path | None) -> Sections:
-    """Return a table by object and variant of the Allegro, the reasons of failures, and known differences."""
+    """Return a table of grasps held, by object and Allegro variant. Add failure reasons and known differences."""
     headings = ["object", "its Allegro", "tried", "verified", "held by both", "by ours only", "by theirs only"]
     headings += ["by neither", "of the verified"]
     groups = [(object_name(record["object"]), [record]) for record in records]

@@ -60,7 +60,7 @@ def frame_cases(request: Request) -> tuple[Frame, ...]:
 
 
 def run_frame(case: Frame) -> Record:
-    """Plan for the object on the view axis, or at the reference cloud's median if the first IoU is at most 0.5."""
+    """Plan for the object on the view axis. If its IoU is at most 0.5, plan at the reference cloud's median instead."""
     folder = Path(case.folder)
     cloud = load_depth_view(folder / "depth_mm.png", folder / "camera.json")
     reference = np.loadtxt(folder / "object_cloud.xyz")

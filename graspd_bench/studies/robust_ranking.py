@@ -39,7 +39,7 @@ def robust_cases(request: Request) -> tuple[ObjectCase, ...]:
 def run_robust(case: ObjectCase) -> Record:
     """Plan with and without ranking by noisy trials. Return both CPU times, and three numbers for each verified grasp.
 
-    The numbers are its score, and the shares of the ranking trials and of the evaluation trials that it passes.
+    The numbers are its score, and the fractions of ranking trials and of evaluation trials that it passes.
     """
     config = case.config
     ranked = replace(config, robust=replace(config.robust, rank=True))
@@ -67,7 +67,7 @@ def run_robust(case: ObjectCase) -> Record:
 
 
 def robust_sections(records: Sequence[Record], chart: Path | None) -> Sections:
-    """Return the chart, a table of planning times and shares held by shape, and the rank correlations."""
+    """Return the chart, a table by shape (planning time, fraction of noisy trials held), and the rank correlations."""
     rows = [record for record in records if record["shares"]]
     if not rows:
         return {}
@@ -81,7 +81,7 @@ def robust_sections(records: Sequence[Record], chart: Path | None) -> Sections:
         gains = (score[0], noise[0], best[0], score[:4].mean(), noise[:4].mean())
         body.append([shape, *(f"{cost:.1f}" for cost in costs), *(f"{gain:.1%}" for gain in gains)])
     score, noise = (correlation(rows, key) for key in ("score", "ranked_by"))
-    line = f"Rank correlation with the share held, within a plan, mean: score {score:.2f}, noise {noise:.2f}."
+    line = f"Rank correlation with the fraction held, within a plan, mean: score {score:.2f}, noise {noise:.2f}."
     picture = chart and Picture("What ranking buys at each place", draw_robust(rows, chart.with_name("robust")))
     return {"robust": [picture, markdown_table(headings, body), line]}
 
@@ -89,9 +89,9 @@ def robust_sections(records: Sequence[Record], chart: Path | None) -> Sections:
 def orders(
     rows: Sequence[Record],
 ) -> tuple[Float[np.ndarray, "places"], Float[np.ndarray, "places"], Float[np.ndarray, "places"]]:
-    """Return the mean share held at each rank in three orders: by score, by noisy trials, and the best possible order.
+    """Return the mean fraction of trials held at each rank in three orders: by score, by noisy trials, best possible.
 
-    There are as many ranks as the shortest plan has grasps. Grasps with equal noisy shares keep the order of the score.
+    There are as many ranks as the shortest plan has grasps. Ties in the noisy trials keep the order of the score.
     """
     places = min(len(row["shares"]) for row in rows)
     held = [np.array(row["shares"]) for row in rows]
@@ -102,7 +102,7 @@ def orders(
 
 
 def correlation(rows: Sequence[Record], key: str) -> float:
-    """Return the mean Spearman correlation of `key` and the share held, over plans in which both vary. NaN if none."""
+    """Return `key`'s Spearman correlation with the fraction of trials held, mean over plans where both vary, or NaN."""
     from scipy.stats import rankdata
 
     found = [
@@ -114,7 +114,7 @@ def correlation(rows: Sequence[Record], key: str) -> float:
 
 
 def draw_robust(rows: Sequence[Record], path: Path) -> Path:
-    """Draw the share held over the rank (left), and planning CPU time by shape (right). Return the PNG's path."""
+    """Draw the fraction held over the rank (left), and planning CPU time by shape (right). Return the PNG's path."""
     with figure(8.0, 3.0, ncols=2) as (made, (gain, cost)):
         by_score, by_noise, best = (100.0 * order for order in orders(rows))
         places = np.arange(1, len(best) + 1)

@@ -142,7 +142,7 @@ def _true_scene(stage: TabletopScene, source: str) -> Scene:
 
 
 def _grasps(case: Seen, scene: Scene, stage: TabletopScene, hand: HandModel) -> Record:
-    """Time a plan for one grasp, then plan `count`. Try verified grasps and those with a probability on the truth."""
+    """Time a plan for one grasp, then plan `count`. Try grasps on the true object if verified or with a probability."""
     first = plan_grasps(scene, hand, count=1, seed=case.seed, preset=case.preset)
     many = plan_grasps(scene, hand, count=case.count, seed=case.seed, preset=case.preset)
     protocol, truth = PROTOCOLS["standard"], _true_scene(stage, case.object)
@@ -247,7 +247,7 @@ def _marks(own: Sequence[Record]) -> str:
 
 
 def calibration(stated: Sequence[tuple[float, bool]], where: str = "") -> list[str]:
-    """Return the Brier score, and a table of the share held per tenth of probability. `stated`: (probability, held)."""
+    """Return the Brier score, and a table of the fraction held by tenth of probability. `stated`: probability, held."""
     if not stated:
         return []
     body = []

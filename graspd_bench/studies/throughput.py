@@ -70,7 +70,7 @@ def throughput_sections(records: Sequence[Record], chart: Path | None) -> Sectio
 
 
 def _figures(rows: Sequence[Record]) -> list[float]:
-    """Return tried per verified grasp. Then for one and two threads: verified grasps per second, CPU ms per grasp."""
+    """Return tries per verified grasp, then for one and two threads: verified grasps per second, CPU ms per grasp."""
     found = [sum(row["tried"] for row in rows) / (sum(row["verified"] for row in rows) or np.nan)]
     for threads in THREADS:
         here = [row for row in rows if row["threads"] == threads]

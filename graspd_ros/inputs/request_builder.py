@@ -152,7 +152,7 @@ class RequestBuilder:
     def request(
         self, request_id: str, source: str, frame: str, stamp: Time, settings: Settings, load: Load, **fields: Any
     ) -> Request:
-        """Return the request for an object in a frame. A zero stamp means now. `fields` set other fields of Request."""
+        """Return a request in the coordinate frame `frame`. A zero stamp means now. `fields`: other fields."""
         timeless = nanoseconds(stamp) == 0
         stamp = self.now() if timeless else stamp
         return Request(request_id, source, frame, stamp, settings, load, timeless=timeless, **fields)
@@ -338,7 +338,7 @@ class SourceInput:
 class Source:
     """Source of objects. The source's constant in GraspRequest is `name` in capitals.
 
-    `find` builds a Request, which reads the object later. Raises GraspdError: object missing, too old or not allowed.
+    `find` builds a Request, which reads the object later. Raises GraspdError: its data are missing, stale or not allowed.
     """
 
     name: str
@@ -346,7 +346,7 @@ class Source:
 
 
 def mesh_source(path: Path, settings: Settings, *, required: bool = False) -> tuple[Load, KnownObject | None]:
-    """Return a function that loads a mesh as a scene, and the mesh's key in the library. None without a library."""
+    """Return a function that loads a mesh as a scene, and the mesh's library key, which is None without a library."""
     mass, friction, scale = settings.mass or None, settings.friction, settings.mesh_scale
     load = lambda: run_isolated(load_scene, str(path), mass=mass, friction=friction, scale=scale)  # noqa: E731
     return load, KnownObject(path=str(path), required=required) if settings.grasp_library else None
@@ -381,7 +381,7 @@ def frame_loader(
 
 
 def frame_views(frame: SensorFrame, settings: Settings, place: CameraPlace, lookup: Lookup) -> SeenViews:
-    """Return a function that reads the frame's view and its warnings. It calls `lookup`, in the worker's thread."""
+    """Return a function that reads a sensor frame as one view, with warnings. The worker's thread calls `lookup`."""
 
     def read() -> tuple[tuple[PointCloud, ...], tuple[str, ...]]:
         cloud = seen.seen_by_camera(frame, place, lookup)
@@ -539,7 +539,7 @@ def resolve_mesh(uri: str, roots: Sequence[str]) -> Path:
 
 
 def _allowed_roots(roots: Sequence[str]) -> list[Path]:
-    """Return the existing directories of `mesh_roots`, with links resolved."""
+    """Return the existing directories of `mesh_roots`, with symbolic links resolved."""
     found = []
     for root in roots:
         with suppress(MeshError):  # the package is not installed

@@ -62,7 +62,7 @@ class SensorFrame:
         read: returns the points in `frame` [m] and the camera's position. Its arguments are the configured camera
             position and a frame lookup. It takes some milliseconds and may raise a CloudError or TransformError.
         pixels: returns one point per pixel in `frame` [m], NaN without a measurement. May raise a CloudError.
-        content: returns a digest of what was measured. Two clouds cut out of one image differ only in the digest.
+        content: returns a digest of the measured data. Two clouds cut out of one image may differ only in this digest.
     """
 
     kind: str
@@ -101,7 +101,7 @@ class SensorFrame:
 
 
 def cloud_frame(message: PointCloud2, arrived: int) -> SensorFrame:
-    """Return the sensor frame of a cloud that arrived at `arrived` [ns]. Raises RequestError: the cloud is too big."""
+    """Return a cloud message that came at `arrived` [ns] as a `SensorFrame`. Raises RequestError: cloud too big."""
     if len(message.data) > MOST_CLOUD_BYTES:
         fault = f"the cloud has {len(message.data)} bytes; valid: at most {MOST_CLOUD_BYTES}"
         raise RequestError(ErrorCode.BAD_CLOUD, fault)
@@ -112,7 +112,7 @@ def cloud_frame(message: PointCloud2, arrived: int) -> SensorFrame:
 
 
 def depth_sensor_frame(image: DepthMessage, info: CameraInfo, arrived: int) -> SensorFrame:
-    """Return the sensor frame of a depth image with calibration that arrived at `arrived` [ns]."""
+    """Return a depth image and its calibration, which came at `arrived` [ns], as a `SensorFrame`."""
     # The camera of a depth image is at the origin of its frame.
     read = lambda *_: cloud_from_depth(*depth_and_camera(image, info, rectified=True))  # noqa: E731
 
@@ -248,7 +248,7 @@ def masked_points(
 class Views:
     """Clouds of one scene in a common frame. Views are immutable, and `add` returns a new object.
 
-    `places` are the poses of a camera's own frame at each view, in the root of /tf [m].
+    `places` has the pose of the camera's frame at each view, in the root frame of /tf [m]. It may be empty.
     """
 
     frame: str = ""

@@ -92,21 +92,21 @@ def bad_message(owner: str, message: str) -> RequestError:
 
 
 def plane_of(surface: PlaneMessage, T_object_frame: Matrix | None = None) -> Plane | None:
-    """Return the support plane in the object's frame. None if all coefficients are 0. Raises RequestError: invalid."""
+    """Return the support plane in the object's frame, or None if all numbers are 0. Raises RequestError if invalid."""
     a, b, c, d = map(float, surface.coef)
     if not any((a, b, c, d)):
         return None
     length = float(np.linalg.norm([a, b, c]))
     if not (np.isfinite([a, b, c, d]).all() and length > 0):
-        raise bad_request(f"surface: {[a, b, c, d]} is no plane; valid: finite numbers, a, b, c not all 0")
+        raise bad_request(f"surface: {[a, b, c, d]} is not a plane; valid: finite numbers, a, b, c not all 0")
     plane = Plane(np.array([a, b, c]) / length, -d / length)
     return plane if T_object_frame is None else moved_plane(plane, T_object_frame)
 
 
 def with_support(load: Callable[[], Scene], plane: Plane | None) -> Callable[[], Scene]:
-    """Return a loader like `load`. If `plane` is given, it is the scene's support (`on_support`).
+    """Return a loader like `load`. If `plane` is given, it becomes the support of the loaded scene (`on_support`).
 
-    If the object is below the plane, the plane is turned, with a warning, because a plane's sign is often arbitrary.
+    If the object is below the plane, the normal is reversed, with a warning, because its sign is often arbitrary.
     """
     if plane is None:
         return load

@@ -59,7 +59,7 @@ class TransformListener:
         self._jumps = node.get_clock().create_jump_callback(back, post_callback=self._on_jump)
 
     def lookup(self, target: str, source: str, stamp: Time) -> Matrix:
-        """Return `T_target_source` at a time, 0 for the newest. Raises TransformError if the transform is unknown."""
+        """Return `T_target_source` at `stamp`, or the newest if `stamp` is 0. Raises TransformError if unknown."""
         return self._buffer.lookup(target, source, nanoseconds(stamp) or None)
 
     def lookup_in_time(self, target: str, source: str, stamp: Time, stop: StopHook) -> Matrix:
@@ -150,7 +150,7 @@ def heard_robot(node: Node, arm: str) -> str:
 
 
 def check_arm(changed: list[Parameter], robot: str) -> SetParametersResult:
-    """Refuse an arm that cannot be used. `robot` is the URDF that the node heard at its start, or ""."""
+    """Return an unsuccessful result if a changed arm cannot be used. `robot` is the URDF heard at the start, or ""."""
     try:
         for name in (parameter.value for parameter in changed if parameter.name == "arm" and parameter.value):
             # Imported here, because a node without an arm needs nothing of it.

@@ -21,7 +21,7 @@ ARGUMENTS = {
     "hand": ("", "name or path of the hand"),
     "hand_prefix": ("", "prefix of the names of the hand's joints and links"),
     "output_frame": ("", "frame of the results in /tf"),
-    "sensor_frame": ("", "frame in /tf at whose origin the camera of the clouds is"),
+    "sensor_frame": ("", "frame in /tf whose origin is the position of the camera, for clouds"),
     "params": (str(config_dir() / "graspd.yaml"), "parameter file"),
     "name": ("graspd", "name of the node"),
     "namespace": ("", "namespace of the node"),

@@ -82,7 +82,7 @@ _TEXT_ABOVE = 0.12
 
 @dataclass(frozen=True)
 class AnswerEnding:
-    """Outcome of a request, for a GraspArray. `planned` is None if the request was not worked on."""
+    """Outcome of a request, for a GraspArray. `planned` is None if the request was not processed."""
 
     status: int
     code: ErrorCode
@@ -138,7 +138,7 @@ def grasp_message(
 ) -> GraspMessage:
     """Return one grasp in the header's frame. Raises FloatingPointError if the grasp contains a NaN.
 
-    The lift acceleration depends on `mass`, the object's mass [kg]. None if unknown.
+    `mass` is the object's mass [kg], or None if unknown. The lift acceleration depends on the mass.
     """
     _check_finite(grasp, rank)
     pregrasp, closed, squeeze = (joint_message(posture, hand, header.stamp) for posture in _postures(grasp))

@@ -317,7 +317,7 @@ class Responses:
             self.not_made(request_id, "cloud", error)
 
     def refused(self, request_id: str, source: str, code: ErrorCode, message: str) -> None:
-        """Report on `~/status` and in the log why a message is not used. `request_id` is "" if it is no request."""
+        """Report on `~/status` and in the log why a message is not used. Without a request, `request_id` is ""."""
         self.publishers.emit("refused", request_id, source, code=code, message=message)
         self._log().warning(f"{request_id or source}: refused: {message}")
 

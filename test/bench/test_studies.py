@@ -144,7 +144,7 @@ def test_scans_count_by_content_and_need_a_mass(tmp_path: Path):
     keys.append(key())
     save_mesh(scan, make_shape("mug"))
     assert len({*keys, key()}) == 3
-    with pytest.raises(ConfigError, match=r"objects: shape:mug; valid: mesh files beside a csv of masses"):
+    with pytest.raises(ConfigError, match=r"objects: shape:mug; valid: mesh files in a folder with a csv of masses"):
         cameras.cases(Request(objects=("shape:mug",)))
 
 

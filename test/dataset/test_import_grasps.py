@@ -294,7 +294,7 @@ def test_isaac_joints_go_by_name(exported, tmp_path: Path):
     joints = next(iter(document["grasps"].values()))["cspace_position"]
     name, value = joints.popitem()
     other = tmp_path / "a.yaml"
-    for more, message in ((None, f"joint '{name}' of allegro_right is missing"), ("LFJ5", "'LFJ5' is no joint of")):
+    for more, message in ((None, f"joint '{name}' of allegro_right is missing"), ("LFJ5", "'LFJ5' is not a joint of")):
         joints.update({more: 0.0} if more else {})
         other.write_text(yaml.safe_dump(document))
         with pytest.raises(FormatError, match=message):
@@ -319,7 +319,7 @@ def test_an_order_that_is_not_known_or_does_not_fit_is_refused(exported, tmp_pat
     folder, _ = exported
     for words, message in (
         (("--hand", "leap_right"), "joint order: not known for leap_right, and npy files name no joints; give one: "),
-        (("--hand", "allegro_right", "--joint-order", "a,b"), "joint order: 'a' is no joint of allegro_right; valid: "),
+        (("--hand", "allegro_right", "--joint-order", "a,b"), "joint order: 'a' is not a joint of allegro_right; "),
         (("--hand", "allegro_right", "--joint-order", HAND.joint_names[0]), "of allegro_right is missing"),
     ):
         assert message in refusal_of("import", folder / "dexgraspbench", *words, "--out", tmp_path)

@@ -229,7 +229,7 @@ def test_solids_have_the_sizes_of_the_message_and_stand_about_their_middle(kind,
 BAD = {
     "primitives: dimensions [0.1], valid: 3": box(0.1),
     "meshes: 0 vertices and 0 triangles": Object(meshes=[Mesh()]),
-    "surface: [0.0, 0.0, 0.0, 1.0] is no plane": box(0.1, 0.1, 0.1, surface=Plane(coef=[0.0, 0.0, 0.0, 1.0])),
+    "surface: [0.0, 0.0, 0.0, 1.0] is not a plane": box(0.1, 0.1, 0.1, surface=Plane(coef=[0.0, 0.0, 0.0, 1.0])),
 }
 
 

@@ -186,7 +186,7 @@ def test_a_direction_and_a_surface_are_kept(folder: Path, hand: HandModel):
             GraspdError,
             "mesh_scale: 0.5 with known_object; .* valid: 0",
         ),
-        (known(surface=Plane(coef=[0.0, 0.0, 0.0, 1.0])), {}, GraspdError, "surface: .* is no plane"),
+        (known(surface=Plane(coef=[0.0, 0.0, 0.0, 1.0])), {}, GraspdError, "surface: .* is not a plane"),
     ],
 )
 def test_what_cannot_be_answered_is_named(folder: Path, hand: HandModel, fields, settings, error, told: str):

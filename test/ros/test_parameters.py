@@ -31,9 +31,9 @@ from graspd_ros.parameters import LiveSettings, Settings, check_parameters
         ("roi_max", [0.0, 1.0, math.nan], "three finite numbers"),
         ("view_point", "here", "three finite numbers"),
         ("arm", "ur99", "unknown arm 'ur99'; valid: "),
-        ("collision_objects", "bad topic", "'bad topic' is no topic; valid: a name such as /collision_object"),
-        ("deadline", "soon", "'soon' is no number"),
-        ("deadline", True, "True is no number"),
+        ("collision_objects", "bad topic", "'bad topic' is not a topic name; valid: a name such as /collision_object"),
+        ("deadline", "soon", "'soon' is not a number"),
+        ("deadline", True, "True is not a number"),
         ("deadline", 0, "0.0; valid: 0.1 to 3600"),
         *(("base_turn", value, f"{value}; valid: 0.01 to 100") for value in (0.0, -1.0, math.inf, math.nan)),
     ],
@@ -121,7 +121,7 @@ def test_an_integer_is_taken_where_a_number_is_meant_and_doubts_are_told(started
     assert "unknown parameter 'num_grasp'; did you mean 'num_grasps'?" in told
     assert "unknown parameter 'nothing_like_it'; it is ignored" in told
     assert "is above roi_max" in told
-    assert "mesh_roots: '/no/such/place' is no directory" in told
+    assert "mesh_roots: '/no/such/place' is not a directory" in told
 
 
 def test_who_describes_a_parameter_sees_the_same_type_whatever_was_set(started):
@@ -147,7 +147,7 @@ def test_what_is_warned_of_at_the_start_is_warned_of_while_the_node_runs(started
     capfd.readouterr()
     for name, value, told in (
         ("roi_max", [-20.0, 1.0, 1.0], "roi_max=[-20.0, 1.0, 1.0]: no point lies in the workspace"),
-        ("mesh_roots", ["/no/such/place"], "mesh_roots: '/no/such/place' is no directory"),
+        ("mesh_roots", ["/no/such/place"], "mesh_roots: '/no/such/place' is not a directory"),
         ("sensor_frame", "camera", "parameter sensor_frame: frame 'camera' is not in /tf yet; known: base_link, cam"),
     ):
         (result,) = node.set_parameters([Parameter(name, value=value)])

@@ -70,7 +70,7 @@ def test_a_hand_that_does_not_fit_is_refused(grasps_file, tmp_path):
     with pytest.raises(FormatError, match="its joints are not those of allegro_right"):
         open_grasps(grasps_file, hand="allegro_right")
     # A hand description with `root` begins the hand at a later link than its URDF.
-    with pytest.raises(FormatError, match="poses are those of link 'palm', but parallel_gripper begins at 'base_link'"):
+    with pytest.raises(FormatError, match="of link 'palm', but the base link of parallel_gripper is 'base_link'"):
         open_grasps(changed(grasps_file, tmp_path, hand={"base_link": "palm"}))
     strange = {"name": "mine", "urdf": "gone.urdf"}
     with pytest.raises(HandError, match=r"gone\.urdf"):
