@@ -2,8 +2,8 @@
 
 Objects with fewer earlier failures come first. At equal numbers of failures, objects with more probable grasps in the
 previous view come first, then higher objects, because nothing lies on them. An object gets one round of the planner,
-but all rounds if an earlier grasp of this or an unknown object failed. It gets at least twice the effort if an earlier
-search found no grasp. The first verified grasp ends the search. After `enough` objects, a grasp with a probability of
+but all rounds if an earlier grasp of this or an unknown object failed. It gets up to four times the effort if earlier
+searches found no grasp. The first verified grasp ends the search. After `enough` objects, a grasp with a probability of
 at least `likely` also ends the search, to limit the time. `result_of_things` returns the result of one request.
 """
 
@@ -41,9 +41,9 @@ OUT_OF_TRIES, NOT_LOOKED_AT = "no tries left", "not tried before the search ende
 _SAME_PLACE, _SLIPPED = 0.04, 0.2
 # Doubt about the scene of an object if a robot executed a grasp of the object and the grasp failed.
 _FAILED = "an earlier grasp of this object failed"
-# Effort of a search for one grasp, after one failed search and after several. An effort of 2 would not add starts,
-# because every search has at least 16 starts. After a failed search, a search for many grasps has an effort of 2.
-_HARDER, _TWICE = (4.0, 8.0), 2.0
+# Effort of a search for one grasp, after one failed search and after several, relative to the usual effort. A search
+# for many grasps has the usual effort.
+_HARDER = (2.0, 4.0)
 # Probability of an object's best grasp before any search: the mean of 93 objects in eight full bins, for two hands.
 _UNKNOWN = 0.2
 # Points belong to a known solid if the fraction `_NEARLY_ALL` of them is within `_STRAY` of the solid's surface [m].
@@ -293,7 +293,7 @@ def _thing_plan(
     lost, config = [failure.grasp for failure in failed if failure.grasp is not None], plan["preset"]
     count, seed = min(plan["count"] + 2 * len(lost), MOST_GRASPS), (plan["seed"] + len(failed)) % SEEDS
     if in_vain := sum(failure.grasp is None for failure in failed):
-        config = config.at_budget(max(_HARDER[in_vain > 1] / count, _TWICE))
+        config = config.at_budget(max(_HARDER[in_vain > 1] / count, 1.0))
     if not lost:
         config = replace(config, rounds=replace(config.rounds, most=1))
     try:

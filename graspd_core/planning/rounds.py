@@ -51,11 +51,12 @@ def rounds_of(scene: Scene, config: PlanConfig, verify: str) -> list[PlanConfig]
     """Return the settings of all rounds, with increasing effort.
 
     The first round has less effort for an object of known shape without support or obstacles. For such an object, hold
-    trials show quickly whether more effort is needed.
+    trials show quickly whether more effort is needed. If cameras saw the object, the first round has the effort of a
+    second round, because few grasps pass all robustness checks.
     """
     rounds = config.rounds
     cheap = verify != "none" and scene.support is None and not scene.obstacles and scene.confidence is None
-    first = rounds.first_budget if cheap else 1.0
+    first = rounds.first_budget if cheap else 1.0 if scene.confidence is None else rounds.growth
     most = rounds.first_budget * rounds.growth ** (rounds.most - 1)
     efforts = (min(first * rounds.growth**attempt, max(first, most)) for attempt in range(rounds.most))
     return [config.at_budget(effort) for effort in efforts]

@@ -47,7 +47,7 @@ def test_without_a_trial_or_with_something_about_it_the_first_round_has_all_step
     assert rounds(scene, "none") == all_steps
     assert rounds(replace(scene, support=Plane(np.array([0.0, 0.0, 1.0]), -0.045))) == all_steps
     assert rounds(replace(scene, obstacles=(neighbour,))) == all_steps
-    assert rounds(replace(scene, confidence=torch.ones(scene.sdf.field.shape[1:]))) == all_steps
+    assert rounds(replace(scene, confidence=torch.ones(scene.sdf.field.shape[1:]))) == [(50, 16.0)] * 3
 
 
 def test_where_nothing_is_found_more_is_sought_however_few_are_asked_for(scene, monkeypatch):
