@@ -71,11 +71,12 @@ class RoundsConfig:
     """Settings for rounds of optimisation and trials. If too few grasps hold, a further round starts from other poses.
 
     An effort of 1 leaves the method's settings unchanged. An effort below 1 multiplies the number of steps. An effort
-    above 1 multiplies the number of starting poses.
+    above 1 multiplies the number of starting poses, and draws the whole hand to the surface.
 
     Attributes:
         most: maximum number of rounds.
-        first_budget: effort of the first round for an object of known shape that stands alone. Other objects get 1.
+        first_budget: effort of the first round for an object of known shape that stands alone. Other known objects get
+            1. Objects that cameras saw get `growth`.
         growth: factor between the efforts of a round and the next round.
     """
 

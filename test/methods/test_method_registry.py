@@ -229,6 +229,17 @@ def test_half_the_budget_is_half_the_steps_and_twice_is_twice_the_starts():
     assert without.at_budget(0.3).settings.polish_steps == 0
 
 
+def test_more_than_the_usual_budget_draws_the_whole_hand_to_the_object():
+    usual, more = USUAL.settings, USUAL.at_budget(2.0).settings
+    assert (more.polish_steps, more.fine_steps) > (usual.polish_steps, usual.fine_steps)
+    assert more.polish_weights.distance > usual.polish_weights.distance
+    # What a preset already does more is kept, and twice more multiplies nothing but the starts.
+    rich = load_preset("contact_rich")
+    assert rich.at_budget(2.0).settings == replace(rich.settings, starts_per_grasp=32.0, keep_per_grasp=8.0)
+    twice = USUAL.at_budget(2.0).at_budget(2.0).settings
+    assert twice == replace(more, starts_per_grasp=32.0, keep_per_grasp=8.0)
+
+
 @given(st.floats(0.01, 10.0), st.floats(0.01, 10.0))
 def test_more_budget_is_never_less_of_anything(one: float, other: float):
     small, large = (USUAL.at_budget(budget) for budget in sorted((one, other)))
