@@ -338,7 +338,7 @@ class SourceInput:
 class Source:
     """Source of objects. The source's constant in GraspRequest is `name` in capitals.
 
-    `find` builds a Request, which reads the object later. Raises GraspdError: its data are missing, stale or not allowed.
+    `find` builds a Request, which reads the object later. Raises GraspdError: data are missing, stale or not allowed.
     """
 
     name: str
