@@ -187,9 +187,9 @@ class Point:
 
 
 def draw_charts(records: Sequence[Record], path: Path) -> dict[str, Path]:
-    """Draw all charts for which the records have data: PATH, PATH_short, PATH_planned and PATH_ladder (.png, .svg).
+    """Draw all charts for which the records have data, as png and svg. Return the path of each png by chart's name.
 
-    `path` gives PATH. Return the path of each drawn PNG by name: "speed" (PATH), "short", "planned", "ladder".
+    The files of chart "speed" are named `path`. Those of "short", "planned" and "ladder" end with _short and so on.
     """
     found = rows(records)
     swept = [row for row in found if is_sweep_value(row.name)]

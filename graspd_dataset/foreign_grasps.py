@@ -152,7 +152,7 @@ def order_of(hand: HandModel, order: Sequence[str]) -> tuple[str, ...]:
     """
     if not order and hand.name not in PALMS:
         names = ",".join(all_joint_names(hand))
-        raise ConfigError(f"joint order: not known for {hand.name}, and npy files name no joints; give one: {names}")
+        raise ConfigError(f"joint order: not known for {hand.name}; give all joints in the file's order, e.g. {names}")
     return checked_order(order or all_joint_names(hand), hand)
 
 

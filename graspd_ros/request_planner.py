@@ -154,8 +154,8 @@ class RecentRuns:
     def next_best(self, request: Request, excluded: Sequence[Matrix]) -> Planned | None:
         """Return earlier grasps of the same object that are not similar to `excluded`. None if too few are left.
 
-        Only runs with equal trials, preset and `closes_late` count, and of these the runs that tried the greatest mass.
-        Only grasps that passed every requested trial count.
+        Use only runs with the trials, preset and `closes_late` of the request. Of these, use the runs that tried the
+        greatest mass. Of their grasps, use those that passed all requested trials.
         """
         same = [run for run in self._runs.values() if run.object_key == request.object_key and request.object_key]
         same = [run for run in same if run.terms == _terms(request) and run.grasps]

@@ -149,7 +149,7 @@ def run_mano(case: HumanGrasps) -> Record:
 
 
 def mano_sections(records: Sequence[Record], chart: Path | None) -> Sections:
-    """Return a table: for each softness the objects and the mean over objects, then the results of the paper."""
+    """Return a table with rows for each softness of the flesh (by object, then the mean) and the paper's results."""
     body = []
     for softness in dict.fromkeys(r["softness"] for r in records):
         alike = [r for r in records if r["softness"] == softness]

@@ -80,7 +80,7 @@ def imported_cases(request: Request) -> tuple[ImportedCase, ...]:
     if not request.imported or not request.hand:
         raise ConfigError("imported: give both --import FOLDER and --hand NAME")
     if len(request.objects) > 1:
-        raise ConfigError(f"objects: {', '.join(request.objects)}; valid: one mesh, which replaces the files' mesh")
+        raise ConfigError(f"objects: {', '.join(request.objects)}; valid: one mesh, used for all imported files")
     trials = requested_trials(request, tuple(TRIALS))
     hand, mesh = load_hand(request.hand, candidates=1), "".join(request.objects)
     files: dict[tuple[str, float], dict[Path, int]] = {}

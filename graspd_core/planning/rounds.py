@@ -71,8 +71,8 @@ _MANY, _FIRST_BATCH = 8, 2
 # Used if no grasp holds the assumed mass: number of grasps whose payload is measured, and tried mass as a fraction of
 # the greatest payload. The tried mass is at most `light_end`, the least mass at which a grasp may be verified.
 _WEIGHED, _LIFTED = 60, 0.8
-# Planning ends if none of at least this many tried grasps lifts `light_end`. On views of `graspd bench cameras` (seeds
-# 80 to 89), later rounds verified a grasp in none of 41 such cases.
+# If none of at least this many tried grasps lifts `light_end`, only a round with more effort follows. On views of
+# `graspd bench cameras` (seeds 80 to 89), later rounds with equal effort verified a grasp in none of 41 such cases.
 _ENOUGH = 20
 
 
@@ -140,8 +140,10 @@ def run_rounds(
     hold, the next batch starts from other initial poses. Candidates that a restriction refuses are not tried.
     `prefetched` holds the worlds of the trials. If `prefetched` is None, no candidate is tried.
     """
-    state = RoundsResult(time.perf_counter())
+    state, weak = RoundsResult(time.perf_counter()), False
     for attempt, batch in enumerate(_batches(scene, rounds, count, prefetched is not None)):
+        if weak and batch.config != rounds[-1]:
+            continue
         enough, good, began = min(batch.most + state.good, count), state.good, time.perf_counter()
         options = {"config": batch.config, "hooks": _hooks(run, good), "device": device, "restrictions": restrictions}
         seek = enough - good if good or not attempt else max(enough, _MANY)
@@ -177,8 +179,11 @@ def run_rounds(
             before = state
             if scene.object.mass_assumed:
                 state = _tried_lighter(run, scene, prefetched, state, batch.config.certainty, count)
-            last = batch.ends_round == len(rounds)
-            if state.good >= count or last or _too_weak(run, scene, before, state.lowered) or run.over():
+            if state.good >= count or batch.ends_round == len(rounds) or run.over():
+                break
+            # Weak grasps call for the greatest effort, whose grasps lift most.
+            weak = _too_weak(run, scene, before, state.lowered)
+            if weak and batch.config == rounds[-1]:
                 break
     return state
 

@@ -318,7 +318,7 @@ def test_a_joint_beyond_its_limit_is_refused_and_counted(exported, tmp_path: Pat
 def test_an_order_that_is_not_known_or_does_not_fit_is_refused(exported, tmp_path: Path, refusal_of):
     folder, _ = exported
     for words, message in (
-        (("--hand", "leap_right"), "joint order: not known for leap_right, and npy files name no joints; give one: "),
+        (("--hand", "leap_right"), "joint order: not known for leap_right; give all joints in the file's order, e.g. "),
         (("--hand", "allegro_right", "--joint-order", "a,b"), "joint order: 'a' is not a joint of allegro_right; "),
         (("--hand", "allegro_right", "--joint-order", HAND.joint_names[0]), "of allegro_right is missing"),
     ):

@@ -119,7 +119,9 @@ def check_scene(views: Sequence[PointCloud]) -> None:
         if share > MAX_HIDDEN_SHARE:
             raise _refusal(view.viewpoint, f"{100 * share:.1f} % of its points are hidden from there by other points")
         if things_behind(points, view.viewpoint):
-            raise _refusal(view.viewpoint, "this place lies in the plane of the table, or objects are behind the table")
+            raise _refusal(
+                view.viewpoint, "this place lies in the table's plane, or most points lie on the table's far side"
+            )
 
 
 def check_viewpoint(thing: PointCloud, view: PointCloud, up: Vector | None = None) -> str:

@@ -272,7 +272,7 @@ def _is_guessed(
 
 
 def _open_area(mesh: TriangleMesh, standing: bool) -> tuple[Float[np.ndarray, "faces"], Float[np.ndarray, "faces 3"]]:
-    """Return area [m²] and unit normal of each face. The area of faces on the support at z = 0 is set to zero."""
+    """Return area [m²] and unit normal of each face. If `standing`, faces on the support have no area."""
     across = scaled_normals(mesh.vertices, mesh.faces)
     length = np.linalg.norm(across, axis=1)
     foot = (across[:, 2] < -_DOWN * length) & (mesh.vertices[mesh.faces, 2].max(1) < MAX_FOOT_HEIGHT_M)

@@ -106,8 +106,9 @@ def turned(rows: Float[np.ndarray, "n 4"], step: float) -> Bool[np.ndarray, "n"]
 def settle_axis(surfels: Surfels, axis: Axis, step: float) -> Axis:
     """Tilt the axis by Gauss-Newton steps until the profile of the points is as thin as possible.
 
-    Points far from the profile, such as those of a handle, count less and less. Use only the tilts of each step. Take
-    the position from the normals, because points seen from one side leave the position uncertain along the view.
+    Points far from the profile, such as those of a handle, count less and less. Each step shifts and tilts the axis,
+    but only the tilts are used. `fit_axis` then shifts the axis by the normals, because points seen from one side leave
+    its position uncertain along the view.
     """
     for round_ in range(GAUSS_NEWTON_STEPS):
         right = perpendicular(axis.direction)
