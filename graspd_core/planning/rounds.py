@@ -176,14 +176,9 @@ def run_rounds(
         # With an unverified grasp, lower the mass only after the second round, which may find stronger grasps.
         unsure = any(grasp.verdict is Verdict.UNVERIFIED for grasp in state.grasps)
         if batch.ends_round > unsure and not state.good and prefetched is not None and state.lowered is None:
-            before = state
-            if scene.object.mass_assumed:
-                state = _tried_lighter(run, scene, prefetched, state, batch.config.certainty, count)
-            if state.good >= count or batch.ends_round == len(rounds) or run.over():
-                break
-            # Weak grasps call for the greatest effort, whose grasps lift most.
-            weak = _too_weak(run, scene, before, state.lowered)
-            if weak and batch.config == rounds[-1]:
+            last = batch.ends_round == len(rounds)
+            state, weak = _weighed(run, scene, prefetched, state, batch.config.certainty, count, last=last)
+            if state.good >= count or last or (weak and batch.config == rounds[-1]) or run.over():
                 break
     return state
 
@@ -222,6 +217,27 @@ def _batches(scene: Scene, rounds: Sequence[PlanConfig], count: int, tried: bool
 
 def _searched_since(state: RoundsResult, began: float) -> RoundsResult:
     return replace(state, optimise_time=state.optimise_time + time.perf_counter() - began)
+
+
+def _weighed(
+    run: Run,
+    scene: Scene,
+    prefetched: Prefetched,
+    state: RoundsResult,
+    certainty: CertaintyConfig,
+    count: int,
+    *,
+    last: bool,
+) -> tuple[RoundsResult, bool]:
+    """Try grasps with a lower mass if the mass is assumed. Return also whether all are too weak, if a round follows.
+
+    After weak grasps, only the rounds with the greatest effort are worth their time, because their grasps lift most.
+    """
+    before = state
+    if scene.object.mass_assumed:
+        state = _tried_lighter(run, scene, prefetched, state, certainty, count)
+    unneeded = last or state.good >= count or run.over()
+    return state, not unneeded and _too_weak(run, scene, before, state.lowered)
 
 
 def _tried_lighter(
