@@ -67,17 +67,17 @@ MAY_IMPORT = {
 # Most lines of Python per package. They are lowered when the code shrinks, and raised only with a reason.
 # The layout aims at 22,000 of graspd_core, 4,500 of graspd_ros, 26,000 of test. Input checks added 1,700, 500, 3,300.
 MAX_PACKAGE_LINES = {
-    "graspd_core": 27_604,
-    "graspd_ros": 5_219,
-    "graspd_bench": 8_070,
+    "graspd_core": 27_651,
+    "graspd_ros": 5_231,
+    "graspd_bench": 8_071,
     "graspd_dataset": 3_008,
     "graspd_viewer": 2_414,
     "graspd_cell": 3_731,
-    "test": 34_064,
+    "test": 34_104,
 }
 # Lines that a program reaches through its imports, those inside functions too.
 # The layout aims at 22,000 of the node.
-MAX_REACH = {"graspd_core.cli.synthesize_command": 22_760, "graspd_ros.node": 26_528}
+MAX_REACH = {"graspd_core.cli.synthesize_command": 22_806, "graspd_ros.node": 26_586}
 
 # The launch file imports this one where ROS runs it, perhaps without any library of graspd.
 SHORT = ("graspd_core/paths.py",)
