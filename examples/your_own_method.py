@@ -1,6 +1,6 @@
 """Add your own planning method, and use and measure it like the built-in methods:
 
-    graspd synthesize shape:box --plugin examples/your_own_method.py --method draws -n 2 --out grasps.json
+    graspd synthesize shape:box --plugin examples/your_own_method.py --method draws -n 1 --out grasps.json
     graspd bench --plugin examples/your_own_method.py --presets draws.yaml --objects shape:box
 
 `draws.yaml` has the line `method: draws` and settings as `draws: {per_grasp: 64}`. A method returns hand poses in the

@@ -2,7 +2,8 @@
 
 As a plugin: graspd synthesize OBJECT --plugin examples/your_own_metric.py --out grasps.json.
 
-A metric is one row of `METRICS`. Every verified grasp then has the metric, and files and tables show the metric.
+A metric is one row of `METRICS`. Every verified grasp then has the metric, for example in the file of `--out`.
+`graspd bench --readme PAGE.md` writes the metric's column to the section `bench-objects` of the page.
 `grasp.placed` has surface samples of the hand in the object's frame, `grasp.context` has object and hand.
 """
 

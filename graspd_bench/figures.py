@@ -136,7 +136,8 @@ def _row(group: Sequence[Record], ran: Collection[str]) -> Row:
     for clock in ("cpu", "wall"):
         values[f"first_{clock}"] = _median((r.get("first_verified") or {}).get(clock) for r in group)
     values["peak_mb"] = max((r["peak_mb"] for r in group), default=None)
-    values["rounds"] = _median(float(r["rounds"]) if "rounds" in r else None for r in group)
+    # A method that sends no progress has 0 rounds in its record, which means unknown.
+    values["rounds"] = _median(float(r["rounds"]) if r.get("rounds") else None for r in group)
     one = group[0]
     return Row(one["name"], one["object"], one["method"], count, held, spent, values, quartiles)
 

@@ -94,8 +94,8 @@ class TransformBuffer:
             target, known = self._chain(source)[-1] if target == ROOT else _name(target), self.frames()
             for name in (target, source):
                 if name not in known:
-                    told = f"unknown frame {name!r}; known: {', '.join(known) or 'none'}"
-                    raise TransformError(told + self.refused)
+                    heard = f"known: {', '.join(known)}" if known else "no transform was received on /tf or /tf_static"
+                    raise TransformError(f"unknown frame {name!r}; {heard}{self.refused}")
             up_target, up_source = self._chain(target), self._chain(source)
             common = next((name for name in up_source if name in up_target), None)
             if common is None:

@@ -13,7 +13,8 @@ import signal
 import sys
 import tempfile
 import threading
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, NoReturn
 
@@ -63,8 +64,9 @@ def run_command(
     _on_signal(stop.set)
     arguments = sys.argv if args is None else [name, *args]
     try:
-        options = parse(remove_ros_args(arguments)[1:])
-        rclpy.init(args=arguments, signal_handler_options=SignalHandlerOptions.NO)
+        with _ros_arguments():
+            options = parse(remove_ros_args(arguments)[1:])
+            rclpy.init(args=arguments, signal_handler_options=SignalHandlerOptions.NO)
         work(options, stop)
     except GraspdError as error:
         sys.stderr.write(f"{name}: {error}\n")
@@ -209,16 +211,26 @@ def _make_node(args: list[str] | None, on_failure: Callable[[], None]) -> GraspN
     from graspd_ros.grasp_node import GraspNode
 
     try:
-        rclpy.init(args=args, signal_handler_options=SignalHandlerOptions.NO)
-    except RuntimeError as error:  # rcl reports invalid arguments on several lines
-        sys.stderr.write(f"graspd_node: {' '.join(str(error).split())}\n")
-        return None
-    try:
+        with _ros_arguments():
+            rclpy.init(args=args, signal_handler_options=SignalHandlerOptions.NO)
         return GraspNode(on_failure=on_failure)
     except (GraspdError, ParameterException) as error:
         sys.stderr.write(f"graspd_node: {error}\n")
         try_shutdown()
         return None
+
+
+@contextmanager
+def _ros_arguments() -> Iterator[None]:
+    """Raise ConfigError if ROS refuses an argument."""
+    try:
+        yield
+    except RuntimeError as error:
+        told = " ".join(str(error).split())  # rcl reports invalid arguments on several lines
+        if type(error).__name__ == "UnknownROSArgsError":  # its text is only the list of the arguments
+            valid = "-p NAME:=VALUE, --params-file FILE.yaml, -r FROM:=TO, --log-level LEVEL"
+            told = f"unknown ROS arguments: {told.strip('[]')}; valid: {valid}"
+        raise ConfigError(told) from error
 
 
 def log_directory() -> str:

@@ -17,6 +17,7 @@ import pytest
 
 import graspd_core
 from graspd_core.cli import build_parser
+from graspd_core.optimize import plan_config
 from graspd_core.optimize.closed_form.closed_form_config import ClosedFormConfig
 from graspd_core.optimize.graspd2022.graspd2022_config import Graspd2022Config
 from graspd_core.optimize.plan_config import load_preset
@@ -144,12 +145,13 @@ def test_your_own_metric(run: Run, tmp_path: Path, monkeypatch: pytest.MonkeyPat
     assert 0 < best["metrics"]["contact_offset_mm"] < 100
 
 
-def test_your_own_metric_is_a_plugin(tmp_path: Path):
+def test_your_own_metric_is_a_plugin(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     plugin = str(EXAMPLES / "your_own_metric.py")
     done = graspd(tmp_path, "synthesize", "shape:box", "--plugin", plugin, "-n", "1", "--out", "g.json")
     assert done.returncode == 0, done.stderr
     assert "contact_offset_mm" in json.loads((tmp_path / "g.json").read_text())["grasps"][0]["metrics"]
-    assert "contact_offset " in graspd(tmp_path, "metrics", "--plugin", plugin).stdout
+    monkeypatch.setenv("GRASPD_PLUGINS", plugin)
+    assert "contact_offset " in graspd(tmp_path, "metrics").stdout
 
 
 PLUGIN = ("--plugin", str(EXAMPLES / "your_own_method.py"))
@@ -190,6 +192,13 @@ def test_a_plugin_that_cannot_be_run_is_one_line(tmp_path: Path, name: str, text
     command = [sys.executable, "-P", "-m", "graspd_core.cli", "synthesize", "shape:box", "--plugin", name]
     done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True)
     assert (done.returncode, done.stderr) == (2, f"graspd: {told}\n")
+
+
+def test_a_bad_list_of_plugins_is_no_fault_of_the_preset(monkeypatch: pytest.MonkeyPatch, refusal_of):
+    monkeypatch.setenv("GRASPD_PLUGINS", "nothing.py")
+    plan_config.run_plugins.cache_clear()
+    told = "GRASPD_PLUGINS: nothing.py is not a Python file; valid: paths of .py files, separated by ':'"
+    assert refusal_of("synthesize", "shape:box") == f"graspd: {told}\n"
 
 
 def test_many_objects(run: Run, tmp_path: Path, capsys: pytest.CaptureFixture[str]):

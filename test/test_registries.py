@@ -12,6 +12,7 @@ from std_msgs.msg import Header
 
 from graspd_bench import tables
 from graspd_core import PlanConfig, load_hand, load_scene
+from graspd_core.errors import ConfigError
 from graspd_core.io.grasps_json import grasps_of, result_document
 from graspd_core.types import Contact, Grasp, GraspResult, Outcome, Posture, Timing, TrialResult, Verdict
 from graspd_core.verify.metrics import METRICS, Metric, measure
@@ -64,6 +65,15 @@ def test_a_metric_is_one_row(grasp, hand, target, monkeypatch: pytest.MonkeyPatc
     event = result_event(GraspResult(Outcome.SUCCEEDED, (measured,), Timing(), 0, "closed_form"))
     assert event["best"]["metrics"]["height_mm"] == 250.0
     assert "| `height` | mm | z of the base link |" in tables.metrics_table()
+
+
+@pytest.mark.parametrize(
+    ("measures", "told"), [(lambda g: "tall", "ValueError: could not convert"), (lambda g: g.nothing, "AttributeError")]
+)
+def test_a_metric_that_gives_no_number_is_named(target, hand, grasp, monkeypatch, measures: Any, told: str):
+    monkeypatch.setitem(METRICS, "height", replace(HEIGHT, measure=measures))
+    with pytest.raises(ConfigError, match=f"^metric 'height': {told}"):
+        measure(make_metrics_context(target, hand), grasp.grasp)
 
 
 def test_a_trial_is_one_row(grasp, hand, target, monkeypatch: pytest.MonkeyPatch):

@@ -11,7 +11,7 @@ from typing import Any
 from graspd_core.cli.options import add_plugin_option
 from graspd_core.cli.output import answer
 from graspd_core.cli.running import EXIT_OK
-from graspd_core.optimize.plan_config import method_names, method_row, preset_names
+from graspd_core.optimize.plan_config import method_names, method_row, preset_names, run_plugins
 from graspd_core.paths import config_dir
 
 
@@ -46,6 +46,7 @@ def _presets() -> dict[str, str]:
 def _metrics() -> dict[str, str]:
     from graspd_core.verify.metrics import METRICS
 
+    run_plugins()
     rows = ((row, _first_sentence(row.description)) for row in METRICS.values())
     return {row.name: f"{about} [{row.unit}]" if row.unit else about for row, about in rows}
 

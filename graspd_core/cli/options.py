@@ -55,7 +55,7 @@ def add_planning_options(parser: argparse.ArgumentParser) -> None:
     add_plugin_option(parser)
     parser.add_argument("--preset", default="balanced", help=f"{', '.join(preset_names())}, or a .yaml file")
     parser.add_argument("--seed", type=int, default=0)
-    about = "mass of the object (default: the greatest mass that its volume allows)"
+    about = "mass of the object (default: the greatest plausible mass for its volume)"
     parser.add_argument("--mass", type=float, metavar="KG", help=about)
     parser.add_argument("--friction", type=float, default=0.6, metavar="MU", help="friction coefficient (default 0.6)")
     parser.add_argument("--deadline", type=float, metavar="SEC", help="time limit incl. loading; found grasps are kept")
@@ -106,7 +106,7 @@ def summary(result: GraspResult, wanted: int, different: int) -> str:
     good = good_grasps(result)
     kind = "unverified" if any(not grasp.trials for grasp in result.tried) else "verified"
     ending = result.message or result.outcome.value
-    copies = f", {different} of them over 20 mm or 20° apart" if different < good else ""
+    copies = f", {different} without near-duplicates" if different < good else ""
     lines = [f"{good} of {wanted} grasps ({kind}{copies}, {len(result.tried)} tried): {ending}"]
     timing = result.timing
     lines.append(

@@ -122,7 +122,7 @@ class HeldShares:
 
 
 # Measured on 366 grasps planned without a mass and 547 with the true mass, on 76 single views (docs/clouds.md).
-# An assumed mass is the heavy end, the most that the volume allows. So trials lift more than most objects weigh.
+# An assumed mass is the heavy end, the greatest plausible one for the volume. Trials lift more than most objects weigh.
 MASS_ASSUMED = HeldShares(0.81, 0.82, 0.95, 0.78, 0.76)
 MASS_KNOWN = HeldShares(0.79, 0.89, 0.95, 0.65, 0.85)
 # Masses as fractions of the heavy end, and for each mass the fraction of objects that weigh at most this mass. Counted
@@ -135,12 +135,12 @@ DOUBTED_SHARE = 0.6
 
 
 def share_as_light(mass: float, heavy: float) -> float:
-    """Return the fraction of objects that weigh at most `mass` [kg], if their volume allows up to `heavy` [kg]."""
+    """Return the fraction of objects that weigh at most `mass` [kg], if the greatest plausible mass is `heavy` [kg]."""
     return float(np.interp(mass / heavy, _MASSES, _LIGHTER))
 
 
 def light_end(heavy: float) -> float:
-    """Return the least mass [kg] that a verified grasp must lift, if the object's volume allows up to `heavy` [kg]."""
+    """Return the least mass [kg] that a verified grasp must lift, if the greatest plausible mass is `heavy` [kg]."""
     return float(np.interp(LEAST_LIGHT, _LIGHTER, _MASSES)) * heavy
 
 

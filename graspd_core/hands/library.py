@@ -48,9 +48,10 @@ def load_hand(name_or_path: str | Path, *, candidates: int = 600, prefix: str = 
     path = _find(name_or_path)
     if path.suffix in (".yaml", ".yml"):
         description = read_description(path)
-        hand = apply_description(_with_effort(read_hand_file(description.urdf, description.root)), description)
+        hand = apply_description(read_hand_file(description.urdf, description.root), description)
     else:
-        hand = default_postures(default_palm(_with_effort(read_hand_file(path))))
+        hand = default_postures(default_palm(read_hand_file(path)))
+    hand = _with_effort(hand)
     hand = replace(hand, adjacent=adjacent_links(hand), warnings=(*hand.warnings, *hand_warnings(hand)))
     return _prefixed(with_candidates(hand, candidates), prefix)
 
@@ -100,8 +101,14 @@ def _find(name_or_path: str | Path) -> Path:
 
 
 def _with_effort(hand: HandModel) -> HandModel:
-    default = np.where(hand.slides, DEFAULT_FORCE, DEFAULT_EFFORT)
-    return replace(hand, effort=np.where(np.isfinite(hand.effort), hand.effort, default))
+    """Return the hand with the default effort for each joint that has none. A warning names these joints."""
+    lost, told = ~np.isfinite(hand.effort), []
+    for default, unit, kind in ((DEFAULT_EFFORT, "N·m", ~hand.slides), (DEFAULT_FORCE, "N", hand.slides)):
+        if names := [name for name, unknown in zip(hand.joint_names, lost & kind, strict=True) if unknown]:
+            warning = f"no effort is given for {', '.join(names)}: {default:g} {unit} is assumed"
+            told.append(f"{warning}; set `effort` in a hand description")
+    effort = np.where(lost, np.where(hand.slides, DEFAULT_FORCE, DEFAULT_EFFORT), hand.effort)
+    return replace(hand, effort=effort, warnings=(*hand.warnings, *told))
 
 
 # Greatest plausible effort of a revolute joint [N·m] and of a prismatic joint [N].

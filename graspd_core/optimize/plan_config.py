@@ -103,21 +103,21 @@ def _registered() -> dict[str, EntryPoint]:
 
 
 @cache
-def _run_plugins() -> None:
-    """Load the parent process's plugins. Do so after the import of this module, because plugins import this module."""
+def run_plugins() -> None:
+    """Load the plugins that GRASPD_PLUGINS lists. Do so after importing this module, because plugins import it."""
     for path in plugin_files():
-        load_plugin(path)
+        load_plugin(path, _PLUGINS, f"paths of .py files, separated by {os.pathsep!r}")
 
 
 def method_names() -> tuple[str, ...]:
     """Return the names of all methods, of graspd_core and of other packages."""
-    _run_plugins()
+    run_plugins()
     return tuple(dict.fromkeys((*METHODS, *_registered())))
 
 
 def method_row(name: Any, where: str = "config") -> Method:
     """Return the row of a method. Raises ConfigError: the method is unknown. The message begins with `where`."""
-    _run_plugins()
+    run_plugins()
     if not isinstance(name, str) or (name not in METHODS and name not in _registered()):
         raise ConfigError(f"{where}.method: unknown method {short_repr(name)}; {choices(name, method_names())}")
     if name not in METHODS:
@@ -242,6 +242,7 @@ def load_preset(name: str) -> PlanConfig:
     Raises:
         ConfigError: the preset does not exist, the YAML is malformed, or a key or value is invalid.
     """
+    run_plugins()  # Otherwise, `yaml_values` would report a fault of a plugin as a fault of the preset's file.
     by_path = Path(name).suffix in (".yaml", ".yml") or "/" in name
     path = Path(name) if by_path else config_dir() / "presets" / f"{name}.yaml"
     if not path.is_file():
@@ -251,15 +252,17 @@ def load_preset(name: str) -> PlanConfig:
         return plan_config(values, where=path.name)
 
 
-def load_plugin(path: str) -> str:
+def load_plugin(path: str, where: str = "plugin", valid: str = "the path of a .py file") -> str:
     """Run a Python file that registers methods, metrics or trials. Child processes run it too. Return its path.
+
+    `where` and `valid` are words for an error: what gave the path, and what is valid there.
 
     Raises:
         ConfigError: the file does not exist, its module name is taken, or the file raises.
     """
     file = Path(path).resolve()
     if file.suffix != ".py" or not file.is_file():
-        raise ConfigError(f"plugin: {path} is not a Python file; valid: the path of a .py file")
+        raise ConfigError(f"{where}: {path} is not a Python file; valid: {valid}")
     if str(file.parent) not in sys.path:
         sys.path.append(str(file.parent))
     try:

@@ -49,7 +49,7 @@ def load_scene(
 
     Args:
         source: a mesh, the path of a mesh, `shape:NAME`, or the path of a point cloud or depth image to reconstruct.
-        mass: mass of the object [kg]. None assumes the most that the volume allows (`heavy_mass`), with a warning.
+        mass: mass of the object [kg]. None assumes the greatest plausible mass (`heavy_mass`), with a warning.
         friction: Coulomb friction coefficient between hand and object.
         scale: factor that converts the file's coordinates to metres.
         resolution: the distance grid has at most `resolution`³ nodes. `plan_grasps` uses the value of its preset.

@@ -146,7 +146,7 @@ def plan_any_thing(
         settings: settings for segmentation, reconstruction and obstacles.
         surface: support plane of all objects, if it is known.
         solids: known solids by name, in the frame of the views [m]: obstacles, padded by at least 5 mm, never grasped.
-        mass: mass of each object [kg]. None assumes the greatest mass that the object's volume allows (`heavy_mass`).
+        mass: mass of each object [kg]. None assumes the greatest plausible mass for the object's volume (`heavy_mass`).
         friction: Coulomb friction coefficient between hand and objects.
         source: name of the views, for messages.
         failures: failures of earlier requests. Grasps like a failed grasp are left out (`unlike`).

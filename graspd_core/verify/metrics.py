@@ -12,6 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 import torch
 
+from graspd_core.errors import ConfigError, GraspdError, first_line
 from graspd_core.hands.model import HandModel
 from graspd_core.se3 import rotation_from_quaternion
 from graspd_core.types import Grasp, GraspMetrics, Posture
@@ -136,10 +137,21 @@ def measure(context: MetricsContext, posture: Posture, *, max_contacts: int = MA
     """Measure all metrics of the context's hand at `posture` on the context's object.
 
     ε and volume use at most `max_contacts` contacts. A metric that another step measures is None.
+    Raises ConfigError: the function of a plugin's metric raises, or returns no number.
     """
     grasp = PreparedGrasp(context, posture, max_contacts)
-    values = {name: row.measure(grasp) if row.measure else None for name, row in METRICS.items()}
-    return GraspMetrics({name: None if value is None else float(value) for name, value in values.items()})
+    return GraspMetrics({name: _value(row, grasp) for name, row in METRICS.items()})
+
+
+def _value(row: Metric, grasp: PreparedGrasp) -> float | None:
+    try:
+        value = row.measure(grasp) if row.measure else None
+        return None if value is None else float(value)
+    except Exception as error:
+        # A plugin's function may raise any exception. A fault of a built-in metric shows its traceback.
+        if row in _ROWS or isinstance(error, GraspdError | MemoryError):
+            raise
+        raise ConfigError(f"metric {row.name!r}: {type(error).__name__}: {first_line(error)}") from error
 
 
 # Two grasps are different if their palms are this far apart [m] or their base rotations differ by this angle [rad].

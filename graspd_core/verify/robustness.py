@@ -247,7 +247,7 @@ def _places(scene: Scene, trials: TrialContext, though_failed: float) -> CheckSt
 def doubted_if_weak(checks: RobustnessChecks, most: float, heavy: float) -> RobustnessChecks:
     """Replace the checks by a doubt if too many objects of the same volume weigh more than the payload `most` [kg].
 
-    `heavy` is the greatest mass that the object's volume allows [kg]. If there are doubts already, change nothing.
+    `heavy` is the greatest plausible mass for the object's volume [kg]. If there are doubts already, change nothing.
     """
     if checks.doubts or most >= light_end(heavy):
         return checks
@@ -258,7 +258,7 @@ def doubted_if_weak(checks: RobustnessChecks, most: float, heavy: float) -> Robu
 def less_sure(checks: RobustnessChecks, most: float, heavy: float) -> RobustnessChecks:
     """Scale all probabilities by the fraction of objects of equal volume that weigh at most the payload `most` [kg].
 
-    First, `doubted_if_weak` may replace the checks by a doubt. `heavy` is the greatest mass the volume allows [kg].
+    First, `doubted_if_weak` may replace the checks by a doubt. `heavy` is the greatest plausible mass [kg].
     """
     checks, share = doubted_if_weak(checks, most, heavy), share_as_light(most, heavy)
     stages = tuple(replace(stage, though_failed=share * stage.though_failed) for stage in checks.stages)

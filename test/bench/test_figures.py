@@ -126,6 +126,8 @@ def test_the_tables_are_these(record, planned):
     records = [record("fast"), record(), record(thing="mug", held=3, grasps=four), planned(), record("steps=90")]
     assert tables.summary_table(records) == SUMMARY
     assert tables.planned_table(records) == PLANNED
+    silent = tables.planned_table([planned(rounds=0)])
+    assert silent == PLANNED.replace("| 2 | 600 |", "| – | 600 |"), "a method that sends no progress has unknown rounds"
     objects = tables.object_tables(records)
     assert "| mug | 3/4 | 50% | 0.20 | 1.50 | 20.0 | – |" not in objects, "columns without figures are left out"
     assert "| mug | 3/4 | 50% | 0.20 | 1.50 | 20.0 | 8 | 0.5 | 1.67 |" in objects

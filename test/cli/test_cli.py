@@ -177,6 +177,8 @@ def test_the_summary_lists_three_grasps_and_counts_the_others():
         for count in (3, 5)
     ]
     assert [line[-1] for line in lines] == ["  #2: 0 contacts", "  and 2 more"]
+    told = summary(GraspResult(Outcome.SUCCEEDED, (grasp,) * 2, Timing(), 0, "closed_form"), 2, different=1)
+    assert told.startswith("2 of 2 grasps (verified, 1 without near-duplicates, 2 tried): ")
 
 
 @pytest.mark.parametrize(

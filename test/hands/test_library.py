@@ -72,6 +72,8 @@ def test_a_bare_urdf_with_a_mesh_loads_with_a_warning(gripper: Path) -> None:
     assert any("open and closed posture guessed" in text for text in hand.warnings)
     assert any("joint 'hinge' has no limits" in text for text in hand.warnings)
     assert (hand.lower, hand.upper) == (pytest.approx([-np.pi]), pytest.approx([np.pi]))
+    told = "no effort is given for hinge: 0.7 N·m is assumed; set `effort` in a hand description"
+    assert told in hand.warnings
     assert hand.effort == pytest.approx([0.7])  # an effort of 0 is a placeholder, not a locked joint
     np.testing.assert_allclose(hand.joint_axis[1], [0, 1, 0])
     hull = hand.primitives_of[1][0]

@@ -306,9 +306,13 @@ CLOUDS = {
         archive(points=in_world(ROWS), viewpoint=POSE[:3, 3]), BOTTLE, "NVlabs/GraspGen#43"
     ),
     "a cloud in mm": Situation(
-        array(1000 * ROWS), "in millimetres, divide them by 1000", "Lewis-Stuart-11/PlantDreamer#3"
+        array(1000 * ROWS), r"in millimetres, divide them by 1000 \(--units mm", "Lewis-Stuart-11/PlantDreamer#3"
     ),
     "a cloud in mm, said": Situation(array(1000 * ROWS), BOTTLE, "Lewis-Stuart-11/PlantDreamer#3", {"scale": 0.001}),
+    "points in m, the camera's place in mm": Situation(
+        archive(points=in_world(ROWS), viewpoint=1000 * POSE[:3, 3]),
+        r"if the camera's position \(.*\) is in millimetres, give it in metres",
+    ),
     "a cloud in cm": Situation(array(100 * ROWS), "in centimetres, divide them by 100", "graspnet/anygrasp_sdk#171"),
     "nothing but NaN": Situation(array(np.full((90, 3), np.nan)), "NaN", "isl-org/Open3D#1188"),
     "a cloud without points": Situation(ply(np.zeros((0, 3))), "empty", "QingyongHu/RandLA-Net#197"),

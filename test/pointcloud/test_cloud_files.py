@@ -52,6 +52,12 @@ def test_a_ply_with_faces_is_a_mesh(tmp_path):
             lambda p: np.save(p, np.array({"points": 1}, dtype=object)),
             r"a pickled Python object, .*np.savez\(path",
         ),
+        (
+            "a.npz",
+            lambda p: np.savez(p, points=np.ones((4, 3)), points_rgb=np.ones((4, 3)), View_Point=np.ones(3)),
+            "a.npz: unknown array 'View_Point'; did you mean 'viewpoint'",
+        ),
+        ("a.npz", lambda p: np.savez(p, depth=np.ones((4, 3)), K=MATRIX, t_world_camera=1), "mean 'T_world_camera'"),
         ("a.xyz", lambda p: p.write_text("0,0,1\n0,1,1\n"), "commas separate its numbers"),
         ("a.mcap", lambda p: p.write_bytes(b"x"), "is a recording of ROS 2; read it with graspd replay a.mcap"),
         ("a.las", lambda p: p.write_bytes(b"rubbish"), "unknown cloud ending '.las'; valid endings: npy"),

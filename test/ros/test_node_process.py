@@ -106,6 +106,7 @@ def test_a_bad_parameter_or_argument_ends_the_start_with_one_line(tmp_path, doma
         "deadline": ["-p", "deadline:=soon"],
         # What ROS itself cannot read.
         "foo": ["-p", "foo"],
+        "unknown ROS arguments: 'num_grasps:=2', '--bar'; valid: -p NAME:=VALUE": ["num_grasps:=2", "--bar"],
         "none": ["--params-file", "none.yaml"],
     }
     for line, culprit in zip(refusals(tmp_path, domain, list(cases.values())), cases, strict=True):

@@ -121,6 +121,7 @@ def test_the_command_loops_under_other_names_until_a_signal(client, start_python
         (["BAG", "--rate", "0"], "--rate: 0.0; valid: above 0"),
         (["BAG", "--topics", "/nothing"], "no topic '/nothing'; the bag has: /play/camera_info"),
         (["BAG", "--backwards"], "unrecognized arguments: --backwards"),
+        (["BAG", "--ros-args", "--foo"], "unknown ROS arguments: '--foo'; valid: -p NAME:=VALUE"),
     ],
 )
 def test_bad_input_is_named_in_one_line(bag, capsys, arguments, culprit):

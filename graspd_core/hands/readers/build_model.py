@@ -240,7 +240,8 @@ def _settled(
         leaders[name] = _finite(path, joint)
         if leaders[name] is not joint:
             turn = f"[{leaders[name].lower:.3g}, {leaders[name].upper:.3g}]"
-            warnings.append(f"joint {name!r} has no limits: restricted to {turn} rad")
+            limits = "no limits" if np.isinf(joint.upper - joint.lower) else "limits more than two turns apart"
+            warnings.append(f"joint {name!r} has {limits}: restricted to {turn} rad")
     for follower in followers:
         leader, multiplier, _ = couplings[follower.name]
         slide = abs(multiplier) * (leaders[leader].upper - leaders[leader].lower)

@@ -7,8 +7,9 @@ Cloud Library).
 
 from __future__ import annotations
 
+import difflib
 import re
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from io import BytesIO
 from pathlib import Path
@@ -35,6 +36,7 @@ CLOUD_ENDINGS = ("npy", "npz", "pcd", "ply", "xyz")
 
 _LONGEST_HEADER = 2**20  # of a ply file [bytes]
 _ROTATION_TOLERANCE = 1e-4
+_ALMOST = 0.85  # least similarity of a misspelt name. Other arrays are often called like points_rgb.
 # Maximum size of an unpacked archive [bytes]. 100 depth images of two million 16-bit pixels take a fifth of this limit.
 _MAX_UNPACKED_BYTES = 2**31
 
@@ -233,9 +235,19 @@ def recording_message(path: Path) -> str:
     return f"is a bag of ROS 1; convert it first: rosbags-convert --src {path.name} --dst {path.stem}"
 
 
+def refuse_near_names(given: Collection[str], optional: Sequence[str], kind: str) -> None:
+    """Raise CloudError if an optional name is missing, but a similar name is given, which nothing would read."""
+    plain = {name.lower().replace("_", ""): name for name in given}
+    for name in optional:
+        near = difflib.get_close_matches(name.lower().replace("_", ""), plain, 1, _ALMOST)
+        if near and name not in given:
+            raise CloudError(f"unknown {kind} {plain[near[0]]!r}; did you mean {name!r}?")
+
+
 def _points_view(arrays: Mapping[str, np.ndarray], said: Vector | None) -> PointCloud:
     if "points" not in arrays:
         raise CloudError(f"holds no array called 'points', 'depth' or 'depths'; it has: {', '.join(arrays) or 'none'}")
+    refuse_near_names(arrays, ("viewpoint", "forward"), "array")
     points = _numbers(arrays, "points")
     viewpoint = _numbers(arrays, "viewpoint") if "viewpoint" in arrays else np.zeros(3)
     viewpoint = viewpoint if said is None else said
@@ -263,6 +275,7 @@ def _depth_views(arrays: Mapping[str, np.ndarray], scale: float) -> tuple[PointC
     for needed in ("K", place) if several else ("K",):
         if needed not in arrays:
             raise CloudError(f"holds {name!r} but no {needed!r}; it has: {', '.join(arrays)}")
+    refuse_near_names(arrays, ("distortion",) if several else ("distortion", place), "array")
     images, poses = arrays[name], arrays.get(place)
     if not several:
         images, poses = images[None], None if poses is None else poses[None]

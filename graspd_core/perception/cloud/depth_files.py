@@ -23,7 +23,7 @@ from graspd_core.perception.cloud.camera import (
     cloud_from_depth,
     depth_in_metres,
 )
-from graspd_core.perception.cloud.cloud_files import read_numpy, rigid
+from graspd_core.perception.cloud.cloud_files import read_numpy, refuse_near_names, rigid
 from graspd_core.perception.cloud.point_cloud import PointCloud
 
 IMAGE_ENDINGS, DEPTH_ENDINGS = ("png", "tif", "tiff"), ("png", "tif", "tiff", "npy", "npz")
@@ -88,6 +88,7 @@ def _camera_of(content: Mapping[str, Any]) -> DepthCamera:
             f"depth_scale: {short_repr(content['depth_scale'])} is ambiguous, because programs disagree on its unit; "
             "write depth_unit, in metres per unit: 0.001 for millimetres"
         )
+    refuse_near_names(content, ("T_world_camera", "distortion", "distortion_model", "depth_unit"), "key")
     width, height = (int(_numbers(content[key], (), key)) for key in ("width", "height"))
     distortion = _numbers(content.get("distortion", []), None, "distortion").reshape(-1).tolist()
     model = content.get("distortion_model", "plumb_bob" if len(distortion) <= 5 else "rational_polynomial")

@@ -30,7 +30,7 @@ def rows_of(label: Int[np.ndarray, "n"]) -> list[Int[np.ndarray, "_"]]:
 # If there are more points than this, only every second (third, ...) point is used.
 MAX_SCENE_POINTS = 5_000_000
 # Units that clouds have by mistake, how many of them make a metre, and the least plausible camera distance [m].
-UNITS_PER_METRE, MIN_CAMERA_DISTANCE_M = (("millimetres", 1000), ("centimetres", 100)), 0.1
+UNITS_PER_METRE, MIN_CAMERA_DISTANCE_M = (("millimetres", "mm", 1000), ("centimetres", "cm", 100)), 0.1
 
 
 @dataclass(frozen=True)
@@ -135,15 +135,24 @@ def _refuse_far_apart(views: Sequence[PointCloud], rows: Sequence[Int[np.ndarray
 
 
 def unit_hint(views: Sequence[PointCloud], farthest: float) -> str:
-    """Return a hint about the likely unit of the points, for an error. Empty if distances are plausible metres."""
+    """Return a hint about the likely unit of points or cameras, for an error. Empty if distances are plausible."""
+    away = _median_distance(views)
+    if away <= farthest:
+        return ""
+    for name, unit, per_metre in UNITS_PER_METRE:
+        told = f"; half of them are beyond {away:.0f} m: if"
+        nearer = [replace(view, viewpoint=view.viewpoint / per_metre) for view in views]
+        if MIN_CAMERA_DISTANCE_M <= _median_distance(nearer) <= farthest:
+            place = ", ".join(f"{coordinate:g}" for coordinate in views[0].viewpoint)
+            return f"{told} the camera's position ({place}) is in {name}, give it in metres"
+        if MIN_CAMERA_DISTANCE_M <= away / per_metre <= farthest:
+            return f"{told} they are in {name}, divide them by {per_metre} (--units {unit} for a file)"
+    return f"; half of them are beyond {away:.1f} m: are the coordinates in metres? (--units or --scale for a file)"
+
+
+def _median_distance(views: Sequence[PointCloud]) -> float:
     some = np.concatenate([view.points[:: 1 + len(view.points) // 10_000] - view.viewpoint for view in views])
-    away = float(np.median([0.0, *np.abs(some[np.isfinite(some).all(1)]).max(1, initial=0.0)]))
-    for name, per_metre in UNITS_PER_METRE:
-        if farthest < away and MIN_CAMERA_DISTANCE_M <= away / per_metre <= farthest:
-            return f"; half of them are beyond {away:.0f} m: if they are in {name}, divide them by {per_metre}"
-    if away > farthest:
-        return f"; half of them are beyond {away:.1f} m: are the coordinates in metres? (--units or --scale for a file)"
-    return ""
+    return float(np.median([0.0, *np.abs(some[np.isfinite(some).all(1)]).max(1, initial=0.0)]))
 
 
 def _voxels(points: Points, size: float, most: int) -> tuple[Int[np.ndarray, "n"], float]:

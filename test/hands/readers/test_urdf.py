@@ -92,7 +92,7 @@ def test_sloppy_xml_is_read(tmp_path: Path, text: bytes) -> None:
     [
         ("<collision>", "<visual>", r"the <visual> is used: palm"),
         ('type="revolute"', 'type="continuous"', r"joint 'hinge' has no limits: restricted to \[-3.14, 3.14\] rad"),
-        ('upper="1"', 'upper="1e9"', r"joint 'hinge' has no limits: restricted to \[-0.5, "),
+        ('upper="1"', 'upper="1e9"', r"joint 'hinge' has limits more than two turns apart: restricted to \[-0.5, "),
         (END, HUNG.format("world", "fixed"), DROPPED.format("world", "fixed")),
         (END, HUNG.format("up", "floating"), DROPPED.format("up", "floating")),
         (
@@ -423,3 +423,5 @@ def test_a_sliding_joint_has_its_own_scale_and_default_force(tmp_path: Path) -> 
     assert hand.slides.tolist() == [False, True]
     assert hand.joint_scale.tolist() == [1.0, 0.05]
     assert hand.effort.tolist() == [DEFAULT_EFFORT, DEFAULT_FORCE]
+    told = [w.partition("given for ")[2].partition(";")[0] for w in hand.warnings if "no effort" in w]
+    assert told == ["first: 0.7 N·m is assumed", "rail: 40 N is assumed"]
