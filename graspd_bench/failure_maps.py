@@ -137,7 +137,7 @@ def run_friction_mass(case: MapCase) -> list[Record]:
 
 
 def run_size(case: MapCase) -> list[Record]:
-    """Plan and try on a shape of 0.1 kg, scaled to a least width of `case.across` times the hand's span."""
+    """Plan grasps of a shape of 0.1 kg and try them. Its least width is `case.across` times the hand's span."""
     config = settings(case.preset)
     width = float(case.across) * _span(case.hand, config.problem.fine_candidates)
     # The least width is along x, y or z. The hand must open at least this wide.

@@ -331,7 +331,7 @@ def _collision_object() -> type:
 
 
 class SynthesizeMessages:
-    """Converter of messages to the feedback and result of a goal of `~/synthesize`."""
+    """Converts the node's messages to the feedback and the result of a `~/synthesize` goal."""
 
     def progressed(self, message: GraspProgress) -> SynthesizeGrasps.Feedback:
         return SynthesizeGrasps.Feedback(progress=message)

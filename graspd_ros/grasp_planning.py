@@ -28,7 +28,7 @@ from graspd_ros.request import Request
 
 
 class PlanningMessages:
-    """Converter of messages for a GraspPlanning goal. Feedback: the grasps found so far. Result: the final grasps."""
+    """Converts the node's messages for a GraspPlanning goal. Feedback: grasps found so far. Result: final grasps."""
 
     def __init__(self, hand: HandModel) -> None:
         self._hand = hand

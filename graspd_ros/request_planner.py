@@ -148,7 +148,7 @@ class RecentRuns:
         found = {} if run is None else {str(row): grasp for row, grasp in enumerate(run.grasps)}
         if run is None or rank not in found:
             kept = ", ".join(self._runs) or "none"
-            raise bad_request(f"exclude: no grasp {name[:128]!r} in the last {MOST_RUNS} runs; kept: {kept}")
+            raise bad_request(f"exclude: no grasp {name[:128]!r} in the last {MOST_RUNS} runs; stored runs: {kept}")
         return run, found[rank]
 
     def next_best(self, request: Request, excluded: Sequence[Matrix]) -> Planned | None:

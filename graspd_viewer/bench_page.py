@@ -63,7 +63,7 @@ def bench_page(folder: Path, *, served: bool = False) -> tuple[str, dict[str, Re
     except (KeyError, TypeError, AttributeError) as error:
         raise FormatError(f"{folder / 'results.json'}: a record has no valid {error}") from None
     if not data["panels"]:
-        raise FormatError(f"{folder}: holds no raw grasps of a preset; `graspd bench` measures them")
+        raise FormatError(f"{folder}: holds no results of raw grasps; `graspd bench` measures some")
     # Only the sequence `</` could end the script element early.
     text = json.dumps(data, allow_nan=False).replace("</", "<\\/")
     return _PAGE.replace("@TITLE@", html.escape(folder.resolve().name)).replace("@DATA@", text), runs

@@ -69,7 +69,7 @@ MAY_IMPORT = {
 MAX_PACKAGE_LINES = {
     "graspd_core": 27_691,
     "graspd_ros": 5_232,
-    "graspd_bench": 8_071,
+    "graspd_bench": 8_073,
     "graspd_dataset": 3_007,
     "graspd_viewer": 2_414,
     "graspd_cell": 3_731,

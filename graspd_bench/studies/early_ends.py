@@ -123,7 +123,9 @@ def early_sections(records: Sequence[Record], chart: Path | None) -> Sections:
                 groups.setdefault(name, []).append(row)
             if row["early"].get("passed") != row["late"].get("passed"):
                 early, late = (row[way]["reason"] or "holds" for way in ("early", "late"))
-                text.append(f"* {record['label']}, grasp {row['index']}, {row['group']}: early {early}; in full {late}")
+                text.append(
+                    f"* {record['label']}, grasp {row['index']}, {row['group']}: early: {early}; full length: {late}"
+                )
     headings = ["group", "trials", "passed", "wrongly verified", "at most (95 %)", "wrongly failed"]
     headings += ["CPU ms, all: full, early", "passing: full, early"]
     body = [[name, str(len(rows)), *_figures(rows)] for name, rows in groups.items()]

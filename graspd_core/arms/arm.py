@@ -315,7 +315,7 @@ def _make_arm(entries: ArmFile, urdf: Path, root: ET.Element, where: str) -> Arm
 
 
 def _keep_chain(root: ET.Element, base: str, tip: str, where: str) -> None:
-    """Keep only the chain from base to tip, and links that are fixed to a chain link before the tip."""
+    """Keep the chain from base to tip and all links that are fixed to it, but not those fixed to the tip."""
     links = [str(link.get("name")) for link in root.findall("link")]
     for key, link in (("tip", tip), ("base", base)):
         if link and link not in links:

@@ -68,10 +68,10 @@ class Failure:
     seen: Float[np.ndarray, "_ 3"] | None = None
 
     def object_among(self, places: Float[np.ndarray, "_ 3"], *, unsure: bool = False) -> int | None:
-        """Return the index of the failed object among objects at `places` [m]: the nearest within 4 cm, or None.
+        """Return the index, among objects at `places` [m], of the object that failed. None if no object matches.
 
-        If no object is within 4 cm and `seen` is known, the object may have moved by up to 20 cm. Then return the
-        nearest object at a place where none was seen before. With `unsure`, all places count.
+        The nearest object within 4 cm of `place` matches. If there is none and `seen` is known, the nearest object
+        within 20 cm matches that is not within 4 cm of a place in `seen`. With `unsure`, it may be at such a place.
         """
         away = np.zeros(0) if self.place is None else np.linalg.norm(places - self.place, axis=1)
         if away.min(initial=np.inf) >= _SAME_PLACE:

@@ -172,7 +172,7 @@ def test_the_next_best_grasp_comes_at_once_from_the_candidates_of_the_same_run(h
     assert unlike(fifth.tried, lost[:1]) == list(fifth.tried)
     for unknown in ("nobody/0", "first/99", "first/" + "9" * 5000):
         with pytest.raises(
-            RequestError, match=f"exclude: no grasp '{unknown[:100]}.* in the last 16 runs; kept: first, "
+            RequestError, match=f"exclude: no grasp '{unknown[:100]}.* in the last 16 runs; stored runs: first, "
         ):
             ask("sixth", unknown)
 

@@ -384,7 +384,7 @@ def _inertial(parts: _Parts, body: Any) -> tuple[float, Float[np.ndarray, "3"], 
     rotation, com = pose(model.body_ipos[number], model.body_iquat[number])
     mass, moments = float(model.body_mass[number]), np.array(model.body_inertia[number])
     if body.mass < 0 or not max(mass, *moments) <= _HEAVIEST:
-        heavy = f"weighs {min(mass, body.mass):g} kg, moments {moments.max():g} kg·m²; valid: 0 to {_HEAVIEST:g}"
+        heavy = f"mass {min(mass, body.mass):g} kg, inertia {moments.max():g} kg·m²; valid: each 0 to {_HEAVIEST:g}"
         raise fault(parts.path, body, heavy)
     _refuse_far(parts, body, com)
     return mass, com, (rotation * moments) @ rotation.T

@@ -330,7 +330,7 @@ def _inertial(path: Path, link: ET.Element) -> tuple[float, Float[np.ndarray, "3
     if inertia is not None:
         moments = np.array([read_numbers(path, inertia, f"i{key}", 1, "0")[0] for key in _MOMENTS])
     if max(mass, *np.abs(moments)) > _HEAVIEST:
-        heavy = f"weighs {mass:g} kg, moments up to {np.abs(moments).max():g} kg·m²; valid: at most {_HEAVIEST:g}"
+        heavy = f"mass {mass:g} kg, inertia up to {np.abs(moments).max():g} kg·m²; valid: each at most {_HEAVIEST:g}"
         raise wrong(path, inertial, heavy)
     xx, xy, xz, yy, yz, zz = moments
     return mass, com, rotation @ np.array([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]]) @ rotation.T

@@ -29,7 +29,7 @@ MIN_ENCLOSED_SHARE = 0.6
 def extrude(seen: Surfels, free_space: FreeSpace, step: float) -> Surfels:
     """Return vertical walls from the object's outline, seen from above, down to the support.
 
-    At each wall's top, cameras must see empty space just outside the outline. The cameras must not contradict the wall.
+    A wall is built only where cameras saw a level top and empty space just outside it, and do not contradict the wall.
     """
     margin = 6
     low = seen.points[:, :2].min(0) - margin * step

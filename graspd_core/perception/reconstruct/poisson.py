@@ -66,7 +66,7 @@ def grid_cell(surfels: Surfels, least: float, cells: int = GRID_CELLS) -> float:
 
 
 def part_walls(surfels: Surfels, cell: float) -> Surfels:
-    """Increase the thickness of thin walls to `MIN_WALL_CELLS` cells. On the grid, closer sides would cancel."""
+    """Thicken thin walls to `MIN_WALL_CELLS` cells, because the sides of a thinner wall cancel on the grid."""
     points, normals = surfels.points, surfels.normals
     thinnest = MIN_WALL_CELLS * cell
     # The other side of a wall is nearest in position and opposite normal. `farthest` is the limit in six dimensions.

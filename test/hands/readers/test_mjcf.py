@@ -255,7 +255,7 @@ def test_where_the_base_stands_in_its_file_is_kept(folder: Path) -> None:
         ("<equality>", '<equality><weld body1="a" body2="b"/>', "equality <weld> is not supported"),
         ('fromto="0 0 0 0 0 .05"', 'fromto="0 0 0 0 0 0"', "changed.xml:9: .*fromto points too close"),
         ('name="b2"', 'name="a2"', "MuJoCo refuses it: .*repeated name 'a2' in body"),
-        ('mass=".01"', 'mass="-1"', "body 'tip': weighs -1 kg"),
+        ('mass=".01"', 'mass="-1"', "body 'tip': mass -1 kg"),
         ('gear="3"', 'gear="3 e"', "changed.xml:20: .*bad format in attribute 'gear'"),
         ('ref=".01"', 'ref="nan"', "joint 's1': <joint ref='nan'>: expected finite numbers"),
         ("</worldbody>", "<site><body/></site>" * 301 + "</worldbody>", "307 links; a hand has at most 300"),
