@@ -110,7 +110,7 @@ class BoundReach(BoundRestriction):
         paths = arm_paths(task, [Grasp(posture, posture, posture) for posture in postures])
         reasons = Counter(path for path in paths if isinstance(path, str)).most_common()
         counts = ", ".join(f"{count} {reason}" for reason, count in reasons)
-        return f"of {len(paths)} hand poses around the object, {counts}" if counts else ""
+        return f"of {len(paths)} hand poses around the object: {counts}" if counts else ""
 
     def starts(self, positions: Places, quaternions: Turns, joints: JointRows) -> Allowed:
         """Return for each initial pose whether pose, retreat and lift are all within the arm's reach."""

@@ -29,7 +29,7 @@ class KeptGrasps:
     def next(self, view: DepthView, failures: tuple[Failure, ...]) -> Offer:
         key = self._world.arm.name, self._world.hand.name
         if key not in OFFERS:
-            source = InProcessGrasps(self._world.arm, self._world.hand, self._world.layout, preset="fast")
+            source = InProcessGrasps(self._world.arm, self._world.hand, self._world.layout)
             OFFERS[key] = source.next(view, failures)
         offer = OFFERS[key]
         known = tuple(replace(failure, place=offer.place, seen=offer.seen) for failure in failures)

@@ -51,7 +51,7 @@ def is_refused(thing: PointCloud, cloud: PointCloud) -> bool:
         check_scene([cloud])
         check_viewpoint(thing, cloud)
     except CloudError as error:
-        return re.search("hidden from there|plane of the table|the inside of the surface", str(error)) is not None
+        return re.search("hidden from there|table's plane|the inside of the surface", str(error)) is not None
     return False
 
 
