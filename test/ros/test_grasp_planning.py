@@ -73,6 +73,8 @@ def ask(client, planning, target: Object, group: str = "") -> tuple[int, list, l
 @pytest.mark.parametrize("kind", ["primitive", "cluster"])
 def test_each_kind_of_object_gets_grasps_and_feedback_before(client, planning, make_cloud, kind):
     target = box(0.05, 0.05, 0.12) if kind == "primitive" else cluster(make_cloud)
+    if kind == "cluster":
+        client.set_parameters(preset="balanced")
     status, grasps, feedback = ask(client, planning, target, "allegro_right")
     assert status == GoalStatus.STATUS_SUCCEEDED
     (answer,) = client.spin_until(lambda: client.answers, "the answer")

@@ -23,14 +23,14 @@ POSES = ring_poses(3, elevation=0.7, azimuth=0.5)
 pytestmark = pytest.mark.timeout(300)
 
 
-def grasp_of(views, hand, **options):
+def grasp_of(views, hand, preset: str = "fast", **options):
     """The scene of the views and its best grasp; the case fails unless one of three seeds leads to a verified one.
 
     Which seed does depends on the processor, where several things stand together.
     """
     scene = scene_from_views(views, **options)
     assert is_closed(scene.object.mesh)
-    results = (plan_grasps(scene, hand, count=1, preset="fast", seed=seed) for seed in range(3))
+    results = (plan_grasps(scene, hand, count=1, preset=preset, seed=seed) for seed in range(3))
     result = some(next((each for each in results if each.outcome is Outcome.SUCCEEDED), None))
     assert result.grasps[0].verdict is Verdict.VERIFIED
     best = result.grasps[0].grasp
@@ -70,7 +70,7 @@ def test_of_two_touching_objects_the_masked_one_is_taken(hand):
     pose = ring_poses(1, elevation=0.9, azimuth=-1.57)
     ((depth, label),) = depth_views(stage, CAMERA, pose, DEFAULT)
     (view,) = views_of(stage, CAMERA, pose, DEFAULT)
-    scene, _ = grasp_of([view], hand, target=Target(mask=label[depth > 0] == 0), mass=0.1)
+    scene, _ = grasp_of([view], hand, "balanced", target=Target(mask=label[depth > 0] == 0), mass=0.1)
     assert stray(scene, stage) < 0.02
     # The other is in the way: a neighbour covers what the camera saw of it.
     other = view.points[label[depth > 0] == 1]
