@@ -119,9 +119,7 @@ def test_an_object_out_of_reach_is_told_by_reasons_not_by_a_class(hand: HandMode
     scene = build_scene(make_shape("box"))
     result = planned(scene, hand, Reach(load_arm("panda_like"), (-1.3, 0.1, 0.0)))
     assert result.outcome is Outcome.NO_CANDIDATES
-    assert result.message.startswith(
-        "no candidate was found under the reach of panda_like; of 64 hand poses around the"
-    )
+    assert result.message.startswith("no candidate was found under the reach of panda_like; of 64 hand poses around")
     assert re.search(r": [1-9]\d* farther than the arm reaches", result.message)
 
 
