@@ -92,7 +92,7 @@ def rows_kept(settings: ClosedFormConfig, keep: int, rows: int, index: int) -> i
 
 
 # With a budget above 1, the fingers wrap the object: polishing is at least this long, and these weights at least this
-# high. On views of `graspd bench cameras` (seeds 90 to 97), half as many more candidates then lift the assumed mass.
+# high. On views of `graspd bench cameras` (seeds 90 to 97), 1.5 times as many candidates then lift the assumed mass.
 _WRAPPING_STEPS = {"polish_steps": 320, "fine_steps": 120}
 _WRAPPING_DISTANCE, _WRAPPING_POLISH = 15.0, {"distance": 1500.0, "penetration": 80.0}
 
