@@ -102,12 +102,13 @@ def _find(name_or_path: str | Path) -> Path:
 
 def _with_effort(hand: HandModel) -> HandModel:
     """Return the hand with the default effort for each joint that has none. A warning names these joints."""
-    lost, told = ~np.isfinite(hand.effort), []
+    effort, told = hand.effort, list[str]()
     for default, unit, kind in ((DEFAULT_EFFORT, "N·m", ~hand.slides), (DEFAULT_FORCE, "N", hand.slides)):
-        if names := [name for name, unknown in zip(hand.joint_names, lost & kind, strict=True) if unknown]:
-            warning = f"no effort is given for {', '.join(names)}: {default:g} {unit} is assumed"
-            told.append(f"{warning}; set `effort` in a hand description")
-    effort = np.where(lost, np.where(hand.slides, DEFAULT_FORCE, DEFAULT_EFFORT), hand.effort)
+        lost = kind & ~np.isfinite(hand.effort)
+        if names := ", ".join(np.array(hand.joint_names)[lost]):
+            assumed = f"no effort is given for {names}: {default:g} {unit} is assumed"
+            told.append(f"{assumed}; set `effort` in a hand description")
+        effort = np.where(lost, default, effort)
     return replace(hand, effort=effort, warnings=(*hand.warnings, *told))
 
 

@@ -56,7 +56,9 @@ def rounds_of(scene: Scene, config: PlanConfig, verify: str) -> list[PlanConfig]
     """
     rounds = config.rounds
     cheap = verify != "none" and scene.support is None and not scene.obstacles and scene.confidence is None
-    first = rounds.first_budget if cheap else 1.0 if scene.confidence is None else rounds.growth
+    first = rounds.first_budget if cheap else 1.0
+    if scene.confidence is not None:
+        first = rounds.growth
     most = rounds.first_budget * rounds.growth ** (rounds.most - 1)
     efforts = (min(first * rounds.growth**attempt, max(first, most)) for attempt in range(rounds.most))
     return [config.at_budget(effort) for effort in efforts]

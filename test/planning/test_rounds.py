@@ -14,7 +14,7 @@ from graspd_core import TriangleMesh, load_hand, load_scene, make_shape, plan_gr
 from graspd_core.config import CertaintyConfig, RobustConfig
 from graspd_core.errors import ConfigError
 from graspd_core.io.grasps_json import result_document
-from graspd_core.optimize.plan_config import PlanConfig, load_preset
+from graspd_core.optimize.plan_config import PlanConfig, load_preset, override
 from graspd_core.perception.scene import Obstacle, Scene, make_obstacle, object_parts
 from graspd_core.planning import rounds as planning_rounds
 from graspd_core.planning.rounds import RoundsResult, rounds_of
@@ -64,6 +64,22 @@ def test_where_nothing_is_found_more_is_sought_however_few_are_asked_for(scene, 
     asked.clear()
     plan_grasps(scene, load_hand("parallel_gripper"), count=20)
     assert asked == [2, *7 * [20]]
+
+
+def test_after_weak_grasps_of_a_mesh_only_the_round_with_the_most_effort_follows(scene, monkeypatch):
+    searched, find = [], planning_rounds.find_candidates
+
+    def noted(task, searches):
+        searched.append(task.config)
+        return find(task, searches=searches)
+
+    monkeypatch.setattr(planning_rounds, "find_candidates", noted)
+    heavy = replace(scene, object=replace(scene.object.at_mass(30.0), mass_assumed=True))
+    config = override(PlanConfig(), {"closed_form.searches": 1})
+    assert plan_grasps(heavy, load_hand("allegro_right"), count=8, preset=config).outcome is Outcome.TOO_FEW
+    first, _, last = rounds_of(heavy, config, "standard")
+    # The small first batch, the rest of the first round, then the last round.
+    assert searched == [first, first, last]
 
 
 def test_a_cancel_is_noticed_while_grasps_are_weighed_for_a_lower_mass(scene, monkeypatch):

@@ -101,7 +101,7 @@ def at_budget(settings: ClosedFormConfig, budget: float) -> ClosedFormConfig:
     """Return the settings for `budget` times the usual effort.
 
     A budget below 1 multiplies the steps and allows one search. Fewer starts would hardly save time in a small batch.
-    A budget above 1, for hard objects, multiplies starts, and draws the whole hand to the surface while polishing.
+    A budget above 1, for hard objects, multiplies starts, and draws the whole hand to the surface.
     """
     if budget > 1.0:
         return _wrapping(settings, budget)
