@@ -106,8 +106,8 @@ def _with_effort(hand: HandModel) -> HandModel:
     for default, unit, kind in ((DEFAULT_EFFORT, "N·m", ~hand.slides), (DEFAULT_FORCE, "N", hand.slides)):
         lost = kind & ~np.isfinite(hand.effort)
         if names := ", ".join(np.array(hand.joint_names)[lost]):
-            assumed = f"no effort is given for {names}: {default:g} {unit} is assumed"
-            told.append(f"{assumed}; set `effort` in a hand description")
+            warning = f"no effort is given for {names}: {default:g} {unit} is assumed"
+            told.append(f"{warning}; set `effort` in a hand description")
         effort = np.where(lost, default, effort)
     return replace(hand, effort=effort, warnings=(*hand.warnings, *told))
 
