@@ -43,6 +43,9 @@ from graspd_core.planning.any_thing import Failure
 
 # An object is still in its place if more than `_STILL_THERE` of its points are within `_UNMOVED` of points seen [m].
 _UNMOVED, _STILL_THERE = 0.006, 0.6
+# Greatest error of an arm joint at the end of a motion in which the hand may touch the object [rad]. The object is never
+# exactly where it seems, and a hand that presses on it stops short.
+_TOUCHING = 0.1
 # Tries to reach `start`, and collision checks for a path to `start`. The picker ends if the arm cannot reach `start`.
 _TRIES_HOME, _WAY_HOME = 3, 20_000
 
@@ -405,7 +408,11 @@ class Picker:
         times = execution.times[rows] - execution.times[rows.start]
         positions = np.concatenate([execution.arm[rows], execution.hand[rows]], 1)[1:]
         speeds = np.concatenate([execution.arm_speed[rows], execution.hand_speed[rows]], 1)[1:]
-        self._follow(JointMotion((*execution.arm_joints, *execution.hand_joints), times[1:], positions, speeds))
+        names = (*execution.arm_joints, *execution.hand_joints)
+        touching = np.full(len(names), np.inf)
+        touching[: len(execution.arm_joints)] = _TOUCHING
+        allowed = None if gate == "lifted" else touching
+        self._follow(JointMotion(names, times[1:], positions, speeds, goal_tolerance=allowed))
 
     def _move_hand(self, goal: np.ndarray) -> None:
         """Move all fingers to joint values [rad] or [m], so that they arrive together."""
