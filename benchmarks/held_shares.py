@@ -70,13 +70,13 @@ def grasps_of_view(case: CameraView) -> list[dict[str, Any]]:
     assert asked is not None
     rows = []
     for grasp in (grasp for grasp in result.tried if grasp.verdict is Verdict.VERIFIED):
-        holds = [(item.hold(grasp, lambda: False) for item in stage.items) for stage in asked.stages]
-        *places, slippery = (hold is not None and hold.passed for hold in holds[0])
-        possible = (hold for hold in holds[1] if hold is not None) if len(holds) > 1 else iter(())
+        *others, of_places = [(item.hold(grasp, lambda: False) for item in stage.items) for stage in asked.stages]
+        slippery, *places = (hold is not None and hold.passed for hold in of_places)
+        possible = (hold for hold in others[0] if hold is not None) if others else iter(())
         shapes = [hold.passed for hold in islice(possible, OTHER_SHAPES)]
         rows.append({
-            "view": case.label, "way": case.way, "lowered": result.mass is not None, "places": sum(places),
-            "slippery": slippery, "shapes": sum(shapes), "of_shapes": len(shapes),
+            "view": case.label, "way": case.way, "places": sum(places), "slippery": slippery,
+            "shapes": sum(shapes), "of_shapes": len(shapes),
             "own": hold_trial(own, grasp, out_of_place(protocol)).passed,
         })  # fmt: skip
     return rows
@@ -121,17 +121,13 @@ def main() -> None:
     shaped = lambda row: row["shapes"] == row["of_shapes"]  # noqa: E731
     most = lambda row: row["places"] >= 2  # noqa: E731
     every = lambda row: row["places"] == 3 and row["slippery"]  # noqa: E731
-    for name, placed, way, lowered in (
-        ("mass assumed", most, ASSUMED, False),
-        ("mass known", every, GIVEN, False),
-        ("mass lowered", every, ASSUMED, True),
-    ):
-        of = [row for row in rows if row["way"] == way and row["lowered"] is lowered]
-        print(f"{name}: likeliest {share(of)}")
+    for placed, way in ((most, ASSUMED), (every, GIVEN)):
+        of = [row for row in rows if row["way"] == way]
+        print(f"{way}: likeliest {share(of)}")
         print(f"  out of place {share([r for r in of if placed(r)])}")
         print(f"  and other shapes {share([r for r in of if placed(r) and shaped(r)])}")
         print(f"  fails out of place {share([r for r in of if not placed(r)])}")
-        print(f"  fails on shapes {share([r for r in of if placed(r) and not shaped(r)])}")
+        print(f"  fails on shapes {share([r for r in of if not shaped(r)])}")
 
 
 if __name__ == "__main__":

@@ -43,8 +43,8 @@ from graspd_core.planning.any_thing import Failure
 
 # An object is still in its place if more than `_STILL_THERE` of its points are within `_UNMOVED` of points seen [m].
 _UNMOVED, _STILL_THERE = 0.006, 0.6
-# Greatest error of an arm joint at the end of a motion in which the hand may touch the object [rad]. The object is never
-# exactly where it seems, and a hand that presses on it stops short.
+# Greatest error of an arm joint at the end of a motion in which the hand may touch the object [rad]. The object is not
+# exactly where it seems. A hand that presses on it stops short.
 _TOUCHING = 0.1
 # Tries to reach `start`, and collision checks for a path to `start`. The picker ends if the arm cannot reach `start`.
 _TRIES_HOME, _WAY_HOME = 3, 20_000

@@ -204,7 +204,6 @@ def camera_sections(records: Sequence[Record], chart: Path | None) -> Sections:
     for name, told in (("camera", str), ("crowd", lambda some: "crowded" if some else "alone"), ("kind", str)):
         values = sorted({r[name] for r in usual})
         rows += [(f"{told(value)}, {ASSUMED}", [r for r in usual if r[name] == value]) for value in values]
-    rows.append((f"lowered mass, {ASSUMED}", [r for r in usual if r.get("tried_mass", 1) < r.get("assumed", 0)]))
     body = [[name, *_row(own)] for name, own in rows if own]
     calibrations = [
         part

@@ -93,7 +93,8 @@ def draw_starts(
     poses are drawn. If all pools contain too few allowed poses, fewer than `count` starts are returned, perhaps none.
     """
     generator = torch.Generator().manual_seed(seed)
-    obstacles = make_obstacle_tensors(scene, hand, "cpu", torch.float64)
+    # Distances to obstacles take most of the time. Single precision is enough for them.
+    obstacles = make_obstacle_tensors(scene, hand, "cpu", torch.float32)
     pool = (_POOL if obstacles is None else _POOL_AMONG_OBSTACLES) * count
     hull = convex_hull(scene.object.mesh)
     surface = torch.as_tensor(surface_samples(scene.object.mesh, _SPAN_POINTS, seed)[0])
@@ -104,8 +105,8 @@ def draw_starts(
 
     drawn = _allowed(draw, pool, seed, restrictions) if restrictions.each else draw(seed)
     if obstacles is not None:
-        links = forward(make_kinematics(hand, dtype=torch.float64), drawn.joints)
-        lift = _lift(obstacles, SE3(drawn.rotation, drawn.translation), links)
+        links = forward(make_kinematics(hand, dtype=torch.float32), drawn.joints.float())
+        lift = _lift(obstacles, SE3(drawn.rotation.float(), drawn.translation.float()), links)
         drawn = replace(drawn, middle=drawn.middle + lift, translation=drawn.translation + lift)
 
     half_width = half_widths(surface, drawn.middle, drawn.rotation, hand)
@@ -113,7 +114,7 @@ def draw_starts(
     gumbel = -torch.log(-torch.log(_uniform(1e-12, 1.0, len(drawn.joints), generator)))
     preference = gumbel - (half_width + drawn.depth) / _SPAN_SCALE
     if obstacles is not None:
-        base = SE3(drawn.rotation, drawn.translation)
+        base = SE3(drawn.rotation.float(), drawn.translation.float())
         penalty = lambda rows: _depth(obstacles, base[rows], links[rows]) / _DEPTH_SCALE  # noqa: E731
         preference = _lowered(preference, count, penalty)
     chosen = preference.topk(min(count, len(preference))).indices

@@ -13,6 +13,7 @@ import torch
 from jaxtyping import Float
 
 from graspd_core.config import VERIFICATIONS
+from graspd_core.config.planning_config import LEAST_LIGHT, light_end
 from graspd_core.errors import ConfigError
 from graspd_core.hands.model import HandModel
 from graspd_core.hands.surface_points import with_candidates
@@ -158,8 +159,10 @@ def on_surface(scene: Scene, grasps: Sequence[Grasp]) -> tuple[Grasp, ...]:
 def _lifted_less(scene: Scene, mass: float | None) -> tuple[str, ...]:
     if mass is None:
         return ()
-    text = f"the hand cannot hold the {scene.object.mass:.2g} kg that were assumed: grasps were tried at {mass:.2g} kg"
-    return (f"{scene.object.source}: {text}",)
+    why = f"the hand cannot hold the {scene.object.mass:.2g} kg that were assumed"
+    if scene.evidence is not None and mass >= light_end(scene.object.mass):
+        why = f"{LEAST_LIGHT:.0%} of objects of this volume weigh at most {mass:.2g} kg"
+    return (f"{scene.object.source}: {why}: grasps were tried at {mass:.2g} kg",)
 
 
 def _why_few(run: Run, scene: Scene, bound: BoundRestrictions, found: RoundsResult, result: GraspResult) -> str:

@@ -103,7 +103,9 @@ class RoundsResult:
     @property
     def mass(self) -> float | None:
         """Object mass in the trials [kg] if this mass is below the assumed mass, else None."""
-        return self.context.mass if self.context and self.lowered and self.good else self.lowered
+        if self.context is None or self.context.heavy is None or (self.lowered and not self.good):
+            return self.lowered
+        return self.context.mass
 
     @property
     def good(self) -> int:
@@ -175,9 +177,9 @@ def run_rounds(
                 break
         if state.good >= count or run.over():
             break
-        # With an unverified grasp, lower the mass only after the second round, which may find stronger grasps.
-        unsure = any(grasp.verdict is Verdict.UNVERIFIED for grasp in state.grasps)
-        if batch.ends_round > unsure and not state.good and prefetched is not None and state.lowered is None:
+        # An unverified grasp lifts the object, so the hand is strong enough.
+        unheld = all(grasp.verdict is Verdict.FAILED for grasp in state.grasps)
+        if batch.ends_round and unheld and prefetched is not None and state.lowered is None:
             last = batch.ends_round == len(rounds)
             state, weak = _weighed(run, scene, prefetched, state, batch.config.certainty, count, last=last)
             if state.good >= count or last or (weak and batch.config == rounds[-1]) or run.over():
@@ -257,7 +259,7 @@ def _tried_lighter(
     lifted = payloads(state.context, best, run.over)
     most = max(lifted, default=0.0)
     mass = min(_LIFTED * most, light_end(heavy))
-    if most <= LEAST_PAYLOAD or run.over():
+    if most <= LEAST_PAYLOAD or mass >= state.context.mass or run.over():
         return state
     context = lighter(scene, prefetched, state.context, certainty, mass, most)
     strongest = sorted(range(len(best)), key=lambda place: -lifted[place])

@@ -38,10 +38,11 @@ def payload(
     protocol: Protocol,
     *,
     least: float = LEAST_PAYLOAD,
+    most: float = MOST_PAYLOAD,
     held: bool = False,
     stop: StopHook = lambda: False,
 ) -> float:
-    """Return the payload [kg]: the greatest mass at which the grasp withstands every pull of the protocol.
+    """Return the payload [kg]: the greatest mass up to `most` at which the grasp withstands every pull of the protocol.
 
     The result is 0 if the grasp does not hold the mass `least` [kg]. The hand closes once, with the object's own mass.
     If a hold trial has already closed the hand, the state of that trial is reused. Each pull starts from this state,
@@ -51,7 +52,7 @@ def payload(
 
     kind = mujoco.mjtState.mjSTATE_INTEGRATION
     steps = CHECK_EVERY * round(protocol.hold_time / protocol.timestep / CHECK_EVERY)
-    most = max(least, MOST_PAYLOAD)
+    most = max(least, most)
     try:
         with trial_data(world) as data:
             closed = next((s for at, by, s in tuple(world.closed) if at is grasp.squeeze and by == protocol), None)

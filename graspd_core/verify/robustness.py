@@ -169,7 +169,7 @@ class RobustnessChecks:
     """The robustness checks that a grasp must pass.
 
     Attributes:
-        stages: first the fast checks, with displaced poses and less friction. Then the checks with other shapes.
+        stages: first the checks with other shapes, which most grasps fail. Then displaced poses and less friction.
         probability: probability that a grasp holds on the true object if it passes all stages.
         waited_for: event that is set once a trial waits for its world, so that other trials may start.
         doubts: reasons to doubt the scene or the object's mass. If there is a doubt, no grasp passes.
@@ -225,7 +225,7 @@ def robustness_checks_of(
             RobustnessCheck(f"other shape {number}", partial(_hold_in, world, trials.protocol, waited_for))
             for number, world in enumerate(others, 1)
         )
-        stages.append(CheckStage(shapes, OTHER_SHAPES, 0, shares.fails_shapes))
+        stages.insert(0, CheckStage(shapes, OTHER_SHAPES, 0, shares.fails_shapes))
     return RobustnessChecks(tuple(stages), surest, waited_for)
 
 
@@ -240,7 +240,8 @@ def _places(scene: Scene, trials: TrialContext, though_failed: float) -> CheckSt
     slippery = at_friction(trials.protocol, _LESS_FRICTION * Protocol.friction[0])
     world = altered(trials.alone, friction=slippery.friction)
     work = lambda grasp, stop: hold_trial(world, grasp, slippery, stop=stop)  # noqa: E731
-    places.append(RobustnessCheck(f"friction {slippery.friction[0]:.2g}", work))
+    # Most of the grasps that fail here fail with less friction.
+    places.insert(0, RobustnessCheck(f"friction {slippery.friction[0]:.2g}", work))
     return CheckStage(tuple(places), len(places), 0, though_failed)
 
 
@@ -252,7 +253,7 @@ def doubted_if_weak(checks: RobustnessChecks, most: float, heavy: float) -> Robu
     if checks.doubts or most >= light_end(heavy):
         return checks
     doubt = f"the grasp lifts {most:.2g} kg, and too many objects of this volume weigh more"
-    return RobustnessChecks((), MASS_KNOWN.likeliest if checks.stages else checks.probability, doubts=(doubt,))
+    return RobustnessChecks((), MASS_ASSUMED.likeliest if checks.stages else checks.probability, doubts=(doubt,))
 
 
 def less_sure(checks: RobustnessChecks, most: float, heavy: float) -> RobustnessChecks:

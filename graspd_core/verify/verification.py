@@ -18,7 +18,7 @@ import numpy as np
 import torch
 
 from graspd_core.config import VERIFICATIONS, CertaintyConfig, RobustConfig
-from graspd_core.config.planning_config import MASS_KNOWN
+from graspd_core.config.planning_config import MASS_ASSUMED, light_end
 from graspd_core.errors import ConfigError, short_repr
 from graspd_core.hands.model import HandModel
 from graspd_core.perception.scene import Scene, moved_grasp, near_scene, object_parts
@@ -126,7 +126,12 @@ def make_trial_context(
         return None
     checks = robustness_checks_of(scene, prefetched.others, worlds, certainty.probability)
     make = lambda: replace(_metrics_context(scene, hand), world=worlds.alone)  # noqa: E731
-    return VerificationContext(worlds, make if measure else None, checks, friction)
+    context = VerificationContext(worlds, make if measure else None, checks, friction)
+    if scene.evidence is None or not scene.object.mass_assumed:
+        return context
+    # Few grasps of a guessed shape hold the assumed mass, and few objects weigh as much.
+    heavy = scene.object.mass
+    return lighter(scene, prefetched, context, certainty, light_end(heavy), heavy)
 
 
 def lighter(
@@ -140,10 +145,9 @@ def lighter(
     trials, others = context.trials, [world.altered(mass) for world in ahead.others]
     around = trials.around and altered(trials.around, mass=mass)
     trials = replace(trials, alone=altered(trials.alone, mass=mass), around=around)
-    known = replace(scene, object=replace(scene.object, mass_assumed=False))
     # Without checks, the probability is the measured fraction for the likeliest shape.
-    bare = RobustnessChecks((), 1.0 if scene.evidence is None else MASS_KNOWN.likeliest)
-    checks = robustness_checks_of(known, others, trials, certainty.probability) or bare
+    bare = RobustnessChecks((), 1.0 if scene.evidence is None else MASS_ASSUMED.likeliest)
+    checks = robustness_checks_of(scene, others, trials, certainty.probability) or bare
     heavy = scene.object.mass
     return replace(context, trials=trials, checks=doubted_if_weak(checks, most, heavy), heavy=heavy)
 
@@ -296,8 +300,8 @@ def _all_trials(context: VerificationContext, hold_under: HoldUnder, grasp: Gras
     if not results[-1].passed or checks is None:
         return replace(grasp, trials=results)
     if context.heavy is not None:
-        most = payload(trials.alone, grasp, trials.protocol, least=context.mass, held=True, stop=stop)
-        checks = less_sure(checks, most, context.heavy)
+        about = {"least": context.mass, "most": context.heavy, "held": True, "stop": stop}
+        checks = less_sure(checks, payload(trials.alone, grasp, trials.protocol, **about), context.heavy)
     under, probability = try_robustness(checks, grasp, stop, hold_under)
     return replace(grasp, trials=(*results, under), probability=probability)
 

@@ -22,7 +22,7 @@ from graspd_core.types import Grasp, GraspMetrics, Outcome, Plane, Posture, Prog
 from graspd_core.verify.hold_trial import noisy_share, pose_errors
 from graspd_core.verify.prepared_grasp import arrival, make_metrics_context, placed_hand
 from graspd_core.verify.run_clock import Run
-from graspd_core.verify.verification import Prefetched, VerificationContext, most_robust_first
+from graspd_core.verify.verification import Prefetched, VerificationContext, most_robust_first, trial_context
 from graspd_core.verify.world import PROTOCOLS, build_world
 
 
@@ -91,8 +91,9 @@ def test_a_cancel_is_noticed_while_grasps_are_weighed_for_a_lower_mass(scene, mo
 
     monkeypatch.setattr(planning_rounds, "payloads", weigh)
     run, settings = Run(0.0, None, None, lambda: True), CertaintyConfig()
-    # Neither is looked at, because the run ends before.
-    context, ahead = object.__new__(VerificationContext), object.__new__(Prefetched)
+    # It is not looked at, because the run ends before.
+    ahead = object.__new__(Prefetched)
+    context = VerificationContext(trial_context(scene, load_hand("parallel_gripper"), "standard"), None)
     state = RoundsResult(0.0, (Grasp(POSTURE, POSTURE, POSTURE),), context)
     assert planning_rounds._tried_lighter(run, scene, ahead, state, settings, 1) is state
     assert cancelled == [True]
