@@ -332,8 +332,8 @@ class GraspResult:
     stands, None for a floating object. `audits` is always zero, and version 0.3 removes it. `next_view` is the camera
     pose `T_object_camera` [m] that shows more of the object's hidden side. It is None unless grasps hold on the
     likeliest shape but none is verified. `refused` counts the candidates that restrictions refused, by reason.
-    `tried_mass` is the object's mass in the trials [kg]. If the hand could not hold the mass that graspd assumed,
-    `mass` equals `tried_mass`. Else `mass` is None. `count` is the requested number of grasps.
+    `tried_mass` is the object's mass in the trials [kg]. If graspd assumed a greater mass, `mass` equals
+    `tried_mass`. Else `mass` is None. `count` is the requested number of grasps.
     """
 
     outcome: Outcome
