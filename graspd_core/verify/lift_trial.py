@@ -157,7 +157,7 @@ def _pressing(world: World, data: Any, limit: float) -> str:
     for geom, said in world.obstacles:
         others = np.where(contact.geom1 == geom, contact.geom2, contact.geom1)
         rows = ((contact.geom1 == geom) | (contact.geom2 == geom)) & np.isin(others, world.hand_geoms)
-        # With elliptic cones the first row of a contact is its normal force. Contacts without force have the address −1.
+        # With elliptic cones the first row of a contact is its normal force. Without force the address is −1.
         address = contact.efc_address[rows]
         if (force := float(data.efc_force[address[address >= 0]].sum())) > limit:
             return f"the hand presses on {said} with {force:.0f} N"
