@@ -28,7 +28,8 @@ _PRESSES = 0.03
 # object covered up to 0.72. Fingers that held an object and met covered up to 0.6.
 _ARRIVED, _MEETING = 0.85, 0.62
 # Two fingers meet if points of theirs were farther apart than `_APART` at the grasp and are within `_NEAR` now [m].
-_APART, _NEAR = 0.009, 0.004
+# Points that were farther apart than `_FAR` cannot meet around an object, however little the fingers covered [m].
+_APART, _NEAR, _FAR = 0.009, 0.004, 0.04
 # As an object slips out, the joints move on and their efforts fall. The object is lost if the fraction covered minus
 # the fraction of effort left exceeds this. Objects that turned in the hand, but reached the other bin, had up to 0.48.
 _SLIPPED = 0.5
@@ -64,7 +65,7 @@ def why_not_gripped(hold: Hold, hand: HandModel) -> str:
     covered = _covered(hold, hold.positions)
     if covered > _ARRIVED:
         return f"the fingers closed on nothing: they covered {100 * covered:.0f} % of the squeeze"
-    if covered > _MEETING and fingers_meet(hand, hold.touch, hold.positions):
+    if fingers_meet(hand, hold.touch, hold.positions, _APART if covered > _MEETING else _FAR):
         return "the fingers press on each other"
     return ""
 
@@ -87,11 +88,11 @@ def _covered(hold: Hold, positions: Joints) -> float:
     return float(np.median(gone / way)) if len(way) else 0.0
 
 
-def fingers_meet(hand: HandModel, before: Joints, now: Joints) -> bool:
-    """Return True if two links that were apart at joint values `before` touch at `now`."""
+def fingers_meet(hand: HandModel, before: Joints, now: Joints, least: float) -> bool:
+    """Return True if points of two fingers touch at joint values `now` that were `least` [m] apart at `before`."""
     at, links = hand_points(hand, now)
     one, other = KDTree(at).query_pairs(_NEAR, output_type="ndarray").T
     group = hand.link_group[links]
     apart = (group[one] != group[other]) & ~hand.adjacent[links[one], links[other]]
     was = hand_points(hand, before)[0]
-    return bool((np.linalg.norm(was[one[apart]] - was[other[apart]], axis=1) > _APART).any())
+    return bool((np.linalg.norm(was[one[apart]] - was[other[apart]], axis=1) > least).any())

@@ -100,7 +100,7 @@ _STRAY, _RISE = 0.006, 0.3
 _GIVES_WAY = 0.0015
 # A grasp of at least this probability ends the search. In a full bin, the best object is often the last one looked at.
 # With a look at all objects, the first grasp had a mean probability of 0.57 instead of 0.42 (LEAP hand, eight bins).
-_LIKELY = 0.7
+_LIKELY = 0.65
 # Plane that hands keep above. Its offset above the table top [m] allows for errors of arm and camera.
 TABLE = Plane(np.array([0.0, 0.0, 1.0]), 0.002)
 

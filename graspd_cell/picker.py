@@ -43,9 +43,9 @@ from graspd_core.planning.any_thing import Failure
 
 # An object is still in its place if more than `_STILL_THERE` of its points are within `_UNMOVED` of points seen [m].
 _UNMOVED, _STILL_THERE = 0.006, 0.6
-# Greatest error of an arm joint at the end of a motion in which the hand may touch the object [rad]. The object is not
-# exactly where it seems. A hand that presses on it stops short.
-_TOUCHING = 0.1
+# Greatest error of an arm joint while the hand closes on the object [rad]. The object is not exactly where it seems, so
+# the closing hand may press on it and stop the arm.
+_TOUCHING = 0.08
 # Tries to reach `start`, and collision checks for a path to `start`. The picker ends if the arm cannot reach `start`.
 _TRIES_HOME, _WAY_HOME = 3, 20_000
 
@@ -408,11 +408,13 @@ class Picker:
         times = execution.times[rows] - execution.times[rows.start]
         positions = np.concatenate([execution.arm[rows], execution.hand[rows]], 1)[1:]
         speeds = np.concatenate([execution.arm_speed[rows], execution.hand_speed[rows]], 1)[1:]
-        names = (*execution.arm_joints, *execution.hand_joints)
-        touching = np.full(len(names), np.inf)
-        touching[: len(execution.arm_joints)] = _TOUCHING
-        allowed = None if gate == "lifted" else touching
-        self._follow(JointMotion(names, times[1:], positions, speeds, goal_tolerance=allowed))
+        touching = np.repeat([_TOUCHING, np.inf], [len(execution.arm_joints), len(execution.hand_joints)])
+        self._follow(
+            JointMotion(
+                (*execution.arm_joints, *execution.hand_joints), times[1:], positions, speeds,
+                goal_tolerance=touching if gate in ("closed", "squeezed") else None,
+            )
+        )  # fmt: skip
 
     def _move_hand(self, goal: np.ndarray) -> None:
         """Move all fingers to joint values [rad] or [m], so that they arrive together."""

@@ -184,8 +184,6 @@ def run_view(case: CameraView) -> Record:
     first = result.timing.first_verified
     return {
         "own_mass": mass,
-        "assumed": scene.object.mass,
-        "tried_mass": result.mass or scene.object.mass,
         "scene_s": scene_s,
         "first_s": None if first is None else scene_s + first - result.timing.load - result.timing.sdf,
         "verified": len(verified),

@@ -110,7 +110,7 @@ class HeldShares:
         likeliest: grasps that hold on the likeliest shape, the best guess from the view.
         places: grasps that also hold with the hand misplaced.
         shapes: grasps that hold with the hand misplaced and on other shapes.
-        fails_places: grasps that hold on the likeliest shape but not with the hand misplaced.
+        fails_places: grasps that hold on the likeliest and on other shapes, but not with the hand misplaced.
         fails_shapes: grasps that hold on the likeliest shape but not on other shapes.
     """
 
@@ -123,8 +123,8 @@ class HeldShares:
 
 # Measured on 834 grasps planned without a mass and 887 with the true mass, on 114 single views (docs/clouds.md).
 # Without a mass, trials use `light_end` of the assumed mass, which is more than most objects weigh.
-MASS_ASSUMED = HeldShares(0.78, 0.83, 0.95, 0.59, 0.71)
-MASS_KNOWN = HeldShares(0.75, 0.83, 0.95, 0.63, 0.65)
+MASS_ASSUMED = HeldShares(0.78, 0.83, 0.95, 0.64, 0.71)
+MASS_KNOWN = HeldShares(0.75, 0.83, 0.95, 0.84, 0.65)
 # Masses as fractions of the heavy end, and for each mass the fraction of objects that weigh at most this mass. Counted
 # on 325 drawn household objects and ten scans.
 _MASSES, _LIGHTER = (0.0, 0.25, 0.5, 0.7, 1.0), (0.0, 0.26, 0.64, 0.85, 1.0)

@@ -161,8 +161,8 @@ def _lifted_less(scene: Scene, mass: float | None) -> tuple[str, ...]:
         return ()
     why = f"the hand cannot hold the {scene.object.mass:.2g} kg that were assumed"
     if scene.evidence is not None and mass >= light_end(scene.object.mass):
-        why = f"{LEAST_LIGHT:.0%} of objects of this volume weigh at most {mass:.2g} kg"
-    return (f"{scene.object.source}: {why}: grasps were tried at {mass:.2g} kg",)
+        why = f"{LEAST_LIGHT:.0%} of objects of this volume weigh no more"
+    return (f"{scene.object.source}: grasps were tried at {mass:.2g} kg, because {why}",)
 
 
 def _why_few(run: Run, scene: Scene, bound: BoundRestrictions, found: RoundsResult, result: GraspResult) -> str:

@@ -70,7 +70,7 @@ _SEED_STEP = 1_000_003
 # early. If a batch finds no grasp, the next batch seeks at least `_MANY`.
 _MANY, _FIRST_BATCH = 8, 2
 
-# Used if no grasp holds the assumed mass: number of grasps whose payload is measured, and tried mass as a fraction of
+# Used if no grasp holds the object: number of grasps whose payload is measured, and tried mass as a fraction of
 # the greatest payload. The tried mass is at most `light_end`, the least mass at which a grasp may be verified.
 _WEIGHED, _LIFTED = 60, 0.8
 # If none of at least this many tried grasps lifts `light_end`, only a round with more effort follows. On views of
@@ -103,9 +103,9 @@ class RoundsResult:
     @property
     def mass(self) -> float | None:
         """Object mass in the trials [kg] if this mass is below the assumed mass, else None."""
-        if self.context is None or self.context.heavy is None or (self.lowered and not self.good):
+        if self.lowered and not self.good:
             return self.lowered
-        return self.context.mass
+        return self.context.mass if self.context and self.context.heavy else None
 
     @property
     def good(self) -> int:
@@ -177,9 +177,7 @@ def run_rounds(
                 break
         if state.good >= count or run.over():
             break
-        # An unverified grasp lifts the object, so the hand is strong enough.
-        unheld = all(grasp.verdict is Verdict.FAILED for grasp in state.grasps)
-        if batch.ends_round and unheld and prefetched is not None and state.lowered is None:
+        if batch.ends_round and _unheld(scene, state) and prefetched is not None and state.lowered is None:
             last = batch.ends_round == len(rounds)
             state, weak = _weighed(run, scene, prefetched, state, batch.config.certainty, count, last=last)
             if state.good >= count or last or (weak and batch.config == rounds[-1]) or run.over():
@@ -217,6 +215,13 @@ def _batches(scene: Scene, rounds: Sequence[PlanConfig], count: int, tried: bool
     for number, config in enumerate(rounds[:1] if doubted else rounds, 1):
         for left in reversed(range(method_row(config.method).searches(config.settings) if once else 1)):
             yield _Batch(config, count, 1 if once else None, 0 if left else number)
+
+
+def _unheld(scene: Scene, state: RoundsResult) -> bool:
+    """Return True if no grasp holds the object. If cameras saw it, a grasp that only fails to lift it still counts."""
+    if scene.evidence is not None:
+        return not any(grasp.trials and grasp.trials[0].passed for grasp in state.grasps)
+    return all(grasp.verdict is Verdict.FAILED for grasp in state.grasps)
 
 
 def _searched_since(state: RoundsResult, began: float) -> RoundsResult:
@@ -265,7 +270,7 @@ def _tried_lighter(
     strongest = sorted(range(len(best)), key=lambda place: -lifted[place])
     tried = run_trials(run, context, tuple(replace(best[place], trials=()) for place in strongest), count, 0)
     if run.over() and all(grasp.verdict is Verdict.FAILED for grasp in tried.grasps):
-        # The run ended before a grasp held the lower mass. The grasps keep their trials at the assumed mass.
+        # The run ended before a grasp held the lower mass. The grasps keep their earlier trials.
         return state
     if context.checks is not None and context.checks.doubts:
         context = lighter(scene, prefetched, context, certainty, light_end(heavy), heavy)

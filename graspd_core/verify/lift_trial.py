@@ -55,7 +55,8 @@ class LiftSettings:
         lift_time: duration of the lift [s].
         hold_time: duration of the hold after the lift [s].
         max_reach_through: greatest allowed penetration of the support or a neighbour by a commanded posture [m].
-        max_press: greatest allowed force of the hand on the support or on a neighbour [N].
+        max_press: greatest allowed force of the fingers on the support or on a neighbour, until the end of the lift
+            [N]. Harder contacts may damage a hand.
     """
 
     retreat: float = RETREAT
@@ -130,9 +131,10 @@ def _raise(
             if not touched and name in (_COMING, _CLOSING):
                 touched = _touches(world, data)
                 _rest(world, data)
-            reason = _pressing(world, data, settings.max_press) if step % LOOK_EVERY == 0 else ""
-            if reason or step % CHECK_EVERY == 0 or step == steps:
-                reason = reason or breach(world, data, protocol, worst)
+            if step % LOOK_EVERY == 0 and (reason := _pressing(world, data, settings.max_press)):
+                return _said(reason, name)
+            if step % CHECK_EVERY == 0 or step == steps:
+                reason = breach(world, data, protocol, worst)
                 if reason or stop():
                     return _said(reason or STOPPED, name)
         if name == _SQUEEZING and (fault := self_fault(world, data, protocol)):

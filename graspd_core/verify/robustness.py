@@ -169,7 +169,8 @@ class RobustnessChecks:
     """The robustness checks that a grasp must pass.
 
     Attributes:
-        stages: first the checks with other shapes, which most grasps fail. Then displaced poses and less friction.
+        stages: first the checks with other shapes, because they refuse most grasps. Then the checks with less friction
+            and displaced poses.
         probability: probability that a grasp holds on the true object if it passes all stages.
         waited_for: event that is set once a trial waits for its world, so that other trials may start.
         doubts: reasons to doubt the scene or the object's mass. If there is a doubt, no grasp passes.
@@ -216,7 +217,7 @@ def robustness_checks_of(
         return RobustnessChecks((places,) if probability > shares.likeliest else (), surest, doubts=doubts)
     if scene.evidence is None or probability <= shares.likeliest:
         return None
-    stages = [_places(scene, trials, shares.fails_places)]
+    stages = list[CheckStage]()
     # If no side was hidden, there are no other shapes to check.
     surest = shares.shapes if others or not scene.evidence.hidden else shares.places
     waited_for = threading.Event()
@@ -225,7 +226,8 @@ def robustness_checks_of(
             RobustnessCheck(f"other shape {number}", partial(_hold_in, world, trials.protocol, waited_for))
             for number, world in enumerate(others, 1)
         )
-        stages.insert(0, CheckStage(shapes, OTHER_SHAPES, 0, shares.fails_shapes))
+        stages.append(CheckStage(shapes, OTHER_SHAPES, 0, shares.fails_shapes))
+    stages.append(_places(scene, trials, shares.fails_places))
     return RobustnessChecks(tuple(stages), surest, waited_for)
 
 

@@ -29,6 +29,7 @@ from graspd_core.verify.limits import FINENESS, LEAST_PAYLOAD, least_friction, p
 from graspd_core.verify.metrics import measure
 from graspd_core.verify.prepared_grasp import MetricsContext, make_metrics_context
 from graspd_core.verify.robustness import (
+    OTHER_SHAPES,
     POLL,
     CheckStage,
     HoldUnder,
@@ -124,14 +125,14 @@ def make_trial_context(
         pass
     if run.over() or (worlds := prefetched.worlds.result()) is None:
         return None
-    checks = robustness_checks_of(scene, prefetched.others, worlds, certainty.probability)
     make = lambda: replace(_metrics_context(scene, hand), world=worlds.alone)  # noqa: E731
-    context = VerificationContext(worlds, make if measure else None, checks, friction)
-    if scene.evidence is None or not scene.object.mass_assumed:
-        return context
-    # Few grasps of a guessed shape hold the assumed mass, and few objects weigh as much.
-    heavy = scene.object.mass
-    return lighter(scene, prefetched, context, certainty, light_end(heavy), heavy)
+    context = VerificationContext(worlds, make if measure else None, friction=friction)
+    if scene.evidence is not None and scene.object.mass_assumed:
+        # Few grasps of a guessed shape hold the assumed mass, and few objects weigh as much.
+        heavy = scene.object.mass
+        return lighter(scene, prefetched, context, certainty, light_end(heavy), heavy)
+    checks = robustness_checks_of(scene, prefetched.others, worlds, certainty.probability)
+    return replace(context, checks=checks)
 
 
 def lighter(
@@ -143,6 +144,8 @@ def lighter(
     greatest payload of any grasp [kg]. If `most` is too low for any grasp to be verified, no robustness check runs.
     """
     trials, others = context.trials, [world.altered(mass) for world in ahead.others]
+    for world in others[:OTHER_SHAPES]:
+        world.begin()
     around = trials.around and altered(trials.around, mass=mass)
     trials = replace(trials, alone=altered(trials.alone, mass=mass), around=around)
     # Without checks, the probability is the measured fraction for the likeliest shape.
@@ -300,8 +303,9 @@ def _all_trials(context: VerificationContext, hold_under: HoldUnder, grasp: Gras
     if not results[-1].passed or checks is None:
         return replace(grasp, trials=results)
     if context.heavy is not None:
-        about = {"least": context.mass, "most": context.heavy, "held": True, "stop": stop}
-        checks = less_sure(checks, payload(trials.alone, grasp, trials.protocol, **about), context.heavy)
+        least, most = context.mass, context.heavy
+        lifted = payload(trials.alone, grasp, trials.protocol, least=least, most=most, held=True, stop=stop)
+        checks = less_sure(checks, lifted, most)
     under, probability = try_robustness(checks, grasp, stop, hold_under)
     return replace(grasp, trials=(*results, under), probability=probability)
 
@@ -360,6 +364,8 @@ def verify_grasps(
     scene: Scene, hand: HandModel, grasps: Sequence[Grasp], *, verify: str = "standard", measure: bool = True
 ) -> tuple[Grasp, ...]:
     """Try and measure the given grasps. Return all of them in order.
+
+    If cameras saw the object and no mass was given, the trials use `light_end` of the assumed mass.
 
     Args:
         scene: scene with the object. With a support or obstacles, the lift trial runs too. If cameras saw the object,

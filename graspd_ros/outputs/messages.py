@@ -119,8 +119,10 @@ def array_message(
         message.outcome, message.warnings = result.outcome.name.lower(), list(result.warnings)
         if result.next_view is not None:
             message.next_view = PoseStamped(header=header, pose=pose_of_matrix(result.next_view))
+        # If the object may weigh more than in the trials, the lift is gentle.
+        mass = result.tried_mass if result.mass is None else None
         message.grasps = [
-            grasp_message(grasp, rank, request_id, header, hand, settings, mass=result.tried_mass)
+            grasp_message(grasp, rank, request_id, header, hand, settings, mass=mass)
             for rank, grasp in enumerate(result.tried)
         ]
     return message

@@ -323,7 +323,8 @@ def test_what_cameras_saw_is_tried_at_the_light_end_of_the_assumed_mass():
     result = plan_grasps(seen, load_hand("allegro_right"), count=2, preset="fast")
     tried = light_end(seen.object.mass)
     assert (result.mass, result.tried_mass) == (tried, tried)
-    assert any(f"80% of objects of this volume weigh at most {tried:.2g} kg" in told for told in result.warnings)
+    why = "because 80% of objects of this volume weigh no more"
+    assert any(f"tried at {tried:.2g} kg, {why}" in told for told in result.warnings)
     assert result.grasps
     for grasp in result.grasps:
         share = some(grasp.probability) / (MASS_ASSUMED.shapes if grasp.verdict is Verdict.VERIFIED else 1.0)
@@ -331,7 +332,7 @@ def test_what_cameras_saw_is_tried_at_the_light_end_of_the_assumed_mass():
         if grasp.verdict is Verdict.VERIFIED:
             # Only what also lifts the assumed mass is as sure as a grasp of a known mass.
             lifts = some(some(grasp.metrics)["payload"]) >= seen.object.mass / 1.1
-            assert share >= LEAST_LIGHT
+            assert share >= LEAST_LIGHT - 1e-9
             assert lifts or share < 1.0
 
 
