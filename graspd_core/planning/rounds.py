@@ -177,7 +177,7 @@ def run_rounds(
                 break
         if state.good >= count or run.over():
             break
-        if batch.ends_round and _unheld(scene, state) and prefetched is not None and state.lowered is None:
+        if batch.ends_round and _unheld(state) and prefetched is not None and state.lowered is None:
             last = batch.ends_round == len(rounds)
             state, weak = _weighed(run, scene, prefetched, state, batch.config.certainty, count, last=last)
             if state.good >= count or last or (weak and batch.config == rounds[-1]) or run.over():
@@ -217,9 +217,9 @@ def _batches(scene: Scene, rounds: Sequence[PlanConfig], count: int, tried: bool
             yield _Batch(config, count, 1 if once else None, 0 if left else number)
 
 
-def _unheld(scene: Scene, state: RoundsResult) -> bool:
-    """Return True if no grasp holds the object. If cameras saw it, a grasp that only fails to lift it still counts."""
-    if scene.evidence is not None:
+def _unheld(state: RoundsResult) -> bool:
+    """Return True if no grasp passed. At a mass below the assumed mass, a grasp that only fails its lift counts too."""
+    if state.context is not None and state.context.heavy is not None:
         return not any(grasp.trials and grasp.trials[0].passed for grasp in state.grasps)
     return all(grasp.verdict is Verdict.FAILED for grasp in state.grasps)
 
