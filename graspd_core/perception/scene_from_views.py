@@ -118,7 +118,7 @@ def reconstruct_object(
         about_units = _unit_doubts(seen, views, settings.segmentation.max_range)
         doubts = (*about_units, *_camera_doubts(seen, views), *filter(None, (seen.cut, seen.beside)))
     whole = reconstruct(seen.views, seen.support, settings.reconstruction, () if alone else views)
-    whole = replace(whole, evidence=replace(whole.evidence, doubts=doubts))
+    whole = replace(whole, evidence=replace(whole.evidence, doubts=doubts, piled=settings.segmentation.piled))
     told = tuple(f"cloud: {doubt}; no grasp counts as verified" for doubt in doubts)
     reach = settings.segmentation.obstacle_range
     obstacles = make_obstacles(seen.obstacles, seen.support, whole.mesh, reach, settings.obstacles)

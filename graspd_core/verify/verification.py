@@ -127,9 +127,10 @@ def make_trial_context(
         return None
     make = lambda: replace(_metrics_context(scene, hand), world=worlds.alone)  # noqa: E731
     context = VerificationContext(worlds, make if measure else None, friction=friction)
-    if scene.evidence is not None and scene.object.mass_assumed and not scene.evidence.doubts:
-        # Few grasps of a guessed shape hold the assumed mass, and few objects weigh as much. In a doubted scene, where
-        # no other shape is tried, the assumed mass sorts out weak grasps.
+    seen = scene.evidence
+    if seen is not None and scene.object.mass_assumed and not (seen.doubts or seen.piled):
+        # Few grasps of a guessed shape hold the assumed mass, and few objects weigh as much. In a doubted scene, no other
+        # shape sorts out weak grasps, and in a pile, objects lie on each other. There the assumed mass is a margin.
         heavy = scene.object.mass
         return lighter(scene, prefetched, context, certainty, light_end(heavy), heavy)
     checks = robustness_checks_of(scene, prefetched.others, worlds, certainty.probability)
@@ -366,8 +367,8 @@ def verify_grasps(
 ) -> tuple[Grasp, ...]:
     """Try and measure the given grasps. Return all of them in order.
 
-    If cameras saw the object and no mass was given, the trials use `light_end` of the assumed mass. In a doubted scene,
-    they use the assumed mass.
+    If cameras saw the object and no mass was given, the trials use `light_end` of the assumed mass. In a doubted scene
+    or in a pile, they use the assumed mass.
 
     Args:
         scene: scene with the object. With a support or obstacles, the lift trial runs too. If cameras saw the object,

@@ -246,6 +246,7 @@ class Evidence:
         settings: settings of the reconstruction.
         hidden: whether a large part of the surface was hidden.
         doubts: reasons why the views may not show the true scene. With any doubt, no grasp counts as verified.
+        piled: whether objects lie on each other.
     """
 
     seen: Surfels
@@ -257,3 +258,4 @@ class Evidence:
     settings: ReconstructionConfig
     hidden: bool
     doubts: tuple[str, ...] = ()
+    piled: bool = False
