@@ -129,8 +129,8 @@ def make_trial_context(
     context = VerificationContext(worlds, make if measure else None, friction=friction)
     seen = scene.evidence
     if seen is not None and scene.object.mass_assumed and not (seen.doubts or seen.piled):
-        # Few grasps of a guessed shape hold the assumed mass, and few objects weigh as much. In a doubted scene, no other
-        # shape sorts out weak grasps, and in a pile, objects lie on each other. There the assumed mass is a margin.
+        # Few grasps of a guessed shape hold the assumed mass, and few objects weigh as much. In a doubted scene, no
+        # other shape sorts out weak grasps. In a pile, objects lie on each other. There the assumed mass is a margin.
         heavy = scene.object.mass
         return lighter(scene, prefetched, context, certainty, light_end(heavy), heavy)
     checks = robustness_checks_of(scene, prefetched.others, worlds, certainty.probability)
