@@ -21,7 +21,7 @@ from jaxtyping import Float
 from graspd_core.hands.kinematics import RETREAT, retreat_posture
 from graspd_core.hands.model import HandModel
 from graspd_core.types import Grasp, Posture, TrialResult
-from graspd_core.verify.early_stop import CHECK_EVERY, LOOK_EVERY
+from graspd_core.verify.early_stop import CHECK_EVERY
 from graspd_core.verify.hold_trial import (
     STOPPED,
     breach,
@@ -55,8 +55,6 @@ class LiftSettings:
         lift_time: duration of the lift [s].
         hold_time: duration of the hold after the lift [s].
         max_reach_through: greatest allowed penetration of the support or a neighbour by a commanded posture [m].
-        max_press: greatest allowed force of the fingers on the support or on a neighbour, until the end of the lift
-            [N]. Harder contacts may damage a hand.
     """
 
     retreat: float = RETREAT
@@ -65,7 +63,6 @@ class LiftSettings:
     lift_time: float = 1.0
     hold_time: float = 3.0
     max_reach_through: float = 0.002
-    max_press: float = 50.0
 
 
 def lift_trial(
@@ -131,8 +128,6 @@ def _raise(
             if not touched and name in (_COMING, _CLOSING):
                 touched = _touches(world, data)
                 _rest(world, data)
-            if step % LOOK_EVERY == 0 and (reason := _pressing(world, data, settings.max_press)):
-                return _said(reason, name)
             if step % CHECK_EVERY == 0 or step == steps:
                 reason = breach(world, data, protocol, worst)
                 if reason or stop():
@@ -151,19 +146,6 @@ def _touches(world: World, data: Any) -> bool:
     first, second = data.contact.geom1, data.contact.geom2
     hand = np.isin(first, world.hand_geoms) | np.isin(second, world.hand_geoms)
     return bool((hand & ((bodies[first] == world.object_body) | (bodies[second] == world.object_body))).any())
-
-
-def _pressing(world: World, data: Any, limit: float) -> str:
-    """Return on which support or neighbour the hand presses with more than `limit` [N], "" if on none."""
-    contact = data.contact
-    for geom, said in world.obstacles:
-        others = np.where(contact.geom1 == geom, contact.geom2, contact.geom1)
-        rows = ((contact.geom1 == geom) | (contact.geom2 == geom)) & np.isin(others, world.hand_geoms)
-        # With elliptic cones the first row of a contact is its normal force. Without force the address is −1.
-        address = contact.efc_address[rows]
-        if (force := float(data.efc_force[address[address >= 0]].sum())) > limit:
-            return f"the hand presses on {said} with {force:.0f} N"
-    return ""
 
 
 def _rest(world: World, data: Any) -> None:
