@@ -336,6 +336,17 @@ def test_what_cameras_saw_is_tried_at_the_light_end_of_the_assumed_mass():
             assert lifts or share < 1.0
 
 
+@pytest.mark.parametrize("about", [{"piled": True}, {"doubts": ("are its numbers metres?",)}])
+def test_in_a_pile_and_in_a_doubted_scene_the_assumed_mass_is_tried(about):
+    seen, hand = seen_from(), load_hand("allegro_right")
+    evidence = replace(some(seen.evidence), **about)
+    scene = replace(seen, object=replace(seen.object, mass_assumed=True), evidence=evidence)
+    run = Run(time.perf_counter(), None, None, None)
+    ahead = verification.prefetch(run, scene, hand, "standard", CertaintyConfig())
+    context = some(verification.make_trial_context(run, scene, hand, ahead, CertaintyConfig(), measure=False))
+    assert (context.mass, context.heavy) == (pytest.approx(scene.object.mass), None)
+
+
 def test_a_grasp_is_as_sure_as_objects_are_lighter_than_its_own_payload():
     worlds = worlds_of_seen()
     grasps = tuple(replace(grasp, trials=()) for grasp in planned().tried if grasp.verdict is not Verdict.FAILED)
