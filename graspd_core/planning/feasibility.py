@@ -83,7 +83,7 @@ def why_trials_failed(scene: Scene, grasps: Sequence[Grasp]) -> str:
 
 def kind_of(reason: str) -> str:
     """Return a failure reason without its numbers and directions, to count equal kinds. Names keep their digits."""
-    number = r"(by |with )?(?<!\w)[-+]?\d+(\.\d+)?(e[-+]?\d+)?( ?°| ?[cm]?m\b| ?N\b)?"
+    number = r"(by )?(?<!\w)[-+]?\d+(\.\d+)?(e[-+]?\d+)?( ?°| ?[cm]?m\b)?"
     for figures in (r"\([^()]*\d[^()]*\)", number, r"along [-+][xyz]"):
         reason = re.sub(figures, " ", reason)
     return re.sub(r" (?=[;,.:])", "", " ".join(reason.split()))
