@@ -1,7 +1,7 @@
 """Check the robustness of grasps of objects that cameras saw: other poses, less friction, other shapes.
 
 A grasp that holds on the likeliest scene, the best guess from the clouds, must also pass these checks. The hidden side
-may be guessed wrong, so the grasp must also hold on three other shapes. On these shapes, the limit of rotation is two
+may be guessed wrong, so the grasp must also hold on two other shapes. On these shapes, the limit of rotation is two
 thirds of the usual limit. docs/clouds.md reports how often grasps that pass all checks hold on the true object. Trials
 run on several threads. The number of threads changes neither results nor order (`results_in_order`).
 """
@@ -105,16 +105,10 @@ _LESS_FRICTION = 2 / 3
 _LESS_TURN = 2 / 3
 # Number and seed of the displaced poses, equal for all grasps. No benchmark uses this seed.
 _PLACES, _PLACES_SEED = 3, 0x706C616365
-# If the mass is assumed, a grasp must hold at `_LEAST_PLACES` displaced poses. It must hold on `OTHER_SHAPES` shapes.
-_LEAST_PLACES, OTHER_SHAPES = 2, 3
 # Number of nodes of another shape's distance grid along an axis. The shape is guessed, so a finer grid would not help.
 _RESOLUTION = 24
 # Name of the threads that build other shapes.
 _SHAPES = "graspd-shapes"
-
-# Results of checks in order. A result is None if the check is impossible. `HoldUnder` runs a stage's checks on a grasp.
-Results = Generator[TrialResult | None]
-HoldUnder = Callable[["CheckStage", Grasp, StopHook], Results]
 
 
 @dataclass(frozen=True)
@@ -132,18 +126,14 @@ class RobustnessCheck:
 
 @dataclass(frozen=True)
 class CheckStage:
-    """Robustness checks of one kind.
+    """Robustness checks of one kind. A grasp must pass all that are possible.
 
     Attributes:
         items: the checks, in the order in which they run.
-        least: number of checks that a grasp must pass. If fewer checks are possible, the grasp must pass all of them.
-        may_fail: number of checks that a grasp may fail before it has passed `least` checks.
         though_failed: probability that a grasp holds on the true object although it fails this stage.
     """
 
     items: tuple[RobustnessCheck, ...]
-    least: int
-    may_fail: int
     though_failed: float
 
 
@@ -187,8 +177,8 @@ def begin_other_worlds(
 ) -> tuple[LaterWorld, ...]:
     """Return worlds (MuJoCo models) with other possible shapes of the object. Empty if no other shape is needed.
 
-    For each world, another rule guesses the hidden side. Threads now build the first three worlds, which every grasp
-    needs. Others are built on request. A world is None if its rule gives no other shape, or the run ended.
+    For each world, another rule guesses the hidden side. Threads now build the worlds. A world is None if its rule
+    gives no other shape, or the run ended.
     """
     making = threading.Lock()
 
@@ -198,7 +188,7 @@ def begin_other_worlds(
 
     rules = _rules_needed(scene.evidence, probability, held_shares(scene.object))
     worlds = tuple(LaterWorld(partial(make, rule)) for rule in rules)
-    for world in worlds[:OTHER_SHAPES]:
+    for world in worlds:
         world.begin()
     return worlds
 
@@ -208,7 +198,7 @@ def robustness_checks_of(
 ) -> RobustnessChecks | None:
     """Return the checks that a grasp must pass to reach the requested `probability`. None if no check is needed.
 
-    `others` comes from `begin_other_worlds`. If the mass is known, all displaced poses and less friction must hold.
+    `others` comes from `begin_other_worlds`. If the mass is known, the grasp must also hold with less friction.
     """
     shares, doubts = held_shares(scene.object), scene.evidence.doubts if scene.evidence else ()
     if doubts:
@@ -226,7 +216,7 @@ def robustness_checks_of(
             RobustnessCheck(f"other shape {number}", partial(_hold_in, world, trials.protocol, waited_for))
             for number, world in enumerate(others, 1)
         )
-        stages.append(CheckStage(shapes, OTHER_SHAPES, 0, shares.fails_shapes))
+        stages.append(CheckStage(shapes, shares.fails_shapes))
     stages.append(_places(scene, trials, shares.fails_places))
     return RobustnessChecks(tuple(stages), surest, waited_for)
 
@@ -238,13 +228,13 @@ def _places(scene: Scene, trials: TrialContext, though_failed: float) -> CheckSt
         for number, error in enumerate(pose_errors(_PLACES_SEED, _PLACES), 1)
     ]
     if scene.object.mass_assumed:
-        return CheckStage(tuple(places), _LEAST_PLACES, _PLACES - _LEAST_PLACES, though_failed)
+        return CheckStage(tuple(places), though_failed)
     slippery = at_friction(trials.protocol, _LESS_FRICTION * Protocol.friction[0])
     world = altered(trials.alone, friction=slippery.friction)
     work = lambda grasp, stop: hold_trial(world, grasp, slippery, stop=stop)  # noqa: E731
     # Most of the grasps that fail here fail with less friction.
     places.insert(0, RobustnessCheck(f"friction {slippery.friction[0]:.2g}", work))
-    return CheckStage(tuple(places), len(places), 0, though_failed)
+    return CheckStage(tuple(places), though_failed)
 
 
 def doubted_if_weak(checks: RobustnessChecks, most: float, heavy: float) -> RobustnessChecks:
@@ -268,42 +258,32 @@ def less_sure(checks: RobustnessChecks, most: float, heavy: float) -> Robustness
     return replace(checks, stages=stages, probability=share * checks.probability)
 
 
-def one_by_one(stage: CheckStage, grasp: Grasp, stop: StopHook) -> Results:
-    """Yield the trial result of each check in turn. A trial starts only when its result is requested."""
-    for item in stage.items:
-        yield item.hold(grasp, stop)
-
-
 def try_robustness(
-    checks: RobustnessChecks,
-    grasp: Grasp,
-    stop: StopHook,
-    hold_under: HoldUnder = one_by_one,
+    checks: RobustnessChecks, grasp: Grasp, stop: StopHook, threads: int = 1
 ) -> tuple[TrialResult, float]:
-    """Run the robustness checks of a grasp, stage by stage. A stage ends when enough checks pass or too many fail.
+    """Run the robustness checks of a grasp, stage by stage, until one fails. `threads` run the checks of a stage.
 
     Return the combined result and the probability that the grasp holds on the true object. The combined result holds
-    the greatest travel and rotation of all passed trials. `hold_under` runs the checks of one stage.
+    the greatest travel and rotation of all passed trials.
     """
     travel = turn = 0.0
     for stage in checks.stages:
-        held, reasons = 0, []
-        with closing(hold_under(stage, grasp, stop)) as results:
+        reason = ""
+        with closing(_results(stage, grasp, stop, threads)) as results:
             for item, result in zip(stage.items, results, strict=False):
                 if stop() or result is None:
                     continue
-                if result.passed:
-                    held += 1
-                    travel, turn = max(travel, result.displacement), max(turn, result.rotation)
-                else:
-                    reasons.append(f"fails with {item.name}: {result.reason}")
-                if held == stage.least or len(reasons) > stage.may_fail:
+                if not result.passed:
+                    reason = f"fails with {item.name}: {result.reason}"
                     break
-        if stop():
-            return TrialResult(ROBUSTNESS, False, travel, turn, STOPPED), stage.though_failed
-        if len(reasons) > stage.may_fail or held < min(stage.least, held + len(reasons)):
-            return TrialResult(ROBUSTNESS, False, travel, turn, reasons[0]), stage.though_failed
+                travel, turn = max(travel, result.displacement), max(turn, result.rotation)
+        if stop() or reason:
+            return TrialResult(ROBUSTNESS, False, travel, turn, STOPPED if stop() else reason), stage.though_failed
     return TrialResult(ROBUSTNESS, not checks.doubts, travel, turn, *checks.doubts[:1]), checks.probability
+
+
+def _results(stage: CheckStage, grasp: Grasp, stop: StopHook, threads: int) -> Generator[TrialResult | None]:
+    return results_in_order(stop, lambda item, ended: item.hold(grasp, ended), stage.items, threads)
 
 
 def held_shares(target: ObjectModel) -> HeldShares:
@@ -348,7 +328,7 @@ def begin_other_shapes(probability: float, likeliest: ObjectModel, evidence: Evi
 
     `scene_from_views` calls this function before it builds the distance grid of the likeliest shape.
     """
-    for rule in _rules_needed(evidence, probability, held_shares(likeliest))[:OTHER_SHAPES]:
+    for rule in _rules_needed(evidence, probability, held_shares(likeliest)):
         work = partial(run_isolated, other_scene, evidence, rule, likeliest)
         _begun(evidence)[rule] = begin_in_thread(_SHAPES, work)
 

@@ -29,18 +29,13 @@ from graspd_core.verify.limits import FINENESS, LEAST_PAYLOAD, least_friction, p
 from graspd_core.verify.metrics import measure
 from graspd_core.verify.prepared_grasp import MetricsContext, make_metrics_context
 from graspd_core.verify.robustness import (
-    OTHER_SHAPES,
     POLL,
-    CheckStage,
-    HoldUnder,
     LaterWorld,
-    Results,
     RobustnessChecks,
     begin_in_thread,
     begin_other_worlds,
     doubted_if_weak,
     less_sure,
-    one_by_one,
     results_in_order,
     robustness_checks_of,
     try_robustness,
@@ -146,7 +141,7 @@ def lighter(
     greatest payload of any grasp [kg]. If `most` is too low for any grasp to be verified, no robustness check runs.
     """
     trials, others = context.trials, [world.altered(mass) for world in ahead.others]
-    for world in others[:OTHER_SHAPES]:
+    for world in others:
         world.begin()
     around = trials.around and altered(trials.around, mass=mass)
     trials = replace(trials, alone=altered(trials.alone, mass=mass), around=around)
@@ -272,7 +267,7 @@ def _tried(
     the first one waits for a world or is done.
     """
     threads, checks = torch.get_num_threads(), context.checks
-    work = partial(_all_trials, context, one_by_one)
+    work = partial(_all_trials, context, 1)
     if alone and checks is not None:
         work = partial(_best_first, context, checks, candidates[0], threads)
     return results_in_order(run.over, work, candidates, threads, needed, known_over=run.known_over)
@@ -285,21 +280,14 @@ def _best_first(
     if grasp is not best:
         while not checks.waited_for.wait(POLL) and not stop():
             pass
-        return _all_trials(context, one_by_one, grasp, stop)
+        return _all_trials(context, 1, grasp, stop)
     try:
-        return _all_trials(context, one_by_one if threads == 1 else partial(_at_once, threads), grasp, stop)
+        return _all_trials(context, threads, grasp, stop)
     finally:
         checks.waited_for.set()
 
 
-def _at_once(threads: int, stage: CheckStage, grasp: Grasp, stop: StopHook) -> Results:
-    """Yield a stage's trial results. The first `least` checks run in parallel. Then the other checks run in turn."""
-    first, others = stage.items[: stage.least], stage.items[stage.least :]
-    yield from results_in_order(stop, lambda item, ended: item.hold(grasp, ended), first, threads, lambda: len(first))
-    yield from one_by_one(replace(stage, items=others), grasp, stop)
-
-
-def _all_trials(context: VerificationContext, hold_under: HoldUnder, grasp: Grasp, stop: StopHook) -> Grasp:
+def _all_trials(context: VerificationContext, threads: int, grasp: Grasp, stop: StopHook) -> Grasp:
     results = grasp_trials(context.trials, grasp, stop)
     checks, trials = context.checks, context.trials
     if not results[-1].passed or checks is None:
@@ -308,7 +296,7 @@ def _all_trials(context: VerificationContext, hold_under: HoldUnder, grasp: Gras
         least, most = context.mass, context.heavy
         lifted = payload(trials.alone, grasp, trials.protocol, least=least, most=most, held=True, stop=stop)
         checks = less_sure(checks, lifted, most)
-    under, probability = try_robustness(checks, grasp, stop, hold_under)
+    under, probability = try_robustness(checks, grasp, stop, threads)
     return replace(grasp, trials=(*results, under), probability=probability)
 
 
@@ -395,7 +383,7 @@ def verify_grasps(
         )
         assert context is not None  # the run has no end
         trials = context.trials
-        tried = tuple(_all_trials(context, one_by_one, grasp, run.over) for grasp in tried)
+        tried = tuple(_all_trials(context, 1, grasp, run.over) for grasp in tried)
     if measure:
         own = replace(_metrics_context(scene, hand), world=trials and trials.alone)
         tried = tuple(

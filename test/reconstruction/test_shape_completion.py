@@ -206,9 +206,9 @@ def half_seen() -> Reconstruction:
 def test_other_rules_give_other_closed_shapes_through_what_was_seen(half_seen):
     evidence = half_seen.evidence
     rules = other_rules(evidence)
-    assert evidence.chosen not in rules
+    assert rules == ("mirror", "revolution")
     shapes = [mesh for rule in rules if (mesh := other_shape(evidence, rule, half_seen.mesh)) is not None]
-    assert len(shapes) >= 2
+    assert shapes
     for mesh in shapes:
         assert is_closed(mesh)
         surface = make_surface(mesh)
@@ -217,9 +217,9 @@ def test_other_rules_give_other_closed_shapes_through_what_was_seen(half_seen):
         assert surface_distance(surface, surface_samples(half_seen.mesh, 2000, 0)[0]).mean() > 2e-4
 
 
-def test_the_shape_that_was_chosen_is_no_other(half_seen):
-    assert half_seen.evidence.hidden
-    assert other_shape(half_seen.evidence, half_seen.evidence.chosen, half_seen.mesh) is None
+def test_an_equal_shape_is_no_other(half_seen):
+    turned = some(other_shape(half_seen.evidence, "revolution", half_seen.mesh))
+    assert other_shape(half_seen.evidence, "revolution", turned) is None
 
 
 def test_nothing_else_may_be_true_of_what_was_seen_all_round():

@@ -20,7 +20,6 @@ from graspd_core.perception.reconstruct.revolution import find_revolution
 from graspd_core.perception.reconstruct.symmetry import Symmetry, find_centre, find_mirrors, image
 
 REVOLUTION, MIRROR, POINT_SYMMETRY, EXTRUSION = "revolution", "mirror", "point symmetry", "extrusion"
-RULES = (REVOLUTION, MIRROR, POINT_SYMMETRY, EXTRUSION, "")
 # Weight of the contradicted fraction of a body of revolution, relative to the fraction of seen points on the body.
 FAULT_WEIGHT = 5.0
 # If the cameras contradict a symmetry at more than this fraction of its points, the symmetry is taken for chance.
@@ -107,20 +106,15 @@ def _mirrored(mirrors: list[Symmetry], seen: Surfels) -> Surfels:
 
 
 def guess_by(rule: str, seen: Surfels, free_space: FreeSpace, step: float) -> Surfels | None:
-    """Return points that `rule`, one of `RULES`, guesses on the unseen side. None if the rule makes no guess.
+    """Return points that `REVOLUTION` or `MIRROR` guesses on the unseen side. None if the rule makes no guess.
 
-    The guess may be unlikely. The rule "" gives an empty set: the surface then closes behind the seen points.
+    The guess may be unlikely.
     """
-    if rule == REVOLUTION:
-        turned = find_revolution(seen, free_space, step)
-        raw = None if turned is None else turned.surfels
-    elif rule == MIRROR:
+    if rule == MIRROR:
         raw = _mirrored(find_mirrors(seen, free_space), seen)
-    elif rule == POINT_SYMMETRY:
-        raw = image(find_centre(seen, free_space), seen)
-    elif rule == EXTRUSION:
-        raw = extrude(seen, free_space, step) if free_space.standing else None
+    elif (turned := find_revolution(seen, free_space, step)) is not None:
+        raw = turned.surfels
     else:
-        return nothing()
-    guess = None if raw is None else plausible(raw, seen, free_space, step)
-    return guess if guess is not None and _counts(guess, seen) else None
+        return None
+    guess = plausible(raw, seen, free_space, step)
+    return guess if _counts(guess, seen) else None
