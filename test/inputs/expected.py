@@ -10,14 +10,23 @@ T = TypeVar("T")
 
 
 @contextmanager
-def refused(error: type[Exception], *told: str, start: str = "", match: str | None = None) -> Iterator[None]:
-    """Expect an error of one line that has these texts, begins with one, and that a regular expression matches."""
+def refused(
+    error: type[Exception], *told: str, start: str = "", match: str | None = None, code: str = ""
+) -> Iterator[None]:
+    """Expect an error of one line that has these texts, begins with one, and that a regular expression matches.
+
+    `code` is the error code that the node gives with the error.
+    """
     with pytest.raises(error, match=match) as caught:
         yield
     line = str(caught.value)
     assert "\n" not in line, line
     assert line.startswith(start), line
     assert [text for text in told if text not in line] == [], line
+    if code:
+        from graspd_ros.error_codes import code_of
+
+        assert code_of(caught.value) == code
 
 
 def some(value: T | None) -> T:

@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from builtin_interfaces.msg import Time
+from expected import refused
 from geometry_msgs.msg import Point, Pose, PoseStamped, Quaternion, Vector3
 from graspd_msgs.msg import GraspRequest
 from hypothesis import given
@@ -165,13 +166,11 @@ def test_a_pose_without_turn_is_a_place_and_a_wrong_one_is_refused():
 
 def test_a_cloud_is_refused_when_none_came_or_it_is_old():
     taker, latest = intake(), GraspRequest(source=GraspRequest.LATEST_CLOUD)
-    with pytest.raises(RequestError, match="no cloud or depth image has arrived yet") as refused:
+    with refused(RequestError, match="no cloud or depth image has arrived yet", code="NO_CLOUD"):
         taker.from_message("a", Settings(), latest)
-    assert refused.value.code is ErrorCode.NO_CLOUD
     taker.newest = sensor_frame(np.zeros((3, 3)), stamp=Time(sec=990))
-    with pytest.raises(RequestError, match=r"10\.0 s old, more than cloud_max_age=5 s") as refused:
+    with refused(RequestError, match=r"10\.0 s old, more than cloud_max_age=5 s", code="STALE_CLOUD"):
         taker.from_message("a", Settings(), latest)
-    assert refused.value.code is ErrorCode.STALE_CLOUD
     request = taker.from_message("a", Settings(cloud_max_age=0.0), latest)
     assert (request.frame, request.stamp.sec, request.source) == ("camera", 990, "latest_cloud")
     taker.newest = cloud_frame(PointCloud2(header=Header(frame_id="camera")), 1000 * 10**9)
@@ -187,9 +186,8 @@ def test_views_are_gathered_in_one_frame():
         return translation_matrix([1.0, 0.0, 0.0])
 
     taker, settings = intake(lookup), Settings(fixed_frame="map")
-    with pytest.raises(RequestError, match="call ~/add_view") as refused:
+    with refused(RequestError, match="call ~/add_view", code="NO_CLOUD"):
         taker.from_message("a", settings, GraspRequest(source=GraspRequest.VIEWS))
-    assert refused.value.code is ErrorCode.NO_CLOUD
     taker.newest = sensor_frame(np.array([[0.0, 0.0, 1.0], [0.0, 0.5, 1.0]]))
     taker.add_view(settings)
     taker.newest = sensor_frame(np.array([[2.0, 0.0, 0.0]]), frame="map")
@@ -385,10 +383,8 @@ def test_every_form_finds_the_file(root: Path, monkeypatch: pytest.MonkeyPatch):
     ],
 )
 def test_what_may_not_be_read_is_refused_by_name(root: Path, uri: str, culprit: str):
-    with pytest.raises(MeshError) as refused:
+    with refused(MeshError, culprit):
         resolve_mesh(uri, [str(root)])
-    assert culprit in str(refused.value)
-    assert "\n" not in str(refused.value)
 
 
 def test_without_a_usable_root_nothing_may_be_read(root: Path):
@@ -537,9 +533,8 @@ def test_a_box_may_be_the_region(tmp_path):
     ],
 )
 def test_wishes_that_make_no_sense_are_refused_by_name(tmp_path, fields, culprit):
-    with pytest.raises(GraspdError, match=culprit) as refused:
+    with refused(GraspdError, match=culprit, code="BAD_REQUEST"):
         request(tmp_path, **fields)
-    assert code_of(refused.value) is ErrorCode.BAD_REQUEST
 
 
 def test_every_constant_of_the_message_has_its_row():
@@ -551,11 +546,10 @@ def test_every_constant_of_the_message_has_its_row():
 
 def test_a_source_without_a_row_is_refused_and_the_rows_are_named(monkeypatch):
     request = GraspRequest(source=SCANNER)
-    with pytest.raises(
-        RequestError, match=r"source: 9; valid: CLOUD=0, MESH=1, LATEST_CLOUD=2, VIEWS=3, KNOWN=4$"
-    ) as refused:
+    with refused(
+        RequestError, match=r"source: 9; valid: CLOUD=0, MESH=1, LATEST_CLOUD=2, VIEWS=3, KNOWN=4$", code="BAD_REQUEST"
+    ):
         intake().from_message("r", Settings(), request)
-    assert refused.value.code is ErrorCode.BAD_REQUEST
     monkeypatch.setitem(SOURCES, 7, replace(SOURCES[GraspRequest.CLOUD], name="lidar"))
     with pytest.raises(RequestError, match=r"LIDAR=7$"):
         intake().from_message("r", Settings(), request)
