@@ -44,14 +44,11 @@ def test_the_table_says_where_most_situations_came_up():
 
 
 @pytest.mark.parametrize("row", REFUSED.values(), ids=REFUSED)
-def test_the_library_refuses_it_by_name(row: Situation, tmp_path: Path):
+def test_the_library_and_the_command_line_refuse_it_in_the_same_words(row: Situation, tmp_path: Path, refusal_of):
+    path = row.make(tmp_path)
     with refused(GraspdError, match=str(row.expect)):
-        load_scene(row.make(tmp_path), resolution=16, **arguments(row))
-
-
-@pytest.mark.parametrize("row", REFUSED.values(), ids=REFUSED)
-def test_the_command_line_refuses_it_in_the_same_words(row: Situation, tmp_path: Path, refusal_of):
-    assert re.search(str(row.expect), refusal_of("synthesize", row.make(tmp_path), *words(row)))
+        load_scene(path, resolution=16, **arguments(row))
+    assert re.search(str(row.expect), refusal_of("synthesize", path, *words(row)))
 
 
 @pytest.mark.parametrize("row", ANSWERED.values(), ids=ANSWERED)
