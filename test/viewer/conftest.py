@@ -12,7 +12,6 @@ from typing import Any
 
 import numpy as np
 import pytest
-import torch
 from PIL import Image
 
 from graspd_core import GraspResult, load_hand, load_preset, load_scene, plan_grasps, save_result
@@ -41,14 +40,6 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     for item in items:
         if "test/viewer" in item.path.as_posix() and "visit" in getattr(item, "fixturenames", ()):
             item.add_marker(pytest.mark.timeout(300))
-
-
-@pytest.fixture(autouse=True)
-def _one_thread() -> Iterator[None]:
-    before = torch.get_num_threads()
-    torch.set_num_threads(1)
-    yield
-    torch.set_num_threads(before)
 
 
 @pytest.fixture(scope="session")
