@@ -17,6 +17,8 @@ from graspd_cell import cell_command, picker
 from graspd_cell.cell_view import FRAMES, Film, LiveCell
 from graspd_cell.simulated_robot import SimulatedRobot
 
+ONE_BOX = ("--hand", "parallel_gripper", "--things", "shape:box", "--count", "1")
+
 
 def _options(*words: str) -> argparse.Namespace:
     parser = argparse.ArgumentParser()
@@ -27,19 +29,7 @@ def _options(*words: str) -> argparse.Namespace:
 @pytest.mark.timeout(300)
 def test_a_bin_is_emptied_in_a_line_a_pick_and_a_film(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
     film = tmp_path / "film.png"
-    words = (
-        "--hand",
-        "parallel_gripper",
-        "--things",
-        "shape:box",
-        "--count",
-        "1",
-        "--preset",
-        "fast",
-        "--film",
-        str(film),
-    )
-    status = cell_command.run(_options(*words))
+    status = cell_command.run(_options(*ONE_BOX, "--preset", "fast", "--film", str(film)))
     *lines, last = capsys.readouterr().out.splitlines()
     # A busy machine may end before the first grasp is found. What came of it is not this test's business.
     assert all(line.startswith(f"{number}: ") for number, line in enumerate(lines, 1))
@@ -51,8 +41,7 @@ def test_a_bin_is_emptied_in_a_line_a_pick_and_a_film(tmp_path: Path, capsys: py
 
 @pytest.mark.timeout(300)
 def test_an_empty_bin_is_filled_again_until_there_were_enough_picks(capsys: pytest.CaptureFixture[str]):
-    words = ("--hand", "parallel_gripper", "--things", "shape:box", "--count", "1", "--attempts", "1", "--picks", "2")
-    assert cell_command.run(_options(*words, "--preset", "fast")) == 0
+    assert cell_command.run(_options(*ONE_BOX, "--attempts", "1", "--picks", "2", "--preset", "fast")) == 0
     *failures, endings, last = capsys.readouterr().out.splitlines()
     assert all(line.startswith(("bin 1, attempt 1: ", "bin 2, attempt 1: ")) for line in failures)
     assert sum(int(part.rpartition(": ")[2]) for part in endings.split("; ")) == 2
@@ -64,8 +53,7 @@ def test_ctrl_c_is_no_failure_of_the_arm(monkeypatch: pytest.MonkeyPatch, capsys
         raise picker.Cancelled("cancelled")
 
     monkeypatch.setattr(picker.Picker, "empty_the_bin", cancelled)
-    words = ("--hand", "parallel_gripper", "--things", "shape:box", "--count", "1", "--picks", "1")
-    cell_command.run(_options(*words))
+    cell_command.run(_options(*ONE_BOX, "--picks", "1"))
     said = capsys.readouterr().out
     assert "bin 1: cancelled" in said
     assert "the arm stayed where it was" not in said
