@@ -4,11 +4,13 @@ import shutil
 import sys
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import pytest
 
 from graspd_dataset.blocks import Block, DatasetRequest, blocks_of
 from graspd_dataset.dataset_store import DatasetStore
+from graspd_dataset.inspect_dataset import tables_of
 
 sys.path.insert(0, str(Path(__file__).parent))
 from small_dataset import REQUEST, make_here
@@ -33,6 +35,17 @@ def allegro(tmp_path_factory: pytest.TempPathFactory) -> DatasetStore:
     store = DatasetStore(str(tmp_path_factory.mktemp("allegro")))
     make_here(blocks_of(DatasetRequest(("shape:mug",), per_object=8, preset="fast", measure="none")), store)
     return store
+
+
+@pytest.fixture(scope="session")
+def exported(allegro: DatasetStore, tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, list[dict[str, Any]]]:
+    """A folder with the eight grasps in every format, and the rows that they were; not to be changed."""
+    from graspd_core.cli import main
+
+    folder = tmp_path_factory.mktemp("exported")
+    for kind in ("isaac", "graspgen", "dexgraspbench"):
+        assert main(["dataset", "export", allegro.where, "--to", kind, "--out", str(folder / kind)]) == 0
+    return folder, [row for _, _, table, _ in tables_of(allegro) for row in table.to_pylist()]
 
 
 @pytest.fixture

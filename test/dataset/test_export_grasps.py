@@ -17,10 +17,6 @@ from graspd_dataset.foreign_grasps import read_foreign
 from graspd_dataset.inspect_dataset import tables_of
 
 
-def rows_of(store: DatasetStore) -> list[dict]:
-    return [row for _, _, table, _ in tables_of(store) for row in table.to_pylist()]
-
-
 def mujoco_tips(urdf: str, position: list[float], orientation: dict, joints: dict[str, float]) -> dict[str, np.ndarray]:
     """Where MuJoCo has the links of the hand in the object's frame [m]; joints by name."""
     model = mujoco.MjModel.from_xml_path(urdf)  # pyright: ignore[reportAttributeAccessIssue]
@@ -34,11 +30,11 @@ def mujoco_tips(urdf: str, position: list[float], orientation: dict, joints: dic
     return {name: rotation.reshape(3, 3) @ there + position for name, there in bodies.items()}
 
 
-def test_isaac_grasps_stand_where_they_did(allegro: DatasetStore, tmp_path: Path, graspd):
-    assert graspd("dataset", "export", allegro.where, "--to", "isaac", "--out", tmp_path) == 0
-    (path,) = (tmp_path / "allegro_right").glob("*.yaml")
+def test_isaac_grasps_stand_where_they_did(exported):
+    folder, rows = exported
+    (path,) = (folder / "isaac" / "allegro_right").glob("*.yaml")
     document = yaml.safe_load(path.read_text())
-    verified = [row for row in rows_of(allegro) if row["verdict"] == "verified"]
+    verified = [row for row in rows if row["verdict"] == "verified"]
     assert (document["format"], document["format_version"]) == ("isaac_grasp", 1.0)
     assert len(document["grasps"]) == len(verified) == 8
     hand = load_hand("allegro_right")
@@ -67,14 +63,14 @@ def se3(row: dict) -> np.ndarray:
     return matrix
 
 
-def test_graspgen_gets_poses_failures_and_the_mesh(allegro: DatasetStore, tmp_path: Path, graspd):
-    assert graspd("dataset", "export", allegro.where, "--to", "graspgen", "--out", tmp_path) == 0
-    (path,) = (tmp_path / "allegro_right").glob("*.json")
-    document, rows = json.loads(path.read_text()), rows_of(allegro)
+def test_graspgen_gets_poses_failures_and_the_mesh(allegro: DatasetStore, exported):
+    folder, rows = exported
+    (path,) = (folder / "graspgen" / "allegro_right").glob("*.json")
+    document = json.loads(path.read_text())
     assert document["grasps"]["object_in_gripper"] == [row["verdict"] == "verified" for row in rows]
     for row, matrix in zip(rows, np.array(document["grasps"]["transforms"]), strict=True):
         assert np.allclose(matrix, se3(row), atol=1e-12)
-    mesh = load_mesh(tmp_path / document["object"]["file"])
+    mesh = load_mesh(folder / "graspgen" / document["object"]["file"])
     assert path.stem == rows[0]["object_sha256"]
     assert len(mesh.vertices) == len(rows_of_objects(allegro)[0]["vertices"])
 
@@ -92,12 +88,12 @@ def test_an_unknown_format_and_a_hand_that_a_format_does_not_know_are_refused(tm
     assert "hand 'parallel_gripper'; valid: allegro_right" in line
 
 
-def test_dexgraspbench_has_every_finger_where_it_was(allegro: DatasetStore, tmp_path: Path, graspd):
-    assert graspd("dataset", "export", allegro.where, "--to", "dexgraspbench", "--out", tmp_path) == 0
+def test_dexgraspbench_has_every_finger_where_it_was(exported):
+    own, rows = exported[0] / "dexgraspbench", exported[1]
     model = mujoco.MjModel.from_xml_string(menagerie_like())  # pyright: ignore[reportAttributeAccessIssue]
     data = mujoco.MjData(model)  # pyright: ignore[reportAttributeAccessIssue]
-    verified = [row for row in rows_of(allegro) if row["verdict"] == "verified"]
-    files = sorted((tmp_path / "allegro_right").glob("*/*.npy"), key=lambda path: int(path.stem))
+    verified = [row for row in rows if row["verdict"] == "verified"]
+    files = sorted((own / "allegro_right").glob("*/*.npy"), key=lambda path: int(path.stem))
     assert len(files) == len(verified)
     for row, path in zip(verified, files, strict=True):
         grasp = np.load(path, allow_pickle=True).item()
@@ -110,7 +106,7 @@ def test_dexgraspbench_has_every_finger_where_it_was(allegro: DatasetStore, tmp_
         for ours in (link_positions(row), link_positions(read)):
             assert max(np.linalg.norm(data.body(end).xpos - ours[link]) for end, link in ends.items()) < 1e-5
         assert grasp["squeeze_qpos"].shape == grasp["pregrasp_qpos"].shape == (23,)
-    folder = tmp_path / grasp["obj_path"]
+    folder = own / grasp["obj_path"]
     assert json.loads((folder / "info" / "simplified.json").read_text())["mass"] == row["mass"] > 0.1
     parts = [load_mesh(path) for path in (folder / "urdf" / "meshes").glob("convex_piece_*.obj")]
     assert len(parts) > 3
@@ -120,8 +116,8 @@ def test_dexgraspbench_has_every_finger_where_it_was(allegro: DatasetStore, tmp_
     )
 
 
-def test_dexgraspbench_gets_the_least_mass_in_the_trials(allegro: DatasetStore, tmp_path: Path):
-    light, heavy = ({**rows_of(allegro)[0], "mass": mass} for mass in (0.2, 0.5))
+def test_dexgraspbench_gets_the_least_mass_in_the_trials(exported, tmp_path: Path):
+    light, heavy = ({**exported[1][0], "mass": mass} for mass in (0.2, 0.5))
     for name, rows in (("light first", [light, heavy]), ("heavy first", [heavy, light])):
         write_dexgraspbench(rows, make_shape("mug"), tmp_path / name)
         (about,) = (tmp_path / name).rglob("simplified.json")

@@ -20,23 +20,10 @@ from graspd_core.hands.kinematics import link_poses
 from graspd_core.hands.model import all_joint_names
 from graspd_core.mesh.mesh_files import save_mesh
 from graspd_core.mesh.shapes import make_shape
-from graspd_dataset.dataset_store import DatasetStore
 from graspd_dataset.export_grasps import qpos
 from graspd_dataset.foreign_grasps import STAGES, npy_dictionary, read_foreign
-from graspd_dataset.inspect_dataset import tables_of
 
 HAND = load_hand("allegro_right")
-
-
-@pytest.fixture(scope="module")
-def exported(allegro: DatasetStore, tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, list[dict[str, Any]]]:
-    """A folder with eight grasps of a mug in every format, and the rows that they were."""
-    from graspd_core.cli import main
-
-    folder = tmp_path_factory.mktemp("exported")
-    for kind in ("isaac", "graspgen", "dexgraspbench"):
-        assert main(["dataset", "export", allegro.where, "--to", kind, "--out", str(folder / kind)]) == 0
-    return folder, [row for _, _, table, _ in tables_of(allegro) for row in table.to_pylist()]
 
 
 def links_at(posture: Posture) -> np.ndarray:
