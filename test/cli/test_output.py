@@ -138,12 +138,14 @@ def test_a_pipe_gets_neither_colours_nor_bars():
 
 
 def test_a_terminal_gets_bars_without_colours():
-    code = f"from graspd_core.cli import main; main({['synthesize', *QUICK]!r})"
-    told = on_a_terminal(code, NO_COLOR="1")
+    words = ["synthesize", *QUICK]
+    code = f"from graspd_core.cli import main; main({words!r}); print('Quietly'); main({[*words, '--quiet']!r})"
+    told, quietly = on_a_terminal(code, NO_COLOR="1").split("Quietly")
     assert "optimise: " in told
     assert "\r" in told
     assert not re.search(r"\x1b\[[0-9;]*m", told)
-    assert "optimise: " not in on_a_terminal(code.replace("'synthesize'", "'synthesize', '--quiet'"))
+    assert "1 of 1 grasps" in quietly
+    assert "optimise: " not in quietly
 
 
 def test_a_wait_is_shown_on_a_terminal_only(capsys: pytest.CaptureFixture[str]):
