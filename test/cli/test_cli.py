@@ -161,7 +161,8 @@ def test_a_scene_file_sets_the_reconstruction(ball: str, refusal_of, capsys: pyt
 
 
 def test_an_arm_that_reaches_is_written_and_one_that_does_not_is_told(tmp_path: Path, capsys):
-    asked = ["synthesize", "shape:box", "-n", "1", "--hand", "barrett_like", "--verify", "none", "--arm", "panda_like"]
+    asked = ["synthesize", "shape:box", "-n", "1", "--preset", "fast", "--hand", "barrett_like", "--verify", "none"]
+    asked += ["--arm", "panda_like"]
     assert main([*asked, "--arm-base", "-0.5", "0", "-0.1", "--out", str(tmp_path / "g.json")]) == EXIT_OK
     assert all(grasp.arm is not None for grasp in load_grasps(tmp_path / "g.json"))
     capsys.readouterr()
