@@ -201,8 +201,8 @@ def test_what_solids_of_every_kind_share_with_an_object_is_that_of_small_voxels(
     assert sorted(primitive.kind for primitive in hand.primitives) == ["box", "capsule", "cylinder", "hull", "sphere"]
     context = make_metrics_context(as_object(BOX), hand)
     placed = placed_hand(context, at(where, (0.4,), (0.9, 0.1, -0.2, 0.3)))
-    # The hand reaches from −20 mm to 100 mm along z, and 50 mm to either side.
-    across, along = np.arange(-100, 100) + 0.5, np.arange(-40, 200) + 0.5
+    # The hand reaches from −7 mm to 72 mm along z, and 33 mm to either side.
+    across, along = np.arange(-66, 66) + 0.5, np.arange(-16, 146) + 0.5
     voxels = np.stack(np.meshgrid(across, across, along, indexing="ij"), -1).reshape(-1, 3) * 0.0005
     points = voxels @ placed.rotations[0].T + placed.translations[0]
     points = points[(np.abs(points) < BOX.vertices.max(0)).all(1)]
