@@ -14,12 +14,10 @@ import yaml
 from expected import Evil, refused
 from scipy.spatial.transform import Rotation
 
-from graspd_core import Posture, Verdict, load_grasps, load_hand, load_scene, plan_grasps
+from graspd_core import Posture, Verdict, load_grasps, load_hand, load_scene, make_shape, plan_grasps, save_mesh
 from graspd_core.errors import FormatError
 from graspd_core.hands.kinematics import link_poses
 from graspd_core.hands.model import all_joint_names
-from graspd_core.mesh.mesh_files import save_mesh
-from graspd_core.mesh.shapes import make_shape
 from graspd_dataset.export_grasps import qpos
 from graspd_dataset.foreign_grasps import STAGES, npy_dictionary, read_foreign
 

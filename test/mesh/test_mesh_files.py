@@ -14,16 +14,14 @@ from hypothesis import strategies as st
 from made_meshes import box_of
 from shape_volumes import shape_volume
 
-from graspd_core import TriangleMesh, load_scene
+from graspd_core import TriangleMesh, load_mesh, load_scene, save_mesh
 from graspd_core.errors import MeshError
 from graspd_core.mesh.collada import read_dae
 from graspd_core.mesh.mesh_files import (
     check_mesh,
     content_hash,
-    load_mesh,
     mass_properties,
     read_mesh,
-    save_mesh,
     simplify,
     surface_samples,
     unit_advice,

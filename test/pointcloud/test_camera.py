@@ -9,18 +9,11 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from graspd_bench.rendering.render import look_at, render_depth
+from graspd_core import PinholeCamera, cloud_from_depth, depth_in_metres
 from graspd_core.errors import CloudError
 from graspd_core.io.messages import depth_from_message
 from graspd_core.mesh.shapes import SPHERE_RADIUS, make_shape
-from graspd_core.perception.cloud.camera import (
-    PinholeCamera,
-    camera_from_calibration,
-    camera_rays,
-    cloud_from_depth,
-    depth_in_metres,
-    distort,
-    undistort,
-)
+from graspd_core.perception.cloud.camera import camera_from_calibration, camera_rays, distort, undistort
 
 MATRIX = [500.0, 0, 320, 0, 510, 240, 0, 0, 1]
 

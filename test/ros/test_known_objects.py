@@ -15,9 +15,8 @@ from scipy.spatial.transform import Rotation
 from shape_msgs.msg import Plane
 from std_msgs.msg import Header
 
-from graspd_core import GraspResult, HandModel, Outcome, TriangleMesh, hand_mesh, load_scene, make_shape
+from graspd_core import GraspLibrary, GraspResult, HandModel, Outcome, TriangleMesh, hand_mesh, load_scene, make_shape
 from graspd_core.errors import ConfigError, GraspdError
-from graspd_core.library.grasp_library import GraspLibrary
 from graspd_core.library.known_grasps import known_or_planned
 from graspd_core.mesh.mesh_files import save_mesh
 from graspd_ros import known_objects

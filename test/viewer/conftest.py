@@ -14,9 +14,8 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from graspd_core import GraspResult, load_hand, load_preset, load_scene, plan_grasps, save_result
+from graspd_core import Grasp, GraspResult, load_hand, load_preset, load_scene, plan_grasps, save_result
 from graspd_core.perception.scene import object_parts
-from graspd_core.types import Grasp
 from graspd_core.verify.trial_registry import build_worlds, grasp_trials
 from graspd_core.verify.world import PROTOCOLS
 

@@ -20,10 +20,9 @@ from std_msgs.msg import Header
 
 from graspd_bench.rendering.depth_noise import DEFAULT
 from graspd_bench.rendering.tabletop import depth_views, ring_poses, tabletop
-from graspd_core import PointCloud
+from graspd_core import PointCloud, make_shape
 from graspd_core.errors import CloudError, TransformError
 from graspd_core.io.messages import camera_from_message, depth_and_camera, depth_from_message, frame_fault, image_size
-from graspd_core.mesh.shapes import make_shape
 from graspd_core.perception.cloud.camera import PinholeCamera, camera_rays
 from graspd_core.transforms import SECOND
 from graspd_ros.error_codes import RequestError

@@ -23,9 +23,8 @@ from trimesh.transformations import translation_matrix
 from visualization_msgs.msg import Marker, MarkerArray
 
 from graspd_bench.rendering.render import render_depth
-from graspd_core import Grasp, GraspResult, Outcome, Posture, TrialResult, Verdict, hand_mesh, load_hand
+from graspd_core import Grasp, GraspResult, Outcome, Posture, TrialResult, Verdict, hand_mesh, load_hand, make_shape
 from graspd_core.hands.model import Primitive
-from graspd_core.mesh.shapes import make_shape
 from graspd_core.paths import config_dir
 from graspd_core.perception.cloud.camera import PinholeCamera
 from graspd_core.types import ROBUSTNESS, Contact, GraspMetrics, Timing

@@ -16,9 +16,8 @@ from sensor_msgs.msg import JointState
 from std_msgs.msg import Header
 from trimesh.transformations import translation_matrix
 
-from graspd_core import make_shape
+from graspd_core import load_hand, make_shape
 from graspd_core.errors import ConfigError
-from graspd_core.hands.library import load_hand
 from graspd_core.perception.obstacles import held_hull
 from graspd_core.types import Grasp, GraspMetrics, Posture, TrialResult, Verdict
 from graspd_ros.convert import matrix_of_pose, pose_of_matrix
