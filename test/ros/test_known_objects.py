@@ -174,12 +174,7 @@ def test_a_direction_and_a_surface_are_kept(folder: Path, hand: HandModel):
             GraspdError,
             "surface: source is 2, a cloud; valid sources: MESH=1, KNOWN=4",
         ),
-        (
-            known(mesh_scale=0.5),
-            {},
-            GraspdError,
-            "mesh_scale: 0.5 with known_object; .* valid: 0",
-        ),
+        (known(mesh_scale=0.5), {}, GraspdError, "mesh_scale: 0.5 with known_object; .* valid: 0"),
         (known(surface=Plane(coef=[0.0, 0.0, 0.0, 1.0])), {}, GraspdError, "surface: .* is not a plane"),
     ],
 )

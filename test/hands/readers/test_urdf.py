@@ -95,11 +95,7 @@ def test_sloppy_xml_is_read(tmp_path: Path, text: bytes) -> None:
         ('upper="1"', 'upper="1e9"', r"joint 'hinge' has limits more than two turns apart: restricted to \[-0.5, "),
         (END, HUNG.format("world", "fixed"), DROPPED.format("world", "fixed")),
         (END, HUNG.format("up", "floating"), DROPPED.format("up", "floating")),
-        (
-            END,
-            STUCK.format('lower=".3" upper=".3"'),
-            "joint 'stuck' cannot move: its limits coincide; taken as fixed",
-        ),
+        (END, STUCK.format('lower=".3" upper=".3"'), "joint 'stuck' cannot move: its limits coincide; taken as fixed"),
         (
             END,
             STUCK.format('effort="3" velocity="1"'),
