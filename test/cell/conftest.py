@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import os
+import subprocess
+import sys
+from collections.abc import Callable, Iterator
 from functools import lru_cache
 
 import numpy as np
@@ -27,6 +30,22 @@ PAIRS = (("ur5e_like", "allegro_right"), ("panda_like", "leap_right"), ("ur5e_li
 def domain(claim_domain: Callable[[], int]) -> int:
     """A domain of the cell's tests: transforms that tests of the node keep would be heard in theirs."""
     return claim_domain()
+
+
+@pytest.fixture(scope="module")
+def simulator(domain: int, tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
+    """A cell with a pear in it, as a process of its own that ends without an error."""
+    folder = tmp_path_factory.mktemp("cell")
+    ros = {"ROS_DOMAIN_ID": str(domain), "ROS_LOG_DIR": str(folder), "ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOST"}
+    words = ["--arm", "ur5e_like", "--hand", "parallel_gripper", "--things", "family:pear:0"]
+    command = [sys.executable, "-m", "graspd_cell.simulator_node", *words, "--clock", "--speed", "3"]
+    with (folder / "node.log").open("w") as log:
+        process = subprocess.Popen(command, env={**os.environ, **ros}, stdout=log, stderr=log)
+        yield
+        process.terminate()
+        status = process.wait(100.0)
+    told = (folder / "node.log").read_text()
+    assert (status, "Traceback" in told) == (0, False), told
 
 
 @lru_cache(maxsize=8)

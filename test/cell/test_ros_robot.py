@@ -3,12 +3,9 @@
 from __future__ import annotations
 
 import os
-import subprocess
-import sys
 import threading
 import time
 from collections.abc import Callable, Iterator
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -36,20 +33,14 @@ ARM, HAND = load_arm("ur5e_like"), load_hand("parallel_gripper")
 
 
 @pytest.fixture(scope="module")
-def robot(domain: int, tmp_path_factory: pytest.TempPathFactory) -> Iterator[RosRobot]:
-    folder: Path = tmp_path_factory.mktemp("cell")
-    environment = {**os.environ, "ROS_DOMAIN_ID": str(domain), "ROS_LOG_DIR": str(folder)}
+def robot(domain: int, simulator: None) -> Iterator[RosRobot]:
     os.environ["ROS_AUTOMATIC_DISCOVERY_RANGE"] = "LOCALHOST"
-    arguments = ["--arm", ARM.name, "--hand", HAND.name, "--things", "family:pear:0", "--clock", "--speed", "3"]
     context = Context()
     rclpy.init(context=context, domain_id=domain)
     node = rclpy.create_node("picker", context=context)
-    process = subprocess.Popen([sys.executable, "-m", "graspd_cell.simulator_node", *arguments], env=environment)
     driven = RosRobot(node, ARM.joint_names, HAND.joint_names, RobotTopics(patience=PATIENCE))
     yield driven
     driven.close()
-    process.terminate()
-    process.wait(PATIENCE)
     node.destroy_node()
     rclpy.shutdown(context=context)
 

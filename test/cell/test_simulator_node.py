@@ -121,23 +121,12 @@ def goal_of(names: tuple[str, ...], *points: tuple[float, list[float]]) -> Follo
 
 
 @pytest.fixture(scope="module")
-def cell(domain: int, tmp_path_factory: pytest.TempPathFactory) -> Iterator[CellClient]:
-    """A cell with a pear in it, and a client."""
-    folder = tmp_path_factory.mktemp("cell")
+def cell(domain: int, simulator: None) -> Iterator[CellClient]:
+    """A client of the cell."""
     client = CellClient(domain)
-    environment = {**os.environ, "ROS_DOMAIN_ID": str(domain), "ROS_LOG_DIR": str(folder)}
-    arguments = ["--arm", ARM, "--hand", HAND, "--things", "family:pear:0", "--clock", "--speed", "3"]
-    with (folder / "node.log").open("w") as log:
-        process = subprocess.Popen(
-            [sys.executable, "-m", "graspd_cell.simulator_node", *arguments], env=environment, stdout=log, stderr=log
-        )
-        client.newest("/joint_states")
-        yield client
-        process.terminate()
-        status = process.wait(PATIENCE)
+    client.newest("/joint_states")
+    yield client
     client.close()
-    told = (folder / "node.log").read_text()
-    assert (status, "Traceback" in told) == (0, False), told
 
 
 def test_the_cell_publishes_what_drivers_publish(cell: CellClient):
