@@ -327,25 +327,20 @@ def resolved_couplings(path: Path, direct: Mapping[str, Coupling]) -> dict[str, 
 
     Raises HandError: couplings form a circle, or a multiplier or offset is too large.
     """
-    return {name: _resolved(path, name, direct) for name in direct}
-
-
-def _resolved(path: Path, name: str, direct: Mapping[str, Coupling]) -> Coupling:
-    """Return the coupling to the actuated joint at the end of the chain: m₁(m₂ q + o₂) + o₁ = m₁m₂ q + m₁o₂ + o₁."""
-    coupling, seen = direct[name], [name]
-    while coupling.leader in direct:
-        if coupling.leader in seen:
-            raise HandError(f"{path}: joints mimic each other in a circle: {' -> '.join([*seen, coupling.leader])}")
-        seen.append(coupling.leader)
-        further = direct[coupling.leader]
-        coupling = Coupling(
-            further.leader,
-            coupling.multiplier * further.multiplier,
-            coupling.multiplier * further.offset + coupling.offset,
-        )
-    if not max(abs(coupling.multiplier), abs(coupling.offset)) <= _LARGEST:
-        raise HandError(
-            f"{path}: joint {name!r} mimics {coupling.leader!r} with multiplier {coupling.multiplier:g} and offset "
-            f"{coupling.offset:g}; valid: at most {_LARGEST:g}"
-        )
-    return coupling
+    resolved: dict[str, Coupling] = {}
+    for name, (leader, multiplier, offset) in direct.items():
+        seen = [name]
+        while leader in direct:
+            if leader in seen:
+                raise HandError(f"{path}: joints mimic each other in a circle: {' -> '.join([*seen, leader])}")
+            seen.append(leader)
+            # m₁(m₂ q + o₂) + o₁ = m₁m₂ q + m₁o₂ + o₁
+            leader, further, beyond = direct[leader]
+            multiplier, offset = multiplier * further, multiplier * beyond + offset
+        if not max(abs(multiplier), abs(offset)) <= _LARGEST:
+            raise HandError(
+                f"{path}: joint {name!r} mimics {leader!r} with multiplier {multiplier:g} and offset {offset:g}; "
+                f"valid: at most {_LARGEST:g}"
+            )
+        resolved[name] = Coupling(leader, multiplier, offset)
+    return resolved
