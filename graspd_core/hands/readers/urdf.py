@@ -41,11 +41,8 @@ def _colliding(link: ET.Element) -> list[ET.Element]:
 def _shapes(
     path: Path, elements: Sequence[ET.Element], read_mesh: Callable[..., TriangleMesh]
 ) -> tuple[Primitive, ...]:
-    return _with_capsules([_read_shape(path, element, read_mesh) for element in elements])
-
-
-def _with_capsules(shapes: Sequence[Primitive]) -> tuple[Primitive, ...]:
-    """Replace each cylinder that has a sphere at each end by a capsule. URDF files often build a capsule this way."""
+    """Read shapes. A cylinder with a sphere at each end becomes a capsule. URDF files often build one this way."""
+    shapes = [_read_shape(path, element, read_mesh) for element in elements]
     found, taken = list(shapes), set[int]()
     for i, shape in enumerate(shapes):
         if shape.kind != "cylinder":
