@@ -236,7 +236,8 @@ def grid_poisson_field(surfels: Surfels, nodes: Nodes, cell: float) -> Grid:
     # The gradient of the field shall equal the vector field of the normals.
     flow = sum(wave * spread(weights * along) for wave, along in zip(waves, surfels.normals.T, strict=True))
     field, there = at_points(-1j * flow * blur / np.maximum(square, 1e-12))
-    slope = _slope(field.reshape(shape), at, surfels.normals)
+    gradient = np.stack([at @ part.ravel() for part in np.gradient(field.reshape(shape))], -1)
+    slope = float(np.median((gradient * surfels.normals).sum(1)))
     if not slope > 0:
         raise CloudError(f"cloud: the normals of its {len(surfels.points)} points fit no surface; add more views")
     field, there = ((values - np.average(there, weights=weights)) / slope for values in (field, there))
@@ -267,8 +268,3 @@ def _waves(shape: tuple[int, ...]) -> list[np.ndarray]:
     turns = [np.fft.fftfreq(shape[0]), np.fft.fftfreq(shape[1]), np.fft.rfftfreq(shape[2])]
     waves = ((2 * np.pi * turn).astype(np.float32) for turn in turns)
     return list(np.meshgrid(*waves, indexing="ij", sparse=True))
-
-
-def _slope(field: Grid, at: Any, normals: Float[np.ndarray, "points 3"]) -> float:
-    gradient = np.stack([at @ part.ravel() for part in np.gradient(field)], -1)
-    return float(np.median((gradient * normals).sum(1)))
