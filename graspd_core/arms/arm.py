@@ -10,7 +10,7 @@ other shape is replaced by a larger enclosing capsule. Distances from a capsule 
 from __future__ import annotations
 
 import xml.etree.ElementTree as ET
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from functools import cached_property, lru_cache
 from pathlib import Path
@@ -53,7 +53,9 @@ class Capsules:
     radius: Float[np.ndarray, "n"]
 
 
-def capsules_about(primitives: Sequence[Primitive]) -> Capsules:
+# Primitives are hashed by identity.
+@lru_cache(maxsize=8)
+def capsules_about(primitives: tuple[Primitive, ...]) -> Capsules:
     """Return an enclosing capsule of each primitive. Spheres and capsules are not enlarged."""
     rows = [(solid, *_about(solid)) for solid in primitives]
     turned = [[solid.rotation @ point + solid.translation for point in (start, end)] for solid, start, end, _ in rows]

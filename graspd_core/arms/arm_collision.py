@@ -15,7 +15,7 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from graspd_core.arms.arm import Arm, Capsules, arm_links, capsules_about, placed, segment_distance, tip_hand
+from graspd_core.arms.arm import Arm, arm_links, capsules_about, placed, segment_distance, tip_hand
 from graspd_core.hands.kinematics import forward, make_kinematics, place_points, placement
 from graspd_core.hands.model import HandModel
 from graspd_core.mesh.sdf import sample_sdf
@@ -117,19 +117,13 @@ def hits_of_hand(arm: Arm, hand: HandModel, links: SE3, joints: Float[Tensor, "b
 
 
 def _hand_capsules(arm: Arm, hand: HandModel, links: SE3, joints: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    capsules = _capsules_of_hand(hand)
     fingers = forward(make_kinematics(hand, dtype=joints.dtype), joints)
     base = links[:, arm.tip].compose(tip_hand(arm, hand))
-    start, end, radius = placed(capsules, fingers)
+    start, end, radius = placed(capsules_about(hand.primitives), fingers)
     return base.apply(start), base.apply(end), radius
 
 
 # Hands and arms are hashed by identity.
-@lru_cache(maxsize=8)
-def _capsules_of_hand(hand: HandModel) -> Capsules:
-    return capsules_about(hand.primitives)
-
-
 @lru_cache(maxsize=8)
 def _pairs(arm: Arm) -> tuple[Int[np.ndarray, "pairs"], Int[np.ndarray, "pairs"]]:
     """Return the pairs of capsules to check. Neighbouring links and pairs that touch in posture `seed` are left out."""

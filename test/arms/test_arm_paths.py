@@ -250,7 +250,7 @@ def test_a_capsule_holds_the_solid_that_it_is_about(seed: int, kind: PrimitiveKi
     half = tuple(rng.uniform(0.01, 0.3, size).tolist())
     at = rng.uniform(-1, 1, 3)
     vertices = corners if kind == "hull" else np.zeros((0, 3))
-    capsule = capsules_about([Primitive(0, kind, rotation, at, half, vertices, faces)])
+    capsule = capsules_about((Primitive(0, kind, rotation, at, half, vertices, faces),))
     surface = solid_points(kind, half, corners, rng) @ rotation.T + at
     point = torch.as_tensor(surface)
     start, end = (torch.as_tensor(x[0]).expand_as(point) for x in (capsule.start, capsule.end))
