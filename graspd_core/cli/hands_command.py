@@ -114,7 +114,8 @@ def as_text(hand: HandModel) -> str:
     ]
     moving, depth = hand.link_joint_names, link_depths(hand.link_parent)
     for link, name in enumerate(hand.link_names):
-        solids = Counter(_solid(p.kind, len(p.vertices)) for p in hand.primitives_of[link])
+        kinds = (f"hull of {len(p.vertices)} corners" if p.kind == "hull" else p.kind for p in hand.primitives_of[link])
+        solids = Counter(kinds)
         solid_names = ", ".join(f"{n} x {solid}" if n > 1 else solid for solid, n in solids.items()) or "no solids"
         mass = f"{hand.link_mass[link] * 1e3:.0f} g" if hand.link_mass[link] else "no mass"
         joint = f" <- {moving[link]}" if moving[link] else ""
@@ -159,10 +160,6 @@ def as_yaml(hand: HandModel, urdf: str) -> str:
             # Write without an exponent, because YAML reads 1e-05 as text.
             lines.append(f"  {_quoted(name)}: {np.format_float_positional(value, trim='0')}")
     return "\n".join(lines) + "\n"
-
-
-def _solid(kind: str, corners: int) -> str:
-    return f"hull of {corners} corners" if kind == "hull" else kind
 
 
 def _vector(values: Float[np.ndarray, "3"]) -> str:

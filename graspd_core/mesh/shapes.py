@@ -88,10 +88,6 @@ def _bowl() -> TriangleMesh:
     return _revolve(profile + np.array([0, BOWL_RADIUS / 2]))
 
 
-def _bottle() -> TriangleMesh:
-    return _revolve([(0, BOTTLE_PROFILE[0][1]), *BOTTLE_PROFILE, (0, BOTTLE_PROFILE[-1][1])])
-
-
 def _l_block() -> TriangleMesh:
     a, b, t = L_LONG, L_SHORT, L_THICK
     outer = np.array([(0, a), (0, 0), (b, 0)]) - [b / 2, a / 2]
@@ -164,7 +160,7 @@ SHAPES: dict[str, Callable[[], TriangleMesh]] = {
     "torus": _torus,
     "mug": _mug,
     "bowl": _bowl,
-    "bottle": _bottle,
+    "bottle": lambda: _revolve([(0, BOTTLE_PROFILE[0][1]), *BOTTLE_PROFILE, (0, BOTTLE_PROFILE[-1][1])]),
     "l_block": _l_block,
     "hammer": _hammer,
 }
