@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-import pickle
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field, replace
-from hashlib import blake2b
 
 import numpy as np
 from jaxtyping import Float
@@ -27,6 +25,7 @@ from graspd_core.perception.segment.target_selection import (
     select_part,
     select_target,
 )
+from graspd_core.runtime.disk_cache import digest
 from graspd_core.types import Plane
 
 # A scene nearer than this to its cameras is probably not in metres [m].
@@ -150,11 +149,11 @@ class _Parted:
 
 
 # The last scene, by a hash of its clouds and settings. If any object may be grasped, it serves each of them.
-_LAST: dict[bytes, _Parted] = {}
+_LAST: dict[str, _Parted] = {}
 
 
 def _parted(views: Sequence[PointCloud], settings: SegmentationConfig, target: Target | None = None) -> _Parted:
-    key = blake2b(pickle.dumps((tuple(views), vars(settings)))).digest()
+    key = digest((*views, settings))
     parted = _LAST.get(key)
     scene = voxel_downsample(views, settings) if parted is None else parted.scene
     if target is not None:
