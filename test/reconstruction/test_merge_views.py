@@ -7,6 +7,7 @@ from hypothesis import strategies as st
 
 from graspd_bench.rendering.tabletop import depth_views, ring_poses, tabletop
 from graspd_core import PinholeCamera, PointCloud, cloud_from_depth, make_shape
+from graspd_core.config import ReconstructionConfig
 from graspd_core.errors import CloudError
 from graspd_core.mesh.mesh_files import surface_samples
 from graspd_core.mesh.surface_queries import make_surface, surface_distance, winding_inside
@@ -17,11 +18,12 @@ CAMERA = PinholeCamera(240, 180, 260.0, 260.0, 119.5, 89.5)
 SCENE = tabletop("mug", yaw=0.3)
 POSES = ring_poses(6, elevation=0.8, distance=0.4)
 DEPTHS = [np.where(label == 0, depth, 0.0) for depth, label in depth_views(SCENE, CAMERA, POSES)]
+SETTINGS = ReconstructionConfig()
 VIEWS = [cloud_from_depth(depth, CAMERA, pose) for depth, pose in zip(DEPTHS, POSES, strict=True)]
 
 
 def test_merged_points_lie_on_the_surface_and_face_a_camera():
-    merged = merge_views(VIEWS)
+    merged = merge_views(VIEWS, point_step(VIEWS), SETTINGS)
     assert surface_distance(make_surface(SCENE.truth), merged.points).mean() < 0.0006
     assert np.linalg.norm(merged.normals, axis=1) == pytest.approx(np.ones(len(merged.points)))
     eyes = np.array([view.viewpoint for view in VIEWS])
@@ -44,7 +46,8 @@ def test_noise_along_the_line_of_sight_is_smoothed():
         noisy.append(PointCloud(view.points + rng.normal(0, 0.0015, (len(ray), 1)) * ray, view.viewpoint))
     surface = make_surface(SCENE.truth)
     before = surface_distance(surface, np.concatenate([view.points for view in noisy])).mean()
-    assert surface_distance(surface, merge_views(noisy).points).mean() < 0.6 * before
+    merged = merge_views(noisy, point_step(noisy), SETTINGS)
+    assert surface_distance(surface, merged.points).mean() < 0.6 * before
 
 
 def test_flying_pixels_are_dropped():
@@ -53,7 +56,8 @@ def test_flying_pixels_are_dropped():
     ray = view.points - view.viewpoint
     few = rng.choice(len(ray), 60, replace=False)
     flying = view.viewpoint + ray[few] * rng.uniform(0.7, 0.93, (60, 1))
-    merged = merge_views([PointCloud(np.vstack([view.points, flying]), view.viewpoint)], point_step([view]))
+    cloud = PointCloud(np.vstack([view.points, flying]), view.viewpoint)
+    merged = merge_views([cloud], point_step([view]), SETTINGS)
     assert surface_distance(make_surface(SCENE.truth), merged.points).max() < 0.008
 
 
@@ -68,9 +72,9 @@ def test_thinning_is_even_and_keeps_both_sides():
 
 
 def test_points_that_are_no_surface_are_named():
-    noise = np.random.default_rng(0).normal(0, 0.05, (60, 3))
+    noise = PointCloud(np.random.default_rng(0).normal(0, 0.05, (60, 3)), np.array([0.0, 0.0, 1.0]))
     with pytest.raises(CloudError, match=r"of its 60 points lie on a surface; at least 50 .* too sparse"):
-        merge_views([PointCloud(noise, np.array([0.0, 0.0, 1.0]))])
+        merge_views([noise], point_step([noise]), SETTINGS)
 
 
 CELL = 0.0025

@@ -34,7 +34,8 @@ def front(name: str, height: float, eye: np.ndarray = EYE) -> PointCloud:
 
 
 def looked_at(view: PointCloud) -> tuple[Surfels, FreeSpace, float]:
-    return merge_views([view]), FreeSpace(make_view_depths([view]), standing=True), point_step([view])
+    step = point_step([view])
+    return merge_views([view], step, ReconstructionConfig()), FreeSpace(make_view_depths([view]), standing=True), step
 
 
 BOX, CYLINDER, BALL = front("box", BOX_HALF[2]), front("cylinder", CYLINDER_HALF), front("sphere", SPHERE_RADIUS)

@@ -83,14 +83,11 @@ def point_step(views: Sequence[PointCloud]) -> float:
     return max(float(np.linalg.norm(high - low)) / 80, 1e-3)
 
 
-def merge_views(
-    views: Sequence[PointCloud], step: float | None = None, settings: ReconstructionConfig | None = None
-) -> Surfels:
+def merge_views(views: Sequence[PointCloud], step: float, settings: ReconstructionConfig) -> Surfels:
     """Return the points of all views with normals. Drop flying pixels, smooth noise, and thin the points to `step` [m].
 
     Raises CloudError if fewer than 50 points are left.
     """
-    step, settings = point_step(views) if step is None else step, settings or ReconstructionConfig()
     together = join(*(orient_view(view, step, settings) for view in views))
     if len(together.points) < MIN_POINTS:
         raise CloudError(
