@@ -4,8 +4,9 @@
 
 Each seed gives one view of every object in `CHOSEN_ON` (three of `compound`), and of the five scans `SCANS` if FOLDER
 has them and a stats.csv of masses. Four kinds of cameras take turns. Half of the views show neighbours. Each view is
-planned without a mass and with the object's own mass. A grasp that holds on the likeliest shape runs every robustness
-check, and is tried on the true object at its own mass. Views in the file are skipped. A view takes 15 CPU s.
+planned without a mass and with the object's own mass. Doubted views give no grasps. A grasp that holds on the likeliest
+shape runs every robustness check, and is tried on the true object at its own mass. Views in the file are skipped. A
+view takes 15 CPU s.
 """
 
 from __future__ import annotations
@@ -58,7 +59,8 @@ def grasps_of_view(case: CameraView) -> list[dict[str, Any]]:
     hand, config = load_hand(case.hand), replace(load_preset(case.preset), certainty=CertaintyConfig(0.0))
     disk_cache.forget()
     scene = scene_from_views([cloud], target=target, mass=mass if case.way == GIVEN else None)
-    if scene.evidence is None or scene.evidence.doubts:
+    assert scene.evidence is not None
+    if scene.evidence.doubts:
         return []
     result = plan_grasps(scene, hand, count=case.count, seed=case.seed, preset=config, measure=False)
     tried = scene.object.at_mass(result.mass or scene.object.mass)

@@ -109,7 +109,7 @@ class HeldShares:
     Attributes:
         likeliest: grasps that hold on the likeliest shape, the best guess from the view.
         places: grasps that also hold with the hand misplaced.
-        shapes: grasps that hold with the hand misplaced and on other shapes.
+        shapes: grasps that hold with the hand misplaced and on other shapes. Stated, not measured.
         fails_places: grasps that hold on the likeliest and on other shapes, but not with the hand misplaced.
         fails_shapes: grasps that hold on the likeliest shape but not on other shapes.
     """
@@ -122,7 +122,7 @@ class HeldShares:
 
 
 # Measured on 919 grasps on 133 single views without a mass, and 412 grasps on 57 views with the true mass. The interval
-# of `shapes` is 0.90 to 0.97 and 0.85 to 0.95. Both state 0.95, as earlier checks held on other views (docs/clouds.md).
+# of `shapes` is 0.90 to 0.97, and 0.85 to 0.95 with the mass. Both state 0.95 for the reasons in docs/clouds.md.
 # Without a mass, trials use `light_end` of the assumed mass, which is more than most objects weigh.
 MASS_ASSUMED = HeldShares(0.80, 0.87, 0.95, 0.81, 0.66)
 MASS_KNOWN = HeldShares(0.77, 0.85, 0.95, 0.75, 0.61)

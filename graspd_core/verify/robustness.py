@@ -1,9 +1,9 @@
 """Check the robustness of grasps of objects that cameras saw: other poses, less friction, other shapes.
 
 A grasp that holds on the likeliest scene, the best guess from the clouds, must also pass these checks. The hidden side
-may be guessed wrong, so the grasp must also hold on two other shapes. On these shapes, the limit of rotation is two
-thirds of the usual limit. docs/clouds.md reports how often grasps that pass all checks hold on the true object. Trials
-run on several threads. The number of threads changes neither results nor order (`results_in_order`).
+may be guessed wrong, so the grasp must also hold on up to two other shapes. On these shapes, the limit of rotation is
+two thirds of the usual limit. docs/clouds.md reports how often grasps that pass all checks hold on the true object.
+Trials run on several threads. The number of threads changes neither results nor order (`results_in_order`).
 """
 
 from __future__ import annotations
@@ -203,7 +203,7 @@ def robustness_checks_of(
     shares, doubts = held_shares(scene.object), scene.evidence.doubts if scene.evidence else ()
     if doubts:
         surest = DOUBTED_SHARE ** len(doubts)
-        places = _places(scene, trials, surest * shares.fails_places / shares.places)
+        places = _places(scene, trials, surest * shares.fails_shapes / shares.places)
         return RobustnessChecks((places,) if probability > shares.likeliest else (), surest, doubts=doubts)
     if scene.evidence is None or probability <= shares.likeliest:
         return None
@@ -217,7 +217,8 @@ def robustness_checks_of(
             for number, world in enumerate(others, 1)
         )
         stages.append(CheckStage(shapes, shares.fails_shapes))
-    stages.append(_places(scene, trials, shares.fails_places))
+    # Without other shapes, grasps that fail a displacement hold in 0.64 (mass assumed) and 0.61 (known) of cases.
+    stages.append(_places(scene, trials, shares.fails_places if others else shares.fails_shapes))
     return RobustnessChecks(tuple(stages), surest, waited_for)
 
 

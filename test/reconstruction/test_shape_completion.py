@@ -1,5 +1,7 @@
 """Guesses about unseen sides: symmetries, axes, what cameras say of guessed points; other shapes, and the next view."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from expected import some
@@ -208,6 +210,7 @@ def test_other_rules_give_other_closed_shapes_through_what_was_seen(half_seen):
     evidence = half_seen.evidence
     rules = other_rules(evidence)
     assert rules == ("mirror", "revolution")
+    assert [other_rules(replace(evidence, chosen=rule)) for rule in rules] == [("revolution",), ("mirror",)]
     shapes = [mesh for rule in rules if (mesh := other_shape(evidence, rule, half_seen.mesh)) is not None]
     assert shapes
     for mesh in shapes:
@@ -221,6 +224,8 @@ def test_other_rules_give_other_closed_shapes_through_what_was_seen(half_seen):
 def test_an_equal_shape_is_no_other(half_seen):
     turned = some(other_shape(half_seen.evidence, "revolution", half_seen.mesh))
     assert other_shape(half_seen.evidence, "revolution", turned) is None
+    mirrored = some(other_shape(half_seen.evidence, "mirror", turned))
+    assert surface_distance(make_surface(half_seen.mesh), surface_samples(mirrored, 2000, 0)[0]).mean() < 5e-4
 
 
 def test_nothing_else_may_be_true_of_what_was_seen_all_round():

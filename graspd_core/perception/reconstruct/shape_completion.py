@@ -92,7 +92,7 @@ def plausible(guess: Surfels, known: Surfels, free_space: FreeSpace, step: float
 def _symmetric(seen: Surfels, free_space: FreeSpace, least: float) -> tuple[str, Surfels]:
     mirrors, centre = find_mirrors(seen, free_space), find_centre(seen, free_space)
     mirror, point = (one.worth if one.wrong < MAX_SYMMETRY_FAULTS else 0.0 for one in (mirrors[0], centre))
-    # Rounding must not decide a near tie. Grasps are also tried on the shape by the other rule.
+    # Rounding must not decide a near tie.
     if point > TIE * mirror:
         return (POINT_SYMMETRY, image(centre, seen)) if point >= least else ("", nothing())
     return (MIRROR, _mirrored(mirrors, seen)) if mirror >= least else ("", nothing())
@@ -110,6 +110,7 @@ def guess_by(rule: str, seen: Surfels, free_space: FreeSpace, step: float) -> Su
 
     The guess may be unlikely.
     """
+    assert rule in (MIRROR, REVOLUTION)
     if rule == MIRROR:
         raw = _mirrored(find_mirrors(seen, free_space), seen)
     elif (turned := find_revolution(seen, free_space, step)) is not None:
