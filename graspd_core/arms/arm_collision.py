@@ -123,7 +123,7 @@ def _hand_capsules(arm: Arm, hand: HandModel, links: SE3, joints: Tensor) -> tup
     return base.apply(start), base.apply(end), radius
 
 
-# Hands and arms are hashed by identity.
+# Arms are hashed by identity.
 @lru_cache(maxsize=8)
 def _pairs(arm: Arm) -> tuple[Int[np.ndarray, "pairs"], Int[np.ndarray, "pairs"]]:
     """Return the pairs of capsules to check. Neighbouring links and pairs that touch in posture `seed` are left out."""

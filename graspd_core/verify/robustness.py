@@ -278,8 +278,9 @@ def try_robustness(
                     reason = f"fails with {item.name}: {result.reason}"
                     break
                 travel, turn = max(travel, result.displacement), max(turn, result.rotation)
-        if stop() or reason:
-            return TrialResult(ROBUSTNESS, False, travel, turn, STOPPED if stop() else reason), stage.though_failed
+        reason = STOPPED if stop() else reason
+        if reason:
+            return TrialResult(ROBUSTNESS, False, travel, turn, reason), stage.though_failed
     return TrialResult(ROBUSTNESS, not checks.doubts, travel, turn, *checks.doubts[:1]), checks.probability
 
 

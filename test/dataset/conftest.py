@@ -23,7 +23,7 @@ def blocks() -> tuple[Block, ...]:
 
 @pytest.fixture(scope="session")
 def made(blocks: tuple[Block, ...], tmp_path_factory: pytest.TempPathFactory) -> DatasetStore:
-    """The data set; not to be changed."""
+    """The data set. Tests only read it."""
     store = DatasetStore(str(tmp_path_factory.mktemp("dataset")))
     make_here(blocks, store)
     return store
@@ -31,7 +31,7 @@ def made(blocks: tuple[Block, ...], tmp_path_factory: pytest.TempPathFactory) ->
 
 @pytest.fixture(scope="session")
 def allegro(tmp_path_factory: pytest.TempPathFactory) -> DatasetStore:
-    """Eight grasps of a mug; not to be changed."""
+    """Eight grasps of a mug. Tests only read them."""
     store = DatasetStore(str(tmp_path_factory.mktemp("allegro")))
     make_here(blocks_of(DatasetRequest(("shape:mug",), per_object=8, preset="fast", measure="none")), store)
     return store
@@ -39,7 +39,7 @@ def allegro(tmp_path_factory: pytest.TempPathFactory) -> DatasetStore:
 
 @pytest.fixture(scope="session")
 def exported(allegro: DatasetStore, tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, list[dict[str, Any]]]:
-    """A folder with the eight grasps in every format, and the rows that they were; not to be changed."""
+    """A folder with the eight grasps in every format, and their rows in the data set. Tests only read it."""
     from graspd_core.cli import main
 
     folder = tmp_path_factory.mktemp("exported")
