@@ -160,6 +160,7 @@ class AttemptWatch:
         now = self._robot.referee()
         moved = {name: place for name, place in now.places.items() if place != self._before.places[name]}
         target = self._target(attempt.place)
+        out = [name for name, place in moved.items() if place == "place bin"]
         told = {key: value for key, value in asdict(attempt).items() if key != "place"}
         record = {
             **{key: round(value, 3) if isinstance(value, float) else value for key, value in told.items()},
@@ -167,9 +168,9 @@ class AttemptWatch:
             "place": np.round(attempt.place, 4).tolist(),
             "target": target,
             "moved": moved,
-            "out": [name for name, place in moved.items() if place == "place bin"],
+            "out": out,
             "astray": [name for name, place in moved.items() if place in ("table", "lost")],
-            "hard": now.hard(target),
+            "hard": now.hard(target, *out),
             "graspd_cpu": round(cpu, 3),
         }
         self.records.append(record)

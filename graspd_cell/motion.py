@@ -285,6 +285,13 @@ def dense(path: Path) -> Path:
 # `ARM_DEEPEST` is for the arm alone, because its capsules are larger than its links.
 DEEPEST, ARM_DEEPEST = -0.02, -0.01
 
+
+def why_blocked(mover: Mover, path: Path) -> str:
+    """Return by how much the arm's links (not the hand) penetrate an obstacle on a path. "" if the path is clear."""
+    depth = -mover.arm_clearances(dense(path)).min()
+    return "" if depth <= -ARM_DEEPEST else f"penetrates an obstacle by {1e3 * depth:.0f} mm on the grasp's path"
+
+
 # Greatest number of checks of postures and straight lines to find a path, and then to shorten the path. Limits of time
 # would give other paths on a busy machine.
 _CHECKS, _SHORTENING = 3000, 150

@@ -20,17 +20,16 @@ from graspd_cell.grasp_held import Hold, after_squeeze, why_lost, why_not_grippe
 from graspd_cell.grasp_source import GraspSource, Offer, cloud_of
 from graspd_cell.layout import Box, CellLayout
 from graspd_cell.motion import (
-    ARM_DEEPEST,
     Mover,
     NoMotionError,
     SeenWorld,
     Speeds,
     arm_shape,
-    dense,
     find_path,
     hand_balls,
     seen_world,
     timed,
+    why_blocked,
 )
 from graspd_cell.robot import DepthView, JointMotion, JointReading, MotionAborted, Robot, never
 from graspd_core.arms.arm import Arm, tip_hand
@@ -171,7 +170,8 @@ class Picker:
             self.go_home()
             view, began = self._robot.look(), self._robot.joints().time
             self._check_taken(view)
-            offer = self.offer = self._source.next(view, self._failures)
+            world = self.world_of(view)
+            offer = self.offer = self._source.next(view, self._failures, world)
             self._failures = list(offer.failures)
             likely = offer.grasp is not None and (offer.grasp.probability or 0.0) >= self._pace.least_probability
             if offer.grasp is None or not (offer.verified or likely):
@@ -184,7 +184,7 @@ class Picker:
                     self._failures.append(Failure(offer.place, offer.grasp.grasp, executed=False, seen=offer.seen))
                 continue
             attempts, ended = attempts + 1, False
-            attempt = self.attempt(offer, self.world_of(view), began, attempts)
+            attempt = self.attempt(offer, world, began, attempts)
             self._learn(attempt, offer)
             yield attempt
         self.why_ended = f"{most} attempts"
@@ -229,7 +229,9 @@ class Picker:
 
     def world_of(self, view: DepthView) -> SeenWorld:
         """Build the obstacles from a view's points that are not on the robot, and from the known solids of the cell."""
-        points = cloud_of(view).points
+        points = _points_of(view)
+        if not len(points):
+            return seen_world(points, 0.0, self._known)
         mover = self._mover(SeenWorld(0.0))
         balls, carried = mover.placed(self._arm_now())
         radius = np.concatenate([mover.shape.radius, mover.carried.radius])
@@ -262,9 +264,7 @@ class Picker:
         start = taking.execution.hand[0]
         self._move_hand(start)
         mover = self._mover(taking.world, start)
-        depth = -mover.arm_clearances(dense(taking.execution.arm)).min()
-        if depth > -ARM_DEEPEST:
-            told = f"penetrates an obstacle by {1e3 * depth:.0f} mm on the grasp's path"
+        if told := why_blocked(mover, taking.execution.arm):
             raise NoMotionError(f"motion: {self._arm.name} {told}; valid: a path without collision")
         goal = taking.execution.arm[0]
         # Approach straight down as far as the line is collision-free. The planner finds the rest of the path.
@@ -355,11 +355,10 @@ class Picker:
         taken, self._taken = self._taken, None
         if taken is None:
             return
-        try:
-            points = cloud_of(view).points
-        except CloudError:
+        points = _points_of(view)
+        if not len(points):
             return
-        if len(points) and (KDTree(points).query(taken.points)[0] < _UNMOVED).mean() > _STILL_THERE:
+        if (KDTree(points).query(taken.points)[0] < _UNMOVED).mean() > _STILL_THERE:
             self._dropped = self._dropped[:-1]
         else:
             self._failures = [failure for failure in self._failures if failure not in taken.earlier]
@@ -443,6 +442,14 @@ class Picker:
     def _stop_if_cancelled(self) -> None:
         if self._cancelled():
             raise Cancelled("the picker was cancelled; the arm does not move")
+
+
+def _points_of(view: DepthView) -> Float[np.ndarray, "_ 3"]:
+    """Return a view's points in the base frame [m]. Return none if the image is unusable."""
+    try:
+        return cloud_of(view).points
+    except CloudError:
+        return np.zeros((0, 3))
 
 
 def summary(attempts: Sequence[Attempt]) -> str:

@@ -39,9 +39,10 @@ class Report:
     in_hand: str
     hardest: Mapping[str, float]
 
-    def hard(self, target: str = "") -> dict[str, float]:
-        """Return the peak forces above `HARD` by pair [N], without the force of the hand on the object `target`."""
-        return {pair: force for pair, force in self.hardest.items() if force > HARD and pair != f"hand on {target}"}
+    def hard(self, *grasped: str) -> dict[str, float]:
+        """Return the peak forces above `HARD` by pair [N], without the forces of the hand on the `grasped` objects."""
+        own = {f"hand on {name}" for name in grasped}
+        return {pair: force for pair, force in self.hardest.items() if force > HARD and pair not in own}
 
 
 class Referee:

@@ -19,6 +19,7 @@ from graspd_core.hands.kinematics import drawn_back, forward, link_poses, make_k
 from graspd_core.hands.model import HandModel
 from graspd_core.mesh.convex_parts import hull_surface
 from graspd_core.mesh.mesh_files import surface_samples
+from graspd_core.optimize.kernel_problem import KernelProblem
 from graspd_core.optimize.loop import Joints, Poses, Positions, Values
 from graspd_core.optimize.obstacle_distance import ObstacleTensors, least_gap, make_obstacle_tensors, obstacle_gaps
 from graspd_core.optimize.restrictions import UNRESTRICTED, Aim, BoundRestrictions
@@ -83,14 +84,16 @@ def draw_starts(
     *,
     fingertips: float = 0.0,
     restrictions: BoundRestrictions = UNRESTRICTED,
+    compiled: KernelProblem | None = None,
 ) -> Poses:
     """Draw `count` seeded starts with the palm near the object's convex hull, where the hand can span the object.
 
     As in Grasp'D, the palm faces a random point with a random roll. The points are on the hull, so that no palm starts
     inside a hollow. Narrow cross-sections are preferred. A share `fingertips` of the starts has half-closed fingers,
     with the fingertips at the point, because an open hand does not reach small or low objects. A pose is rarely chosen
-    if the hand penetrates an obstacle at the pose or at its retreat. With restrictions, at most `_MOST_POOLS` pools of
-    poses are drawn. If all pools contain too few allowed poses, fewer than `count` starts are returned, perhaps none.
+    if the hand penetrates an obstacle at the pose or at its retreat (`compiled`, if given, measures the depths). With
+    restrictions, at most `_MOST_POOLS` pools of poses are drawn. If all pools contain too few allowed poses, fewer than
+    `count` starts are returned, perhaps none.
     """
     generator = torch.Generator().manual_seed(seed)
     # Distances to obstacles take most of the time. Single precision is enough for them.
@@ -114,9 +117,7 @@ def draw_starts(
     gumbel = -torch.log(-torch.log(_uniform(1e-12, 1.0, len(drawn.joints), generator)))
     preference = gumbel - (half_width + drawn.depth) / _SPAN_SCALE
     if obstacles is not None:
-        base = SE3(drawn.rotation.float(), drawn.translation.float())
-        penalty = lambda rows: _depth(obstacles, base[rows], links[rows]) / _DEPTH_SCALE  # noqa: E731
-        preference = _lowered(preference, count, penalty)
+        preference = _lowered(preference, count, _penalty(drawn, obstacles, links, compiled))
     chosen = preference.topk(min(count, len(preference))).indices
     return Poses(
         drawn.translation[chosen].to(device, dtype),
@@ -225,6 +226,25 @@ def _depth(obstacles: ObstacleTensors, base: SE3, links: SE3) -> Values:
     twice = SE3(base.rotation.repeat(2, 1, 1), torch.cat([base.translation, behind]))
     both = SE3(links.rotation.repeat(2, 1, 1, 1), links.translation.repeat(2, 1, 1))
     return -least_gap(obstacles, twice, both).view(2, len(behind)).amin(0).clamp_max(0.0)
+
+
+def _penalty(
+    pool: StartPool, obstacles: ObstacleTensors, links: SE3, compiled: KernelProblem | None
+) -> Callable[[Tensor], Values]:
+    """Return a function of rows of the pool that returns their depths in obstacles, relative to `_DEPTH_SCALE`."""
+    base = SE3(pool.rotation.float(), pool.translation.float())
+    if compiled is None:
+        return lambda rows: _depth(obstacles, base[rows], links[rows]) / _DEPTH_SCALE
+    turned = torch.cat([quaternion_from_rotation(base.rotation), pool.joints.float()], -1)
+    behind = drawn_back(base.translation, base.rotation, obstacles.approach)
+    x = torch.stack([torch.cat([at, turned], -1) for at in (base.translation, behind)])
+
+    def penalty(rows: Tensor) -> Values:
+        poses, gap = x[:, rows].flatten(0, 1).contiguous(), torch.empty(2 * len(rows))
+        compiled.call("graspd_least_gap", len(poses), poses, 0.0, gap)
+        return -gap.view(2, -1).amin(0) / _DEPTH_SCALE
+
+    return penalty
 
 
 def _lowered(preference: Values, count: int, penalty: Callable[[Tensor], Values]) -> Values:

@@ -1,27 +1,33 @@
 """Plan for any object of a scene: find an object with a verified grasp, else rank the objects by their best grasp.
 
 Objects with fewer earlier failures come first. At equal numbers of failures, objects with more probable grasps in the
-previous view come first, then higher objects, because nothing lies on them. An object gets one round of the planner,
-but all rounds if an earlier grasp of this or an unknown object failed. It gets up to four times the effort if earlier
-searches found no grasp. The first verified grasp ends the search. After `enough` objects, a grasp with a probability of
-at least `likely` also ends the search, to limit the time. `result_of_things` returns the result of one request.
+previous view come first, then higher objects, because nothing lies on them. An object that has not moved since the
+previous view keeps its plan if it has a likely grasp. Any other object gets one round of the planner, but all rounds if
+an earlier grasp of this or an unknown object failed. It gets up to four times the effort if earlier searches found no
+grasp. The first verified grasp ends the search. After `enough` objects, a grasp with a probability of at least `likely`
+also ends the search, to limit the time. `result_of_things` returns the result of one request.
 """
 
 from __future__ import annotations
 
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
+from itertools import zip_longest
 from typing import Any
 
 import numpy as np
+import torch
 from jaxtyping import Float
+from scipy.spatial import KDTree
 from scipy.spatial.distance import cdist
 
 from graspd_core.config import ObstacleConfig, SceneConfig
 from graspd_core.errors import CloudError, ConfigError, MeshError, NoObjectError
+from graspd_core.hands.kinematics import in_base, link_poses
 from graspd_core.hands.model import HandModel
+from graspd_core.hands.self_collision import collision_spheres
 from graspd_core.mesh.surface_queries import make_surface, surface_distance
 from graspd_core.optimize.plan_config import load_preset
 from graspd_core.perception.cloud.point_cloud import PointCloud
@@ -30,8 +36,11 @@ from graspd_core.perception.scene import Scene, on_support
 from graspd_core.perception.scene_from_views import scene_from_views, things_from_views
 from graspd_core.perception.segment.target_selection import Target
 from graspd_core.planning.plan_grasps import MOST_GRASPS, SEEDS, check_request, plan_grasps
+from graspd_core.se3 import rotation_from_quaternion
 from graspd_core.types import Grasp, GraspResult, Outcome, Plane, Posture, Timing, TriangleMesh, Verdict
-from graspd_core.verify.robustness import begin_other_shapes
+from graspd_core.verify.robustness import begin_in_thread, begin_other_shapes
+
+Points = Float[np.ndarray, "_ 3"]
 
 # Two grasps are alike if their bases differ by less than this distance [m] and this angle [rad].
 LIKE_DISTANCE, LIKE_TURN = 0.015, 0.26
@@ -46,6 +55,11 @@ _FAILED = "an earlier grasp of this object failed"
 _HARDER = (2.0, 4.0)
 # Probability of an object's best grasp before any search: the mean of 93 objects in eight full bins, for two hands.
 _UNKNOWN = 0.2
+# An object has not moved since the previous view if at least `_SHARED` of its points in each view are within `_STILL`
+# [m] of those in the other view, and if their mean moved by less than `_SHIFT` [m]. In three bins, no vertex of such an
+# object had moved by more than 7.1 mm. A plan is kept if no point that was not seen before is within `_NEAR` [m] of the
+# hand.
+_SHARED, _STILL, _SHIFT, _NEAR = 0.9, 0.005, 0.003, 0.015
 # Points belong to a known solid if the fraction `_NEARLY_ALL` of them is within `_STRAY` of the solid's surface [m].
 _STRAY, _NEARLY_ALL = 0.016, 0.9
 
@@ -65,9 +79,9 @@ class Failure:
     place: Float[np.ndarray, "3"] | None
     grasp: Posture | None = None
     executed: bool = True
-    seen: Float[np.ndarray, "_ 3"] | None = None
+    seen: Points | None = None
 
-    def object_among(self, places: Float[np.ndarray, "_ 3"], *, unsure: bool = False) -> int | None:
+    def object_among(self, places: Points, *, unsure: bool = False) -> int | None:
         """Return the index, among objects at `places` [m], of the object that failed. None if no object matches.
 
         The nearest object within 4 cm of `place` matches. If there is none and `seen` is known, the nearest object
@@ -80,6 +94,10 @@ class Failure:
             was_seen = (cdist(places, self.seen) < _SAME_PLACE).any(1)
             away[(away > _SLIPPED) | (was_seen & (not unsure))] = np.inf
         return int(away.argmin()) if np.isfinite(away).any() else None
+
+
+# Points of an object [m], and its earlier failures.
+Row = tuple[Points, list[Failure]]
 
 
 @dataclass(frozen=True, eq=False)
@@ -96,7 +114,7 @@ class ThingPlan:
         failures: earlier failures with this object.
     """
 
-    points: Float[np.ndarray, "_ 3"]
+    points: Points
     scene: Scene | None = None
     result: GraspResult | None = None
     grasp: Grasp | None = None
@@ -152,7 +170,7 @@ def plan_any_thing(
         failures: failures of earlier requests. Grasps like a failed grasp are left out (`unlike`).
         tries: number of failures after which an object is skipped.
         deadline: time after which the whole search ends [s]. None for no limit.
-        before: plans for the previous view. The search begins where their grasps were more probable.
+        before: plans for the previous view with the same other arguments (see above).
         enough, likely: number of objects after which a grasp with at least the probability `likely` ends the search.
         plan: other arguments of `plan_grasps`. `seed` grows by 1 per failure with this object or an unknown object.
 
@@ -160,27 +178,35 @@ def plan_any_thing(
         CloudError: a cloud is empty, all NaN, or has too few points.
         ConfigError: see `plan_grasps`. If an object cannot meet a restriction, the object's `reason` says so instead.
     """
-    began, things, over = time.perf_counter(), list[ThingPlan](), False
-    asked = {"seed": 0, "count": 1, "verify": "standard", "device": "cpu", "preset": "balanced"} | plan
-    check_request(deadline=deadline, **{name: asked[name] for name in ("count", "seed", "verify", "device")})
-    config = asked["preset"] = load_preset(asked["preset"]) if isinstance(asked["preset"], str) else asked["preset"]
-    ahead = None if asked["verify"] == "none" else partial(begin_other_shapes, config.certainty.probability)
+    end, things, over = time.perf_counter() + (np.inf if deadline is None else deadline), list[ThingPlan](), False
+    asked = _checked(plan, deadline)
+    ahead = None if asked["verify"] == "none" else partial(begin_other_shapes, asked["preset"].certainty.probability)
     about = {"settings": settings, "mass": mass, "friction": friction, "source": source, "ahead": ahead}
-    stop = asked.get("stop") or (lambda: False)
     seen = [p for p in things_from_views(views, settings and settings.segmentation) if not _is_solid(p, solids or {})]
-    for points, failed in _in_order(seen, _up(views, surface), failures, before):
+    lost = [failure for failure in failures if failure.place is None]
+    rows = _in_order(seen, _up(views, surface), failures, before)
+    kept = [None if lost else _kept(row, seen, before, likely, hand) for row in rows]
+    work = partial(_scene_among, views, surface, solids, about)
+    scenes = _one_ahead(work, [row for row, thing in zip(rows, kept, strict=True) if not thing and len(row[1]) < tries])
+    for (points, failed), thing in zip(rows, kept, strict=True):
         if over or len(failed) >= tries:
             reason = OUT_OF_TRIES if len(failed) >= tries else NOT_LOOKED_AT
             things.append(ThingPlan(points, reason=reason, looked_at=False, failures=failed))
             continue
-        scene = _scene_among(views, points, surface, solids, about, failed)
-        left = None if deadline is None else max(deadline - (time.perf_counter() - began), 1e-3)
-        lost = [*failed, *(failure for failure in failures if failure.place is None)]
-        things.append(replace(_thing_plan(points, scene, hand, lost, {**asked, "deadline": left}), failures=failed))
-        late = deadline is not None and time.perf_counter() - began > deadline
+        left = deadline and max(end - time.perf_counter(), 1e-3)
+        thing = thing or _thing_plan(points, next(scenes), hand, [*failed, *lost], {**asked, "deadline": left})
+        things.append(replace(thing, failures=failed))
         found = any(thing.is_likely(likely) for thing in things) and sum(thing.looked_at for thing in things) >= enough
-        over = late or stop() or found or things[-1].surety >= 1.0
+        over = time.perf_counter() > end or asked["stop"]() or found or things[-1].surety >= 1.0
     return tuple(sorted(things, key=lambda thing: -thing.surety))
+
+
+def _checked(plan: dict[str, Any], deadline: float | None) -> dict[str, Any]:
+    """Return arguments of `plan_grasps` with defaults and a loaded preset. Raises ConfigError: see `plan_grasps`."""
+    asked = {"seed": 0, "count": 1, "verify": "standard", "device": "cpu", "preset": "balanced"} | plan
+    check_request(deadline=deadline, **{name: asked[name] for name in ("count", "seed", "verify", "device")})
+    preset, stop = asked["preset"], asked.get("stop") or (lambda: False)
+    return {**asked, "preset": load_preset(preset) if isinstance(preset, str) else preset, "stop": stop}
 
 
 def result_of_things(things: Sequence[ThingPlan], seed: int = 0) -> GraspResult:
@@ -204,7 +230,7 @@ def result_of_things(things: Sequence[ThingPlan], seed: int = 0) -> GraspResult:
     return GraspResult(Outcome.NO_CANDIDATES, (), Timing(), seed, "", told)
 
 
-def _is_solid(points: Float[np.ndarray, "_ 3"], solids: Mapping[str, Sequence[TriangleMesh]]) -> bool:
+def _is_solid(points: Points, solids: Mapping[str, Sequence[TriangleMesh]]) -> bool:
     """Return True if nearly all points lie on the surface of a known solid."""
     meshes = [mesh for solid in solids.values() for mesh in solid]
     away = (surface_distance(make_surface(mesh), points) for mesh in meshes)
@@ -222,11 +248,11 @@ def _up(views: Sequence[PointCloud], surface: Plane | None) -> Float[np.ndarray,
 
 
 def _in_order(
-    things: Sequence[Float[np.ndarray, "_ 3"]],
+    things: Sequence[Points],
     up: Float[np.ndarray, "3"],
     failures: Sequence[Failure],
     before: Sequence[ThingPlan],
-) -> list[tuple[Float[np.ndarray, "_ 3"], list[Failure]]]:
+) -> list[Row]:
     places = np.array([points.mean(0) for points in things]).reshape(-1, 3)
     rows = [(points, list[Failure]()) for points in things]
     lost = dict[int | None, Failure]()
@@ -242,7 +268,7 @@ def _in_order(
             rows[index][1].append(failure)
     known = [(thing.place, max(thing.surety, 0.0)) for thing in before if thing.looked_at]
 
-    def rank(row: tuple[Float[np.ndarray, "_ 3"], list[Failure]]) -> tuple[int, float, float]:
+    def rank(row: Row) -> tuple[int, float, float]:
         place = row[0].mean(0)
         hopes = [surety for there, surety in known if np.linalg.norm(place - there) < _SAME_PLACE]
         return len(row[1]), -max(hopes, default=_UNKNOWN), -float((row[0] @ up).max())
@@ -250,18 +276,70 @@ def _in_order(
     return sorted(rows, key=rank)
 
 
+def _one_ahead(work: Callable[[Row], Scene | str], rows: Sequence[Row]) -> Iterator[Scene | str]:
+    """Yield the scene of each object. A thread builds the next scene while the caller plans on the present scene."""
+    begun = None
+    for row, following in zip_longest(rows, rows[1:]):
+        scene = work(row) if begun is None else begun.result()
+        begun = following and begin_in_thread("graspd-scenes", partial(work, following))
+        yield scene
+
+
+def _kept(
+    row: Row,
+    seen: Sequence[Points],
+    before: Sequence[ThingPlan],
+    likely: float,
+    hand: HandModel,
+) -> ThingPlan | None:
+    """Return the plan of the previous view for an object with its points and failures, if it has a likely grasp.
+
+    Return None if the object has moved, a grasp of it has failed since, or something new is near the hand.
+    """
+    points, failed = row
+    for plan in before:
+        if plan.grasp is None or not plan.is_likely(likely) or len(plan.failures) != len(failed):
+            continue
+        if _is_unmoved(plan.points, points):
+            known = KDTree(np.concatenate([thing.points for thing in before]))
+            others = np.concatenate([other for other in seen if other is not points] or [points[:0]])
+            new = others[known.query(others, distance_upper_bound=_STILL)[0] > _STILL]
+            return replace(plan, points=points) if _gap(new, plan.grasp, hand) > _NEAR else None
+    return None
+
+
+def _is_unmoved(before: Points, now: Points) -> bool:
+    if np.linalg.norm(before.mean(0) - now.mean(0)) >= _SHIFT:
+        return False
+    pairs = ((before, now), (now, before))
+    return all((KDTree(to).query(of, distance_upper_bound=_STILL)[0] < _STILL).mean() >= _SHARED for of, to in pairs)
+
+
+def _gap(points: Points, grasp: Grasp, hand: HandModel) -> float:
+    """Return the least distance of the points from the hand at pregrasp and grasp [m]. Infinite without points."""
+    if not len(points):
+        return float("inf")
+    tree, (local, radii, links) = KDTree(points), collision_spheres(hand)
+    gaps = []
+    for posture in (grasp.pregrasp, grasp.grasp):
+        rotation = rotation_from_quaternion(torch.as_tensor(posture.quaternion_wxyz, dtype=torch.float64)).numpy()
+        centers = in_base(link_poses(hand, posture.joint_positions), local, links) @ rotation.T + posture.position
+        gaps.append(float((tree.query(centers)[0] - radii).min()))
+    return min(gaps)
+
+
 def _scene_among(
     views: Sequence[PointCloud],
-    points: Float[np.ndarray, "_ 3"],
     surface: Plane | None,
     solids: Mapping[str, Sequence[TriangleMesh]] | None,
     about: dict[str, Any],
-    failed: Sequence[Failure],
+    row: Row,
 ) -> Scene | str:
-    """Return the scene of the object with the given points, or the error message if the scene cannot be built.
+    """Return the scene of an object with its points and failures, or the error message if it cannot be built.
 
     `about` holds other arguments of `scene_from_views`. If an executed grasp failed, add a doubt to the scene.
     """
+    points, failed = row
     again = any(failure.grasp is not None and failure.executed for failure in failed)
     # The target is a point on the object, because the middle of a ring is empty.
     middle = points[np.linalg.norm(points - points.mean(0), axis=1).argmin()]
@@ -284,9 +362,7 @@ def _scene_among(
     return with_neighbours(scene, solids, replace(settings, obstacles=replace(settings.obstacles, padding=padding)))
 
 
-def _thing_plan(
-    points: Float[np.ndarray, "_ 3"], scene: Scene | str, hand: HandModel, failed: Sequence[Failure], plan: Any
-) -> ThingPlan:
+def _thing_plan(points: Points, scene: Scene | str, hand: HandModel, failed: Sequence[Failure], plan: Any) -> ThingPlan:
     """Plan for one object. `plan` holds the keyword arguments of `plan_grasps`."""
     if isinstance(scene, str):
         return ThingPlan(points, reason=scene)

@@ -7,12 +7,16 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+import torch
 
 from graspd_cell.grasp_held import after_squeeze, why_lost, why_not_gripped
-from graspd_cell.grasp_source import EMPTY, InProcessGrasps, Offer
+from graspd_cell.grasp_source import EMPTY, ClearPath, InProcessGrasps, Offer
+from graspd_cell.motion import SeenWorld, seen_world
 from graspd_cell.picker import Cancelled, Ending, Picker
 from graspd_cell.robot import DepthView, JointMotion, JointReading, MotionAborted
 from graspd_cell.simulated_robot import SimulatedRobot
+from graspd_core.arms.arm import arm_links
+from graspd_core.optimize.restrictions import Refusal
 from graspd_core.planning.any_thing import Failure
 
 RobotOf = Callable[..., SimulatedRobot]
@@ -26,11 +30,11 @@ class KeptGrasps:
     def __init__(self, robot: SimulatedRobot) -> None:
         self._world = robot.world
 
-    def next(self, view: DepthView, failures: tuple[Failure, ...]) -> Offer:
+    def next(self, view: DepthView, failures: tuple[Failure, ...], world: SeenWorld | None = None) -> Offer:
         key = self._world.arm.name, self._world.hand.name
         if key not in OFFERS:
             source = InProcessGrasps(self._world.arm, self._world.hand, self._world.layout)
-            OFFERS[key] = source.next(view, failures)
+            OFFERS[key] = source.next(view, failures, world or SeenWorld(0.0))
         offer = OFFERS[key]
         known = tuple(replace(failure, place=offer.place, seen=offer.seen) for failure in failures)
         return replace(offer, failures=known, earlier=known)
@@ -89,6 +93,24 @@ def test_a_thing_goes_to_the_other_bin_and_the_gates_come_in_order(
         np.testing.assert_allclose(end[:count], arm, atol=1e-9)
         limits = robot.world.hand.lower, robot.world.hand.upper
         np.testing.assert_allclose(end[count:], np.clip(posture.joint_positions, *limits), atol=1e-9)
+
+
+def test_a_grasp_is_refused_if_something_outside_the_bin_is_in_the_arms_way(robot_of: RobotOf):
+    robot = robot_of("ur5e_like", "parallel_gripper", THING, height=0.05)
+    robot.wait(1.0)
+    grasp, world = KeptGrasps(robot).next(robot.look(), ()).grasp, robot.world
+    assert grasp is not None
+    assert grasp.arm is not None
+    links = arm_links(world.arm, torch.as_tensor(grasp.arm.at("grasp"))[None])
+    wrist = links.translation[0, world.arm.chain.link_names.index("wrist_1")].numpy()
+    post = seen_world(wrist + np.linspace(-0.02, 0.02, 9)[:, None] * np.array([0.0, 0.0, 1.0]), 0.0)
+    for seen, refused in ((post, True), (SeenWorld(0.0), False), (SeenWorld(0.0, world.layout.solids[1:]), False)):
+        (answer,) = ClearPath(world.arm, world.hand, seen).admit([grasp])
+        assert isinstance(answer, Refusal) == refused
+        assert refused or answer is grasp
+    # Without an arm path, nothing is known to collide.
+    bare = replace(grasp, arm=None)
+    assert ClearPath(world.arm, world.hand, post).admit([bare]) == [bare]
 
 
 @pytest.mark.parametrize("seed", [0, 1])
@@ -213,9 +235,9 @@ def test_a_thing_that_only_seemed_to_be_taken_counts_as_lost_each_time(
     robot.wait(1.0)
     told, next_offer = list[list[Failure]](), KeptGrasps.next
 
-    def noted(self: KeptGrasps, view: DepthView, failures: tuple[Failure, ...]) -> Offer:
+    def noted(self: KeptGrasps, view: DepthView, failures: tuple[Failure, ...], world: SeenWorld) -> Offer:
         told.append(list(failures))
-        return next_offer(self, view, failures)
+        return next_offer(self, view, failures, world)
 
     monkeypatch.setattr(KeptGrasps, "next", noted)
     picker = picker_of(robot)
@@ -239,9 +261,9 @@ def test_one_look_at_nothing_does_not_end_it(robot_of: RobotOf, monkeypatch: pyt
     robot = robot_of("ur5e_like", "parallel_gripper", THING, height=0.05)
     offers, next_offer = [True, False, True, True, False], KeptGrasps.next
 
-    def sometimes(self: KeptGrasps, view: DepthView, failures: tuple[Failure, ...]) -> Offer:
+    def sometimes(self: KeptGrasps, view: DepthView, failures: tuple[Failure, ...], world: SeenWorld) -> Offer:
         empty = Offer(None, reason=EMPTY, failures=tuple(failures), exhausted=True)
-        return empty if offers.pop(0) else next_offer(self, view, failures)
+        return empty if offers.pop(0) else next_offer(self, view, failures, world)
 
     monkeypatch.setattr(KeptGrasps, "next", sometimes)
     monkeypatch.setattr(Picker, "_steps", lambda *_: (Ending.NOT_GRIPPED, "nothing"))

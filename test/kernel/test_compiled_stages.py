@@ -4,11 +4,14 @@ from dataclasses import replace
 
 import pytest
 import torch
+from expected import some
 
-from graspd_core import hand_names
+from graspd_core import draw_starts, hand_names
 from graspd_core.config import GraspStagesConfig
+from graspd_core.hands.kinematics import forward
 from graspd_core.optimize.grasp_postures import find_pregrasp, nearest_features, self_overlap, settle
-from graspd_core.optimize.loop import Poses, moved_along, unpack
+from graspd_core.optimize.loop import Poses, moved_along, pack, unpack
+from graspd_core.optimize.obstacle_distance import least_gap
 
 
 @pytest.fixture
@@ -40,6 +43,28 @@ def test_a_few_steps_are_torchs_and_all_come_as_far(problem_of, rows_of, torch_a
     assert (mine_share - their_share).abs().median() < 0.01
     assert (end_share - far_share).abs().median() < 0.05
     assert ((end.joints >= problem.hand.lower) & (end.joints <= problem.hand.upper)).all()
+
+
+@pytest.mark.parametrize("hand", ["allegro_right", "barrett_like", "parallel_gripper"])
+@pytest.mark.parametrize("wide", [0.0, 0.02])
+def test_the_least_gap_to_support_and_obstacles_is_torchs(problem_of, rows_of, hand, wide):
+    problem = problem_of(hand, "crowded")
+    poses = grasps_of(problem, rows_of(hand, "crowded", problem))
+    shifts = 0.05 * torch.randn(40, len(poses.joints), 3, generator=torch.Generator().manual_seed(0))
+    x = torch.cat([pack(moved) for moved in (replace(poses, translation=poses.translation + s) for s in shifts)])
+    gap, rows = torch.empty(len(x)), unpack(x)
+    some(problem.compiled).call("graspd_least_gap", len(x), x, wide, gap)
+    links = forward(problem.hand.kinematics, rows.joints)
+    theirs = least_gap(some(problem.obstacles), rows.base, links, wide).clamp_max(wide)
+    assert (gap == wide).any()
+    assert (gap < 0).any()
+    torch.testing.assert_close(gap, theirs, atol=2e-6, rtol=1e-4)
+
+
+def test_starts_among_obstacles_are_those_of_torch(problem_of, scenes, hands):
+    asked = scenes["crowded"], hands("allegro_right"), 40, 1, "cpu", torch.float32
+    compiled = some(problem_of("allegro_right", "crowded").compiled)
+    torch.testing.assert_close(pack(draw_starts(*asked, compiled=compiled)), pack(draw_starts(*asked)))
 
 
 @pytest.mark.parametrize(("hand", "scene"), ON)

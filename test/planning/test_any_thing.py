@@ -135,6 +135,29 @@ def test_the_best_of_the_view_before_comes_first(views, first):
         assert [thing.looked_at for thing in again] == [True, False]
 
 
+def test_an_object_that_has_not_moved_keeps_its_plan_unless_something_new_is_near_the_hand(views, first):
+    scene = tabletop("box", obstacles=[("bowl", 0.16, 0.05)])
+    camera = ring_poses(1, elevation=np.deg2rad(55.0), distance=0.65)
+    again = plan_any_thing(views_of(scene, CAMERA, camera, DEFAULT, 4), HAND, before=first, **ASKED)
+    assert again[0].result is some(first[0].result)
+    assert not np.array_equal(again[0].points, first[0].points)
+    points, grasp = first[0].points, some(first[0].grasp)
+    others, quick = [thing.points for thing in first[1:]], {**ASKED, "verify": "none", "enough": 1}
+    assert module._kept((points, []), [points, *others], first, 0.5, HAND) is not None
+    assert module._kept((points, []), [points], first, 0.5, HAND) is not None
+    # Something came where the hand will be, or far from it.
+    palm, up = grasp.grasp.position, np.array([0.0, 0.0, 1.0])
+    for place, kept in ((palm, False), (palm + 0.3 * up, True)):
+        new = place + 1e-3 * np.random.default_rng(0).normal(size=(50, 3))
+        assert (module._kept((points, []), [points, new, *others], first, 0.5, HAND) is not None) == kept
+    # The object moved, or was seen in part, or a grasp of it failed, or a grasp failed nobody knows where.
+    assert module._kept((points + np.array([0.004, 0.0, 0.0]), []), [], first, 0.5, HAND) is None
+    assert module._kept((points[points[:, 0] > np.median(points[:, 0])], []), [], first, 0.5, HAND) is None
+    assert module._kept((points, [Failure(first[0].place)]), [points], first, 0.5, HAND) is None
+    lost = plan_any_thing(views, HAND, before=first, failures=[Failure(None, grasp.grasp)], **quick)
+    assert lost[0].result is not first[0].result
+
+
 def test_one_result_answers_for_all_things(views, first):
     assert result_of_things(first) is some(first[0].result)
     # A grasp that failed nobody knows where is left out, and makes no object come later.

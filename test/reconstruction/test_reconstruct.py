@@ -1,9 +1,11 @@
 """Views to closed meshes: rendered scenes on a table, of which the truth is known."""
 
 import functools
+from functools import partial
 
 import numpy as np
 import pytest
+from expected import some
 from made_meshes import box_of
 from scipy.spatial import KDTree
 from scipy.spatial.transform import Rotation
@@ -12,6 +14,7 @@ from shape_volumes import shape_volume
 from graspd_bench.rendering.depth_noise import DEFAULT, NONE, DepthNoise
 from graspd_bench.rendering.tabletop import CAMERA as D415
 from graspd_bench.rendering.tabletop import TabletopScene, depth_views, ring_poses, tabletop
+from graspd_bench.studies.cameras import ASSUMED, CameraView, view_of
 from graspd_core import PinholeCamera, PointCloud, cloud_from_depth
 from graspd_core.config import ReconstructionConfig
 from graspd_core.errors import CloudError
@@ -20,7 +23,10 @@ from graspd_core.mesh.shapes import SHAPES, make_shape
 from graspd_core.mesh.surface_queries import make_surface, surface_distance, winding_inside
 from graspd_core.mesh.topology import is_closed
 from graspd_core.perception.cloud.free_space import FreeSpace, empty_depth, make_view_depths
-from graspd_core.perception.reconstruct.reconstruct import Reconstruction, reconstruct
+from graspd_core.perception.reconstruct.poisson import GRID_CELLS, poisson_field
+from graspd_core.perception.reconstruct.reconstruct import Reconstruction, closed_mesh, reconstruct
+from graspd_core.perception.reconstruct.shape_completion import complete_shape
+from graspd_core.perception.scene_from_views import scene_from_views
 from graspd_core.types import Plane, TriangleMesh
 
 CAMERA = PinholeCamera(240, 180, 260.0, 260.0, 119.5, 89.5)
@@ -258,6 +264,19 @@ def test_an_all_round_cloud_needs_no_camera(name):
 def test_hopeless_views_are_named(views, complaint):
     with pytest.raises(CloudError, match=complaint):
         reconstruct(views)
+
+
+def test_a_guess_that_no_closed_surface_fits_together_with_the_seen_points_is_dropped():
+    stage, cloud, _, _ = view_of(CameraView("pan", 144, "d435", False, ASSUMED, "", "", 0))
+    scene = scene_from_views([cloud])
+    evidence = some(scene.evidence)
+    guess = complete_shape(evidence.seen, evidence.free_space, evidence.step, evidence.settings)
+    with pytest.raises(CloudError, match="the surface fits"):
+        closed_mesh(evidence, guess.surfels, partial(poisson_field, finest=evidence.settings.poisson_cell), GRID_CELLS)
+    assert guess.method
+    assert (evidence.chosen, evidence.hidden) == ("", True)
+    assert any("guessed by closing the surface smoothly" in told for told in scene.object.warnings)
+    assert distances(scene.object.mesh, stage.truth).mean() < 0.012
 
 
 @pytest.mark.parametrize("few", [BALL[:1], BALL[:3], np.repeat(BALL[:1], 90, 0), np.repeat(BALL[:2], 45, 0)])

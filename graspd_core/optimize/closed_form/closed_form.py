@@ -212,12 +212,13 @@ def plan(task: PlannerInput) -> PlannerOutput:
     """Run the closed-form relaxation from `starts_per_grasp` starts for every requested grasp."""
     settings, problem = task.config.settings, task.problem
     count = max(_FEWEST_STARTS, round(task.count * settings.starts_per_grasp))
-    drawn = {"fingertips": settings.fingertip_starts, "restrictions": task.restrictions}
+    compiled = problem.compiled
+    drawn = {"fingertips": settings.fingertip_starts, "restrictions": task.restrictions, "compiled": compiled}
     starts = draw_starts(task.scene, task.hand, count, task.seed, task.device, task.dtype, **drawn)
     if len(starts.joints) == 0:
         return PlannerOutput(starts)
     solver = ClosedForm(settings, keep=max(_FEWEST_KEPT, round(task.count * settings.keep_per_grasp)))
-    if (compiled := problem.compiled) is None:
+    if compiled is None:
         solution = minimise(solver, problem, starts, task.hooks)
     else:
         solution = minimise_compiled(solver, problem, compiled, starts, task.hooks)

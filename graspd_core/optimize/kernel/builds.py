@@ -30,6 +30,7 @@ _ARGUMENTS = {
     "graspd_find_pregrasps": [_AT, _AT, _INT, _AT, _AT, _AT, _INT, POLL],
     "graspd_settle": [_AT, _AT, _INT, _AT, _AT, _INT, POLL],
     "graspd_nearest_features": [_AT, _INT, _AT, _AT, _AT, _AT, _INT],
+    "graspd_least_gap": [_AT, _INT, _AT, _FLOAT, _AT, _INT],
     "graspd_self_overlap": [_AT, _INT, _AT, _AT, _INT],
     "graspd_wrench_hull": [_INT, _AT, _AT],
     "graspd_build_surface": [_INT, _AT, _AT, _AT],

@@ -110,7 +110,14 @@ def reconstruct(
         )
         guess = complete_shape(seen, free_space, step, settings)
     evidence = Evidence(seen, free_space, step, rotation, origin, guess.method, settings, hidden=False)
-    mesh = _closed(evidence, guess.surfels, cells)
+    try:
+        mesh = _closed(evidence, guess.surfels, cells)
+    except CloudError:
+        if not guess.method:
+            raise
+        # No surface fits both the guess and the seen points, so the guess is wrong.
+        guess, evidence = replace(guess, method="", surfels=nothing()), replace(evidence, chosen="")
+        mesh = _closed(evidence, guess.surfels, cells)
     confidence = _confidence(mesh, np.concatenate([view.points for view in local]), settings)
     hidden = not unposed and _is_guessed(mesh, evidence, guess, confidence, len(local))
     by = guess.method or "closing the surface smoothly within the cameras' outlines"

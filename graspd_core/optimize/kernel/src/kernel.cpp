@@ -103,6 +103,20 @@ int32_t graspd_nearest_features(const Problem* p, int32_t rows, const float* x, 
     });
 }
 
+// Computes for every row of x (with base positions) the least distance of the hand to support and obstacles [m], at
+// most `wide`.
+int32_t graspd_least_gap(const Problem* p, int32_t rows, const float* x, float wide, float* gap, int32_t threads) {
+    return guarded([&] {
+        for_rows(*p, rows, threads, [&](int row, Scratch& s, bool) {
+            const float* at = x + row * (7 + p->hand.joints);
+            float base[12];
+            turned_base(at + 3, at, base);
+            place_links(p->hand, base, at + 7, s.link);
+            gap[row] = least_gap(*p, wide, s);
+        });
+    });
+}
+
 // Computes for every row of joints the greatest depth of the hand's solids in each other [m].
 int32_t graspd_self_overlap(const Problem* p, int32_t rows, const float* joints, float* depth, int32_t threads) {
     return guarded([&] {

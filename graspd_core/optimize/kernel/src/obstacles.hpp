@@ -58,6 +58,29 @@ static float neighbour_depth(
     return total;
 }
 
+// Returns the least distance of the spheres at placed points to one obstacle [m], at most `wide`.
+static float neighbour_gap(const Grid& grid, const Points& points, const float* radius, float wide, Samples& at) {
+    if (!near_grid(grid, points.count, radius, wide, at)) return wide;
+    sample(grid, points.count, at);
+    for (int i = 0; i < points.count; i++) wide = std::min(wide, at.phi[i] - radius[i]);
+    return wide;
+}
+
+// Returns the least distance of the hand to support and obstacles [m], at most `wide`. `s.link` has the links' poses.
+static float least_gap(const Problem& p, float wide, Scratch& s) {
+    const Obstacles& o = p.obstacles;
+    Samples& at = s.obstacle;
+    place_points(o.corners, s.link, at.x, at.y, at.z);
+    for (int i = 0; i < o.corners.count && o.has_support; i++)
+        wide = std::min(wide, at.x[i] * o.normal[0] + at.y[i] * o.normal[1] + at.z[i] * o.normal[2] - o.offset -
+                                  o.corner_radius[i]);
+    for (int k = 0; k < o.grids; k++) wide = neighbour_gap(o.grid[k], o.corners, o.corner_radius, wide, at);
+    if (o.grids == 0) return wide;
+    place_points(o.spheres, s.link, at.x, at.y, at.z);
+    for (int k = 0; k < o.grids; k++) wide = neighbour_gap(o.grid[k], o.spheres, o.sphere_radius, wide, at);
+    return wide;
+}
+
 // Returns the unweighted loss, and adds the weighted forces to the links.
 static float obstacle_depth(const Problem& p, float weight, Scratch& s) {
     const Obstacles& o = p.obstacles;
