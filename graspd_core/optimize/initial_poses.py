@@ -19,6 +19,7 @@ from graspd_core.hands.kinematics import drawn_back, forward, link_poses, make_k
 from graspd_core.hands.model import HandModel
 from graspd_core.mesh.convex_parts import hull_surface
 from graspd_core.mesh.mesh_files import surface_samples
+from graspd_core.optimize import kernel_problem
 from graspd_core.optimize.kernel_problem import KernelProblem
 from graspd_core.optimize.loop import Joints, Poses, Positions, Values
 from graspd_core.optimize.obstacle_distance import ObstacleTensors, least_gap, make_obstacle_tensors, obstacle_gaps
@@ -239,12 +240,8 @@ def _penalty(
     behind = drawn_back(base.translation, base.rotation, obstacles.approach)
     x = torch.stack([torch.cat([at, turned], -1) for at in (base.translation, behind)])
 
-    def penalty(rows: Tensor) -> Values:
-        poses, gap = x[:, rows].flatten(0, 1).contiguous(), torch.empty(2 * len(rows))
-        compiled.call("graspd_least_gap", len(poses), poses, 0.0, gap)
-        return -gap.view(2, -1).amin(0) / _DEPTH_SCALE
-
-    return penalty
+    gaps = lambda rows: kernel_problem.least_gap(compiled, x[:, rows].flatten(0, 1), 0.0)  # noqa: E731
+    return lambda rows: -gaps(rows).view(2, -1).amin(0) / _DEPTH_SCALE
 
 
 def _lowered(preference: Values, count: int, penalty: Callable[[Tensor], Values]) -> Values:

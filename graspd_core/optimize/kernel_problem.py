@@ -1,6 +1,6 @@
 """Convert a problem to the memory layout of the compiled kernel: arrays of float32 and int32.
 
-The arrays of the last hands and objects are cached, because most requests use the same hand and object.
+The arrays of the last hands, objects and obstacles are cached, because the searches of a run share them.
 """
 
 from __future__ import annotations
@@ -19,6 +19,7 @@ from graspd_core.hands.model import HandModel
 from graspd_core.hands.self_collision import collision_spheres
 from graspd_core.mesh.sdf import GridSDF
 from graspd_core.optimize.kernel import builds as structs
+from graspd_core.optimize.loop import Rows, Values
 from graspd_core.optimize.obstacle_distance import ObstacleTensors
 from graspd_core.optimize.problem import (
     FEATURE_PAIRS,
@@ -103,6 +104,13 @@ class KernelProblem:
             raise MemoryError(f"{function}: not enough memory for {torch.get_num_threads()} threads; use fewer threads")
 
 
+def least_gap(compiled: KernelProblem, x: Rows, wide: float) -> Values:
+    """Return the least distance of the hand at each row of `pack` to support and obstacles [m], at most `wide`."""
+    gap = torch.empty(len(x))
+    compiled.call("graspd_least_gap", len(x), x.contiguous(), wide, gap)
+    return gap
+
+
 def _given(argument: Argument) -> object:
     if isinstance(argument, Tensor):
         return argument.data_ptr()
@@ -113,10 +121,11 @@ def kernel_problem(problem: Problem) -> KernelProblem:
     """Convert a problem to the kernel's memory layout. The kernel must be able to evaluate it (`Problem.compiled`)."""
     hand, hand_arrays = _hand(problem.hand)
     target, object_arrays = _object(problem.object)
+    obstacles, obstacle_arrays = _obstacles(problem.obstacles)
     own = Arrays()
     struct = structs.Problem(
         object=target,
-        obstacles=_obstacles(problem.obstacles, own),
+        obstacles=obstacles,
         directions=len(problem.directions),
         task_points=TASK_POINTS,
         feature_pairs=FEATURE_PAIRS,
@@ -125,7 +134,7 @@ def kernel_problem(problem: Problem) -> KernelProblem:
         sharp_reach=REACH_WHEN_SHARP,
         **hand,
     )
-    return KernelProblem(struct, (hand_arrays, object_arrays, own))
+    return KernelProblem(struct, (hand_arrays, object_arrays, obstacle_arrays, own))
 
 
 @lru_cache(maxsize=8)
@@ -244,9 +253,11 @@ def _grid(sdf: GridSDF, arrays: Arrays) -> structs.Grid:
     return structs.Grid(nodes, *sdf.field.shape[1:], tuple(sdf.origin.tolist()), float(sdf.spacing))
 
 
-def _obstacles(obstacles: ObstacleTensors | None, arrays: Arrays) -> structs.Obstacles:
+@lru_cache(maxsize=4)
+def _obstacles(obstacles: ObstacleTensors | None) -> tuple[structs.Obstacles, Arrays]:
+    arrays = Arrays()
     if obstacles is None:
-        return structs.Obstacles()
+        return structs.Obstacles(), arrays
     grids = (structs.Grid * len(obstacles.sdfs))(*(_grid(sdf, arrays) for sdf in obstacles.sdfs))
     arrays.kept.append(grids)
     corners, corner_radius = _balls(obstacles, slice(obstacles.corners), arrays)
@@ -262,7 +273,7 @@ def _obstacles(obstacles: ObstacleTensors | None, arrays: Arrays) -> structs.Obs
         spheres=spheres,
         corner_radius=corner_radius,
         sphere_radius=sphere_radius,
-    )
+    ), arrays
 
 
 def _balls(obstacles: ObstacleTensors, some: slice, arrays: Arrays) -> tuple[structs.Points, int]:

@@ -44,7 +44,7 @@ WIDE = 0.005
 _RIM, _HULL, _SURFACE = 12, 32, 1000
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class ObstacleTensors:
     """Support and obstacles, and the points of the hand that are tested against them.
 

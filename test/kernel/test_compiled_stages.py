@@ -9,6 +9,7 @@ from expected import some
 from graspd_core import draw_starts, hand_names
 from graspd_core.config import GraspStagesConfig
 from graspd_core.hands.kinematics import forward
+from graspd_core.optimize import kernel_problem
 from graspd_core.optimize.grasp_postures import find_pregrasp, nearest_features, self_overlap, settle
 from graspd_core.optimize.loop import Poses, moved_along, pack, unpack
 from graspd_core.optimize.obstacle_distance import least_gap
@@ -52,8 +53,7 @@ def test_the_least_gap_to_support_and_obstacles_is_torchs(problem_of, rows_of, h
     poses = grasps_of(problem, rows_of(hand, "crowded", problem))
     shifts = 0.05 * torch.randn(40, len(poses.joints), 3, generator=torch.Generator().manual_seed(0))
     x = torch.cat([pack(moved) for moved in (replace(poses, translation=poses.translation + s) for s in shifts)])
-    gap, rows = torch.empty(len(x)), unpack(x)
-    some(problem.compiled).call("graspd_least_gap", len(x), x, wide, gap)
+    gap, rows = kernel_problem.least_gap(some(problem.compiled), x, wide), unpack(x)
     links = forward(problem.hand.kinematics, rows.joints)
     theirs = least_gap(some(problem.obstacles), rows.base, links, wide).clamp_max(wide)
     assert (gap == wide).any()

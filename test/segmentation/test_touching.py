@@ -163,6 +163,10 @@ def test_one_that_lies_on_another_is_a_thing_where_things_are_piled():
     found = find_things([view], SegmentationConfig(piled=True))
     assert len(found) == 2
     assert max(points[:, 2].min() for points in found) > 0.5 * top
+    # Without a floor, as in a full bin, the seam is found too.
+    bare = PointCloud(view.points[view.points[:, 2] > 0.01], view.viewpoint)
+    assert len(find_things([bare], SegmentationConfig(piled=True))) == 2
+    assert len(find_things([bare])) == 1
     # The seam may also be one within an object, as between a drill and its handle, so the part is doubted.
     point = max(found, key=lambda points: points[:, 2].min()).mean(0)
     seen = segment([view], target=Target(point=point), settings=SegmentationConfig(piled=True))

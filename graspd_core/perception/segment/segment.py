@@ -261,17 +261,19 @@ def _cut(parted: _Parted, chosen: Mask, views: Sequence[PointCloud]) -> str:
 
 
 def _parts(parted: _Parted, chosen: Mask) -> Labels:
-    """Split the chosen object at seams if there is a support. Return each voxel's part number, -1 outside."""
+    """Split the chosen object at seams. Return each voxel's part number, -1 outside.
+
+    Without a support, only a pile is split. In a full bin, objects may hide the whole floor.
+    """
     scene, support, key = parted.scene, parted.support, chosen.tobytes()
     if key in parted.parts:
         return parted.parts[key]
     part = parted.parts[key] = np.where(chosen, 0, -1)
-    if support is not None:
-        points, eyes = scene.mean[chosen], parted.eyes
-        if parted.settings.piled:
-            part[chosen] = clusters.heaped_things(points, eyes, scene.size)
-        else:
-            part[chosen] = clusters.touching_things(points, eyes, support.height(points), scene.size)
+    points, eyes = scene.mean[chosen], parted.eyes
+    if parted.settings.piled:
+        part[chosen] = clusters.heaped_things(points, eyes, scene.size)
+    elif support is not None:
+        part[chosen] = clusters.touching_things(points, eyes, support.height(points), scene.size)
     return part
 
 
