@@ -445,7 +445,7 @@ class Picker:
 
 
 def _points_of(view: DepthView) -> Float[np.ndarray, "_ 3"]:
-    """Return a view's points in the base frame [m]. Return none if the image is unusable."""
+    """Return a view's points in the base frame [m]. The array is empty if the image is unusable."""
     try:
         return cloud_of(view).points
     except CloudError:

@@ -98,7 +98,7 @@ def draw_starts(
     """
     generator = torch.Generator().manual_seed(seed)
     # Distances to obstacles take most of the time. Single precision is enough for them.
-    obstacles = make_obstacle_tensors(scene, hand, "cpu", torch.float32)
+    obstacles = make_obstacle_tensors(restrictions.searched(scene), hand, "cpu", torch.float32)
     pool = (_POOL if obstacles is None else _POOL_AMONG_OBSTACLES) * count
     hull = convex_hull(scene.object.mesh)
     surface = torch.as_tensor(surface_samples(scene.object.mesh, _SPAN_POINTS, seed)[0])
@@ -240,8 +240,10 @@ def _penalty(
     behind = drawn_back(base.translation, base.rotation, obstacles.approach)
     x = torch.stack([torch.cat([at, turned], -1) for at in (base.translation, behind)])
 
-    gaps = lambda rows: kernel_problem.least_gap(compiled, x[:, rows].flatten(0, 1), 0.0)  # noqa: E731
-    return lambda rows: -gaps(rows).view(2, -1).amin(0) / _DEPTH_SCALE
+    def penalty(rows: Tensor) -> Values:
+        return -kernel_problem.least_gap(compiled, x[:, rows].flatten(0, 1), 0.0).view(2, -1).amin(0) / _DEPTH_SCALE
+
+    return penalty
 
 
 def _lowered(preference: Values, count: int, penalty: Callable[[Tensor], Values]) -> Values:

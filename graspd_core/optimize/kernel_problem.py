@@ -106,7 +106,7 @@ class KernelProblem:
 
 def least_gap(compiled: KernelProblem, x: Rows, wide: float) -> Values:
     """Return the least distance of the hand at each row of `pack` to support and obstacles [m], at most `wide`."""
-    gap = torch.empty(len(x))
+    gap = torch.empty(len(x), dtype=torch.float32)
     compiled.call("graspd_least_gap", len(x), x.contiguous(), wide, gap)
     return gap
 

@@ -2,10 +2,11 @@
 
 Objects with fewer earlier failures come first. At equal numbers of failures, objects with more probable grasps in the
 previous view come first, then higher objects, because nothing lies on them. An object that has not moved since the
-previous view keeps its plan if it has a likely grasp. Any other object gets one round of the planner, but all rounds if
-an earlier grasp of this or an unknown object failed. It gets up to four times the effort if earlier searches found no
-grasp. The first verified grasp ends the search. After `enough` objects, a grasp with a probability of at least `likely`
-also ends the search, to limit the time. `result_of_things` returns the result of one request.
+previous view keeps its plan if it has a likely grasp and nothing new is near the hand. Any other object gets one round
+of the planner, but all rounds if an earlier grasp of this or an unknown object failed. It gets up to four times the
+effort if earlier searches found no grasp. The first verified grasp ends the search. After `enough` objects, a grasp
+with a probability of at least `likely` also ends the search, to limit the time. `result_of_things` returns the result
+of one request.
 """
 
 from __future__ import annotations
@@ -30,6 +31,7 @@ from graspd_core.hands.model import HandModel
 from graspd_core.hands.self_collision import collision_spheres
 from graspd_core.mesh.surface_queries import make_surface, surface_distance
 from graspd_core.optimize.plan_config import load_preset
+from graspd_core.optimize.restrictions import BoundRestrictions
 from graspd_core.perception.cloud.point_cloud import PointCloud
 from graspd_core.perception.obstacles import with_neighbours
 from graspd_core.perception.scene import Scene, on_support
@@ -38,7 +40,7 @@ from graspd_core.perception.segment.target_selection import Target
 from graspd_core.planning.plan_grasps import MOST_GRASPS, SEEDS, check_request, plan_grasps
 from graspd_core.se3 import rotation_from_quaternion
 from graspd_core.types import Grasp, GraspResult, Outcome, Plane, Posture, Timing, TriangleMesh, Verdict
-from graspd_core.verify.robustness import begin_in_thread, begin_other_shapes
+from graspd_core.verify.robustness import begin_in_thread
 
 Points = Float[np.ndarray, "_ 3"]
 
@@ -57,8 +59,7 @@ _HARDER = (2.0, 4.0)
 _UNKNOWN = 0.2
 # An object has not moved since the previous view if at least `_SHARED` of its points in each view are within `_STILL`
 # [m] of those in the other view, and if their mean moved by less than `_SHIFT` [m]. In three bins, no vertex of such an
-# object had moved by more than 7.1 mm. A plan is kept if no point that was not seen before is within `_NEAR` [m] of the
-# hand.
+# object had moved by more than 7.1 mm. A plan is dropped if a new point is within `_NEAR` [m] of the hand.
 _SHARED, _STILL, _SHIFT, _NEAR = 0.9, 0.005, 0.003, 0.015
 # Points belong to a known solid if the fraction `_NEARLY_ALL` of them is within `_STRAY` of the solid's surface [m].
 _STRAY, _NEARLY_ALL = 0.016, 0.9
@@ -170,7 +171,7 @@ def plan_any_thing(
         failures: failures of earlier requests. Grasps like a failed grasp are left out (`unlike`).
         tries: number of failures after which an object is skipped.
         deadline: time after which the whole search ends [s]. None for no limit.
-        before: plans for the previous view with the same other arguments (see above).
+        before: plans for the previous view. Other arguments than `views` and `restrictions` must be the same.
         enough, likely: number of objects after which a grasp with at least the probability `likely` ends the search.
         plan: other arguments of `plan_grasps`. `seed` grows by 1 per failure with this object or an unknown object.
 
@@ -180,12 +181,12 @@ def plan_any_thing(
     """
     end, things, over = time.perf_counter() + (np.inf if deadline is None else deadline), list[ThingPlan](), False
     asked = _checked(plan, deadline)
-    ahead = None if asked["verify"] == "none" else partial(begin_other_shapes, asked["preset"].certainty.probability)
-    about = {"settings": settings, "mass": mass, "friction": friction, "source": source, "ahead": ahead}
+    about = {"settings": settings, "mass": mass, "friction": friction, "source": source}
     seen = [p for p in things_from_views(views, settings and settings.segmentation) if not _is_solid(p, solids or {})]
     lost = [failure for failure in failures if failure.place is None]
     rows = _in_order(seen, _up(views, surface), failures, before)
-    kept = [None if lost else _kept(row, seen, before, likely, hand) for row in rows]
+    sure = [] if lost else [thing for thing in before if thing.is_likely(likely) and _allowed(thing, hand, asked)]
+    kept = [_kept(row, seen, sure, before, hand) for row in rows]
     work = partial(_scene_among, views, surface, solids, about)
     scenes = _one_ahead(work, [row for row, thing in zip(rows, kept, strict=True) if not thing and len(row[1]) < tries])
     for (points, failed), thing in zip(rows, kept, strict=True):
@@ -193,8 +194,7 @@ def plan_any_thing(
             reason = OUT_OF_TRIES if len(failed) >= tries else NOT_LOOKED_AT
             things.append(ThingPlan(points, reason=reason, looked_at=False, failures=failed))
             continue
-        left = deadline and max(end - time.perf_counter(), 1e-3)
-        thing = thing or _thing_plan(points, next(scenes), hand, [*failed, *lost], {**asked, "deadline": left})
+        thing = thing or _thing_plan(points, next(scenes), hand, [*failed, *lost], asked, end)
         things.append(replace(thing, failures=failed))
         found = any(thing.is_likely(likely) for thing in things) and sum(thing.looked_at for thing in things) >= enough
         over = time.perf_counter() > end or asked["stop"]() or found or things[-1].surety >= 1.0
@@ -285,30 +285,44 @@ def _one_ahead(work: Callable[[Row], Scene | str], rows: Sequence[Row]) -> Itera
         yield scene
 
 
-def _kept(
-    row: Row,
-    seen: Sequence[Points],
-    before: Sequence[ThingPlan],
-    likely: float,
-    hand: HandModel,
-) -> ThingPlan | None:
-    """Return the plan of the previous view for an object with its points and failures, if it has a likely grasp.
+def _allowed(thing: ThingPlan, hand: HandModel, asked: dict[str, Any]) -> bool:
+    """Return True if the restrictions of this request admit the grasp of an earlier plan."""
+    if thing.grasp is None or thing.scene is None:
+        return False
+    try:
+        bound = BoundRestrictions(tuple(one.bind(thing.scene, hand) for one in asked.get("restrictions", ())))
+    except ConfigError:
+        return False
+    return bool(bound.admit([thing.grasp])[0])
 
-    Return None if the object has moved, a grasp of it has failed since, or something new is near the hand.
+
+def _kept(
+    row: Row, seen: Sequence[Points], sure: Sequence[ThingPlan], before: Sequence[ThingPlan], hand: HandModel
+) -> ThingPlan | None:
+    """Return the earlier plan for the object of a row. None if the plan may be wrong now.
+
+    A plan may be wrong if the object has moved, a grasp of it has failed since, or a new point is near the hand. Only
+    points of objects are compared. `sure` lists the plans that may be kept, `before` all plans of the previous view.
     """
     points, failed = row
-    for plan in before:
-        if plan.grasp is None or not plan.is_likely(likely) or len(plan.failures) != len(failed):
+    for plan in sure:
+        if plan.grasp is None or _executed(plan.failures) != _executed(failed) or not _is_unmoved(plan.points, points):
             continue
-        if _is_unmoved(plan.points, points):
-            known = KDTree(np.concatenate([thing.points for thing in before]))
-            others = np.concatenate([other for other in seen if other is not points] or [points[:0]])
-            new = others[known.query(others, distance_upper_bound=_STILL)[0] > _STILL]
-            return replace(plan, points=points) if _gap(new, plan.grasp, hand) > _NEAR else None
+        known = KDTree(np.concatenate([thing.points for thing in before]))
+        others = np.concatenate([other for other in seen if other is not points] or [points[:0]])
+        new = others[known.query(others, distance_upper_bound=_STILL)[0] > _STILL]
+        again = not unlike([plan.grasp], [failure.grasp for failure in failed if failure.grasp is not None])
+        # The plan keeps the points of its own view, so that an object that creeps from view to view gets a new plan.
+        return None if again or _gap(new, plan.grasp, hand) <= _NEAR else plan
     return None
 
 
+def _executed(failures: Sequence[Failure]) -> int:
+    return sum(failure.executed and failure.grasp is not None for failure in failures)
+
+
 def _is_unmoved(before: Points, now: Points) -> bool:
+    """Return True if two views of an object show it in one place (`_SHARED`, `_STILL`, `_SHIFT`)."""
     if np.linalg.norm(before.mean(0) - now.mean(0)) >= _SHIFT:
         return False
     pairs = ((before, now), (now, before))
@@ -344,7 +358,7 @@ def _scene_among(
     # The target is a point on the object, because the middle of a ring is empty.
     middle = points[np.linalg.norm(points - points.mean(0), axis=1).argmin()]
     try:
-        scene = scene_from_views(views, target=Target(point=middle), **{**about, "ahead": None} if again else about)
+        scene = scene_from_views(views, target=Target(point=middle), **about)
     except (CloudError, MeshError) as error:
         return str(error)
     if again and scene.evidence is not None:
@@ -362,8 +376,10 @@ def _scene_among(
     return with_neighbours(scene, solids, replace(settings, obstacles=replace(settings.obstacles, padding=padding)))
 
 
-def _thing_plan(points: Points, scene: Scene | str, hand: HandModel, failed: Sequence[Failure], plan: Any) -> ThingPlan:
-    """Plan for one object. `plan` holds the keyword arguments of `plan_grasps`."""
+def _thing_plan(
+    points: Points, scene: Scene | str, hand: HandModel, failed: Sequence[Failure], plan: Any, end: float
+) -> ThingPlan:
+    """Plan for one object until the time `end` [s]. `plan` holds the keyword arguments of `plan_grasps`."""
     if isinstance(scene, str):
         return ThingPlan(points, reason=scene)
     lost, config = [failure.grasp for failure in failed if failure.grasp is not None], plan["preset"]
@@ -372,8 +388,9 @@ def _thing_plan(points: Points, scene: Scene | str, hand: HandModel, failed: Seq
         config = config.at_budget(max(_HARDER[in_vain > 1] / count, 1.0))
     if not lost:
         config = replace(config, rounds=replace(config.rounds, most=1))
+    left = None if end == np.inf else max(end - time.perf_counter(), 1e-3)
     try:
-        result = plan_grasps(scene, hand, **{**plan, "preset": config, "count": count, "seed": seed})
+        result = plan_grasps(scene, hand, **{**plan, "preset": config, "count": count, "seed": seed, "deadline": left})
     except ConfigError as error:  # The object cannot meet a restriction.
         return ThingPlan(points, scene, reason=str(error))
     left = [grasp for grasp in unlike(result.tried, lost) if grasp.verdict is not Verdict.FAILED]

@@ -105,12 +105,19 @@ def test_a_grasp_is_refused_if_something_outside_the_bin_is_in_the_arms_way(robo
     wrist = links.translation[0, world.arm.chain.link_names.index("wrist_1")].numpy()
     post = seen_world(wrist + np.linspace(-0.02, 0.02, 9)[:, None] * np.array([0.0, 0.0, 1.0]), 0.0)
     for seen, refused in ((post, True), (SeenWorld(0.0), False), (SeenWorld(0.0, world.layout.solids[1:]), False)):
-        (answer,) = ClearPath(world.arm, world.hand, seen).admit([grasp])
+        (answer,) = ClearPath(picker_of(robot)._mover(seen)).admit([grasp])
         assert isinstance(answer, Refusal) == refused
         assert refused or answer is grasp
     # Without an arm path, nothing is known to collide.
     bare = replace(grasp, arm=None)
-    assert ClearPath(world.arm, world.hand, post).admit([bare]) == [bare]
+    assert ClearPath(picker_of(robot)._mover(post)).admit([bare]) == [bare]
+
+
+def test_an_image_without_depth_shows_no_obstacle_but_the_known_solids(robot_of: RobotOf):
+    robot = robot_of("ur5e_like", "parallel_gripper")
+    view = robot.look()
+    world = picker_of(robot).world_of(replace(view, depth=np.full_like(view.depth, np.nan)))
+    assert (len(world.points), world.boxes) == (0, robot.world.layout.solids[1:])
 
 
 @pytest.mark.parametrize("seed", [0, 1])

@@ -1,5 +1,6 @@
 """Of all things seen, one with a grasp that is sure enough; what failed is not asked again in the same way."""
 
+import time
 from dataclasses import replace
 
 import numpy as np
@@ -140,25 +141,33 @@ def test_an_object_that_has_not_moved_keeps_its_plan_unless_something_new_is_nea
     camera = ring_poses(1, elevation=np.deg2rad(55.0), distance=0.65)
     again = plan_any_thing(views_of(scene, CAMERA, camera, DEFAULT, 4), HAND, before=first, **ASKED)
     assert again[0].result is some(first[0].result)
-    assert not np.array_equal(again[0].points, first[0].points)
+    np.testing.assert_array_equal(again[0].points, first[0].points)
     points, grasp = first[0].points, some(first[0].grasp)
     others, quick = [thing.points for thing in first[1:]], {**ASKED, "verify": "none", "enough": 1}
-    assert module._kept((points, []), [points, *others], first, 0.5, HAND) is not None
-    assert module._kept((points, []), [points], first, 0.5, HAND) is not None
+    assert module._kept((points, []), [points, *others], first[:1], first, HAND) is not None
+    assert module._kept((points, []), [points], first[:1], first, HAND) is not None
     # Something came where the hand will be, or far from it.
     palm, up = grasp.grasp.position, np.array([0.0, 0.0, 1.0])
     for place, kept in ((palm, False), (palm + 0.3 * up, True)):
         new = place + 1e-3 * np.random.default_rng(0).normal(size=(50, 3))
-        assert (module._kept((points, []), [points, new, *others], first, 0.5, HAND) is not None) == kept
+        assert (module._kept((points, []), [points, new, *others], first[:1], first, HAND) is not None) == kept
     # The object moved, or was seen in part, or a grasp of it failed, or a grasp failed nobody knows where.
-    assert module._kept((points + np.array([0.004, 0.0, 0.0]), []), [], first, 0.5, HAND) is None
-    assert module._kept((points[points[:, 0] > np.median(points[:, 0])], []), [], first, 0.5, HAND) is None
-    assert module._kept((points, [Failure(first[0].place)]), [points], first, 0.5, HAND) is None
+    assert module._kept((points + np.array([0.004, 0.0, 0.0]), []), [], first[:1], first, HAND) is None
+    assert module._kept((points[points[:, 0] > np.median(points[:, 0])], []), [], first[:1], first, HAND) is None
+    failed, other = Failure(first[0].place, grasp.grasp), replace(grasp.grasp, position=palm + 0.1 * up)
+    assert module._kept((points, [failed]), [points], first[:1], first, HAND) is None
+    assert module._kept((points, [replace(failed, executed=False)]), [points], first[:1], first, HAND) is None
+    unlike_it = [replace(failed, grasp=other, executed=False), Failure(first[0].place)]
+    assert module._kept((points, unlike_it), [points], first[:1], first, HAND) is not None
     lost = plan_any_thing(views, HAND, before=first, failures=[Failure(None, grasp.grasp)], **quick)
     assert lost[0].result is not first[0].result
+    # A restriction of the new request refuses the earlier grasp.
+    far = Steering(region=Sphere([9.0, 0.0, 0.0], 0.1))
+    assert not module._allowed(first[0], HAND, {"restrictions": (far,)})
+    assert module._allowed(first[0], HAND, {})
 
 
-def test_one_result_answers_for_all_things(views, first):
+def test_one_result_answers_for_all_things(views, first, monkeypatch: pytest.MonkeyPatch):
     assert result_of_things(first) is some(first[0].result)
     # A grasp that failed nobody knows where is left out, and makes no object come later.
     loose = Failure(None, first[0].grasp.grasp)
@@ -173,6 +182,14 @@ def test_one_result_answers_for_all_things(views, first):
     assert (result.outcome, result.tried) == (Outcome.DEADLINE, ())
     assert result.message == "none of 2 objects has a grasp: " + "; ".join(thing.reason for thing in late)
     assert late[1].reason == NOT_LOOKED_AT
+    left = list[float]()
+    monkeypatch.setattr(module, "_scene_among", lambda *_: time.sleep(0.3) or some(first[0].scene))
+    monkeypatch.setattr(
+        module, "plan_grasps", lambda *_, deadline, **__: left.append(deadline) or some(first[0].result)
+    )
+    plan_any_thing(views, HAND, deadline=60.0, **ASKED)
+    assert left[0] < 59.7
+    monkeypatch.undo()
     far = Steering(region=Sphere([9.0, 0.0, 0.0], 0.1))
     with pytest.raises(ConfigError, match=r"none of 2 objects .*region: no part .*; region: "):
         result_of_things(plan_any_thing(views, HAND, restrictions=(far,), **ASKED))

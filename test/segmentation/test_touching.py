@@ -151,6 +151,19 @@ def test_a_small_thing_of_a_heap_is_found_beside_large_ones():
     assert sum(np.ptp(points[:, 0]) > 0.08 for points in seen.obstacles) == 2
 
 
+def test_many_things_of_a_heap_are_found_though_each_is_a_small_part_of_it():
+    # Each of the nine balls has a ninth of the heap's points.
+    ball = make_shape("sphere")
+    scale = 0.03 / ball.vertices[:, 0].max()
+    middles = [np.array([0.06 * x, 0.06 * y, 0.03]) for x in (-1, 0, 1) for y in (-1, 0, 1)]
+    balls = [TriangleMesh(ball.vertices * scale + middle, ball.faces) for middle in middles]
+    view = view_of(on_table(balls[0], balls[1:]), -1.5, elevation=1.2)
+    found = find_things([view], SegmentationConfig(piled=True))
+    assert len(found) == 9
+    nearest = [min(range(9), key=lambda k: np.linalg.norm(points.mean(0) - middles[k])) for points in found]
+    assert sorted(nearest) == list(range(9))
+
+
 def test_one_that_lies_on_another_is_a_thing_where_things_are_piled():
     # A ball on a box: it does not come down to the table.
     stage = tabletop("box")

@@ -115,7 +115,8 @@ def reconstruct(
     except CloudError:
         if not guess.method:
             raise
-        # No surface fits both the guess and the seen points, so the guess is wrong.
+        # No surface fits both the guess and the seen points, so the guess is wrong. Robustness checks may use the rule
+        # again, if its shape fits on their coarser grid.
         guess, evidence = replace(guess, method="", surfels=nothing()), replace(evidence, chosen="")
         mesh = _closed(evidence, guess.surfels, cells)
     confidence = _confidence(mesh, np.concatenate([view.points for view in local]), settings)

@@ -268,12 +268,13 @@ def _parts(parted: _Parted, chosen: Mask) -> Labels:
     scene, support, key = parted.scene, parted.support, chosen.tobytes()
     if key in parted.parts:
         return parted.parts[key]
-    part = parted.parts[key] = np.where(chosen, 0, -1)
+    part = np.where(chosen, 0, -1)
     points, eyes = scene.mean[chosen], parted.eyes
     if parted.settings.piled:
         part[chosen] = clusters.heaped_things(points, eyes, scene.size)
     elif support is not None:
         part[chosen] = clusters.touching_things(points, eyes, support.height(points), scene.size)
+    parted.parts[key] = part
     return part
 
 
