@@ -151,6 +151,13 @@ def test_a_small_thing_of_a_heap_is_found_beside_large_ones():
     assert sum(np.ptp(points[:, 0]) > 0.08 for points in seen.obstacles) == 2
 
 
+def test_a_thing_that_stands_on_nothing_seen_is_a_thing_where_things_are_piled():
+    up = np.eye(4)
+    up[:3, 3] = 0.15, 0.0, 0.12
+    view = view_of(on_table(tabletop("box").truth, [moved(make_shape("sphere"), up)]), -1.5, elevation=0.5)
+    assert [len(find_things([view], SegmentationConfig(piled=piled))) for piled in (False, True)] == [1, 2]
+
+
 def test_many_things_of_a_heap_are_found_though_each_is_a_small_part_of_it():
     # Each of the nine balls has a ninth of the heap's points.
     ball = make_shape("sphere")

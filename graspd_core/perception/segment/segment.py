@@ -187,11 +187,14 @@ def _things(
 
 
 def _candidates(parted: _Parted) -> list[int]:
-    """Return indices of objects of graspable size that stand on the support. If none does, ignore the support."""
+    """Return indices of objects of graspable size that stand on the support. In a pile, all may lie on others.
+
+    If no object stands on the support, ignore the support.
+    """
     scene, label, settings, part = parted.scene, parted.label, parted.settings, parted.support
     things = rows_of(label)
     fits = [k for k, rows in enumerate(things) if clusters.extent(scene.mean[rows]) <= settings.largest_object]
-    if part is None:
+    if part is None or settings.piled:
         return fits
     distance = scene.mean_distance
     standing = [k for k in fits if stands_on(part, scene.mean[things[k]], distance[things[k]], parted.eyes, settings)]
