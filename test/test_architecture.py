@@ -73,7 +73,7 @@ MAX_PACKAGE_LINES = {
     "graspd_dataset": 3_007,
     "graspd_viewer": 2_414,
     "graspd_cell": 3_796,
-    "test": 34_222,
+    "test": 34_225,
 }
 # Lines that a program reaches through its imports, those inside functions too.
 # The layout aims at 22,000 of the node.
