@@ -46,7 +46,7 @@ _LINK_SPACINGS = 1.7
 _WAIST, _WAISTS_M = 0.3, (0.0, 0.003, 0.005, 0.007, 0.009, 0.012)
 # A part of a cluster is an object if it has at least this fraction of the cluster's points, and its lowest points are
 # within this height of the support [m]. A concave part is no object, because it may be the inside of a bowl. In a heap,
-# which has many objects, this area is enough [m²]. It was chosen on ten bins (seeds 266 to 268 and 270 to 273).
+# which has many objects, this area is enough [m²]. It was chosen on eight bins (seeds 266 to 268 and 270 to 273).
 _MIN_SHARE, _FOOT_M, _MIN_AREA = 0.12, 0.03, 0.0025
 _NEIGHBOURS = 24  # points to which the plane at a point is fitted, including the point
 # A point is on the outline of the visible surface if a sector wider than _OUTLINE_ANGLE around it has no neighbour.
