@@ -240,7 +240,7 @@ class Mover:
         held = shape.beyond_shoulder
         at = np.concatenate([balls[:, held], carried], 1)
         radius = np.concatenate([shape.radius[held], self.carried.radius])
-        away = np.minimum(self.world.clearance(at), at[..., 2] - self.world.floor) - radius
+        away = self._from_obstacles(at, radius)
         between = np.linalg.norm(balls[:, pairs[:, 0]] - balls[:, pairs[:, 1]], axis=-1) - shape.radius[pairs].sum(1)
         parts = [away, between + self.margin]
         if len(with_carried):
@@ -257,7 +257,11 @@ class Mover:
 
     def arm_clearances(self, q: Path) -> Float[np.ndarray, "rows balls"]:
         """Return the distances of the arm's spheres (not of hand and object) to floor, boxes and points seen [m]."""
-        return self.clearances(q)[:, : self.carried_columns.start]
+        held = self.shape.beyond_shoulder
+        return self._from_obstacles(self._placed(q)[0][:, held], self.shape.radius[held])
+
+    def _from_obstacles(self, at: np.ndarray, radius: np.ndarray) -> Float[np.ndarray, "rows balls"]:
+        return np.minimum(self.world.clearance(at), at[..., 2] - self.world.floor) - radius
 
     def allowed(self, ends: Path) -> Float[np.ndarray, "balls"]:
         """Return the distance that each sphere must keep [m]: the margin, or less if nearer at one of `ends`."""

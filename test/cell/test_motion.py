@@ -53,7 +53,9 @@ def test_a_way_around_a_pillar_of_points_keeps_clear_of_every_one_of_them(name: 
     # In the way of the straight connection, as high as the hand.
     points = tip + np.random.default_rng(1).uniform([-0.02, -0.02, -0.35], [0.02, 0.02, -0.02], (4000, 3))
     mover = mover_of(name, points)
-    assert mover.clearances(dense(np.stack([start, goal]))).min() < 0
+    way = dense(np.stack([start, goal]))
+    assert mover.clearances(way).min() < 0
+    np.testing.assert_allclose(mover.arm_clearances(way), mover.clearances(way)[:, : mover.carried_columns.start])
     path = find_path(mover, start, goal)
     np.testing.assert_allclose(path[[0, -1]], [start, goal])
     motion = timed(arm, path, Speeds())

@@ -136,6 +136,27 @@ def test_the_best_of_the_view_before_comes_first(views, first):
         assert [thing.looked_at for thing in again] == [True, False]
 
 
+def test_objects_known_to_be_worse_are_not_looked_at_again_unless_something_changed_there(views, first):
+    far = replace(some(first[0].grasp).grasp, position=np.array([9.0, 0.0, 0.0]))
+    failed = [Failure(thing.place, far) for thing in first]
+    for probability, looked in ((0.01, [True, False]), (0.99, [True, True])):
+        grasp = replace(some(first[0].grasp), probability=probability, trials=())
+        known = replace(first[1], result=first[0].result, grasp=grasp, failures=failed[1:])
+        again = plan_any_thing(views, HAND, before=[known, *first[:1]], failures=failed, **{**ASKED, "likely": 2.0})
+        assert [thing.looked_at for thing in again] == looked
+        assert (again[1].reason == NOT_LOOKED_AT) == (probability < 0.5)
+    (points, seen), failures = (known.points, [thing.points for thing in first]), failed[1:]
+    beside = points + np.array([0.0, 0.0, 0.06])
+    assert module._known((points, failures), [first[0].points, points], [known, *first[:1]], 2.0) is known
+    # A grasp failed since, or the grasp is likely, or the object moved, or something came or went beside it.
+    before = [known, *first[:1]]
+    assert module._known((points, failed), seen, before, 2.0) is None
+    assert module._known((points, failures), seen, before, 0.5) is None
+    assert module._known((points + 0.01, failures), seen, before, 2.0) is None
+    assert module._known((points, failures), [*seen, beside], before, 2.0) is None
+    assert module._known((points, failures), seen, [*before, replace(first[0], points=beside)], 2.0) is None
+
+
 def test_an_object_that_has_not_moved_keeps_its_plan_unless_something_new_is_near_the_hand(views, first):
     scene = tabletop("box", obstacles=[("bowl", 0.16, 0.05)])
     camera = ring_poses(1, elevation=np.deg2rad(55.0), distance=0.65)
