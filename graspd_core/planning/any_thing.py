@@ -1,13 +1,14 @@
 """Plan for any object of a scene: find an object with a verified grasp, else rank the objects by their best grasp.
 
 Objects with fewer earlier failures come first. At equal numbers of failures, objects with more probable grasps in the
-previous view come first, then higher objects, because nothing lies on them. An object that has not moved since the
-previous view keeps its plan if it has a likely grasp and nothing new is near the hand. Any other object gets one round
-of the planner, but all rounds if an earlier grasp of this or an unknown object failed. It gets up to four times the
-effort if earlier searches found no grasp. The first verified grasp ends the search. After `enough` objects, a grasp
-with a probability of at least `likely` also ends the search, to limit the time. So does the best grasp so far, if all
-objects left had worse ones in the previous view and nothing has changed around them. `result_of_things` returns the
-result of one request.
+previous view come first, then higher objects, because nothing lies on them. An object is known if it has no likely
+grasp, and nothing has changed around it since the previous view. Known objects come last. An object that has not moved
+since the previous view keeps its plan if it has a likely grasp and nothing new is near the hand. Any other object gets
+one round of the planner, but all rounds if an earlier grasp of this or an unknown object failed. It gets up to four
+times the effort if earlier searches found no grasp. The first verified grasp ends the search. After `enough` objects, a
+grasp with a probability of at least `likely` also ends the search, to limit the time. The search also ends if only
+known objects are left, with grasps no better than the best one found. `result_of_things` returns the result of one
+request.
 """
 
 from __future__ import annotations
@@ -56,7 +57,7 @@ _FAILED = "an earlier grasp of this object failed"
 # Effort of a search for one grasp, after one failed search and after several, relative to the usual effort. A search
 # for many grasps has the usual effort.
 _HARDER = (2.0, 4.0)
-# Greatest number of searches for an object in a scene with doubts, before a failure. Of 56 objects in four bins, a
+# Greatest number of searches for one grasp in a scene with doubts, before a failure. Of 56 objects in four bins, a
 # third search found a grasp for 2 more, of probability 0.25 and 0.35, and took a third of the time (seeds 316 to 319).
 _SEARCHES = 2
 # Probability of an object's best grasp before any search: the mean of 93 objects in eight full bins, for two hands.
@@ -118,8 +119,8 @@ class ThingPlan:
         result: result of planning. None if planning did not run.
         grasp: the best grasp, verified or unverified. None if no grasp was found.
         reason: why there is no verified grasp. Empty if there is a verified grasp.
-        looked_at: whether this request tried to find a grasp for the object. If not, `scene`, `result` and `grasp` are
-            those of the previous view, or None.
+        looked_at: whether this request tried to find a grasp for the object. If not, `points`, `scene`, `result` and
+            `grasp` may be those of an earlier view.
         failures: earlier failures with this object.
     """
 
@@ -166,7 +167,7 @@ def plan_any_thing(
     likely: float = 0.5,
     **plan: Any,
 ) -> tuple[ThingPlan, ...]:
-    """Plan for one object after the other until one has a verified grasp. Return all objects, by descending `surety`.
+    """Plan for one object after the other until one has a verified grasp. Return all objects, planned ones first.
 
     Args:
         views: point cloud of each camera, all in the same frame [m].
@@ -187,21 +188,21 @@ def plan_any_thing(
         CloudError: a cloud is empty, all NaN, or has too few points.
         ConfigError: see `plan_grasps`. If an object cannot meet a restriction, the object's `reason` says so instead.
     """
-    end, things, over = time.perf_counter() + (np.inf if deadline is None else deadline), list[ThingPlan](), False
+    end, over = time.perf_counter() + (np.inf if deadline is None else deadline), False
     asked = _checked(plan, deadline)
     about = {"settings": settings, "mass": mass, "friction": friction, "source": source}
     seen = [p for p in things_from_views(views, settings and settings.segmentation) if not _is_solid(p, solids or {})]
     lost = [failure for failure in failures if failure.place is None]
     rows = _in_order(seen, _up(views, surface), failures, before)
-    rows, known = _known_last(rows, seen, () if lost else before, likely)
+    things = [ThingPlan(p, reason=OUT_OF_TRIES, looked_at=False, failures=f) for p, f in rows if len(f) >= tries]
+    rows, known = _known_last([row for row in rows if len(row[1]) < tries], seen, () if lost else before, likely)
     sure = [] if lost else [thing for thing in before if thing.is_likely(likely) and _allowed(thing, hand, asked)]
     kept = [_kept(row, seen, sure, before, hand) for row in rows]
     work = partial(_scene_among, views, surface, solids, about)
-    scenes = _one_ahead(work, [row for row, thing in zip(rows, kept, strict=True) if not thing and len(row[1]) < tries])
-    for place, ((points, failed), thing) in enumerate(zip(rows, kept, strict=True)):
-        if over or len(failed) >= tries or _is_best(things, known[place:]):
-            reason, skipped = OUT_OF_TRIES if len(failed) >= tries else NOT_LOOKED_AT, known[place] or ThingPlan(points)
-            things.append(replace(skipped, reason=reason, looked_at=False, failures=failed))
+    scenes = _one_ahead(work, [row for row, thing in zip(rows, kept, strict=True) if not thing])
+    for k, ((points, failed), thing) in enumerate(zip(rows, kept, strict=True)):
+        if over or _is_best(things, known[k:]):
+            things += [replace(known[k] or ThingPlan(points), reason=NOT_LOOKED_AT, looked_at=False, failures=failed)]
             continue
         thing = thing or _thing_plan(points, next(scenes), hand, [*failed, *lost], asked, end)
         things.append(replace(thing, failures=failed))
@@ -227,7 +228,7 @@ def result_of_things(things: Sequence[ThingPlan], seed: int = 0) -> GraspResult:
     """
     if not things:
         raise NoObjectError("cloud: no object is seen, except known solids; valid: a cloud with a graspable object")
-    best, results = things[0], [thing.result for thing in things if thing.result is not None]
+    best, results = things[0], [thing.result for thing in things if thing.looked_at and thing.result is not None]
     if best.grasp is not None and best.result is not None:
         return best.result
     told = f"none of {len(things)} objects has a grasp: {'; '.join(dict.fromkeys(thing.reason for thing in things))}"
@@ -336,14 +337,15 @@ def _known_last(
 
 
 def _known(row: Row, seen: Sequence[Points], before: Sequence[ThingPlan], likely: float) -> ThingPlan | None:
-    """Return the earlier, unlikely plan for the object of a row if neither the object nor what is around it changed."""
+    """Return the earlier plan for the object of a row if no grasp was likely, and nothing has changed around it."""
     points, failed = row
     for plan in before:
-        same = plan.result is not None and not plan.is_likely(likely) and _executed(plan.failures) == _executed(failed)
-        if same and _is_unmoved(plan.points, points):
-            then = np.concatenate([thing.points for thing in before if thing is not plan] or [points[:0]])
-            now = np.concatenate([other for other in seen if other is not points] or [points[:0]])
-            return plan if _changed(now, then, points) <= _NOISE >= _changed(then, now, points) else None
+        ended = plan.result is not None and plan.result.outcome not in (Outcome.CANCELLED, Outcome.DEADLINE)
+        same = not plan.is_likely(likely) and _executed(plan.failures) == _executed(failed)
+        if ended and same and _is_unmoved(plan.points, points):
+            then = np.concatenate([points[:0], *(thing.points for thing in before if thing is not plan)])
+            now = np.concatenate([points[:0], *(other for other in seen if other is not points)])
+            return plan if max(_changed(now, then, points), _changed(then, now, points)) <= _NOISE else None
     return None
 
 
@@ -432,7 +434,8 @@ def _thing_plan(
         config = config.at_budget(max(_HARDER[in_vain > 1] / count, 1.0))
     if not lost:
         config = replace(config, rounds=replace(config.rounds, most=1))
-    if not failed and scene.evidence is not None and scene.evidence.doubts and hasattr(config.settings, "searches"):
+    doubted = scene.evidence is not None and bool(scene.evidence.doubts)
+    if doubted and not failed and count == 1 and hasattr(config.settings, "searches"):
         config = replace(config, settings=replace(config.settings, searches=min(config.settings.searches, _SEARCHES)))
     left = None if end == np.inf else max(end - time.perf_counter(), 1e-3)
     try:

@@ -145,6 +145,12 @@ def test_objects_known_to_be_worse_are_not_looked_at_again_unless_something_chan
         again = plan_any_thing(views, HAND, before=[known, *first[:1]], failures=failed, **{**ASKED, "likely": 2.0})
         assert [thing.looked_at for thing in again] == looked
         assert (again[1].reason == NOT_LOOKED_AT) == (probability < 0.5)
+    # An object that is given up has no grasp, and does not keep others from being skipped.
+    given_up = [Failure(first[0].place, far, executed=False)] * 2
+    again = plan_any_thing(views, HAND, before=[known, *first[:1]], failures=[*failed[1:], *given_up], tries=2, **ASKED)
+    assert [thing.reason == OUT_OF_TRIES for thing in again] == [False, True]
+    again = plan_any_thing(views, HAND, before=[known], failures=[*failed[1:], *given_up[:1]] * 2, tries=2, **ASKED)
+    assert [(thing.reason, thing.grasp) for thing in again] == [(OUT_OF_TRIES, None)] * 2
     (points, seen), failures = (known.points, [thing.points for thing in first]), failed[1:]
     beside = points + np.array([0.0, 0.0, 0.06])
     assert module._known((points, failures), [first[0].points, points], [known, *first[:1]], 2.0) is known
@@ -153,6 +159,8 @@ def test_objects_known_to_be_worse_are_not_looked_at_again_unless_something_chan
     assert module._known((points, failed), seen, before, 2.0) is None
     assert module._known((points, failures), seen, before, 0.5) is None
     assert module._known((points + 0.01, failures), seen, before, 2.0) is None
+    cut = replace(known, result=replace(some(known.result), outcome=Outcome.DEADLINE))
+    assert module._known((points, failures), seen, [cut, *first[:1]], 2.0) is None
     assert module._known((points, failures), [*seen, beside], before, 2.0) is None
     assert module._known((points, failures), seen, [*before, replace(first[0], points=beside)], 2.0) is None
 
