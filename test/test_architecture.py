@@ -67,17 +67,17 @@ MAY_IMPORT = {
 # Most lines of Python per package. They are lowered when the code shrinks, and raised only with a reason.
 # The layout aims at 22,000 of graspd_core, 4,500 of graspd_ros, 26,000 of test. Input checks added 1,700, 500, 3,300.
 MAX_PACKAGE_LINES = {
-    "graspd_core": 27_855,
+    "graspd_core": 27_898,
     "graspd_ros": 5_234,
     "graspd_bench": 8_070,
     "graspd_dataset": 3_007,
     "graspd_viewer": 2_414,
     "graspd_cell": 3_800,
-    "test": 34_256,
+    "test": 34_292,
 }
 # Lines that a program reaches through its imports, those inside functions too.
 # The layout aims at 22,000 of the node.
-MAX_REACH = {"graspd_core.cli.synthesize_command": 23_016, "graspd_ros.node": 26_799}
+MAX_REACH = {"graspd_core.cli.synthesize_command": 23_059, "graspd_ros.node": 26_842}
 
 # The launch file imports this one where ROS runs it, perhaps without any library of graspd.
 SHORT = ("graspd_core/paths.py",)

@@ -35,6 +35,9 @@ _FAR, _ENDLESS = 100.0, 1e100
 _NEAREST, _CUT_OFF = 0.1, 0.3
 # Views whose cameras are nearer to each other than this [m] show the object from one side.
 _SAME_PLACE = 0.01
+# In a pile, an object may lie on others if its lowest seen point is higher than this above the support [m].
+_DEEP = 0.04
+_STRAY = 0.01  # share of an object's points that may be too low by error
 
 
 def scene_from_views(
@@ -48,6 +51,7 @@ def scene_from_views(
     source: str = "cloud",
     resolution: int = 48,
     device: torch.device | str = "cpu",
+    surface: Plane | None = None,
     ahead: Callable[[ObjectModel, Evidence], None] | None = None,
 ) -> Scene:
     """Build a scene from one or several views, in their common frame. The scene's warnings name what was guessed.
@@ -61,6 +65,7 @@ def scene_from_views(
         friction: Coulomb friction coefficient between hand and object.
         source: name of the views, for messages.
         resolution: the distance grid has at most `resolution`³ nodes.
+        surface: known plane beneath the objects. It is the support if the views show none.
         ahead: called with object and evidence before the grid is built, to start work that does not need the grid.
 
     Raises:
@@ -71,7 +76,7 @@ def scene_from_views(
     refuse_numbers(source, mass=mass, friction=friction, resolution=resolution)
     settings = settings or SceneConfig()
     # The distance grid is built in this process, so that the child process is free for other work.
-    whole, support, obstacles, warnings = run_isolated(reconstruct_object, views, target, alone, settings)
+    whole, support, obstacles, warnings = run_isolated(reconstruct_object, views, target, alone, settings, surface)
     scene = build_scene(
         whole.mesh,
         source=source,
@@ -89,16 +94,22 @@ def scene_from_views(
     return replace(scene, evidence=whole.evidence)
 
 
-def things_from_views(views: Sequence[PointCloud], settings: SegmentationConfig | None = None) -> tuple[Points, ...]:
+def things_from_views(
+    views: Sequence[PointCloud], settings: SegmentationConfig | None = None, surface: Plane | None = None
+) -> tuple[Points, ...]:
     """Return the points [m] of each object that `scene_from_views` can select. See `find_things`.
 
     The segmentation is cached. The next scenes from the same views and settings reuse it.
     """
-    return run_isolated(find_things, [replace(view, points=_single(view.points)) for view in views], settings)
+    return run_isolated(find_things, [replace(view, points=_single(view.points)) for view in views], settings, surface)
 
 
 def reconstruct_object(
-    views: Sequence[PointCloud], target: Target | None, alone: bool, settings: SceneConfig
+    views: Sequence[PointCloud],
+    target: Target | None,
+    alone: bool,
+    settings: SceneConfig,
+    surface: Plane | None = None,
 ) -> tuple[Reconstruction, Plane | None, tuple[Obstacle, ...], tuple[str, ...]]:
     """Return the object's reconstructed surface, its support, its obstacles and the warnings.
 
@@ -112,17 +123,27 @@ def reconstruct_object(
     if alone:
         seen = Segmentation(tuple(views), tuple(range(len(views))), None, (), ())
     else:
-        seen = segment(views, target=target, settings=settings.segmentation)
+        seen = segment(views, target=target, settings=settings.segmentation, surface=surface)
     doubts = ()
     if seen.views:
         about_units = _unit_doubts(seen, views, settings.segmentation.max_range)
         doubts = (*about_units, *_camera_doubts(seen, views), *filter(None, (seen.cut, seen.beside)))
+    height = 0.0 if seen.support is None else _lowest(seen.views, seen.support)
+    if settings.segmentation.piled and height > _DEEP:
+        doubts += (f"the object may lie on others, {1e3 * height:.0f} mm above the support",)
     whole = reconstruct(seen.views, seen.support, settings.reconstruction, () if alone else views)
     whole = replace(whole, evidence=replace(whole.evidence, doubts=doubts, piled=settings.segmentation.piled))
     told = tuple(f"cloud: {doubt}; no grasp counts as verified" for doubt in doubts)
     reach = settings.segmentation.obstacle_range
     obstacles = make_obstacles(seen.obstacles, seen.support, whole.mesh, reach, settings.obstacles)
     return whole, seen.support, obstacles, seen.warnings + told
+
+
+def _lowest(views: Sequence[PointCloud], support: Plane) -> float:
+    """Return the height of the object's lowest seen points above the support [m]. 0 without points."""
+    points = np.concatenate([np.zeros((0, 3)), *(view.points for view in views)])
+    heights = (points @ support.normal - support.offset)[np.isfinite(points).all(1)]
+    return float(np.quantile(heights, _STRAY)) if len(heights) else 0.0
 
 
 def _single(points: Points) -> Points:

@@ -190,16 +190,16 @@ def plan_any_thing(
     """
     end, over = time.perf_counter() + (np.inf if deadline is None else deadline), False
     asked = _checked(plan, deadline)
-    about = {"settings": settings, "mass": mass, "friction": friction, "source": source}
-    seen = [p for p in things_from_views(views, settings and settings.segmentation) if not _is_solid(p, solids or {})]
-    lost = [failure for failure in failures if failure.place is None]
+    about = {"settings": settings, "mass": mass, "friction": friction, "source": source, "surface": surface}
+    objects = things_from_views(views, settings and settings.segmentation, surface)
+    seen, lost = [p for p in objects if not _is_solid(p, solids)], [one for one in failures if one.place is None]
     rows = _in_order(seen, _up(views, surface), failures, before)
     things = [ThingPlan(p, reason=OUT_OF_TRIES, looked_at=False, failures=f) for p, f in rows if len(f) >= tries]
     rows, known = _known_last([row for row in rows if len(row[1]) < tries], seen, () if lost else before, likely)
     sure = [] if lost else [thing for thing in before if thing.is_likely(likely) and _allowed(thing, hand, asked)]
     kept = [_kept(row, seen, sure, before, hand) for row in rows]
-    work = partial(_scene_among, views, surface, solids, about)
-    scenes = _one_ahead(work, [row for row, thing in zip(rows, kept, strict=True) if not thing])
+    new = [row for row, thing in zip(rows, kept, strict=True) if not thing]
+    scenes = _one_ahead(partial(_scene_among, views, solids, about), new)
     for k, ((points, failed), thing) in enumerate(zip(rows, kept, strict=True)):
         if over or _is_best(things, known[k:]):
             things += [replace(known[k] or ThingPlan(points), reason=NOT_LOOKED_AT, looked_at=False, failures=failed)]
@@ -240,9 +240,9 @@ def result_of_things(things: Sequence[ThingPlan], seed: int = 0) -> GraspResult:
     return GraspResult(Outcome.NO_CANDIDATES, (), Timing(), seed, "", told)
 
 
-def _is_solid(points: Points, solids: Mapping[str, Sequence[TriangleMesh]]) -> bool:
+def _is_solid(points: Points, solids: Mapping[str, Sequence[TriangleMesh]] | None) -> bool:
     """Return True if nearly all points lie on the surface of a known solid."""
-    meshes = [mesh for solid in solids.values() for mesh in solid]
+    meshes = [mesh for solid in (solids or {}).values() for mesh in solid]
     away = (surface_distance(make_surface(mesh), points) for mesh in meshes)
     return any(float(np.quantile(one, _NEARLY_ALL)) < _STRAY for one in away)
 
@@ -390,7 +390,6 @@ def _gap(points: Points, grasp: Grasp, hand: HandModel) -> float:
 
 def _scene_among(
     views: Sequence[PointCloud],
-    surface: Plane | None,
     solids: Mapping[str, Sequence[TriangleMesh]] | None,
     about: dict[str, Any],
     row: Row,
@@ -409,9 +408,9 @@ def _scene_among(
         return str(error)
     if again and scene.evidence is not None:
         scene = replace(scene, evidence=replace(scene.evidence, doubts=(*scene.evidence.doubts, _FAILED)))
-    if surface is not None:
+    if about["surface"] is not None:
         try:
-            scene = on_support(scene, surface)
+            scene = on_support(scene, about["surface"])
         except ConfigError as error:
             return str(error)
     if not solids:

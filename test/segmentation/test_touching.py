@@ -1,6 +1,7 @@
 """Two things that touch are told where a camera sees the seam between them; one thing is not told to be two."""
 
 import re
+from dataclasses import replace
 from itertools import combinations_with_replacement
 
 import numpy as np
@@ -10,9 +11,10 @@ from expected import some
 from graspd_bench.rendering.depth_noise import DEFAULT
 from graspd_bench.rendering.tabletop import TabletopScene, moved, on_table, ring_poses, tabletop, views_of
 from graspd_core import PinholeCamera, PointCloud, Target, TriangleMesh, scene_from_views
-from graspd_core.config import SegmentationConfig
+from graspd_core.config import SceneConfig, SegmentationConfig
 from graspd_core.mesh.shapes import SHAPES, make_shape
 from graspd_core.perception.segment.segment import find_things, segment
+from graspd_core.types import Plane
 
 # As a D415 with half its pixels each way.
 CAMERA = PinholeCamera(320, 240, 308.0, 308.0, 159.5, 119.5)
@@ -169,6 +171,40 @@ def test_many_things_of_a_heap_are_found_though_each_is_a_small_part_of_it():
     assert len(found) == 9
     nearest = [min(range(9), key=lambda k: np.linalg.norm(points.mean(0) - middles[k])) for points in found]
     assert sorted(nearest) == list(range(9))
+
+
+def test_a_known_floor_is_the_support_where_the_views_show_too_little_of_it():
+    ball = make_shape("sphere")
+    scale = 0.03 / ball.vertices[:, 0].max()
+    middles = [np.array([0.06 * x, 0.06 * y, 0.03]) for x in (-1, 0, 1) for y in (-1, 0, 1)]
+    balls = [TriangleMesh(ball.vertices * scale + middle, ball.faces) for middle in middles]
+    view = view_of(on_table(balls[0], balls[1:]), -1.5, elevation=1.2)
+    # As in a bin: the floor is seen between the balls only.
+    inside = (view.points[:, 2] > 0.008) | (np.abs(view.points[:, :2]) < 0.04).all(1)
+    full = PointCloud(view.points[inside], view.viewpoint)
+    floor, piled = Plane(np.array([0.0, 0.0, 1.0]), 0.0), SceneConfig(segmentation=SegmentationConfig(piled=True))
+    assert segment([full], target=Target(point=middles[4]), settings=piled.segmentation).support is None
+    found = find_things([full], piled.segmentation, floor)
+    assert len(found) == 9
+    assert min(points[:, 2].min() for points in found) > 0.004
+    scene = scene_from_views([full], target=Target(point=middles[4]), settings=piled, surface=floor)
+    assert some(scene.support).offset == 0.0
+    np.testing.assert_allclose(scene.object.mesh.vertices[:, 2].min(), 0.0, atol=0.004)
+    # The floor that a camera sees is known better.
+    near = replace(floor, offset=0.003)
+    assert some(segment([view], target=Target(point=middles[4]), surface=near).support).offset < 0.002
+
+
+@pytest.mark.parametrize("height", [0.0, 0.12])
+def test_one_that_may_lie_on_what_is_hidden_is_doubted_where_things_are_piled(height):
+    up, sphere = np.eye(4), make_shape("sphere")
+    up[:3, 3] = 0.15, 0.0, height - sphere.vertices[:, 2].min()
+    thing = moved(sphere, up)
+    view = view_of(on_table(tabletop("box").truth, [thing]), -1.5, elevation=0.5)
+    piled = SceneConfig(segmentation=SegmentationConfig(piled=True))
+    scene = scene_from_views([view], target=Target(point=thing.vertices.mean(0)), settings=piled)
+    told = [doubt for doubt in some(scene.evidence).doubts if "may lie on others" in doubt]
+    assert len(told) == (height > 0)
 
 
 def test_one_that_lies_on_another_is_a_thing_where_things_are_piled():

@@ -86,6 +86,18 @@ class FlatPart:
         return np.asarray((flat @ self.hull[:, :2].T + self.hull[:, 2] <= margin).all(1))
 
 
+def known_part(points: Points, plane: Plane, settings: SegmentationConfig) -> FlatPart | None:
+    """Return a known plane as a flat part beneath all points [m]. Return None if the points have no hull.
+
+    The camera's noise is unknown, so the tolerance is half the greatest one.
+    """
+    axes = np.linalg.svd(plane.normal[None])[2][1:].T
+    flat, most = points @ axes, 0.5 * settings.max_plane_tolerance
+    inliers, hull = np.abs(points @ plane.normal - plane.offset) < most, convex_hull(flat)
+    sides = tuple(sorted(np.ptp(flat, axis=0).tolist(), reverse=True))
+    return hull and FlatPart(plane, axes, 0.0, most, most, inliers, sides, hull.equations, float(hull.volume), 1.0)
+
+
 def find_planes(
     points: Points, distance: Float[np.ndarray, "n"], viewpoints: Eyes, settings: SegmentationConfig
 ) -> list[FlatPart]:

@@ -15,7 +15,7 @@ from graspd_core.perception.cloud.camera import MIN_BORDER_POINTS, reaches_image
 from graspd_core.perception.cloud.point_cloud import MIN_POINTS, Eyes, PointCloud, Vector, measured
 from graspd_core.perception.cloud.voxel_downsample import Labels, Mask, VoxelScene, rows_of, voxel_downsample
 from graspd_core.perception.segment import clusters
-from graspd_core.perception.segment.planes import FlatPart, find_planes
+from graspd_core.perception.segment.planes import FlatPart, find_planes, known_part
 from graspd_core.perception.segment.support_plane import find_ground, stands_on
 from graspd_core.perception.segment.target_selection import (
     SURFACE_VOXELS,
@@ -63,7 +63,11 @@ class Segmentation:
 
 
 def segment(
-    views: Sequence[PointCloud], *, target: Target | None = None, settings: SegmentationConfig | None = None
+    views: Sequence[PointCloud],
+    *,
+    target: Target | None = None,
+    settings: SegmentationConfig | None = None,
+    surface: Plane | None = None,
 ) -> Segmentation:
     """Segment the object in one or several views of a scene.
 
@@ -72,13 +76,14 @@ def segment(
         target: selects the object. If None, the object nearest the first view's optical axis is taken. An unknown axis
             is assumed to point to the mean of the points.
         settings: sizes and tolerances.
+        surface: known plane beneath the objects. It is the support if the views show none.
 
     Raises:
         CloudError: a cloud is empty, all NaN or has too few points, or the target is not valid.
         NoObjectError: the scene is usable, but does not contain the requested object.
     """
     settings, target = settings or SegmentationConfig(), target or Target()
-    parted = _parted(views, settings, target)
+    parted = _parted(views, settings, target, surface)
     scene, label = parted.scene, parted.label
     free = _candidates(parted)
     marked = target.box is not None or target.mask is not None
@@ -112,15 +117,16 @@ def segment(
 
 
 def find_things(
-    views: Sequence[PointCloud], settings: SegmentationConfig | None = None
+    views: Sequence[PointCloud], settings: SegmentationConfig | None = None, surface: Plane | None = None
 ) -> tuple[Float[np.ndarray, "_ 3"], ...]:
     """Return the points [m] of each object that `segment` can select. Touching objects are split at seams.
 
-    To select an object, give any of its points as target. The result is empty if no object is found.
+    To select an object, give any of its points as target. The result is empty if no object is found. `surface` is a
+    known plane beneath the objects.
 
     Raises CloudError: a cloud is empty, all NaN, or has too few points.
     """
-    parted = _parted(views, settings or SegmentationConfig())
+    parted = _parted(views, settings or SegmentationConfig(), None, surface)
     scene, label, most = parted.scene, parted.label, parted.settings.largest_object
     known, found = _candidates(parted), []
     # If a cluster is too large for an object, its parts between seams may be objects.
@@ -152,8 +158,10 @@ class _Parted:
 _LAST: dict[str, _Parted] = {}
 
 
-def _parted(views: Sequence[PointCloud], settings: SegmentationConfig, target: Target | None = None) -> _Parted:
-    key = digest((*views, settings))
+def _parted(
+    views: Sequence[PointCloud], settings: SegmentationConfig, target: Target | None, surface: Plane | None
+) -> _Parted:
+    key = digest((*views, settings, surface))
     parted = _LAST.get(key)
     scene = voxel_downsample(views, settings) if parted is None else parted.scene
     if target is not None:
@@ -162,6 +170,9 @@ def _parted(views: Sequence[PointCloud], settings: SegmentationConfig, target: T
         eyes = np.array([view.viewpoint for view in views], dtype=float)
         parts = find_planes(scene.mean, scene.mean_distance, eyes, settings)
         support, background, left = find_ground(scene, parts, eyes, settings)
+        if support is None and surface is not None:
+            support = known_part(scene.mean, surface, settings)
+            left &= support is None or support.clearance(scene.mean, scene.mean_distance) > 0
         label = _things(scene, left, support, eyes, settings)
         parted = _Parted(scene, eyes, support, background, label, settings)
         _LAST.clear()
