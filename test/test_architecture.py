@@ -73,7 +73,7 @@ MAX_PACKAGE_LINES = {
     "graspd_dataset": 3_007,
     "graspd_viewer": 2_414,
     "graspd_cell": 3_800,
-    "test": 34_292,
+    "test": 34_293,
 }
 # Lines that a program reaches through its imports, those inside functions too.
 # The layout aims at 22,000 of the node.

@@ -408,9 +408,9 @@ def _scene_among(
         return str(error)
     if again and scene.evidence is not None:
         scene = replace(scene, evidence=replace(scene.evidence, doubts=(*scene.evidence.doubts, _FAILED)))
-    if about["surface"] is not None:
+    if (surface := about["surface"]) is not None:
         try:
-            scene = on_support(scene, about["surface"])
+            scene = on_support(scene, surface)
         except ConfigError as error:
             return str(error)
     if not solids:

@@ -160,13 +160,18 @@ def test_a_thing_that_stands_on_nothing_seen_is_a_thing_where_things_are_piled()
     assert [len(find_things([view], SegmentationConfig(piled=piled))) for piled in (False, True)] == [1, 2]
 
 
-def test_many_things_of_a_heap_are_found_though_each_is_a_small_part_of_it():
-    # Each of the nine balls has a ninth of the heap's points.
+def nine_balls() -> tuple[list[np.ndarray], PointCloud]:
+    """The middles of nine balls that touch in a square, and a view of them from above."""
     ball = make_shape("sphere")
     scale = 0.03 / ball.vertices[:, 0].max()
     middles = [np.array([0.06 * x, 0.06 * y, 0.03]) for x in (-1, 0, 1) for y in (-1, 0, 1)]
     balls = [TriangleMesh(ball.vertices * scale + middle, ball.faces) for middle in middles]
-    view = view_of(on_table(balls[0], balls[1:]), -1.5, elevation=1.2)
+    return middles, view_of(on_table(balls[0], balls[1:]), -1.5, elevation=1.2)
+
+
+def test_many_things_of_a_heap_are_found_though_each_is_a_small_part_of_it():
+    # Each of the nine balls has a ninth of the heap's points.
+    middles, view = nine_balls()
     found = find_things([view], SegmentationConfig(piled=True))
     assert len(found) == 9
     nearest = [min(range(9), key=lambda k: np.linalg.norm(points.mean(0) - middles[k])) for points in found]
@@ -174,11 +179,7 @@ def test_many_things_of_a_heap_are_found_though_each_is_a_small_part_of_it():
 
 
 def test_a_known_floor_is_the_support_where_the_views_show_too_little_of_it():
-    ball = make_shape("sphere")
-    scale = 0.03 / ball.vertices[:, 0].max()
-    middles = [np.array([0.06 * x, 0.06 * y, 0.03]) for x in (-1, 0, 1) for y in (-1, 0, 1)]
-    balls = [TriangleMesh(ball.vertices * scale + middle, ball.faces) for middle in middles]
-    view = view_of(on_table(balls[0], balls[1:]), -1.5, elevation=1.2)
+    middles, view = nine_balls()
     # As in a bin: the floor is seen between the balls only.
     inside = (view.points[:, 2] > 0.008) | (np.abs(view.points[:, :2]) < 0.04).all(1)
     full = PointCloud(view.points[inside], view.viewpoint)
