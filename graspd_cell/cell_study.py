@@ -177,12 +177,15 @@ class AttemptWatch:
         return record
 
     def _target(self, place: np.ndarray) -> str:
-        """Return which object in the pick bin is nearest to `place`, base frame [m]. Return "" if the bin is empty."""
+        """Return which object outside the place bin is nearest to `place`, base frame [m]. Return "" if none is left.
+
+        An object that leans over the pick bin's wall is graspable, although its centre of mass is outside the bin.
+        """
         world = self._robot.world
         surfaces = [
             (np.linalg.norm((thing.seen.vertices @ pose[:3, :3].T + pose[:3, 3]) - place, axis=1).min(), thing.name)
             for thing, pose in zip(world.things, self._poses, strict=True)
-            if self._before.places[thing.name] == world.layout.pick.name
+            if self._before.places[thing.name] != world.layout.place.name
         ]
         return min(surfaces)[1] if surfaces else ""
 

@@ -82,6 +82,15 @@ def test_what_the_referee_saw_counts_and_not_what_the_picker_says(robot_of: Call
     assert watch.note(_attempt(pear, Ending.NOT_GRIPPED), 0.5)["astray"] == ["pear 0"]
 
 
+def test_an_object_over_the_wall_of_its_bin_is_the_target_of_its_grasp(robot_of: Callable[..., SimulatedRobot]):
+    robot = robot_of("ur5e_like", "parallel_gripper", "shape:box")
+    robot._data.qpos[robot.world.thing_qpos[0]] += robot.world.layout.pick.half + 0.1
+    robot.step()
+    watch = AttemptWatch(robot)
+    assert robot.referee().places["box"] == "table"
+    assert watch.note(_attempt(robot.thing_poses()[0][:3, 3], Ending.NOT_GRIPPED), 0.5)["target"] == "box"
+
+
 def _record(pair: str, **changed: object) -> Record:
     base = {
         "ending": "picked", "target": "a", "out": ["a"], "astray": [], "hard": {}, "tries": 0,
