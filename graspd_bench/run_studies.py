@@ -40,7 +40,7 @@ class Job:
         case: the case.
         run: function that runs the case.
         code: code version that the record will name.
-        alone: whether the case gets a new process, in which no earlier plan has loaded the libraries.
+        alone: whether the case gets a new process, without libraries and random states of earlier cases.
         patience: seconds until the case counts as hung.
     """
 

@@ -140,7 +140,7 @@ class Study:
         seconds: returns the estimated CPU time of a case [s].
         faults: returns the faults of a record, one line per fault.
         summary: returns the result in a record without faults, in a few words.
-        alone: whether every case gets a new process, in which no earlier plan has loaded the libraries.
+        alone: whether every case gets a new process, without libraries and random states of earlier cases.
         patience: returns the seconds until a case counts as hung.
         usual: whether `graspd bench all` includes the study. False, for example, if it needs files of the user.
         failures: whether `sections` also needs the records of failed cases.

@@ -72,8 +72,8 @@ MAX_PACKAGE_LINES = {
     "graspd_bench": 8_070,
     "graspd_dataset": 3_007,
     "graspd_viewer": 2_414,
-    "graspd_cell": 3_800,
-    "test": 34_293,
+    "graspd_cell": 3_805,
+    "test": 34_302,
 }
 # Lines that a program reaches through its imports, those inside functions too.
 # The layout aims at 22,000 of the node.
